@@ -1,0 +1,61 @@
+"""Morton (Z-order) codes: the keys of quadtree vertices and of evidence blocks.
+
+Bit ``i`` of the first coordinate lands at bit ``i * D`` of the code, of the second at
+``i * D + 1``, and so on, for ``D`` coordinates.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+BITS_2D = 31
+BITS_3D = 20
+
+_SPREAD_2D = (
+    (16, 0x0000FFFF0000FFFF),
+    (8, 0x00FF00FF00FF00FF),
+    (4, 0x0F0F0F0F0F0F0F0F),
+    (2, 0x3333333333333333),
+    (1, 0x5555555555555555),
+)
+_SPREAD_3D = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def encode(cells: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Morton codes of integer cells.
+
+    Args:
+        cells: ``[..., D]`` with ``D`` 2 or 3, each coordinate in ``[0, 2**31)`` or ``[0, 2**20)``.
+
+    Returns:
+        ``[...]`` int64 codes, ordered along the Z curve.
+    """
+    dimensions = cells.shape[-1]
+    spread = _SPREAD_2D if dimensions == 2 else _SPREAD_3D
+    code = np.zeros(cells.shape[:-1], np.int64)
+    for axis in range(dimensions):
+        bits = cells[..., axis].astype(np.int64)
+        for shift, mask in spread:
+            bits = (bits | (bits << shift)) & mask
+        code |= bits << axis
+    return code
+
+
+def decode(codes: NDArray[np.integer], dimensions: int) -> NDArray[np.int64]:
+    """Integer cells ``[..., D]`` of Morton codes ``[...]``; the inverse of :func:`encode`."""
+    spread = _SPREAD_2D if dimensions == 2 else _SPREAD_3D
+    shifts = [shift for shift, _ in spread]
+    top = 0x00000000FFFFFFFF if dimensions == 2 else 0x00000000001FFFFF
+    masks = [top, *(mask for _, mask in spread[:-1])]
+    cells = np.empty((*codes.shape, dimensions), np.int64)
+    for axis in range(dimensions):
+        bits = (codes.astype(np.int64) >> axis) & spread[-1][1]
+        for shift, mask in zip(reversed(shifts), reversed(masks), strict=True):
+            bits = (bits | (bits >> shift)) & mask
+        cells[..., axis] = bits
+    return cells

@@ -1,0 +1,102 @@
+"""A region as plain arrays: what the map file holds and what the evaluator reads.
+
+A region is a cube of the world of side ``2**depth * leaf_m``. Region ``(i, j, k)`` is centred at
+``(i, j, k) * region_pitch_m`` of the map frame; neighbours overlap by ``overlap_m`` and are
+blended there (see :mod:`triquad_format.evaluator`).
+
+Inside a region, ``u = (p - centre) / leaf_m + 2**(depth - 1)`` are leaf coordinates in
+``[0, 2**depth]``. At level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a
+plane lies at ``(a, b) * 2**(depth - l)``. Evidence voxels have the side of a leaf; a block is a
+cube of 8 x 8 x 8 voxels.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format.field_settings import FieldSettings
+
+AXES = ((0, 1), (0, 2), (1, 2))
+"""Coordinate axes of the planes XY, XZ and YZ."""
+
+PLANE_NAMES = ("xy", "xz", "yz")
+
+BLOCK_VOXELS = 8
+"""Voxels along the side of an evidence block."""
+
+BLOCK_BYTES = BLOCK_VOXELS**3 // 8
+"""Bytes of one bit mask of a block: voxel (x, y, z) is bit ``z`` of byte ``x * 8 + y``."""
+
+RegionIndex = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class VertexTable:
+    """The vertices of one plane and level with their feature vectors."""
+
+    plane: int
+    level: int
+    codes: NDArray[np.int64]  # [V] Morton codes of (a, b), strictly increasing
+    features: NDArray[np.floating]  # [V, feature_size]
+
+
+@dataclass(frozen=True)
+class Mlp:
+    """Weights of the decoder: three dense layers, ``y = x @ weight + bias``, ReLU between."""
+
+    weights: tuple[NDArray[np.float32], ...]  # [input, hidden], [hidden, hidden], [hidden, 1]
+    biases: tuple[NDArray[np.float32], ...]  # [hidden], [hidden], [1]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What rays have shown, as bit masks of 0.2 m voxels in sparse blocks."""
+
+    codes: NDArray[np.int64]  # [B] 3-D Morton codes of blocks, strictly increasing
+    surface: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray ended in the voxel
+    free: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray passed through the voxel
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """What training needs beyond the field, to go on as if it had not stopped.
+
+    Adam's moments follow the order of the tables' rows and of the MLP's arrays.
+    """
+
+    table_means: tuple[NDArray[np.floating], ...]  # per table [V, feature_size]
+    table_variances: tuple[NDArray[np.floating], ...]  # per table [V, feature_size]
+    table_steps: tuple[NDArray[np.int32], ...]  # per table [V] steps that each row took
+    mlp_means: tuple[NDArray[np.float32], ...]  # weights, then biases
+    mlp_variances: tuple[NDArray[np.float32], ...]
+    mlp_steps: int
+    sample_points: NDArray[np.float32]  # [S, 3] replay samples, metres from the region's centre
+    sample_labels: NDArray[np.floating]  # [S] signed distance, metres
+
+
+@dataclass(frozen=True)
+class Region:
+    """One region of a map, complete."""
+
+    index: RegionIndex
+    frequencies: NDArray[np.float32]  # [m] Fourier frequencies s_i
+    mlp: Mlp
+    tables: tuple[VertexTable, ...]  # plane-major: (plane 0, coarsest level), ...
+    evidence: Evidence
+    training: TrainingState | None
+
+
+@dataclass(frozen=True)
+class MapRecord:
+    """A map at one epoch: what a map file holds."""
+
+    name: str
+    epoch: int
+    settings: FieldSettings
+    regions: tuple[Region, ...]
+
+
+def region_centre(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:
+    """Centre [3] of a region in the map frame, metres."""
+    return np.asarray(index, np.float64) * settings.region_pitch_m

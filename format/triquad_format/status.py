@@ -1,0 +1,16 @@
+"""What the evidence says of a queried point."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Status of a point; the values travel on the wire as ``uint8``."""
+
+    UNKNOWN = 0
+    """No ray has shown anything here: the distance is not to be trusted."""
+
+    FREE = 1
+    """Rays have passed through here."""
+
+    SURFACE = 2
+    """Within the band around seen surfaces in which the distance is trained."""

@@ -1,0 +1,1 @@
+"""The triquad map server."""

@@ -1,0 +1,1 @@
+"""Command-line tools, the exact world and the scores."""
