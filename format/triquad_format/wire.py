@@ -89,7 +89,7 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
 
 
 @functools.cache
-def _annotations(message: type[Message]) -> dict[str, Any]:
+def _annotations(message: type[Any]) -> dict[str, Any]:
     hints = typing.get_type_hints(message, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(message)}
 

@@ -1,0 +1,179 @@
+"""Settings of the server: one small record per part, and their TOML file."""
+
+import dataclasses
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from triquad_format.errors import SettingsError
+from triquad_format.field_settings import FieldSettings, check_range
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """Which points of a scan are used, and which samples its rays give."""
+
+    range_min_m: float = 1.5
+    range_max_m: float = 50.0
+    thin_m: float = 0.05  # one point is kept per voxel of this side
+    surface_samples: int = 3  # N_s, per ray
+    free_samples: int = 3  # N_f, per ray
+    truncation_m: float = 0.3  # half width of the band around the end point
+    free_from: float = 0.3  # free samples begin at this share of the range
+    behind_m: float = 0.8  # and end this far behind the end point
+    max_points: int = 2_000_000  # a larger scan is refused
+
+    def __post_init__(self) -> None:
+        check_range("range_min_m", self.range_min_m, 0.0, 1e3)
+        check_range("range_max_m", self.range_max_m, self.range_min_m, 1e4)
+        check_range("thin_m", self.thin_m, 1e-3, 10.0)
+        check_range("surface_samples", self.surface_samples, 1, 64)
+        check_range("free_samples", self.free_samples, 0, 64)
+        check_range("truncation_m", self.truncation_m, 0.01, 10.0)
+        check_range("free_from", self.free_from, 0.0, 1.0)
+        check_range("behind_m", self.behind_m, 0.0, 100.0)
+        check_range("max_points", self.max_points, 1, 20_000_000)
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How the field is trained."""
+
+    batch: int = 8192  # samples per step
+    learning_rate: float = 0.01
+    beta1: float = 0.9
+    beta2: float = 0.99
+    pool_samples: int = 4_000_000  # replay samples kept, over the whole map
+    fresh_share: float = 0.5  # of a batch, drawn from the newest scans while they stream in
+    visits: float = 4.0  # training visits that each new sample pays for
+    max_backlog: int = 24_000_000  # visits owed at most
+    seed: int = 42
+
+    def __post_init__(self) -> None:
+        check_range("batch", self.batch, 1, 10_000_000)
+        check_range("learning_rate", self.learning_rate, 0.0, 1.0)
+        check_range("beta1", self.beta1, 0.0, 0.9999)
+        check_range("beta2", self.beta2, 0.0, 0.99999)
+        check_range("pool_samples", self.pool_samples, 1000, 1_000_000_000)
+        check_range("fresh_share", self.fresh_share, 0.0, 1.0)
+        check_range("visits", self.visits, 0.0, 1000.0)
+        check_range("max_backlog", self.max_backlog, 1, 10_000_000_000)
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """The lattice of mesh tiles."""
+
+    cell_m: float = 0.1
+    tile_cells: int = 64  # along the side of a tile
+
+    def __post_init__(self) -> None:
+        check_range("cell_m", self.cell_m, 0.01, 10.0)
+        check_range("tile_cells", self.tile_cells, 4, 256)
+
+    @property
+    def tile_side_m(self) -> float:
+        """Side of a tile."""
+        return self.cell_m * self.tile_cells
+
+
+@dataclass(frozen=True)
+class StoreSettings:
+    """When checkpoints are written and how many are kept."""
+
+    period_s: float = 60.0  # between checkpoints while the map changes; 0: only on request
+    keep: int = 5  # newest checkpoints that stay on disk
+
+    def __post_init__(self) -> None:
+        check_range("period_s", self.period_s, 0.0, 1e7)
+        check_range("keep", self.keep, 2, 1_000_000)
+
+
+@dataclass(frozen=True)
+class ServiceSettings:
+    """Limits of the network service."""
+
+    scan_queue: int = 32  # scans waiting; the oldest is pushed out, and counted
+    request_queue: int = 64  # requests waiting per operation
+    query_workers: int = 2
+    max_query_points: int = 1_000_000  # of one request
+    publish_period_s: float = 0.5  # between epochs while the map changes
+    epochs_kept: int = 4  # that a request can pin
+    flush_timeout_max_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        check_range("scan_queue", self.scan_queue, 1, 10_000)
+        check_range("request_queue", self.request_queue, 1, 10_000)
+        check_range("query_workers", self.query_workers, 1, 64)
+        check_range("max_query_points", self.max_query_points, 1, 20_000_000)
+        check_range("publish_period_s", self.publish_period_s, 0.01, 3600.0)
+        check_range("epochs_kept", self.epochs_kept, 1, 1000)
+        check_range("flush_timeout_max_s", self.flush_timeout_max_s, 0.1, 1e6)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings; each part of the server receives its own section."""
+
+    field: FieldSettings = field(default_factory=FieldSettings)
+    scan: ScanSettings = field(default_factory=ScanSettings)
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+    mesh: MeshSettings = field(default_factory=MeshSettings)
+    store: StoreSettings = field(default_factory=StoreSettings)
+    service: ServiceSettings = field(default_factory=ServiceSettings)
+
+
+def load_settings(path: Path) -> Settings:
+    """Settings from a TOML file; what it leaves out keeps its default.
+
+    Raises:
+        SettingsError: the file cannot be read, or a key is unknown, of the wrong type or out of
+            range. The text names the key and what is allowed.
+    """
+    try:
+        sections = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SettingsError(f"settings file {path}: {error}") from error
+    try:
+        return parse_settings(sections)
+    except SettingsError as error:
+        raise SettingsError(f"settings file {path}: {error}") from error
+
+
+def parse_settings(sections: dict[str, Any]) -> Settings:
+    """Settings from nested tables, such as ``{"field": {"leaf_m": 0.3}}``."""
+    defaults = Settings()
+    known = [part.name for part in dataclasses.fields(Settings)]
+    parts: dict[str, Any] = {}
+    for name, table in sections.items():
+        if name not in known:
+            raise SettingsError(f"unknown section [{name}]; known are {', '.join(known)}")
+        if not isinstance(table, dict):
+            raise SettingsError(f"{name} = {table!r} is not a section: write [{name}]")
+        parts[name] = _parse_section(name, type(getattr(defaults, name)), table)
+    return dataclasses.replace(defaults, **parts)
+
+
+def _parse_section(section: str, record: type[Any], table: dict[str, Any]) -> Any:
+    known = {entry.name: entry.type for entry in dataclasses.fields(record)}
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key not in known:
+            raise SettingsError(f"unknown key {key!r} in [{section}]; known are {', '.join(known)}")
+        wanted = known[key]
+        if wanted is float and type(value) is int:
+            value = float(value)
+        if type(value) is not wanted:
+            kind = getattr(wanted, "__name__", wanted)
+            raise SettingsError(f"{section}.{key} = {value!r} is not of type {kind}")
+        values[key] = value
+    try:
+        return record(**values)
+    except SettingsError as error:
+        raise SettingsError(f"[{section}] {error}") from error
