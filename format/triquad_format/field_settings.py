@@ -53,12 +53,12 @@ class FieldSettings:
     @property
     def region_side_m(self) -> float:
         """Side of a region's cube."""
-        return self.leaf_m * 2**self.depth
+        return self.leaf_m * (1 << self.depth)
 
     @property
     def region_pitch_m(self) -> float:
         """Distance between the centres of neighbouring regions: they overlap."""
-        return self.leaf_m * (2**self.depth - OVERLAP_LEAVES)
+        return self.leaf_m * ((1 << self.depth) - OVERLAP_LEAVES)
 
     @property
     def overlap_m(self) -> float:

@@ -5,11 +5,10 @@ its class) and its fields. The messages themselves are in :mod:`triquad_format.m
 ``docs/wire-protocol.md`` is the specification.
 """
 
-import dataclasses
 import functools
 import types
 import typing
-from typing import Any, ClassVar, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import msgpack
 import numpy as np
@@ -27,8 +26,6 @@ MessageT = TypeVar("MessageT", bound="Message")
 
 class Message:
     """Base of all wire messages; subclasses are frozen dataclasses."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
 
 
 def encode(message: Message) -> bytes:
@@ -90,8 +87,7 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
 
 @functools.cache
 def _annotations(message: type[Any]) -> dict[str, Any]:
-    hints = typing.get_type_hints(message, include_extras=True)
-    return {field.name: hints[field.name] for field in dataclasses.fields(message)}
+    return typing.get_type_hints(message, include_extras=True)
 
 
 def _pack(name: str, annotation: Any, value: object) -> object:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -121,12 +121,12 @@ class ServiceSettings:
 class Settings:
     """All settings; each part of the server receives its own section."""
 
-    field: FieldSettings = field(default_factory=FieldSettings)
-    scan: ScanSettings = field(default_factory=ScanSettings)
-    training: TrainingSettings = field(default_factory=TrainingSettings)
-    mesh: MeshSettings = field(default_factory=MeshSettings)
-    store: StoreSettings = field(default_factory=StoreSettings)
-    service: ServiceSettings = field(default_factory=ServiceSettings)
+    field: FieldSettings = FieldSettings()
+    scan: ScanSettings = ScanSettings()
+    training: TrainingSettings = TrainingSettings()
+    mesh: MeshSettings = MeshSettings()
+    store: StoreSettings = StoreSettings()
+    service: ServiceSettings = ServiceSettings()
 
 
 def load_settings(path: Path) -> Settings:
