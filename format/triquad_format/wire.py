@@ -27,6 +27,12 @@ MessageT = TypeVar("MessageT", bound="Message")
 class Message:
     """Base of all wire messages; subclasses are frozen dataclasses."""
 
+    @classmethod
+    @functools.cache
+    def annotations(cls) -> dict[str, Any]:
+        """The fields' names and annotations."""
+        return typing.get_type_hints(cls, include_extras=True)
+
 
 def encode(message: Message) -> bytes:
     """The bytes of a message.
@@ -35,7 +41,7 @@ def encode(message: Message) -> bytes:
         WireError: a field does not fit its annotation.
     """
     body: dict[str, object] = {"triquad": PROTOCOL_VERSION, "kind": type(message).__name__}
-    for name, annotation in _annotations(type(message)).items():
+    for name, annotation in message.annotations().items():
         body[name] = _pack(f"{type(message).__name__}.{name}", annotation, getattr(message, name))
     return typing.cast(bytes, msgpack.packb(body))
 
@@ -61,7 +67,7 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
     if body.get("kind") != expected.__name__:
         raise WireError(f"expected a {expected.__name__}, got {body.get('kind')!r}")
     fields: dict[str, object] = {}
-    for name, annotation in _annotations(expected).items():
+    for name, annotation in expected.annotations().items():
         if name not in body:
             raise WireError(f"{expected.__name__}.{name}: missing")
         fields[name] = _unpack(f"{expected.__name__}.{name}", annotation, body[name])
@@ -85,11 +91,6 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
     return body
 
 
-@functools.cache
-def _annotations(message: type[Any]) -> dict[str, Any]:
-    return typing.get_type_hints(message, include_extras=True)
-
-
 def _pack(name: str, annotation: Any, value: object) -> object:
     spec = _array_spec(annotation)
     if spec is not None:
@@ -98,14 +99,14 @@ def _pack(name: str, annotation: Any, value: object) -> object:
         spec.check(name, value)
         return pack_array(value)
     origin = get_origin(annotation)
-    if origin is types.UnionType:
+    if origin in (types.UnionType, typing.Union):
         return None if value is None else _pack(name, _required(annotation), value)
     if isinstance(annotation, type) and issubclass(annotation, Message):
         if not isinstance(value, annotation):
             raise WireError(f"{name}: expected {annotation.__name__}, got {value!r}")
         return {
             key: _pack(f"{name}.{key}", hint, getattr(value, key))
-            for key, hint in _annotations(annotation).items()
+            for key, hint in annotation.annotations().items()
         }
     if origin is list and isinstance(value, list):
         (item,) = get_args(annotation)
@@ -126,10 +127,10 @@ def _unpack(name: str, annotation: Any, value: object) -> object:
         spec.check(name, array)
         return array
     origin = get_origin(annotation)
-    if origin is types.UnionType:
+    if origin in (types.UnionType, typing.Union):
         return None if value is None else _unpack(name, _required(annotation), value)
     if isinstance(annotation, type) and issubclass(annotation, Message):
-        hints = _annotations(annotation)
+        hints = annotation.annotations()
         if not isinstance(value, dict) or not hints.keys() <= value.keys():
             raise WireError(f"{name}: expected a map with {', '.join(hints)}")
         return annotation(
