@@ -57,11 +57,13 @@ def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
     if not isinstance(packed, Mapping) or set(packed) != {"dtype", "shape", "data"}:
         raise WireError(f"{name}: expected an array with dtype, shape and data")
     dtype, shape, data = packed["dtype"], packed["shape"], packed["data"]
-    if dtype not in DTYPES:
+    if not isinstance(dtype, str) or dtype not in DTYPES:
         raise WireError(f"{name}: dtype {dtype!r} is not one of {sorted(DTYPES)}")
     if not isinstance(shape, list) or len(shape) > MAX_DIMENSIONS:
         raise WireError(f"{name}: shape {shape!r} is not a list of at most {MAX_DIMENSIONS} sizes")
-    if not all(type(size) is int and 0 <= size < 2**40 for size in shape):
+    # Sizes beside a zero count too: numpy does not form shapes beyond 64 bits, however empty.
+    counts = all(type(size) is int and 0 <= size < 2**40 for size in shape)
+    if not counts or math.prod(size or 1 for size in shape) >= 2**40:
         raise WireError(f"{name}: shape {shape!r} has a size that is not a count")
     if not isinstance(data, bytes) or math.prod(shape) * np.dtype(dtype).itemsize != len(data):
         raise WireError(f"{name}: shape {shape!r} of {dtype} does not fill its data")

@@ -1,0 +1,26 @@
+"""The map file: how a map is kept and handed on. ``docs/map-file.md`` is the specification."""
+
+from triquad_format.mapfile_reader import (
+    KNOWN_FEATURES,
+    MAX_MAP_BYTES,
+    MapFile,
+    StoredPart,
+    read_map,
+    read_map_file,
+)
+from triquad_format.mapfile_writer import FORMAT_VERSION, MapFileInfo, write_map
+
+SUFFIX = ".triquad"
+
+__all__ = [
+    "FORMAT_VERSION",
+    "KNOWN_FEATURES",
+    "MAX_MAP_BYTES",
+    "SUFFIX",
+    "MapFile",
+    "MapFileInfo",
+    "StoredPart",
+    "read_map",
+    "read_map_file",
+    "write_map",
+]

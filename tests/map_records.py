@@ -1,0 +1,125 @@
+"""Small random map records, sound in every field, for any test that needs a map."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format import morton
+from triquad_format.field_settings import FieldSettings
+from triquad_format.region import (
+    AXES,
+    BLOCK_BYTES,
+    BLOCK_VOXELS,
+    Evidence,
+    MapRecord,
+    Mlp,
+    Region,
+    RegionIndex,
+    TrainingState,
+    VertexTable,
+)
+
+SMALL = FieldSettings(
+    leaf_m=0.25, depth=6, feature_levels=2, feature_size=3, frequencies=4, hidden=5,
+    frequency_variance=4.0, logit_scale_m=0.5,
+)  # fmt: skip
+"""A region of 16 m that overlaps its neighbours by 4 m."""
+
+
+def random_record(
+    seed: int = 0,
+    *,
+    settings: FieldSettings = SMALL,
+    indices: tuple[RegionIndex, ...] = ((0, 0, 0),),
+    points: int = 40,
+    training: bool = True,
+    feature_dtype: str = "<f2",
+    name: str = "default",
+    epoch: int = 7,
+) -> MapRecord:
+    """A record whose regions have seen ``points`` random surface points each."""
+    rng = np.random.default_rng(seed)
+    regions = tuple(
+        random_region(rng, settings, index, points, training, feature_dtype) for index in indices
+    )
+    return MapRecord(name, epoch, settings, regions)
+
+
+def random_region(
+    rng: np.random.Generator,
+    settings: FieldSettings,
+    index: RegionIndex,
+    points: int,
+    training: bool,
+    feature_dtype: str,
+) -> Region:
+    """A region with vertices and evidence at random leaves."""
+    leaves = rng.integers(0, 1 << settings.depth, (points, 3))
+    tables = tuple(
+        _table(rng, settings, leaves, plane, level, feature_dtype)
+        for plane in range(len(AXES))
+        for level in settings.levels
+    )
+    mlp = _mlp(rng, settings)
+    return Region(
+        index=index,
+        frequencies=_floats(rng, settings.frequencies) * np.float32(settings.frequency_variance**0.5),
+        mlp=mlp,
+        tables=tables,
+        evidence=_evidence(rng, leaves),
+        training=_training(rng, mlp, tables, points) if training else None,
+    )
+
+
+def _floats(rng: np.random.Generator, *shape: int) -> NDArray[np.float32]:
+    return rng.standard_normal(shape, np.float32)
+
+
+def _table(
+    rng: np.random.Generator,
+    settings: FieldSettings,
+    leaves: NDArray[np.int64],
+    plane: int,
+    level: int,
+    dtype: str,
+) -> VertexTable:
+    nodes = leaves[:, AXES[plane]] >> (settings.depth - level)
+    corners = np.concatenate([nodes + (a, b) for a in (0, 1) for b in (0, 1)])
+    codes = np.unique(morton.encode(corners))
+    features = _floats(rng, len(codes), settings.feature_size).astype(dtype)
+    return VertexTable(plane, level, codes, features)
+
+
+def _mlp(rng: np.random.Generator, settings: FieldSettings) -> Mlp:
+    sizes = (settings.input_size, settings.hidden, settings.hidden, 1)
+    pairs = list(zip(sizes[:-1], sizes[1:], strict=True))
+    weights = tuple(_floats(rng, a, b) * np.float32(a**-0.5) for a, b in pairs)
+    return Mlp(weights, tuple(_floats(rng, b) for _, b in pairs))
+
+
+def _evidence(rng: np.random.Generator, leaves: NDArray[np.int64]) -> Evidence:
+    codes = np.unique(morton.encode(leaves // BLOCK_VOXELS))
+    surface = np.zeros((len(codes), BLOCK_BYTES), np.uint8)
+    rows = np.searchsorted(codes, morton.encode(leaves // BLOCK_VOXELS))
+    x, y, z = (leaves % BLOCK_VOXELS).T
+    np.bitwise_or.at(surface, (rows, x * BLOCK_VOXELS + y), (1 << z).astype(np.uint8))
+    free = rng.integers(0, 256, surface.shape).astype(np.uint8)
+    return Evidence(codes, surface, free)
+
+
+def _training(
+    rng: np.random.Generator, mlp: Mlp, tables: tuple[VertexTable, ...], samples: int
+) -> TrainingState:
+    arrays = (*mlp.weights, *mlp.biases)
+    return TrainingState(
+        table_means=tuple(_floats(rng, *table.features.shape) for table in tables),
+        table_variances=tuple(_floats(rng, *table.features.shape) ** 2 for table in tables),
+        table_steps=tuple(
+            rng.integers(0, 1000, len(table.codes)).astype(np.int32) for table in tables
+        ),
+        mlp_means=tuple(_floats(rng, *array.shape) for array in arrays),
+        mlp_variances=tuple(_floats(rng, *array.shape) ** 2 for array in arrays),
+        mlp_steps=int(rng.integers(0, 10**6)),
+        sample_points=_floats(rng, samples, 3),
+        sample_labels=_floats(rng, samples).astype(np.float16),
+        visits_owed=int(rng.integers(0, 10**6)),
+    )
