@@ -14,6 +14,7 @@ from triquad_tools.voxel import thin
 _SENSOR_HEIGHT_M = 1.8
 _LANE_M = 1.6  # lateral offset of the lane from the middle of the road
 _WEAVE_M = 0.3
+_MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 _TILT_RAD = math.radians(1.0)  # of the gentle roll and pitch
 
 
@@ -99,10 +100,12 @@ class SimulatedDrive:
 
         The noise-free hits of all scans, one per voxel of side ``voxel_m``.
         """
-        seen = np.empty((0, 3))
+        clouds = [np.empty((0, 3))]  # the first is what is merged so far
         for scan in self:
-            seen = thin(np.concatenate([seen, scan.true_hits]), voxel_m)
-        return seen
+            clouds.append(thin(scan.true_hits, voxel_m))
+            if sum(map(len, clouds[1:])) > max(len(clouds[0]), _MERGED_POINTS):
+                clouds = [thin(np.concatenate(clouds), voxel_m)]
+        return thin(np.concatenate(clouds), voxel_m)
 
 
 def drive(scene: Scene, n_scans: int, step_m: float) -> NDArray[np.float64]:

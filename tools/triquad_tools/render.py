@@ -11,11 +11,11 @@ from triquad_tools.raster import Raster, rasterise, vertex_normals
 
 _SUPERSAMPLING = 2
 _SHADOW_PIXELS = 3072
-_TOWARDS_SUN = np.array([-0.64, -0.40, 0.66]) / np.linalg.norm([-0.64, -0.40, 0.66])
+_TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 
 # Colours are linear light in [0, 1].
 _CLAY = np.array([0.66, 0.62, 0.56])
-_SUN = np.array([1.0, 0.93, 0.80]) * 0.95
+_SUN = np.array([1.0, 0.93, 0.80]) * 1.08
 _SKY_LIGHT = np.array([0.55, 0.68, 0.90]) * 0.50
 _GROUND_LIGHT = np.array([0.50, 0.44, 0.38]) * 0.22
 _SKY_TOP = np.array([0.52, 0.67, 0.85])
