@@ -52,7 +52,8 @@ class TrainingSettings:
     pool_samples: int = 4_000_000  # replay samples kept, over the whole map
     fresh_share: float = 0.5  # of a batch, drawn from the newest scans while they stream in
     visits: float = 4.0  # training visits that each new sample pays for
-    max_backlog: int = 24_000_000  # visits owed at most
+    max_backlog: int = 24_000_000  # visits owed at most, per region
+    cooldown: float = 1.0  # the rate falls once less than this many visits a kept sample are owed
     seed: int = 42
 
     def __post_init__(self) -> None:
@@ -63,6 +64,7 @@ class TrainingSettings:
         check_range("pool_samples", self.pool_samples, 1000, 1_000_000_000)
         check_range("fresh_share", self.fresh_share, 0.0, 1.0)
         check_range("visits", self.visits, 0.0, 1000.0)
+        check_range("cooldown", self.cooldown, 0.001, 1000.0)
         check_range("max_backlog", self.max_backlog, 1, 10_000_000_000)
 
 
@@ -72,10 +74,12 @@ class MeshSettings:
 
     cell_m: float = 0.1
     tile_cells: int = 64  # along the side of a tile
+    reach_m: float = 0.1  # cells are meshed up to this far from voxels with seen surface
 
     def __post_init__(self) -> None:
         check_range("cell_m", self.cell_m, 0.01, 10.0)
         check_range("tile_cells", self.tile_cells, 4, 256)
+        check_range("reach_m", self.reach_m, 0.0, 1.0)
 
     @property
     def tile_side_m(self) -> float:

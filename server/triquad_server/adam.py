@@ -1,0 +1,90 @@
+"""Adam for parameters of which a step touches some rows (Kingma and Ba 2015, algorithm 1)."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+EPSILON = 1e-10
+
+
+@dataclass(frozen=True)
+class Betas:
+    """Decay rates of the two moments."""
+
+    mean: float
+    variance: float
+
+
+class Parameter:
+    """Rows of values with their optimiser state; growing keeps both together.
+
+    ``steps`` counts the steps of each row, so that the moments of a row that is new or seldom
+    touched are corrected for its own age.
+    """
+
+    def __init__(self, values: Tensor) -> None:
+        self._count = len(values)
+        self._values = values.clone()
+        self._means = torch.zeros_like(values)
+        self._variances = torch.zeros_like(values)
+        self._steps = torch.zeros(len(values), dtype=torch.int32, device=values.device)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def values(self) -> Tensor:
+        """The parameter [rows, ...]; a view that :meth:`step` changes in place."""
+        return self._values[: self._count]
+
+    @property
+    def means(self) -> Tensor:
+        """First moments, shaped as ``values``."""
+        return self._means[: self._count]
+
+    @property
+    def variances(self) -> Tensor:
+        """Second moments, shaped as ``values``."""
+        return self._variances[: self._count]
+
+    @property
+    def steps(self) -> Tensor:
+        """Steps that each row took [rows] int32."""
+        return self._steps[: self._count]
+
+    def append(self, values: Tensor) -> None:
+        """Add rows with fresh optimiser state; that of the others stays."""
+        count = self._count + len(values)
+        if count > len(self._values):
+            capacity = max(count, 2 * len(self._values))
+            self._values = _grown(self._values, capacity)
+            self._means = _grown(self._means, capacity)
+            self._variances = _grown(self._variances, capacity)
+            self._steps = _grown(self._steps, capacity)
+        self._values[self._count : count] = values
+        self._count = count
+
+    def restore(self, means: Tensor, variances: Tensor, steps: Tensor) -> None:
+        """Take over optimiser state, shaped as this parameter's."""
+        self.means.copy_(means)
+        self.variances.copy_(variances)
+        self.steps.copy_(steps)
+
+    def step(self, rows: Tensor, gradient: Tensor, rates: Tensor | float, betas: Betas) -> None:
+        """One step of ``rows`` [T] along ``gradient`` [T, ...] at learning ``rates`` ([T, 1])."""
+        self._steps[rows] += 1
+        age = self._steps[rows].to(gradient.dtype).reshape(-1, *[1] * (gradient.dim() - 1))
+        means = self._means[rows].lerp_(gradient, 1 - betas.mean)
+        variances = self._variances[rows].lerp_(gradient.square(), 1 - betas.variance)
+        self._means[rows] = means
+        self._variances[rows] = variances
+        mean = means / (1 - betas.mean**age)
+        deviation = (variances / (1 - betas.variance**age)).sqrt_()
+        self._values[rows] -= rates * mean / (deviation + EPSILON)
+
+
+def _grown(tensor: Tensor, capacity: int) -> Tensor:
+    grown = tensor.new_zeros((capacity, *tensor.shape[1:]))
+    grown[: len(tensor)] = tensor
+    return grown

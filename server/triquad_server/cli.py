@@ -1,0 +1,141 @@
+"""``triquad-server``: the command line of the map server."""
+
+import argparse
+import importlib.util
+import logging
+import queue
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import triquad_format
+from triquad_format.errors import FormatError
+from triquad_format.keys import check_name
+
+OK, UNEXPECTED, USAGE, CANNOT_LISTEN, STORE = 0, 1, 2, 3, 4
+
+_EPILOG = """\
+exit codes:
+  0  stopped by SIGINT or SIGTERM; the map is in the store, if there is one
+  1  an unexpected error; the log has the details
+  2  wrong usage or settings, or a missing extra (install triquad[server])
+  3  cannot listen on an endpoint (port in use), or cannot connect to one
+  4  the store cannot be used: not writable, in use, or all checkpoints are damaged
+"""
+
+_NEEDED = ("torch", "numba", "skimage")
+
+_log = logging.getLogger("triquad_server")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the server until SIGINT or SIGTERM; returns the exit code."""
+    options = _parser().parse_args(argv)
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=options.log_level.upper(),
+        format="%(asctime)s %(levelname)s %(message)s",
+    )
+    for name in ("numba", "torch"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        _log.error("%s is missing: install triquad[server]", ", ".join(missing))
+        return USAGE
+    return _run(options)
+
+
+def _run(options: argparse.Namespace) -> int:
+    # Only now, since these need the server's extra.
+    from triquad_server.errors import ListenError, ServerError, StoreError
+    from triquad_server.launch import LaunchOptions, Stop, run_server
+    from triquad_server.network import NetworkOptions
+    from triquad_server.settings import Settings, load_settings
+
+    stops: queue.SimpleQueue[Stop] = queue.SimpleQueue()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stops.put(Stop.ASKED))
+    try:
+        launch = LaunchOptions(
+            check_name("map", options.map),
+            NetworkOptions(
+                tuple(options.listen),
+                tuple(options.connect),
+                options.mode,
+                options.config,
+                False if options.no_multicast_scouting else None,
+            ),
+            load_settings(options.settings) if options.settings else Settings(),
+            options.store,
+            options.device,
+        )
+        why = run_server(launch, stops)
+    except ListenError as error:
+        _log.error("%s", error)
+        return CANNOT_LISTEN
+    except StoreError as error:
+        _log.error("%s", error)
+        return STORE
+    except (ServerError, FormatError) as error:
+        _log.error("%s", error)
+        return USAGE
+    except Exception:
+        _log.exception("unexpected")
+        return UNEXPECTED
+    return OK if why is Stop.ASKED else UNEXPECTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="triquad-server",
+        description="A long-running map server: learns a signed-distance field from scans that "
+        "arrive over Zenoh, and answers queries.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--map", default="default", metavar="NAME", help="name of the map (default: default)")
+    add(
+        "--store",
+        type=Path,
+        metavar="DIR",
+        help="folder for checkpoints, in a folder per map; without it the map is not kept",
+    )
+    add("--settings", type=Path, metavar="FILE", help="settings of the server, TOML")
+    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
+    network = parser.add_argument_group("network")
+    add = network.add_argument
+    add(
+        "-l",
+        "--listen",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="such as tcp/0.0.0.0:7447, repeatable (default: tcp/127.0.0.1:7447)",
+    )
+    add(
+        "-e",
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="another Zenoh router to connect to, repeatable",
+    )
+    add("-m", "--mode", choices=("router", "peer", "client"), help="default: router")
+    add("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration, JSON5")
+    add("--no-multicast-scouting", action="store_true", help="do not look for others by multicast")
+    parser.add_argument(
+        "--log-level",
+        choices=("debug", "info", "warning", "error"),
+        default="info",
+        help="default: info",
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"triquad {triquad_format.__version__}"
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,81 @@
+"""Map files that clients fetch in chunks."""
+
+import hashlib
+import logging
+import tempfile
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_format.mapfile import write_map
+from triquad_format.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
+from triquad_format.region import MapRecord
+
+from triquad_server.errors import RequestError
+from triquad_server.mapper_thread import MapperThread
+
+_log = logging.getLogger(__name__)
+
+CHUNK_BYTES = 2**20
+FILES_KEPT = 2
+
+
+@dataclass(frozen=True)
+class _MapBytes:
+    """A map file in memory."""
+
+    info: MapInfo
+    training: bool
+    data: bytes
+
+
+class MapDownloads:
+    """Serialises epochs on request; the files asked for last are kept."""
+
+    def __init__(self, mapper: MapperThread) -> None:
+        self._mapper = mapper
+        self._lock = threading.Lock()
+        self._files: OrderedDict[str, _MapBytes] = OrderedDict()
+
+    def info(self, request: MapInfoRequest) -> MapInfo:
+        """Make the newest epoch's file, unless it is there."""
+        newest = self._mapper.epochs.newest
+        with self._lock:
+            for file in self._files.values():
+                if file.info.epoch == newest.number and file.training == request.training:
+                    self._files.move_to_end(file.info.sha256)
+                    return file.info
+        if request.training:
+            record = self._mapper.call(lambda mapper: mapper.record(True))
+        else:
+            record = newest.record()
+        data = _serialised(record)
+        sha256 = hashlib.sha256(data).hexdigest()
+        info = MapInfo(record.epoch, len(data), sha256, CHUNK_BYTES)
+        with self._lock:
+            self._files[sha256] = _MapBytes(info, request.training, data)
+            while len(self._files) > FILES_KEPT:
+                self._files.popitem(last=False)
+        return info
+
+    def chunk(self, request: MapChunkRequest) -> MapChunk:
+        """Bytes of a file that is kept."""
+        with self._lock:
+            file = self._files.get(request.sha256)
+        if file is None:
+            raise RequestError("chunk_gone", "this map file is not kept; ask for its info again")
+        if not 0 <= request.offset < len(file.data):
+            raise RequestError(
+                "bad_request",
+                f"offset {request.offset} is outside the file of {len(file.data)} bytes",
+            )
+        end = request.offset + CHUNK_BYTES
+        return MapChunk(request.offset, file.data[request.offset : end])
+
+
+def _serialised(record: MapRecord) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="triquad-") as folder:
+        path = Path(folder) / "map.triquad"
+        write_map(record, path)
+        return path.read_bytes()

@@ -1,0 +1,243 @@
+"""A published, immutable state of the map, and the questions it answers."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.field_settings import FieldSettings
+from triquad_format.region import (
+    BLOCK_VOXELS,
+    MapRecord,
+    Region,
+    RegionIndex,
+    region_centre,
+)
+from triquad_format.status import Status
+
+from triquad_server.engine import Engine, make_engine
+from triquad_server.evidence import Evidence
+from triquad_server.field import Field
+from triquad_server.field_record import field_mlp, field_tables
+from triquad_server.mesher import TileMesh, mesh_tile
+from triquad_server.settings import MeshSettings
+
+_CHUNK = 65_536
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a map says of N points."""
+
+    sdf: NDArray[np.float32]  # [N] metres, NaN where no region is
+    status: NDArray[np.uint8]  # [N] Status values
+    gradient: NDArray[np.float32] | None  # [N, 3] d(sdf)/dx, map frame
+
+
+@dataclass(frozen=True)
+class TileSet:
+    """Mesh tiles that may hold a surface."""
+
+    indices: NDArray[np.int32]  # [T, 3]
+    changed: NDArray[np.int64]  # [T] epoch in which each last changed
+
+
+@dataclass(frozen=True)
+class FrozenRegion:
+    """A region as it was when it was published."""
+
+    index: RegionIndex
+    centre: NDArray[np.float64]  # [3] map frame
+    field: Field
+    engine: Engine  # that computes the field
+    evidence: Evidence
+    changed: int  # epoch of its last change
+
+
+class Epoch:
+    """An immutable map: every answer comes from the same state. Safe to read from any thread."""
+
+    def __init__(
+        self,
+        name: str,
+        number: int,
+        settings: FieldSettings,
+        mesh: MeshSettings,
+        regions: tuple[FrozenRegion, ...],
+    ) -> None:
+        self.number = number
+        self.frozen_regions = regions
+        self._name = name
+        self._settings = settings
+        self._mesh = mesh
+
+    @property
+    def regions(self) -> int:
+        """Regions of the map."""
+        return len(self.frozen_regions)
+
+    @property
+    def vertices(self) -> int:
+        """Quadtree vertices of all regions."""
+        return sum(region.field.vertices for region in self.frozen_regions)
+
+    @property
+    def parameters(self) -> int:
+        """Learnable numbers of all regions."""
+        return sum(region.field.parameters for region in self.frozen_regions)
+
+    def query(self, points: NDArray[np.float64], gradient: bool) -> Answer:
+        """Signed distance, status and, on request, gradient at points [N, 3] of the map frame."""
+        parts = [
+            self._query(points[start : start + _CHUNK], gradient)
+            for start in range(0, max(1, len(points)), _CHUNK)
+        ]
+        gradients = [part.gradient for part in parts if part.gradient is not None]
+        return Answer(
+            np.concatenate([part.sdf for part in parts]),
+            np.concatenate([part.status for part in parts]),
+            np.concatenate(gradients) if gradient else None,
+        )
+
+    def status(
+        self,
+        points: NDArray[np.float64],
+        reach_m: float | None = None,
+    ) -> NDArray[np.uint8]:
+        """Status values [N] of points [N, 3]: what the evidence of each point's region says.
+
+        ``SURFACE`` reaches ``reach_m`` beyond the voxels in which rays ended; half a voxel if
+        not given.
+        """
+        reach = 0.5 if reach_m is None else reach_m / self._settings.leaf_m
+        owners = np.floor(points / self._settings.region_pitch_m + 0.5)
+        status = np.full(len(points), Status.UNKNOWN, np.uint8)
+        for region in self.frozen_regions:
+            mine = (owners == region.index).all(axis=1)
+            if mine.any():
+                status[mine] = region.evidence.status(self._voxels(region, points[mine]), reach)
+        return status
+
+    def tiles(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> TileSet:
+        """Tiles that hold seen surface and meet the box between two corners [3]."""
+        changed: dict[tuple[int, int, int], int] = {}
+        for region in self.frozen_regions:
+            for tile in self._surface_tiles(region):
+                changed[tile] = max(region.changed, changed.get(tile, 0))
+        indices = np.array(sorted(changed), np.int32).reshape(-1, 3)
+        low = indices * self._mesh.tile_side_m
+        meets = ((low <= maximum) & (low + self._mesh.tile_side_m >= minimum)).all(axis=1)
+        indices = indices[meets]
+        versions = [changed[(int(x), int(y), int(z))] for x, y, z in indices]
+        return TileSet(indices, np.array(versions, np.int64))
+
+    def mesh(self, tile: tuple[int, int, int]) -> TileMesh:
+        """The mesh of one tile; empty where no surface was seen."""
+        return mesh_tile(self, tile, self._mesh)
+
+    def changed(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> int:
+        """Epoch of the last change to any region that meets the box; 0 where there is none."""
+        half = self._settings.region_side_m / 2
+        return max(
+            (
+                region.changed
+                for region in self.frozen_regions
+                if ((region.centre - half <= high) & (region.centre + half >= low)).all()
+            ),
+            default=0,
+        )
+
+    def record(self) -> MapRecord:
+        """The epoch as a map file holds it, without training state."""
+        regions = tuple(
+            Region(
+                index=region.index,
+                frequencies=region.field.frequencies.cpu().numpy(),
+                mlp=field_mlp(region.field),
+                tables=field_tables(region.field),
+                evidence=region.evidence.record(),
+                training=None,
+            )
+            for region in self.frozen_regions
+        )
+        return MapRecord(self._name, self.number, self._settings, regions)
+
+    def _query(self, points: NDArray[np.float64], gradient: bool) -> Answer:
+        """Blend the regions that cover each point, so that there is no step where they overlap."""
+        half = self._settings.region_side_m / 2
+        weight_sum = np.zeros(len(points))
+        value_sum = np.zeros(len(points))
+        slope_sum = np.zeros((len(points), 3))  # of weight * value
+        tilt_sum = np.zeros((len(points), 3))  # of weight
+        for region in self.frozen_regions:
+            offsets = points - region.centre
+            mine = np.flatnonzero((np.abs(offsets) < half).all(axis=1))
+            if len(mine) == 0:
+                continue
+            inside = half - np.abs(offsets[mine])
+            ramps = np.clip(inside / self._settings.overlap_m, 0, 1)
+            weights = ramps.prod(axis=1)
+            values = region.engine.evaluate(offsets[mine].astype(np.float32), gradient)
+            weight_sum[mine] += weights
+            value_sum[mine] += weights * values.sdf
+            if gradient:
+                tilt = _ramp_gradient(offsets[mine], ramps, self._settings.overlap_m)
+                slope_sum[mine] += weights[:, None] * values.gradient + tilt * values.sdf[:, None]
+                tilt_sum[mine] += tilt
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sdf = value_sum / weight_sum
+            slopes = (slope_sum - sdf[:, None] * tilt_sum) / weight_sum[:, None]
+        return Answer(
+            sdf.astype(np.float32),
+            self.status(points),
+            slopes.astype(np.float32) if gradient else None,
+        )
+
+    def _surface_tiles(self, region: FrozenRegion) -> Iterator[tuple[int, int, int]]:
+        """Tiles that meet a block with seen surface, and half a voxel around it."""
+        side = BLOCK_VOXELS * self._settings.leaf_m
+        reach = self._settings.leaf_m / 2
+        corner = region.centre - self._settings.region_side_m / 2
+        low = region.evidence.surface_cells() * side + corner - reach
+        tiles = set()
+        for shift in np.ndindex(2, 2, 2):
+            ends = low + np.array(shift) * (side + 2 * reach)
+            tiles.update(map(tuple, np.floor(ends / self._mesh.tile_side_m).astype(int).tolist()))
+        return iter(tiles)
+
+    def _voxels(self, region: FrozenRegion, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        half = 1 << (self._settings.depth - 1)
+        return (points - region.centre) / self._settings.leaf_m + half
+
+
+def frozen_region(
+    index: RegionIndex,
+    settings: FieldSettings,
+    field: Field,
+    evidence: Evidence,
+    changed: int,
+) -> FrozenRegion:
+    """A copy of a live region for publication."""
+    twin = field.copy()
+    return FrozenRegion(
+        index,
+        region_centre(settings, index),
+        twin,
+        make_engine(twin),
+        evidence.copy(),
+        changed,
+    )
+
+
+def _ramp_gradient(
+    offsets: NDArray[np.float64],
+    ramps: NDArray[np.float64],
+    overlap_m: float,
+) -> NDArray[np.float64]:
+    """Gradient [N, 3] of the product of the three ramps."""
+    slopes = np.where((ramps > 0) & (ramps < 1), -np.sign(offsets) / overlap_m, 0.0)
+    others = np.stack(
+        [ramps[:, 1] * ramps[:, 2], ramps[:, 0] * ramps[:, 2], ramps[:, 0] * ramps[:, 1]],
+        axis=1,
+    )
+    return slopes * others

@@ -1,0 +1,78 @@
+"""Publishes the status once a second, and logs the progress now and then."""
+
+import logging
+import threading
+
+import zenoh
+from triquad_format import keys, wire
+from triquad_format.messages import ServerStatus
+
+from triquad_server.health import Health
+
+_log = logging.getLogger(__name__)
+
+STATUS_PERIOD_S = 1.0
+_BEATS_PER_LOG_LINE = 5
+
+
+class Heartbeat:
+    """Tells the network and the log how the server is doing."""
+
+    def __init__(self, session: zenoh.Session, map_name: str, health: Health) -> None:
+        self._health = health
+        # Not the priority of the replies: a publisher that drops, at the priority of one that
+        # blocks, waits for the same slow client.
+        self._publisher = session.declare_publisher(
+            keys.status_key(map_name),
+            encoding=keys.encoding(ServerStatus),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_LOW,
+        )
+        self._logged: ServerStatus | None = None
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop publishing."""
+        self._stopping.set()
+        self._thread.join()
+        self._publisher.undeclare()
+
+    def _run(self) -> None:
+        beat = 0
+        while not self._stopping.wait(STATUS_PERIOD_S):
+            beat += 1
+            try:
+                status = self._health.status()
+                self._publisher.put(wire.encode(status))
+            except Exception:
+                _log.exception("the status could not be published")
+                continue
+            if beat % _BEATS_PER_LOG_LINE == 0:
+                self._log_progress(status)
+
+    def _log_progress(self, status: ServerStatus) -> None:
+        """One line, where anything happened since the last one."""
+        before, self._logged = self._logged, status
+        if before is not None and _activity(before) == _activity(status):
+            return
+        _log.info(
+            "epoch %d%s: %d scans taken, %d dropped, %d lost, %d waiting; "
+            "%.1f M samples trained, loss %.4f; %d regions, %d vertices; %.0f MB",
+            status.epoch,
+            " (settled)" if status.settled else "",
+            status.scans_taken,
+            sum(status.scans_dropped.values()),
+            sum(status.scans_lost.values()),
+            status.scans_waiting,
+            status.samples_trained / 1e6,
+            status.loss,
+            status.regions,
+            status.vertices,
+            status.memory_bytes / 1e6,
+        )
+
+
+def _activity(status: ServerStatus) -> tuple[object, ...]:
+    return status.epoch, status.scans_taken, status.scans_dropped, status.scans_lost

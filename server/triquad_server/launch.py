@@ -1,0 +1,108 @@
+"""Starting and stopping a server process."""
+
+import logging
+import queue
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import torch
+
+from triquad_server.errors import ServerError
+from triquad_server.mapper import Mapper
+from triquad_server.network import NetworkOptions, listen_endpoints, open_session
+from triquad_server.service import Service
+from triquad_server.settings import Settings
+from triquad_server.store import Store
+
+_log = logging.getLogger("triquad_server")
+
+
+class Stop(Enum):
+    """Why a server stops."""
+
+    ASKED = "asked to"
+    DEFECT = "by a defect"
+
+
+Stops = queue.SimpleQueue[Stop]
+"""Where signals and defects ask the server to stop; may be put to from a signal handler."""
+
+
+@dataclass(frozen=True)
+class LaunchOptions:
+    """What a server process is started with."""
+
+    map_name: str
+    network: NetworkOptions
+    settings: Settings
+    store: Path | None
+    device: str  # "cpu", "cuda" or "auto"
+
+
+def run_server(options: LaunchOptions, stops: Stops) -> Stop:
+    """Serve until something is put into ``stops``, and return it.
+
+    Raises:
+        ServerError: the server cannot start; subclasses tell what is in the way.
+    """
+    device = choose_device(options.device)
+    with ExitStack() as stack:
+        store = None
+        restored = None
+        if options.store is not None:
+            store = Store(options.store, options.map_name, options.settings.store.keep)
+            stack.enter_context(closing(store))
+            restored = store.newest()
+        if restored is not None:
+            _log.info("restoring epoch %d from %s", restored.record.epoch, restored.info.path)
+        record = restored.record if restored else None
+        mapper = Mapper(options.map_name, options.settings, device, record)
+        session = stack.enter_context(closing(open_session(options.network)))
+        service = Service(
+            session,
+            mapper,
+            options.map_name,
+            options.settings,
+            device,
+            store,
+            restored.info if restored else None,
+            lambda: stops.put(Stop.DEFECT),
+        )
+        stack.enter_context(closing(service))
+        _log_ready(options, service.epoch, device)
+        why = stops.get()
+        _log.info("stopping, %s", why.value)
+    _log.info("stopped")
+    return why
+
+
+def choose_device(wanted: str) -> str:
+    """The device to compute on: ``wanted``, or for "auto" a GPU where there is one.
+
+    Raises:
+        ServerError: there is no GPU, but one is wanted.
+    """
+    available = torch.cuda.is_available()
+    if wanted == "cuda" and not available:
+        raise ServerError("--device cuda: no CUDA device is usable here; use cpu or auto")
+    if wanted == "auto":
+        return "cuda" if available else "cpu"
+    return wanted
+
+
+def _log_ready(options: LaunchOptions, epoch: int, device: str) -> None:
+    endpoints = ", ".join(listen_endpoints(options.network)) or "the configured endpoints"
+    if not options.network.listen and options.network.config_file is None:
+        _log.info("no --listen: only this machine can connect")
+    if options.store is None:
+        _log.warning("no --store: the map is not kept when the server stops")
+    _log.info(
+        "ready: map '%s' on %s, epoch %d, %s, store %s",
+        options.map_name,
+        endpoints,
+        epoch,
+        device,
+        options.store or "none",
+    )

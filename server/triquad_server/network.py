@@ -1,0 +1,77 @@
+"""Where the server listens, as a Zenoh configuration."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import zenoh
+
+from triquad_server.errors import ListenError, ServerError
+
+DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Options that are given to the Zenoh session; ``None`` leaves the file's value."""
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    mode: str | None = None
+    config_file: Path | None = None
+    multicast_scouting: bool | None = None
+
+
+def open_session(options: NetworkOptions) -> zenoh.Session:
+    """An open Zenoh session.
+
+    Raises:
+        ServerError: the configuration is not valid.
+        ListenError: an endpoint cannot be listened on, or none to connect to answers.
+    """
+    try:
+        config = _configuration(options)
+    except (zenoh.ZError, ValueError, OSError) as error:
+        raise ServerError(f"Zenoh configuration: {first_line(error)}") from error
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        endpoints = ", ".join(listen_endpoints(options)) or "the configured endpoints"
+        raise ListenError(
+            f"cannot open {endpoints}: {first_line(error)} (is another server running there? "
+            "choose another endpoint with --listen)",
+        ) from error
+
+
+def listen_endpoints(options: NetworkOptions) -> tuple[str, ...]:
+    """The endpoints given, or the default; () where the file decides, or a client."""
+    if options.listen or options.config_file is not None or options.mode == "client":
+        return options.listen
+    return (DEFAULT_LISTEN,)
+
+
+def first_line(error: Exception) -> str:
+    """The text of an error without Zenoh's source locations."""
+    return str(error).split(" at /", 1)[0].strip()
+
+
+def _configuration(options: NetworkOptions) -> zenoh.Config:
+    if options.config_file is None:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"router"')
+        # Samples in shared memory are lost without notice where the receiver is descheduled for
+        # a tenth of a second, which training does to it.
+        config.insert_json5("transport/shared_memory/enabled", "false")
+    else:
+        config: zenoh.Config = zenoh.Config.from_file(str(options.config_file))
+    listen = listen_endpoints(options)
+    if listen:
+        config.insert_json5("listen/endpoints", json.dumps(listen))
+        config.insert_json5("listen/exit_on_failure", "true")
+    if options.connect:
+        config.insert_json5("connect/endpoints", json.dumps(options.connect))
+    if options.mode is not None:
+        config.insert_json5("mode", json.dumps(options.mode))
+    if options.multicast_scouting is not None:
+        config.insert_json5("scouting/multicast/enabled", json.dumps(options.multicast_scouting))
+    return config

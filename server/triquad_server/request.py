@@ -1,0 +1,66 @@
+"""One request: its Zenoh query, answered exactly once."""
+
+import logging
+from collections.abc import Callable
+from typing import TypeVar
+
+import zenoh
+from triquad_format import keys, wire
+from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.messages import ErrorReply
+from triquad_format.wire import Message
+
+from triquad_server.errors import RequestError
+from triquad_server.tally import Tally
+
+_log = logging.getLogger(__name__)
+
+RequestT = TypeVar("RequestT", bound=Message)
+
+
+class Request:
+    """A query that waits for its answer."""
+
+    def __init__(self, query: zenoh.Query, key: str, refused: Tally) -> None:
+        """``key`` is the key of the operation; refusals are counted in ``refused``."""
+        self._query = query
+        self._key = key
+        self._refused = refused
+
+    def read(self, kind: type[RequestT]) -> RequestT:
+        """The request's message.
+
+        Raises:
+            RequestError: there is none, or it cannot be decoded.
+        """
+        payload = self._query.payload
+        if payload is None:
+            raise RequestError("bad_request", f"no payload: expected a {kind.__name__}")
+        try:
+            return wire.decode(kind, payload.to_bytes())
+        except ProtocolVersionError as error:
+            raise RequestError("bad_version", str(error)) from error
+        except WireError as error:
+            raise RequestError("bad_request", str(error)) from error
+
+    def answer(self, message: Message) -> None:
+        """Reply with ``message``."""
+        payload = wire.encode(message)
+        self._finish(
+            lambda: self._query.reply(self._key, payload, encoding=keys.encoding(type(message))),
+        )
+
+    def refuse(self, code: str, text: str) -> None:
+        """Reply with an error; ``code`` is one of ``messages.ERROR_CODES``."""
+        self._refused.add(code)
+        _log.debug("request on %s refused (%s): %s", self._key, code, text)
+        payload = wire.encode(ErrorReply(code, text[:4096]))
+        self._finish(lambda: self._query.reply_err(payload, encoding=keys.encoding(ErrorReply)))
+
+    def _finish(self, reply: Callable[[], None]) -> None:
+        """Send the reply and end the query, also where the one who asked is gone."""
+        try:
+            with self._query:
+                reply()
+        except zenoh.ZError as error:
+            _log.warning("no answer could be sent on %s: %s", self._key, error)

@@ -1,0 +1,124 @@
+"""What each request gets: from its message to the answer's message."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.messages import (
+    ResetReply,
+    ResetRequest,
+    SdfReply,
+    SdfRequest,
+    Tile,
+    TileList,
+    TileListRequest,
+    TileRequest,
+)
+from triquad_format.wire import Message
+
+from triquad_server.desk import Handler
+from triquad_server.epochs import EpochShelf
+from triquad_server.errors import RequestError
+from triquad_server.gate import QueryGate
+from triquad_server.mapper import Mapper
+from triquad_server.mapper_thread import MapperThread
+from triquad_server.request import Request
+
+TILE_INDEX_LIMIT = 1_000_000
+"""Tile indices lie in ``[-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT]``."""
+
+MAX_TILES = 1_000_000
+"""Tiles of one list."""
+
+RequestT = TypeVar("RequestT", bound=Message)
+
+
+def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Handler:
+    """A handler that decodes a ``kind`` and replies with what ``answer`` makes of it."""
+
+    def handle(request: Request) -> None:
+        request.answer(answer(request.read(kind)))
+
+    return handle
+
+
+class SdfQueries:
+    """Answers distance queries; training gives way meanwhile."""
+
+    def __init__(self, epochs: EpochShelf, gate: QueryGate, max_points: int) -> None:
+        self._epochs = epochs
+        self._gate = gate
+        self._max_points = max_points
+
+    def answer(self, request: SdfRequest) -> SdfReply:
+        """Distances, status and gradients at the request's points."""
+        if len(request.points) > self._max_points:
+            raise RequestError(
+                "too_large",
+                f"{len(request.points)} points exceed the limit of {self._max_points}",
+            )
+        points = request.origin + request.points.astype(np.float64)
+        bad = ~np.isfinite(points).all(axis=1)
+        if bad.any():
+            index = int(bad.argmax())
+            raise RequestError("bad_request", f"point {index} is not finite: {points[index]}")
+        with self._gate.query():
+            epoch = self._epochs.get(request.epoch)
+            answer = epoch.query(points, request.gradient)
+        return SdfReply(epoch.number, answer.sdf, answer.status, answer.gradient)
+
+
+class TileQueries:
+    """Answers mesh queries."""
+
+    def __init__(self, epochs: EpochShelf, tile_side_m: float) -> None:
+        self._epochs = epochs
+        self._tile_side_m = tile_side_m
+
+    def tiles(self, request: TileListRequest) -> TileList:
+        """The tiles that meet the request's box."""
+        _check_box(request.minimum, request.maximum)
+        epoch = self._epochs.get(request.epoch)
+        tiles = epoch.tiles(request.minimum, request.maximum)
+        if len(tiles.indices) > MAX_TILES:
+            raise RequestError("too_large", f"{len(tiles.indices)} tiles: ask for a smaller box")
+        return TileList(epoch.number, self._tile_side_m, tiles.indices, tiles.changed)
+
+    def tile(self, request: TileRequest) -> Tile:
+        """The mesh of one tile."""
+        index = (request.x, request.y, request.z)
+        if max(map(abs, index)) > TILE_INDEX_LIMIT:
+            raise RequestError(
+                "bad_request",
+                f"tile {index} is out of range: use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
+            )
+        epoch = self._epochs.get(request.epoch)
+        mesh = epoch.mesh(index)
+        return Tile(epoch.number, mesh.changed, mesh.origin, mesh.vertices, mesh.faces)
+
+
+class Resets:
+    """Forgets parts of the map."""
+
+    def __init__(self, mapper: MapperThread) -> None:
+        self._mapper = mapper
+
+    def answer(self, request: ResetRequest) -> ResetReply:
+        """Forget the request's box; answered once an epoch shows it."""
+        _check_box(request.minimum, request.maximum)
+
+        def reset(mapper: Mapper) -> int:
+            mapper.reset(request.minimum, request.maximum)
+            return mapper.publish().number
+
+        return ResetReply(self._mapper.call(reset))
+
+
+def _check_box(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> None:
+    """Refuse a box [3], [3] with NaN or with corners the wrong way round; infinite is allowed."""
+    if np.isnan([minimum, maximum]).any() or (minimum > maximum).any():
+        raise RequestError(
+            "bad_request",
+            f"not a box: minimum {minimum}, maximum {maximum}",
+        )

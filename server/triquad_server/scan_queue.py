@@ -1,0 +1,103 @@
+"""Scans on their way from the network to the mapper."""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+
+import zenoh
+from triquad_format import keys, wire
+from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.messages import Scan
+
+from triquad_server.sources import SourceLedger
+from triquad_server.tally import Tally
+
+_log = logging.getLogger(__name__)
+
+
+class ScanQueue:
+    """The newest scans that wait; where it is full, the oldest is pushed out and counted."""
+
+    def __init__(self, limit: int, ledger: SourceLedger, dropped: Tally) -> None:
+        self._lock = threading.Lock()
+        self._scans: deque[Scan] = deque()
+        self._limit = limit
+        self._ledger = ledger
+        self._dropped = dropped
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def put(self, scan: Scan) -> None:
+        """Add a scan, unless its sequence or stamp refuses it."""
+        with self._lock:
+            reason = self._ledger.arrive(scan)
+            if reason is not None:
+                self._dropped.add(reason)
+                return
+            self._scans.append(scan)
+            pushed_out = self._scans.popleft() if len(self._scans) > self._limit else None
+            if pushed_out is not None:
+                self._ledger.push_out(pushed_out)
+
+    def take(self) -> Scan | None:
+        """The oldest waiting scan."""
+        with self._lock:
+            return self._scans.popleft() if self._scans else None
+
+
+class ScanIntake:
+    """Receives scans from Zenoh, decodes them and puts them into the queue."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_name: str,
+        limit: int,
+        queue: ScanQueue,
+        dropped: Tally,
+        arrived: Callable[[], None],
+    ) -> None:
+        """Begin to receive; ``arrived`` is called after each scan that was queued."""
+        self._queue = queue
+        self._dropped = dropped
+        self._arrived = arrived
+        # A ring, since a full channel of another kind would stall the network's threads.
+        self._subscriber = session.declare_subscriber(
+            keys.scan_key(map_name, "*"),
+            zenoh.handlers.RingChannel(limit),
+        )
+        self._thread = threading.Thread(target=self._run, name="scan-intake")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Take no more scans."""
+        self._subscriber.undeclare()
+        self._thread.join()
+
+    def _run(self) -> None:
+        for sample in self._subscriber:
+            try:
+                self._receive(str(sample.key_expr), sample.payload.to_bytes())
+            except Exception:  # a defect must not stop the intake of all other scans
+                self._dropped.add("internal")
+                _log.exception("a scan on %s could not be received", sample.key_expr)
+            self._arrived()
+
+    def _receive(self, key: str, payload: bytes) -> None:
+        try:
+            scan = wire.decode(Scan, payload)
+        except ProtocolVersionError as error:
+            self._drop("bad_version", key, error)
+        except WireError as error:
+            self._drop("decode", key, error)
+        else:
+            if key.rsplit("/", 1)[1] == scan.source:
+                self._queue.put(scan)
+            else:
+                self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
+
+    def _drop(self, reason: str, key: str, cause: object) -> None:
+        self._dropped.add(reason)
+        _log.debug("scan on %s dropped (%s): %s", key, reason, cause)

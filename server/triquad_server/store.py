@@ -1,0 +1,142 @@
+"""Checkpoints on disk: one folder per map, the newest few map files in it."""
+
+import hashlib
+import logging
+import os
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from triquad_format.errors import MapFileError, UnsupportedMapFileError
+from triquad_format.mapfile import read_map, write_map
+from triquad_format.messages import CheckpointInfo
+from triquad_format.region import MapRecord
+
+from triquad_server.errors import StoreError
+
+if sys.platform != "win32":
+    import fcntl
+
+_log = logging.getLogger(__name__)
+
+_NAME = re.compile(r"epoch-(\d{9,19})\.triquad")
+_LOCK_NAME = "lock"
+_DAMAGED_SUFFIX = ".damaged"
+_READ_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class Restored:
+    """A checkpoint that was read."""
+
+    record: MapRecord
+    info: CheckpointInfo
+
+
+class Store:
+    """The checkpoints of one map. One server at a time holds the folder."""
+
+    def __init__(self, root: Path, map_name: str, keep: int) -> None:
+        """Take possession of ``root/map_name``, which is made if need be.
+
+        Raises:
+            StoreError: the folder cannot be written to, or another server holds it.
+        """
+        self.folder = root / map_name
+        self._keep = keep
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock = (self.folder / _LOCK_NAME).open("a+b")
+        except OSError as error:
+            raise StoreError(f"store {self.folder} cannot be written to: {error}") from error
+        if not _locked(self._lock):
+            self._lock.close()
+            raise StoreError(f"store {self.folder} is in use by another server")
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        self._lock.close()
+
+    def newest(self) -> Restored | None:
+        """The newest sound checkpoint, or ``None`` where there are no checkpoints at all.
+
+        Damaged ones are renamed, so that they are kept but never count as checkpoints again.
+
+        Raises:
+            StoreError: there are checkpoints but all are damaged, or the newest one needs a
+                newer release.
+        """
+        damaged: list[Path] = []
+        for path in self._checkpoints():
+            try:
+                restored = Restored(read_map(path), _info(path))
+            except UnsupportedMapFileError as error:
+                raise StoreError(f"checkpoint {path} needs a newer release: {error}") from error
+            except (MapFileError, OSError) as error:
+                _log.warning("checkpoint %s is damaged and left out: %s", path, error)
+                damaged.append(path)
+                continue
+            for bad in damaged:
+                bad.rename(bad.with_name(bad.name + _DAMAGED_SUFFIX))
+            if damaged:
+                _log.warning("the older checkpoint %s is used instead", path)
+            return restored
+        if damaged:
+            raise StoreError(
+                f"all {len(damaged)} checkpoints in {self.folder} are damaged; move them away to "
+                "start with an empty map",
+            )
+        return None
+
+    def write(self, record: MapRecord) -> CheckpointInfo:
+        """Write a checkpoint and delete those beyond the number to keep.
+
+        Raises:
+            StoreError: it could not be written; the older ones are untouched.
+        """
+        path = self.folder / f"epoch-{record.epoch:09d}.triquad"
+        try:
+            write_map(record, path)
+            info = _info(path)
+        except OSError as error:
+            raise StoreError(f"checkpoint {path} cannot be written: {error}") from error
+        for old in self._checkpoints()[self._keep :]:
+            try:
+                old.unlink()
+            except OSError as error:
+                _log.warning("old checkpoint %s cannot be deleted: %s", old, error)
+        return info
+
+    def _checkpoints(self) -> list[Path]:
+        """Checkpoint files, newest first."""
+        found = [
+            (int(match[1]), path)
+            for path in self.folder.iterdir()
+            if (match := _NAME.fullmatch(path.name))
+        ]
+        return [path for _, path in sorted(found, reverse=True)]
+
+
+def _info(path: Path) -> CheckpointInfo:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_READ_BYTES):
+            digest.update(block)
+        size = file.tell()
+        stamp_ns = os.fstat(file.fileno()).st_mtime_ns
+    match = _NAME.fullmatch(path.name)
+    epoch = int(match[1]) if match else 0
+    return CheckpointInfo(str(path), size, epoch, digest.hexdigest(), stamp_ns)
+
+
+def _locked(file: IO[bytes]) -> bool:
+    """Lock a file for this process; the system lets go of it however the process ends."""
+    if sys.platform == "win32":
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
