@@ -3,6 +3,7 @@
 import re
 
 from triquad_format.errors import FormatError
+from triquad_format.wire import PROTOCOL_VERSION, Message
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
@@ -43,6 +44,11 @@ def scan_key(map_name: str, source: str) -> str:
     return f"triquad/{check_name('map', map_name)}/scan/{check_name('source', source)}"
 
 
+def all_scans_key(map_name: str) -> str:
+    """Key expression of the scans of all sources."""
+    return f"triquad/{check_name('map', map_name)}/scan/*"
+
+
 def status_key(map_name: str) -> str:
     """Key on which the server publishes its status about once a second."""
     return f"triquad/{check_name('map', map_name)}/status"
@@ -51,3 +57,8 @@ def status_key(map_name: str) -> str:
 def alive_key(map_name: str, server: str) -> str:
     """Liveliness token of a server; ``*`` for both lists all servers and their maps."""
     return f"triquad/{map_name}/@alive/{server}"
+
+
+def encoding(message: type[Message]) -> str:
+    """Zenoh encoding of a message, such as ``application/msgpack;triquad.SdfRequest.v1``."""
+    return f"{SCHEMA_PREFIX}{message.__name__}.v{PROTOCOL_VERSION}"

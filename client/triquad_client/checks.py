@@ -1,0 +1,114 @@
+"""Arguments turned into arrays of known dtype and shape, or refused."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from triquad_client.errors import InvalidInputError, InvalidScanError
+
+Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
+"""Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
+
+_RIGID_TOLERANCE = 1e-3
+
+
+def query_points(points: ArrayLike) -> NDArray[np.float64]:
+    """Points [N, 3] as float64, all finite.
+
+    Raises:
+        InvalidInputError: they are not.
+    """
+    array = _points(points, np.float64, InvalidInputError)
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        index = int(bad.argmax())
+        raise InvalidInputError(f"point {index} is not finite: {array[index]}")
+    return array
+
+
+def scan_points(points: ArrayLike) -> NDArray[np.float32]:
+    """Points [N, 3] of a scan as float32; points that are not finite may be among them.
+
+    Raises:
+        InvalidScanError: they are not such points, or there are none.
+    """
+    array = _points(points, np.float32, InvalidScanError)
+    if len(array) == 0:
+        raise InvalidScanError("the scan has no points")
+    return array
+
+
+def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
+    """A pose [4, 4] as float64: a rotation and a translation, within 1e-3.
+
+    Raises:
+        InvalidScanError: it is not.
+    """
+    try:
+        pose = np.asarray(world_from_sensor, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidScanError(f"world_from_sensor is not a matrix: {error}") from error
+    if pose.shape != (4, 4):
+        raise InvalidScanError(f"world_from_sensor is {list(pose.shape)}, not [4, 4]")
+    if not np.isfinite(pose).all():
+        raise InvalidScanError(f"world_from_sensor has values that are not finite:\n{pose}")
+    rotation = pose[:3, :3]
+    skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if skew > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise InvalidScanError(
+            f"world_from_sensor is not rigid: R R^T is off by {skew:.2g}, det R = "
+            f"{np.linalg.det(rotation):.3g}; remove scale, shear and mirroring",
+        )
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > _RIGID_TOLERANCE:
+        raise InvalidScanError(
+            f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?",
+        )
+    return pose
+
+
+def stamp_ns(stamp: float) -> int:
+    """A stamp in seconds since 1970 as nanoseconds.
+
+    Raises:
+        InvalidScanError: it is not a time.
+    """
+    if not math.isfinite(stamp) or not 0 <= stamp < 2**63 / 1e9:
+        raise InvalidScanError(f"stamp = {stamp!r} is not a time in seconds since 1970")
+    return round(stamp * 1e9)
+
+
+def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The corners [3] of ``bounds``; ``None`` is everywhere.
+
+    Raises:
+        InvalidInputError: they are not the corners of a box.
+    """
+    if bounds is None:
+        return np.full(3, -np.inf), np.full(3, np.inf)
+    try:
+        minimum, maximum = (np.asarray(corner, np.float64) for corner in bounds)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"bounds = {bounds!r}: give (minimum, maximum)") from error
+    if minimum.shape != (3,) or maximum.shape != (3,):
+        raise InvalidInputError(f"bounds = {bounds!r}: each corner has three coordinates")
+    if not (minimum <= maximum).all():
+        raise InvalidInputError(f"bounds = {bounds!r}: the minimum must not exceed the maximum")
+    return minimum, maximum
+
+
+def _points(points: ArrayLike, dtype: Any, error: type[InvalidInputError]) -> NDArray[Any]:
+    try:
+        array = np.asarray(points)
+        if array.dtype.kind not in "fiu":
+            raise TypeError(f"dtype {array.dtype} is not one of real numbers")
+        array = array.astype(dtype, copy=False)
+    except (TypeError, ValueError) as cause:
+        raise error(f"points are not an array [N, 3] of real numbers: {cause}") from cause
+    if array.size == 0 and array.ndim == 1:
+        array = array.reshape(0, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise error(f"points are {list(array.shape)}, not [N, 3]")
+    return array

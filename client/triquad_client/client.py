@@ -1,0 +1,182 @@
+"""The client: publishes scans to a map server, and asks it about the map."""
+
+from pathlib import Path
+from types import TracebackType
+
+from numpy.typing import ArrayLike
+from triquad_format import keys
+from triquad_format.messages import (
+    CheckpointInfo,
+    CheckpointRequest,
+    MapInfo,
+    ResetReply,
+    ResetRequest,
+    ServerStatus,
+    StatusRequest,
+    TileList,
+)
+
+from triquad_client import checks
+from triquad_client.checks import Bounds
+from triquad_client.connection import Connection, open_connection
+from triquad_client.download import MapDownload
+from triquad_client.mesh import Mesh
+from triquad_client.meshes import Meshes
+from triquad_client.scans import FlushReport, ScanPublisher
+from triquad_client.sdf import SdfQueries, SdfResult
+
+_SLOW_TIMEOUT_S = 60.0
+"""For requests that write to the server's disk."""
+
+
+class Client:
+    """A connection to one map of a server. Close it, or use it in a ``with`` statement.
+
+    Positions are metres in the map frame. All methods may be called from several threads, and
+    raise a :class:`TriquadError` where they fail: :class:`RefusedError` where the server refuses,
+    :class:`RequestTimeoutError` where it does not answer in time, :class:`InvalidInputError`
+    where an argument cannot be used.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        """Use :func:`connect`."""
+        self._connection = connection
+        self._scans = ScanPublisher(connection)
+        self._sdf = SdfQueries(connection)
+        self._meshes = Meshes(connection)
+        self._download = MapDownload(connection)
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @property
+    def map_name(self) -> str:
+        """The map this client works with."""
+        return self._connection.map_name
+
+    def close(self) -> None:
+        """End the connection. Scans that were published may still be on their way: flush first."""
+        self._connection.close()
+
+    def publish_scan(
+        self,
+        points: ArrayLike,
+        world_from_sensor: ArrayLike,
+        stamp: float | None = None,
+        source: str = "default",
+    ) -> None:
+        """Send a scan to be learnt. Returns once it is handed to the network.
+
+        Args:
+            points: [N, 3] metres, sensor frame; points that are not finite are left out.
+            world_from_sensor: [4, 4] rigid pose of the sensor in the map frame.
+            stamp: seconds since 1970, never running backwards within a source; ``None``: now.
+            source: name of the sensor.
+
+        Raises:
+            InvalidScanError: the scan cannot be used; nothing was sent.
+        """
+        self._scans.publish(points, world_from_sensor, stamp, source)
+
+    def flush(self, timeout: float = 30.0, pending: int = 0) -> FlushReport:
+        """Wait until what this client published is dealt with and queries see it.
+
+        Args:
+            timeout: seconds.
+            pending: number of scans that may still be under way: more than 0 lets a fast
+                publisher run ahead of the server by so many.
+
+        Returns:
+            What became of the scans so far.
+
+        Raises:
+            RefusedError: ``timeout``.
+        """
+        return self._scans.flush(timeout, pending)
+
+    def query_sdf(self, points: ArrayLike, gradient: bool = False) -> SdfResult:
+        """Signed distance and status, on request also the gradient, at ``points`` [N, 3].
+
+        Queries of any size are answered from one epoch.
+        """
+        return self._sdf.query(checks.query_points(points), gradient)
+
+    def query_gradient(self, points: ArrayLike) -> SdfResult:
+        """As :meth:`query_sdf`, with the gradient."""
+        return self.query_sdf(points, gradient=True)
+
+    def tiles(self, bounds: Bounds | None = None) -> TileList:
+        """The mesh tiles that meet ``bounds``, with the epoch in which each last changed."""
+        return self._meshes.tiles(*checks.box(bounds))
+
+    def mesh_tile(self, x: int, y: int, z: int) -> Mesh:
+        """The newest mesh of one tile of the mesh lattice."""
+        return self._meshes.tile(x, y, z)
+
+    def mesh(self, bounds: Bounds | None = None) -> Mesh:
+        """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch."""
+        return self._meshes.mesh(*checks.box(bounds))
+
+    def status(self) -> ServerStatus:
+        """How the server is doing."""
+        return self._connection.ask(keys.STATUS, StatusRequest(), ServerStatus)
+
+    def checkpoint(self) -> CheckpointInfo:
+        """Have the server write the map to its store now."""
+        return self._connection.ask(
+            keys.CHECKPOINT, CheckpointRequest(), CheckpointInfo, timeout_s=_SLOW_TIMEOUT_S
+        )
+
+    def reset(self, bounds: Bounds | None = None) -> int:
+        """Forget what was learnt within ``bounds``; returns the first epoch without it."""
+        request = ResetRequest(*checks.box(bounds))
+        return self._connection.ask(
+            keys.RESET, request, ResetReply, timeout_s=_SLOW_TIMEOUT_S
+        ).epoch
+
+    def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
+        """Write the newest map to a file, checked against its digest, all of it or nothing.
+
+        Args:
+            path: the file; an older one is replaced.
+            training: with the state from which training can go on.
+
+        Raises:
+            DownloadError: what arrived is not what the server announced.
+        """
+        return self._download.fetch(Path(path), training)
+
+    def maps(self) -> list[str]:
+        """Names of all maps that can be reached, also those of other servers."""
+        return self._connection.maps()
+
+
+def connect(
+    endpoint: str = "tcp/127.0.0.1:7447",
+    map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
+    *,
+    timeout_s: float = 10.0,
+    config: str | Path | None = None,
+) -> Client:
+    """Connect to a map server.
+
+    Args:
+        endpoint: Zenoh endpoint of the server, or of a router that leads to it.
+        map: name of the map.
+        timeout_s: for connecting and for each request.
+        config: Zenoh configuration file (JSON5), for TLS or credentials; the endpoint is added.
+
+    Raises:
+        ConnectError: nothing listens at the endpoint, or it does not let us in.
+        UnknownMapError: no server there has this map.
+    """
+    file = None if config is None else Path(config)
+    return Client(open_connection(endpoint, map, timeout_s, file))

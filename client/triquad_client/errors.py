@@ -1,0 +1,56 @@
+"""The errors of the client. Each text says what to do about it."""
+
+
+class TriquadError(Exception):
+    """Base of all errors of the client."""
+
+
+class ConnectError(TriquadError):
+    """No server, or one that does not let us in, at the endpoint."""
+
+
+class UnknownMapError(TriquadError):
+    """No server has a map of this name; ``available`` lists the maps there are."""
+
+    def __init__(self, map_name: str, available: list[str]) -> None:
+        there = ", ".join(available) or "none (is this a router without a triquad server?)"
+        super().__init__(f"no server has a map {map_name!r}; available: {there}")
+        self.map_name = map_name
+        self.available = available
+
+
+class NoReplyError(TriquadError):
+    """The map is there, but the request got no reply at all."""
+
+
+class RequestTimeoutError(TriquadError):
+    """The reply did not come in time."""
+
+
+class BadReplyError(TriquadError):
+    """A reply that this release does not understand."""
+
+
+class RefusedError(TriquadError):
+    """The server refused; ``code`` is one of ``triquad_format.messages.ERROR_CODES``."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(f"{code}: {message}")
+        self.code = code
+        self.message = message
+
+
+class ClosedError(TriquadError):
+    """The client was closed."""
+
+
+class DownloadError(TriquadError):
+    """The map file could not be fetched whole."""
+
+
+class InvalidInputError(TriquadError, ValueError):
+    """An argument that cannot be used; nothing was sent."""
+
+
+class InvalidScanError(InvalidInputError):
+    """A scan that cannot be published; nothing was sent."""

@@ -1,0 +1,64 @@
+"""Fetching mesh tiles, and whole meshes from them."""
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format import keys
+from triquad_format.messages import Tile, TileList, TileListRequest, TileRequest
+
+from triquad_client.connection import Connection, Pending, in_flight
+from triquad_client.errors import RefusedError
+from triquad_client.mesh import Mesh
+from triquad_client.welding import compacted, welded
+
+
+class Meshes:
+    """Mesh requests; they go in the background of everything else."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def tiles(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> TileList:
+        """The tiles that meet the box between two corners [3]."""
+        request = TileListRequest(minimum, maximum, 0)
+        return self._connection.ask(keys.TILE_LIST, request, TileList, background=True)
+
+    def tile(self, x: int, y: int, z: int) -> Mesh:
+        """The newest mesh of one tile."""
+        tile = self._send((x, y, z), 0).result()
+        return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
+
+    def mesh(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Mesh:
+        """The faces whose centroids lie in the box between two corners [3], from one epoch."""
+        for last in (False, False, True):
+            try:
+                return self._mesh(minimum, maximum)
+            except RefusedError as error:
+                if error.code != "epoch_gone" or last:
+                    raise
+        raise AssertionError("unreachable")
+
+    def _mesh(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Mesh:
+        listed = self.tiles(minimum, maximum)
+        indices = [(int(x), int(y), int(z)) for x, y, z in listed.tiles]
+        tiles = list(in_flight(lambda index: self._send(index, listed.epoch), indices))
+        vertices, faces = _joined(tiles)
+        vertices, faces = welded(vertices, faces, listed.tile_side_m)
+        centroids = vertices[faces].mean(axis=1)
+        inside = ((centroids >= minimum) & (centroids <= maximum)).all(axis=1)
+        vertices, faces = compacted(vertices, faces[inside])
+        return Mesh(vertices, faces, listed.epoch)
+
+    def _send(self, index: tuple[int, int, int], epoch: int) -> Pending[Tile]:
+        request = TileRequest(*index, epoch)
+        return self._connection.send(keys.TILE, request, Tile, background=True)
+
+
+def _joined(tiles: list[Tile]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Vertices [V, 3] in the map frame and faces [F, 3] of all tiles."""
+    starts = np.cumsum([0, *(len(tile.vertices) for tile in tiles)])
+    vertices = [np.zeros((0, 3)), *(tile.origin + tile.vertices for tile in tiles)]
+    faces = [
+        np.zeros((0, 3), np.int32),
+        *(tile.faces + int(start) for start, tile in zip(starts, tiles, strict=False)),
+    ]
+    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
