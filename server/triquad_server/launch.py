@@ -12,7 +12,7 @@ import torch
 from triquad_server.errors import ServerError
 from triquad_server.mapper import Mapper
 from triquad_server.network import NetworkOptions, listen_endpoints, open_session
-from triquad_server.service import Service
+from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.store import Store
 
@@ -60,16 +60,9 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         record = restored.record if restored else None
         mapper = Mapper(options.map_name, options.settings, device, record)
         session = stack.enter_context(closing(open_session(options.network)))
-        service = Service(
-            session,
-            mapper,
-            options.map_name,
-            options.settings,
-            device,
-            store,
-            restored.info if restored else None,
-            lambda: stops.put(Stop.DEFECT),
-        )
+        info = restored.info if restored else None
+        served = ServedMap(options.map_name, mapper, device, store, info)
+        service = Service(session, served, options.settings, lambda: stops.put(Stop.DEFECT))
         stack.enter_context(closing(service))
         _log_ready(options, service.epoch, device)
         why = stops.get()

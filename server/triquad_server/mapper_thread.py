@@ -31,7 +31,7 @@ ResultT = TypeVar("ResultT")
 class Progress:
     """The mapper's numbers, as of its last slice."""
 
-    settled: bool = True
+    settled: bool = True  # nothing is left to learn, and the newest epoch shows all
     scans_taken: int = 0
     samples_trained: int = 0
     samples_kept: int = 0
@@ -150,10 +150,10 @@ class MapperThread:
             self._inputs.gate.give_way(_GIVE_WAY_S)
             self._mapper.train()
             self._unpublished = True
-        self._note_progress()
         if self._publish_soon.is_set() or self._publish_due():
             self._publish_soon.clear()
             self._publish()
+        self._note_progress()
         if self._mapper.settled and not took_scan:
             self._wake.wait(self._rest_s())
 
@@ -208,7 +208,7 @@ class MapperThread:
 
     def _note_progress(self) -> None:
         self.progress = Progress(
-            self._mapper.settled,
+            self._mapper.settled and not self._unpublished,
             self._scans_taken,
             self._mapper.samples_trained,
             self._mapper.samples_kept,

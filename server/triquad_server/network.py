@@ -56,14 +56,14 @@ def first_line(error: Exception) -> str:
 
 
 def _configuration(options: NetworkOptions) -> zenoh.Config:
-    if options.config_file is None:
+    if options.config_file is not None:
+        config: zenoh.Config = zenoh.Config.from_file(str(options.config_file))
+    else:
         config = zenoh.Config()
         config.insert_json5("mode", '"router"')
         # Samples in shared memory are lost without notice where the receiver is descheduled for
         # a tenth of a second, which training does to it.
         config.insert_json5("transport/shared_memory/enabled", "false")
-    else:
-        config: zenoh.Config = zenoh.Config.from_file(str(options.config_file))
     listen = listen_endpoints(options)
     if listen:
         config.insert_json5("listen/endpoints", json.dumps(listen))

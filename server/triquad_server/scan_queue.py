@@ -22,12 +22,13 @@ class ScanQueue:
     def __init__(self, limit: int, ledger: SourceLedger, dropped: Tally) -> None:
         self._lock = threading.Lock()
         self._scans: deque[Scan] = deque()
+        self._in_hand = False
         self._limit = limit
         self._ledger = ledger
         self._dropped = dropped
 
     def __len__(self) -> int:
-        return len(self._scans)
+        return len(self._scans) + self._in_hand
 
     def put(self, scan: Scan) -> None:
         """Add a scan, unless its sequence or stamp refuses it."""
@@ -42,8 +43,9 @@ class ScanQueue:
                 self._ledger.push_out(pushed_out)
 
     def take(self) -> Scan | None:
-        """The oldest waiting scan."""
+        """The oldest waiting scan; it counts as waiting until the next one is asked for."""
         with self._lock:
+            self._in_hand = bool(self._scans)
             return self._scans.popleft() if self._scans else None
 
 
@@ -65,7 +67,7 @@ class ScanIntake:
         self._arrived = arrived
         # A ring, since a full channel of another kind would stall the network's threads.
         self._subscriber = session.declare_subscriber(
-            keys.scan_key(map_name, "*"),
+            keys.all_scans_key(map_name),
             zenoh.handlers.RingChannel(limit),
         )
         self._thread = threading.Thread(target=self._run, name="scan-intake")

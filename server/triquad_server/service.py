@@ -2,6 +2,8 @@
 
 import secrets
 from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
 from types import TracebackType
 
 import zenoh
@@ -20,7 +22,7 @@ from triquad_format.messages import (
 )
 
 from triquad_server.checkpoints import Checkpoints
-from triquad_server.desk import RequestDesk
+from triquad_server.desk import Handler, RequestDesk
 from triquad_server.download import MapDownloads
 from triquad_server.flush import FlushDesk
 from triquad_server.gate import QueryGate
@@ -36,67 +38,45 @@ from triquad_server.store import Store
 from triquad_server.tally import Tally
 
 
+@dataclass(frozen=True)
+class ServedMap:
+    """A map that is handed over to a service; nothing else may use it from then on."""
+
+    name: str
+    mapper: Mapper
+    device: str  # where the mapper computes
+    store: Store | None = None  # where its checkpoints go
+    restored: CheckpointInfo | None = None  # the checkpoint it was restored from
+
+
 class Service:
-    """Serves one map until it is closed."""
+    """Serves one map until it is closed. Session and store are closed by the caller, after."""
 
     def __init__(
         self,
         session: zenoh.Session,
-        mapper: Mapper,
-        map_name: str,
+        served: ServedMap,
         settings: Settings,
-        device: str,
-        store: Store | None = None,
-        restored: CheckpointInfo | None = None,
         failed: Callable[[], None] = lambda: None,
     ) -> None:
-        """Serve ``mapper`` on an open ``session``; closing session and store is the caller's.
-
-        Args:
-            session: an open Zenoh session.
-            mapper: the map; nothing else may use it from now on.
-            map_name: the map's name in all keys.
-            settings: each part takes its own section.
-            device: where the mapper computes, for the status.
-            store: where checkpoints go.
-            restored: the checkpoint that ``mapper`` was restored from.
-            failed: called where the service can go on no longer, by a defect.
-        """
-        limits = settings.service
+        """Begin to serve; ``failed`` is called where mapping stops by a defect."""
+        self._session = session
+        self._served = served
+        self._settings = settings
         self._counts = Counts(Tally(), Tally(), Tally())
         self._gate = QueryGate()
-        ledger = SourceLedger()
-        scans = ScanQueue(limits.scan_queue, ledger, self._counts.scans_dropped)
-        inputs = MapperInputs(
-            scans, ledger, self._gate, self._counts.scans_dropped, self._counts.points_dropped
-        )
-        self._mapper = MapperThread(
-            mapper, inputs, limits.publish_period_s, limits.epochs_kept, failed
-        )
-        self._checkpoints = Checkpoints(self._mapper, store, settings.store.period_s, restored)
-        identity = Identity(map_name, secrets.token_hex(8), device)
-        self._health = Health(
-            identity, self._counts, ledger, scans, self._mapper, self._checkpoints
-        )
-        self._flush = FlushDesk(
-            ledger, self._mapper.publish_soon, limits.flush_timeout_max_s, limits.request_queue
-        )
-        self._mapper.start()
-        self._checkpoints.start()
-        self._flush.start()
-        self._intake = ScanIntake(
-            session,
-            map_name,
-            limits.scan_queue,
-            scans,
+        self._ledger = SourceLedger()
+        self._scans = ScanQueue(
+            settings.service.scan_queue,
+            self._ledger,
             self._counts.scans_dropped,
-            self._mapper.wake,
         )
-        self._desks = self._open_desks(session, map_name, settings)
-        self._heartbeat = Heartbeat(session, map_name, self._health)
-        self._token = session.liveliness().declare_token(
-            keys.alive_key(map_name, identity.server),
-        )
+        self._parts = ExitStack()  # closed in reverse order of opening
+        try:
+            self._open(failed)
+        except BaseException:
+            self._parts.close()
+            raise
 
     def __enter__(self) -> "Service":
         return self
@@ -116,70 +96,115 @@ class Service:
 
     def close(self) -> None:
         """Stop mapping, write a last checkpoint, and answer what still waits."""
-        self._token.undeclare()
-        self._intake.close()
-        self._mapper.rest()
-        self._checkpoints.close()
-        self._flush.close()
-        for desk in self._desks:
-            desk.close()
-        self._heartbeat.close()
-        self._mapper.close()
+        self._parts.close()
 
-    def _open_desks(
-        self,
-        session: zenoh.Session,
-        map_name: str,
-        settings: Settings,
-    ) -> list[RequestDesk]:
+    def _open(self, failed: Callable[[], None]) -> None:
+        self._mapper = self._open_mapper(failed)
+        checkpoints = Checkpoints(
+            self._mapper,
+            self._served.store,
+            self._settings.store.period_s,
+            self._served.restored,
+        )
+        identity = Identity(self._served.name, secrets.token_hex(8), self._served.device)
+        health = Health(
+            identity,
+            self._counts,
+            self._ledger,
+            self._scans,
+            self._mapper,
+            checkpoints,
+        )
+        self._open_desks(health, checkpoints)
+        checkpoints.start()
+        self._parts.callback(checkpoints.close)
+        self._parts.callback(self._mapper.rest)
+        self._open_intake()
+        self._parts.callback(Heartbeat(self._session, identity.map_name, health).close)
+        token = self._session.liveliness().declare_token(
+            keys.alive_key(identity.map_name, identity.server),
+        )
+        self._parts.callback(token.undeclare)
+
+    def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
+        inputs = MapperInputs(
+            self._scans,
+            self._ledger,
+            self._gate,
+            self._counts.scans_dropped,
+            self._counts.points_dropped,
+        )
+        limits = self._settings.service
+        mapper = MapperThread(
+            self._served.mapper,
+            inputs,
+            limits.publish_period_s,
+            limits.epochs_kept,
+            failed,
+        )
+        mapper.start()
+        self._parts.callback(mapper.close)
+        return mapper
+
+    def _open_intake(self) -> None:
+        intake = ScanIntake(
+            self._session,
+            self._served.name,
+            self._settings.service.scan_queue,
+            self._scans,
+            self._counts.scans_dropped,
+            self._mapper.wake,
+        )
+        self._parts.callback(intake.close)
+
+    def _open_desks(self, health: Health, checkpoints: Checkpoints) -> None:
         """One desk per group of operations, so that none waits for a slower one."""
-        limits = settings.service
-        epochs = self._mapper.epochs
-        sdf = SdfQueries(epochs, self._gate, limits.max_query_points)
-        tiles = TileQueries(epochs, settings.mesh.tile_side_m)
+        limits = self._settings.service
+        sdf = SdfQueries(self._mapper.epochs, self._gate, limits.max_query_points)
+        tiles = TileQueries(self._mapper.epochs, self._settings.mesh.tile_side_m)
         downloads = MapDownloads(self._mapper)
         resets = Resets(self._mapper)
-        groups = [
-            ({keys.SDF: answering(SdfRequest, sdf.answer)}, limits.query_workers),
-            (
-                {
-                    keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
-                    keys.TILE: answering(TileRequest, tiles.tile),
-                },
-                1,
-            ),
-            (
-                {
-                    keys.STATUS: answering(StatusRequest, self._health.answer),
-                    keys.FLUSH: lambda request: self._flush.hold(
-                        request, request.read(FlushRequest)
-                    ),
-                },
-                1,
-            ),
-            (
-                {
-                    keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
-                    keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
-                },
-                1,
-            ),
-            (
-                {
-                    keys.CHECKPOINT: answering(CheckpointRequest, self._checkpoints.answer),
-                    keys.RESET: answering(ResetRequest, resets.answer),
-                },
-                1,
-            ),
-        ]
-        return [
-            RequestDesk(
-                session,
-                map_name,
-                operations,
-                workers,
-                limits.request_queue,
-                self._counts.requests_refused,
-            )
-            for operations, workers in groups
-        ]
+        flush = FlushDesk(
+            self._ledger,
+            self._mapper.publish_soon,
+            limits.flush_timeout_max_s,
+            limits.request_queue,
+        )
+        flush.start()
+        self._parts.callback(flush.close)
+        self._open_desk({keys.SDF: answering(SdfRequest, sdf.answer)}, limits.query_workers)
+        self._open_desk(
+            {
+                keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
+                keys.TILE: answering(TileRequest, tiles.tile),
+            },
+        )
+        self._open_desk(
+            {
+                keys.STATUS: answering(StatusRequest, health.answer),
+                keys.FLUSH: lambda request: flush.hold(request, request.read(FlushRequest)),
+            },
+        )
+        self._open_desk(
+            {
+                keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
+                keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
+            },
+        )
+        self._open_desk(
+            {
+                keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
+                keys.RESET: answering(ResetRequest, resets.answer),
+            },
+        )
+
+    def _open_desk(self, operations: dict[str, Handler], workers: int = 1) -> None:
+        desk = RequestDesk(
+            self._session,
+            self._served.name,
+            operations,
+            workers,
+            self._settings.service.request_queue,
+            self._counts.requests_refused,
+        )
+        self._parts.callback(desk.close)
