@@ -76,7 +76,7 @@ def _find_block(index: Index, key: int) -> int:
     slot = ((key * MULTIPLIER) >> index.shift) & mask
     while index.keys[slot] != EMPTY:
         if index.keys[slot] == key:
-            return index.numbers[slot]
+            return int(index.numbers[slot])
         slot = (slot + 1) & mask
     return 0
 
@@ -106,7 +106,7 @@ def _add_to_row(table: Floats, row: int, scale: float, values: Floats, start: in
 @numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
 def _dot_row(values: Floats, start: int, table: Floats, row: int) -> float:
     """``values[start:] @ table[row]``."""
-    total = np.float32(0)
+    total: float = np.float32(0)
     if table.shape[1] == 8:
         for k in range(8):
             total += values[start + k] * table[row, k]
@@ -222,7 +222,7 @@ def _decode(x: Floats, decoder: Decoder, h1: Floats, h2: Floats) -> float:
         for k in range(len(x)):
             total += decoder.w1[j, k] * x[k]
         h1[j] = max(total, np.float32(0))
-    logit = decoder.b3[0]
+    logit: float = decoder.b3[0]
     for j in range(len(h2)):
         total = decoder.b2[j]
         for k in range(len(h1)):
@@ -380,7 +380,7 @@ def accumulate(
             touched[row] = 1
             start = ((at >> 2) % geometry.levels) * size
             _add_to_row(feature_sums, row, weights[at], gx, start)
-    return loss * share
+    return float(loss * share)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)

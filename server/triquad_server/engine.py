@@ -136,7 +136,7 @@ class CompiledEngine:
     ) -> None:
         only = torch.zeros(1, dtype=torch.int64)
         for part, parameter in enumerate(self._field.mlp):
-            total = sum(np.asarray(thread[part]) for thread in sums)
+            total = np.sum([thread[part] for thread in sums], axis=0)
             gradient = torch.from_numpy(np.ascontiguousarray(total.T))
             parameter.step(only, gradient.reshape(parameter.values.shape), rate, betas)
 
@@ -193,11 +193,11 @@ class CompiledEngine:
     def _decoder(self) -> compiled_field.Decoder:
         settings = self._field.settings
         arrays = [np.ascontiguousarray(part.values[0].numpy().T) for part in self._field.mlp]
-        arrays[4] = arrays[4].reshape(-1)
         turns = self._field.frequencies.numpy() / np.float32(settings.region_side_m / 2)
         if settings.encoding == "features":
             turns = turns[:0]
-        return compiled_field.Decoder(*arrays, turns)
+        w1, b1, w2, b2, w3, b3 = arrays
+        return compiled_field.Decoder(w1, b1, w2, b2, w3.reshape(-1), b3, turns)
 
 
 def _zeros_like(decoder: compiled_field.Decoder) -> compiled_field.Decoder:

@@ -199,10 +199,13 @@ class Epoch:
         reach = self._settings.leaf_m / 2
         corner = region.centre - self._settings.region_side_m / 2
         low = region.evidence.surface_cells() * side + corner - reach
-        tiles = set()
+        tiles: set[tuple[int, int, int]] = set()
         for shift in np.ndindex(2, 2, 2):
             ends = low + np.array(shift) * (side + 2 * reach)
-            tiles.update(map(tuple, np.floor(ends / self._mesh.tile_side_m).astype(int).tolist()))
+            tiles.update(
+                (x, y, z)
+                for x, y, z in np.floor(ends / self._mesh.tile_side_m).astype(int).tolist()
+            )
         return iter(tiles)
 
     def _voxels(self, region: FrozenRegion, points: NDArray[np.float64]) -> NDArray[np.float64]:

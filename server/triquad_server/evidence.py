@@ -44,7 +44,7 @@ def _block_row(keys: Keys, rows: Rows, block_keys: Keys, count: int, key: int) -
         keys[slot] = key
         rows[slot] = count
         block_keys[count] = key
-    return rows[slot]
+    return int(rows[slot])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -144,7 +144,7 @@ def _bit(keys: Keys, rows: Rows, masks: Masks, side: int, x: int, y: int, z: int
     if keys[slot] == EMPTY:
         return False
     byte = masks[rows[slot], ((x & _LOW) << _SHIFT) | (y & _LOW)]
-    return (byte >> (z & _LOW)) & 1 == 1
+    return bool((byte >> (z & _LOW)) & 1)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -81,7 +81,7 @@ class Field:
             logits = self._decode(points, encoded, weights)
             target = torch.sigmoid(labels / self.settings.logit_scale_m)
             loss = F.binary_cross_entropy_with_logits(logits, target)
-            loss.backward()
+            torch.autograd.backward(loss)
         for part, weight in zip(self.mlp, weights, strict=True):
             assert weight.grad is not None
             part.step(

@@ -106,7 +106,7 @@ def _restore_moments(field: Field, record: Region, device: torch.device) -> None
 
 
 def _array(tensor: Tensor) -> NDArray[Any]:
-    return tensor.detach().cpu().numpy().copy()
+    return np.array(tensor.detach().cpu().numpy())
 
 
 def _tensor(array: NDArray[Any], device: torch.device) -> Tensor:

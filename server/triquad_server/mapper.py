@@ -1,7 +1,6 @@
 """The live map: takes in scans, trains, publishes epochs. Owned by one thread."""
 
 import itertools
-import math
 
 import numpy as np
 import torch
@@ -144,14 +143,12 @@ class Mapper:
         """Regions whose cubes hold any of the points."""
         pitch = self._field_settings.region_pitch_m
         half = self._field_settings.region_side_m / 2
-        spans = []
-        for axis in range(3):
-            low = math.ceil((points[:, axis].min() - half) / pitch)
-            high = math.floor((points[:, axis].max() + half) / pitch)
-            spans.append(range(low, high + 1))
+        low = np.ceil((points.min(axis=0) - half) / pitch).astype(int)
+        high = np.floor((points.max(axis=0) + half) / pitch).astype(int)
+        x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
         return [
             index
-            for index in itertools.product(*spans)
+            for index in itertools.product(x, y, z)
             if (np.abs(points - np.multiply(index, pitch)) < half).all(axis=1).any()
         ]
 

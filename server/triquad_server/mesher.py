@@ -59,7 +59,7 @@ def mesh_tile(source: Distances, tile: tuple[int, int, int], settings: MeshSetti
     """
     cells = settings.tile_cells
     first = np.asarray(tile, np.int64) * cells
-    origin = first * settings.cell_m
+    origin = (first * settings.cell_m).astype(np.float64)
     version = source.changed(origin, origin + settings.tile_side_m)
     seen = _seen_cells(source, first, settings)
     if len(seen) == 0:
@@ -71,7 +71,13 @@ def mesh_tile(source: Distances, tile: tuple[int, int, int], settings: MeshSetti
     mask &= ~_no_crossing(volume, mask)
     if not mask.any():
         return _empty(origin, version)
-    vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=mask)
+    # Face order: the distance falls towards the solid.
+    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+        volume,
+        0.0,
+        mask=mask,
+        gradient_direction="descent",
+    )
     return TileMesh(
         origin,
         (vertices * settings.cell_m).astype(np.float32),
@@ -87,13 +93,14 @@ def _seen_cells(
 ) -> NDArray[np.int64]:
     """Cells [C, 3] of the tile at whose centres a surface was seen."""
     groups = _grid(-(-settings.tile_cells // _GROUP)) * _GROUP
-    centres = (first + groups + _GROUP / 2) * settings.cell_m
+    centres = ((first + groups + _GROUP / 2) * settings.cell_m).astype(np.float64)
     # A group is looked into where a surface may be seen at the centre of any of its cells.
     wide = settings.cell_m * _GROUP / 2 + settings.reach_m
     groups = groups[source.status(centres, wide) == Status.SURFACE]
     cells = (groups[:, None] + _grid(_GROUP)).reshape(-1, 3)
     cells = cells[(cells < settings.tile_cells).all(axis=1)]
-    seen = source.status((first + cells + 0.5) * settings.cell_m, settings.reach_m)
+    centres = ((first + cells + 0.5) * settings.cell_m).astype(np.float64)
+    seen = source.status(centres, settings.reach_m)
     return np.asarray(cells[seen == Status.SURFACE])
 
 
@@ -115,7 +122,8 @@ def _lattice_values(
         needed[tuple((seen + corner).T)] = True
     points = np.argwhere(needed)
     volume = np.ones(shape, np.float32)
-    volume[needed] = source.query((first + points) * settings.cell_m, False).sdf
+    lattice = ((first + points) * settings.cell_m).astype(np.float64)
+    volume[needed] = source.query(lattice, False).sdf
     return volume
 
 

@@ -186,14 +186,16 @@ class TriQuadtree:
 
 
 def _block_key(plane: int, first: Tensor, second: Tensor) -> Tensor:
-    return morton.encode(first, second) | (plane << PLANE_BITS)
+    key: Tensor = morton.encode(first, second) + (plane << PLANE_BITS)
+    return key
 
 
 def _node_vertices(nodes: Tensor) -> Tensor:
     """Unique Morton codes of the 4 vertices of each node."""
     first, second = morton.decode(nodes)
     corners = [morton.encode(first + i, second + j) for i in (0, 1) for j in (0, 1)]
-    return torch.unique(torch.cat(corners))
+    vertices: Tensor = torch.unique(torch.cat(corners))
+    return vertices
 
 
 def _bilinear(t: Tensor) -> Tensor:

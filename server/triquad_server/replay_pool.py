@@ -105,7 +105,8 @@ class ReplayPool:
         """Up to ``count`` different places whose samples are the best to push out."""
         candidates = self._random(self._size, _CANDIDATES * count).view(count, _CANDIDATES)
         worst = self._crowd[self._bins[candidates]].argmax(dim=1, keepdim=True)
-        return torch.unique(candidates.gather(1, worst)[:, 0])
+        victims: Tensor = torch.unique(candidates.gather(1, worst)[:, 0])
+        return victims
 
     def _random(self, below: int, count: int) -> Tensor:
         return torch.randint(
@@ -118,5 +119,5 @@ class ReplayPool:
 
 def _bin(points: Tensor) -> Tensor:
     cells = (points / _BIN_M).floor().to(torch.int64)
-    mixed = cells[:, 0] * _PRIMES[0] ^ cells[:, 1] * _PRIMES[1] ^ cells[:, 2] * _PRIMES[2]
-    return mixed & (_BINS - 1)
+    mixed: Tensor = cells[:, 0] * _PRIMES[0] ^ cells[:, 1] * _PRIMES[1] ^ cells[:, 2] * _PRIMES[2]
+    return mixed % _BINS

@@ -25,7 +25,7 @@ def new_index(capacity: int) -> tuple[Keys, Rows]:
 @numba.njit(cache=True, nogil=True, inline="always")
 def pack(x: int, y: int, z: int) -> int:
     """Key of a cell."""
-    return ((x + CELL_LIMIT) << 42) | ((y + CELL_LIMIT) << 21) | (z + CELL_LIMIT)
+    return int(((x + CELL_LIMIT) << 42) | ((y + CELL_LIMIT) << 21) | (z + CELL_LIMIT))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -44,7 +44,7 @@ def find_slot(keys: Keys, key: int) -> int:
     """Slot that holds ``key``, or the empty slot where it belongs."""
     mask = len(keys) - 1
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = np.int64(mixed >> np.uint64(32)) & mask
+    slot: int = np.int64(mixed >> np.uint64(32)) & mask
     while keys[slot] != key and keys[slot] != EMPTY:
         slot = (slot + 1) & mask
     return slot
