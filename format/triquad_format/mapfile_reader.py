@@ -39,7 +39,7 @@ class StoredPart:
 
     topic: str
     size: int  # bytes of its msgpack map
-    stored_size: int  # bytes of its chunk in the file, compressed
+    stored_size: int  # bytes that it takes in the file, compressed
     sha256: bytes
 
 

@@ -44,7 +44,7 @@ class Message:
     topic: str
     encoding: str
     data: bytes
-    stored_bytes: int  # of the record in the file that holds it: its chunk, if it has one
+    stored_bytes: int  # its share of the record in the file that holds it, compressed
 
 
 class McapFile:
@@ -79,10 +79,11 @@ class McapFile:
             if record.opcode == _CHUNK:
                 chunk = _decompress(record, max_bytes)
                 max_bytes -= len(chunk)
+                ratio = len(record.content) / max(len(chunk), 1)
                 for inner in _walk(chunk, 0):
-                    yield from _message(inner, channels, len(record.content))
+                    yield from _message(inner, channels, ratio)
             else:
-                yield from _message(record, channels, len(record.content))
+                yield from _message(record, channels, 1.0)
 
 
 class _Fields:
@@ -232,9 +233,12 @@ def _decompress_zstd(where: str, stored: memoryview, size: int) -> memoryview:
 
 
 def _message(
-    record: Record, channels: dict[int, tuple[str, str]], stored_bytes: int
+    record: Record, channels: dict[int, tuple[str, str]], ratio: float
 ) -> Iterator[Message]:
-    """The message in a record, if it is one; a channel is noted in ``channels``."""
+    """The message in a record, if it is one; a channel is noted in ``channels``.
+
+    ``ratio`` is that of stored to decompressed bytes.
+    """
     fields = _Fields(record)
     if record.opcode == _CHANNEL:
         number = fields.number(2)
@@ -247,4 +251,5 @@ def _message(
         fields.take(20)  # sequence, log time, publish time
         if number not in channels:
             raise DamagedMapFileError(f"a message is of channel {number}, which nothing describes")
-        yield Message(*channels[number], bytes(fields.rest()), stored_bytes)
+        stored = round(len(record.content) * ratio)
+        yield Message(*channels[number], bytes(fields.rest()), stored)
