@@ -1,5 +1,6 @@
 """The client: publishes scans to a map server, and asks it about the map."""
 
+import time
 from pathlib import Path
 from types import TracebackType
 
@@ -20,6 +21,7 @@ from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.connection import Connection, open_connection
 from triquad_client.download import MapDownload
+from triquad_client.errors import RequestTimeoutError
 from triquad_client.mesh import Mesh
 from triquad_client.meshes import Meshes
 from triquad_client.scans import FlushReport, ScanPublisher
@@ -27,6 +29,8 @@ from triquad_client.sdf import SdfQueries, SdfResult
 
 _SLOW_TIMEOUT_S = 60.0
 """For requests that write to the server's disk."""
+
+_SETTLE_PAUSE_S = 0.2
 
 
 class Client:
@@ -101,6 +105,22 @@ class Client:
             RefusedError: ``timeout``.
         """
         return self._scans.flush(timeout, pending)
+
+    def settle(self, timeout: float = 600.0) -> ServerStatus:
+        """Wait until the server has nothing left to learn from the scans that reached it.
+
+        Args:
+            timeout: seconds.
+
+        Raises:
+            RequestTimeoutError: it still had after that time.
+        """
+        deadline = time.monotonic() + timeout
+        while not (status := self.status()).settled:
+            if time.monotonic() > deadline:
+                raise RequestTimeoutError(f"the server still learns after {timeout:g} s")
+            time.sleep(_SETTLE_PAUSE_S)
+        return status
 
     def query_sdf(self, points: ArrayLike, gradient: bool = False) -> SdfResult:
         """Signed distance and status, on request also the gradient, at ``points`` [N, 3].

@@ -1,0 +1,21 @@
+import subprocess
+import sys
+
+CODE = """
+import sys
+import triquad_client
+heavy = {"torch", "numba", "skimage", "scipy", "triquad_server"} & set(sys.modules)
+sys.exit(f"importing the client brought in {heavy}" if heavy else 0)
+"""
+
+
+def test_client_comes_without_the_server_and_its_libraries():
+    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_all_public_names_exist():
+    import triquad_client
+
+    for name in triquad_client.__all__:
+        assert getattr(triquad_client, name) is not None
