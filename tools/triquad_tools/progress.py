@@ -1,0 +1,62 @@
+"""Progress for the person who waits: bars on a terminal, plain lines elsewhere."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+Report = Callable[[float, str], None]
+"""Takes how much is done, in the units of the total, and a note."""
+
+_LINE_PERIOD_S = 10.0
+
+
+@contextmanager
+def progress(title: str, total: float | None = None) -> Iterator[Report]:
+    """Show the progress of a step on standard error; without a total, that it goes on."""
+    show = _bar if sys.stderr.isatty() else _lines
+    with show(title, total) as report:
+        yield report
+
+
+@contextmanager
+def _bar(title: str, total: float | None) -> Iterator[Report]:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        task = bars.add_task(title, total=total, note="")
+
+        def report(done: float, note: str) -> None:
+            bars.update(task, completed=done, note=note)
+
+        yield report
+        if total is None:
+            bars.update(task, total=1.0, completed=1.0)
+
+
+@contextmanager
+def _lines(title: str, total: float | None) -> Iterator[Report]:
+    started = time.monotonic()
+    next_line = started + _LINE_PERIOD_S
+    latest = ""
+    print(f"{title} ...", file=sys.stderr, flush=True)
+
+    def report(done: float, note: str) -> None:
+        nonlocal next_line, latest
+        share = "" if total is None else f"{done / max(total, 1e-9):4.0%} "
+        latest = f"{share}{note}".strip()
+        if time.monotonic() >= next_line:
+            next_line = time.monotonic() + _LINE_PERIOD_S
+            print(f"  {title}: {latest}", file=sys.stderr, flush=True)
+
+    yield report
+    end = f"  {title}: done in {time.monotonic() - started:.1f} s"
+    print(f"{end}, {latest}" if latest else end, file=sys.stderr, flush=True)
