@@ -31,6 +31,9 @@ class Mapper:
         self._settings = settings
         self._field_settings = record.settings if record else settings.field
         self._device = torch.device(device)
+        if self._device.type == "cpu":
+            # Its threads spin between operations, and would take the cores from the kernels.
+            torch.set_num_threads(1)
         self._rng = np.random.default_rng(settings.training.seed)
         self._normals = SurfaceNormals()
         self._regions: dict[RegionIndex, RegionMap] = {}

@@ -51,7 +51,7 @@ class TrainingSettings:
     beta2: float = 0.99
     pool_samples: int = 4_000_000  # replay samples kept, over the whole map
     fresh_share: float = 0.5  # of a batch, drawn from the newest scans while they stream in
-    visits: float = 2.0  # training visits that each new sample pays for
+    visits: float = 8.0  # training visits that each new sample pays for
     max_backlog: int = 12_000_000  # visits owed at most, per region
     cooldown: float = 1.0  # the rate falls once less than this many visits a kept sample are owed
     seed: int = 42
