@@ -1,8 +1,10 @@
 """Small random map records, sound in every field, for any test that needs a map."""
 
+import dataclasses
+import math
+
 import numpy as np
 from numpy.typing import NDArray
-
 from triquad_format import morton
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import (
@@ -37,7 +39,7 @@ def random_record(
     epoch: int = 7,
 ) -> MapRecord:
     """A record whose regions have seen ``points`` random surface points each."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.RandomState(seed)  # its numbers never change, whatever numpy's release
     regions = tuple(
         random_region(rng, settings, index, points, training, feature_dtype) for index in indices
     )
@@ -45,7 +47,7 @@ def random_record(
 
 
 def random_region(
-    rng: np.random.Generator,
+    rng: np.random.RandomState,
     settings: FieldSettings,
     index: RegionIndex,
     points: int,
@@ -53,7 +55,7 @@ def random_region(
     feature_dtype: str,
 ) -> Region:
     """A region with vertices and evidence at random leaves."""
-    leaves = rng.integers(0, 1 << settings.depth, (points, 3))
+    leaves = rng.randint(0, 1 << settings.depth, (points, 3), np.int64)
     tables = tuple(
         _table(rng, settings, leaves, plane, level, feature_dtype)
         for plane in range(len(AXES))
@@ -62,7 +64,8 @@ def random_region(
     mlp = _mlp(rng, settings)
     return Region(
         index=index,
-        frequencies=_floats(rng, settings.frequencies) * np.float32(settings.frequency_variance**0.5),
+        frequencies=_floats(rng, settings.frequencies)
+        * np.float32(math.sqrt(settings.frequency_variance)),
         mlp=mlp,
         tables=tables,
         evidence=_evidence(rng, leaves),
@@ -70,12 +73,13 @@ def random_region(
     )
 
 
-def _floats(rng: np.random.Generator, *shape: int) -> NDArray[np.float32]:
-    return rng.standard_normal(shape, np.float32)
+def _floats(rng: np.random.RandomState, *shape: int) -> NDArray[np.float32]:
+    """Uniform in [-2, 2), of so few bits that every machine makes the same."""
+    return (rng.randint(-(2**15), 2**15, shape, np.int64) / 2**14).astype(np.float32)
 
 
 def _table(
-    rng: np.random.Generator,
+    rng: np.random.RandomState,
     settings: FieldSettings,
     leaves: NDArray[np.int64],
     plane: int,
@@ -89,37 +93,57 @@ def _table(
     return VertexTable(plane, level, codes, features)
 
 
-def _mlp(rng: np.random.Generator, settings: FieldSettings) -> Mlp:
+def _mlp(rng: np.random.RandomState, settings: FieldSettings) -> Mlp:
     sizes = (settings.input_size, settings.hidden, settings.hidden, 1)
     pairs = list(zip(sizes[:-1], sizes[1:], strict=True))
-    weights = tuple(_floats(rng, a, b) * np.float32(a**-0.5) for a, b in pairs)
+    weights = tuple(_floats(rng, a, b) * np.float32(1 / math.sqrt(a)) for a, b in pairs)
     return Mlp(weights, tuple(_floats(rng, b) for _, b in pairs))
 
 
-def _evidence(rng: np.random.Generator, leaves: NDArray[np.int64]) -> Evidence:
+def _evidence(rng: np.random.RandomState, leaves: NDArray[np.int64]) -> Evidence:
     codes = np.unique(morton.encode(leaves // BLOCK_VOXELS))
     surface = np.zeros((len(codes), BLOCK_BYTES), np.uint8)
     rows = np.searchsorted(codes, morton.encode(leaves // BLOCK_VOXELS))
     x, y, z = (leaves % BLOCK_VOXELS).T
     np.bitwise_or.at(surface, (rows, x * BLOCK_VOXELS + y), (1 << z).astype(np.uint8))
-    free = rng.integers(0, 256, surface.shape).astype(np.uint8)
+    free = rng.randint(0, 256, surface.shape, np.int64).astype(np.uint8)
     return Evidence(codes, surface, free)
 
 
 def _training(
-    rng: np.random.Generator, mlp: Mlp, tables: tuple[VertexTable, ...], samples: int
+    rng: np.random.RandomState, mlp: Mlp, tables: tuple[VertexTable, ...], samples: int
 ) -> TrainingState:
     arrays = (*mlp.weights, *mlp.biases)
     return TrainingState(
         table_means=tuple(_floats(rng, *table.features.shape) for table in tables),
         table_variances=tuple(_floats(rng, *table.features.shape) ** 2 for table in tables),
         table_steps=tuple(
-            rng.integers(0, 1000, len(table.codes)).astype(np.int32) for table in tables
+            rng.randint(0, 1000, len(table.codes), np.int64).astype(np.int32) for table in tables
         ),
         mlp_means=tuple(_floats(rng, *array.shape) for array in arrays),
         mlp_variances=tuple(_floats(rng, *array.shape) ** 2 for array in arrays),
-        mlp_steps=int(rng.integers(0, 10**6)),
+        mlp_steps=int(rng.randint(0, 10**6, dtype=np.int64)),
         sample_points=_floats(rng, samples, 3),
         sample_labels=_floats(rng, samples).astype(np.float16),
-        visits_owed=int(rng.integers(0, 10**6)),
+        visits_owed=int(rng.randint(0, 10**6, dtype=np.int64)),
     )
+
+
+def assert_same(have: object, want: object, where: str = "record") -> None:
+    """Fail, naming the field, unless two records are equal in every value and dtype."""
+    if dataclasses.is_dataclass(want):
+        assert type(have) is type(want), where
+        for field in dataclasses.fields(want):
+            name = f"{where}.{field.name}"
+            assert_same(getattr(have, field.name), getattr(want, field.name), name)
+    elif isinstance(want, np.ndarray):
+        assert isinstance(have, np.ndarray), where
+        assert have.dtype == want.dtype, where
+        np.testing.assert_array_equal(have, want, err_msg=where)
+    elif isinstance(want, tuple):
+        assert isinstance(have, tuple), where
+        assert len(have) == len(want), where
+        for i, (one, other) in enumerate(zip(have, want, strict=True)):
+            assert_same(one, other, f"{where}[{i}]")
+    else:
+        assert have == want, where

@@ -1,0 +1,160 @@
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from map_records import SMALL, assert_same, random_record
+from triquad_format.crop import crop_record, without_training
+from triquad_format.errors import FormatError
+from triquad_format.evaluator import MapEvaluator
+from triquad_format.field_settings import FieldSettings
+from triquad_format.mapfile import read_map, write_map
+from triquad_tools.pack import main
+
+CUBE = tuple(itertools.product((0, 1), repeat=3))
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    path = tmp_path / "in.triquad"
+    write_map(random_record(1, indices=CUBE, points=200), path)
+    return path
+
+
+def box_points(low, high, count=2000):
+    """Points in a box, many of them on its faces, edges and on leaf borders."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    points = np.random.default_rng(0).uniform(low, high, (count, 3))
+    share = np.random.default_rng(1).integers(0, 4, (count, 3))
+    points = np.where(share == 0, low, np.where(share == 1, high, points))
+    snapped = np.clip(np.round(points[: count // 4] * 8) / 8, low, high)
+    return np.concatenate([points, snapped])
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([-1, -1, -1], [1, 1, 1]),
+        ([4.25, 4.5, 4.75], [8.0, 8.0, 8.0]),
+        ([-100, 2, 2], [100, 2.1, 2.1]),
+        ([6.0001, 6, 6], [6.0002, 7, 7]),
+        ([-100, -100, -100], [100, 100, 100]),
+    ],
+)
+def test_crop_answers_in_the_box_as_before(low, high):
+    record = random_record(2, indices=CUBE, points=200)
+    cropped = crop_record(record, low, high)
+    points = box_points(low, high)
+    before = MapEvaluator(record).query(points, gradient=True)
+    after = MapEvaluator(cropped).query(points, gradient=True)
+    np.testing.assert_array_equal(before.sdf, after.sdf)
+    np.testing.assert_array_equal(before.status, after.status)
+    np.testing.assert_array_equal(before.gradient, after.gradient)
+
+
+def test_crop_at_default_settings():
+    record = random_record(3, settings=FieldSettings(), points=2000)
+    low, high = [-300.3, 100.1, -50], [-200.2, 380.4, 60]
+    cropped = crop_record(record, low, high)
+    points = box_points(low, high)
+    before, after = (MapEvaluator(r).query(points, gradient=True) for r in (record, cropped))
+    np.testing.assert_array_equal(before.sdf, after.sdf)
+    np.testing.assert_array_equal(before.status, after.status)
+    kept, all_ = (sum(len(t.codes) for t in r.regions[0].tables) for r in (cropped, record))
+    assert kept < all_ / 3
+    assert len(cropped.regions[0].evidence.codes) < len(record.regions[0].evidence.codes) / 10
+
+
+def test_crop_can_be_written_and_keeps_training_rows(tmp_path):
+    record = random_record(4, indices=CUBE, points=100)
+    cropped = crop_record(record, [-1, -1, -1], [1, 1, 1])
+    write_map(cropped, tmp_path / "map.triquad")
+    assert_same(read_map(tmp_path / "map.triquad"), cropped)
+    table, old = cropped.regions[0].tables[3], record.regions[0].tables[3]
+    rows = np.searchsorted(old.codes, table.codes)
+    training, before = cropped.regions[0].training, record.regions[0].training
+    np.testing.assert_array_equal(training.table_means[3], before.table_means[3][rows])
+    np.testing.assert_array_equal(training.table_steps[3], before.table_steps[3][rows])
+    assert 0 < len(training.sample_points) < len(before.sample_points)
+    assert np.abs(training.sample_points).max() <= 1 + SMALL.leaf_m
+
+
+def test_crop_drops_regions_that_the_box_does_not_meet():
+    record = random_record(5, indices=CUBE)
+    assert [r.index for r in crop_record(record, [0, 0, 0], [1, 1, 1]).regions] == [(0, 0, 0)]
+    assert crop_record(record, [500, 0, 0], [501, 1, 1]).regions == ()
+    everything = crop_record(record, [-1e9] * 3, [1e9] * 3)
+    assert_same(everything, record)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [([0, 0, 0], [1, 0, 1]), ([0, 0, 0], [1, np.nan, 1]), ([0] * 3, [np.inf] * 3)]
+)
+def test_bad_boxes(low, high):
+    with pytest.raises(FormatError, match="box"):
+        crop_record(random_record(), low, high)
+
+
+def test_without_training():
+    record = without_training(random_record(6))
+    assert record.regions[0].training is None
+    assert_same(record.regions[0].tables, random_record(6).regions[0].tables)
+
+
+def test_tool_packs(map_file, tmp_path, capsys):
+    out = tmp_path / "out.triquad"
+    box = ["--crop", "-1", "-1", "-1", "2.5", "2", "2"]
+    assert main([str(map_file), str(out), *box, "--no-training"]) == 0
+    assert "bytes" in capsys.readouterr().out
+    assert out.stat().st_size < map_file.stat().st_size / 2
+    expected = crop_record(read_map(map_file), [-1, -1, -1], [2.5, 2, 2])
+    assert_same(read_map(out), without_training(expected))
+
+
+def test_tool_changes_precision(tmp_path):
+    record = random_record(7, feature_dtype="<f4")
+    fine, coarse = tmp_path / "fine.triquad", tmp_path / "coarse.triquad"
+    write_map(record, fine, feature_dtype="<f4")
+    assert main([str(fine), str(coarse), "--precision", "fp16"]) == 0
+    assert read_map(coarse).regions[0].tables[0].features.dtype == np.float16
+    again = tmp_path / "again.triquad"
+    assert main([str(fine), str(again)]) == 0
+    assert again.read_bytes() == fine.read_bytes()
+
+
+def test_tool_refuses(map_file, tmp_path, capsys):
+    out = tmp_path / "out.triquad"
+
+    def refused(status, text, *arguments):
+        assert main([str(a) for a in arguments]) == status
+        error = capsys.readouterr().err
+        assert text in error
+        assert error.count("\n") == 1
+
+    before = map_file.read_bytes()
+    link = tmp_path / "link.triquad"
+    link.symlink_to(map_file)
+    refused(2, "is the input", map_file, map_file, "--force")
+    refused(2, "is the input", map_file, link, "--force")
+    out.write_bytes(b"precious")
+    refused(2, "--force", map_file, out)
+    assert out.read_bytes() == b"precious"
+    refused(1, "box", map_file, out, "--force", "--crop", *["900", "0", "0", "901", "1", "1"])
+    refused(2, "box", map_file, out, "--force", "--crop", *["1", "0", "0", "0", "1", "1"])
+    refused(2, "No such file", tmp_path / "none", out, "--force")
+    broken = tmp_path / "broken"
+    broken.write_bytes(before[:-50])
+    refused(1, "incomplete", broken, out, "--force")
+    assert out.read_bytes() == b"precious"
+    assert main([str(map_file), str(out), "--force"]) == 0
+    assert map_file.read_bytes() == before
+    with pytest.raises(SystemExit, match="2"):
+        main([str(map_file)])
+
+
+def test_records_are_left_alone():
+    record = random_record(8)
+    copy = dataclasses.replace(record)
+    crop_record(record, [0, 0, 0], [1, 1, 1])
+    assert_same(record, copy)
+    assert_same(record, random_record(8))
