@@ -1,0 +1,32 @@
+# make test    set up a virtual environment and run every check
+# make demo    set up a virtual environment and map a street, end to end
+VENV ?= .venv
+PYTHON ?= python3
+# Extra flags for pip; --extra-index-url https://download.pytorch.org/whl/cpu takes torch's CPU build.
+PIP_FLAGS ?=
+
+BIN = $(VENV)/bin
+INSTALLED = $(VENV)/.installed
+
+.PHONY: demo test lint clean
+
+demo: $(INSTALLED)
+	$(BIN)/triquad-demo --out demo-out
+
+test: lint
+	$(BIN)/python -m pytest -q --durations=10
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	touch $(INSTALLED)
+
+clean:
+	rm -rf $(VENV) demo-out
