@@ -1,0 +1,163 @@
+"""The steps of the demonstration, each against a running server."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_client import CheckpointInfo, Client, Mesh, SdfResult, connect
+from triquad_format.crop import without_training
+from triquad_format.mapfile import read_map, write_map
+
+from triquad_tools import meshfile
+from triquad_tools.demo_probe import Probe, ProbeReport
+from triquad_tools.demo_results import Intake, MapSize, Restart
+from triquad_tools.lidar import SimulatedDrive, SimulatedScan
+from triquad_tools.map_scores import StreetProbes, StreetScores, score_street, street_probes
+from triquad_tools.metrics import MeshScores, ScoreSettings, score_against_scene
+from triquad_tools.progress import progress
+from triquad_tools.render import render_mesh, write_png
+from triquad_tools.settling import wait_until_settled
+from triquad_tools.street_drive import street_drive
+
+MAP = "demo"
+
+_SEED = 0  # of the points that are asked
+_PENDING = 4  # scans under way at most
+_FLUSH_TIMEOUT_S = 120.0
+_SETTLE_LIMIT_S = 70.0
+_QUERY_POINTS = 1_000
+_RESTART_POINTS = 50_000
+_MESH_SAMPLES = 3_000_000
+_VISIBLE_VOXEL_M = 0.05
+
+
+@dataclass(frozen=True)
+class Street:
+    """A simulated drive, its scans and where its map will be asked."""
+
+    drive: SimulatedDrive
+    scans: list[SimulatedScan]
+    probes: StreetProbes
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """How the server took in a street while it was asked."""
+
+    intake: Intake
+    queries: ProbeReport
+
+
+@dataclass(frozen=True)
+class Scored:
+    """How good the map is, and what the server said before it was stopped."""
+
+    street: StreetScores
+    mesh: MeshScores
+    surface: Mesh
+    parameters: int
+    checkpoint: CheckpointInfo
+    points: NDArray[np.float64]  # [N, 3] where it was asked
+    answers: SdfResult
+
+
+def simulate(scans: int, seed: int) -> Street:
+    """Drive along a street with a simulated lidar."""
+    drive = street_drive(seed, scans)
+    made: list[SimulatedScan] = []
+    with progress("simulating the drive", scans) as report:
+        for scan in drive:
+            made.append(scan)
+            report(len(made), f"{len(made)} of {scans} scans")
+    return Street(drive, made, street_probes(drive, np.random.default_rng(_SEED)))
+
+
+def learn(endpoint: str, street: Street, out: Path) -> Learnt:
+    """Stream the scans and wait until they are learnt, while another process asks."""
+    rng = np.random.default_rng(_SEED)
+    asked = out / "query_points.npy"
+    np.save(asked, rng.choice(street.probes.near, _QUERY_POINTS))
+    try:
+        with connect(endpoint, MAP) as client, Probe(endpoint, MAP, asked) as probe:
+            intake = _stream(client, street)
+            return Learnt(intake, probe.finish())
+    finally:
+        asked.unlink()
+
+
+def _stream(client: Client, street: Street) -> Intake:
+    started = time.monotonic()
+    start_s = time.time()
+    with progress("streaming scans", len(street.scans)) as report:
+        for index, scan in enumerate(street.scans):
+            stamp_s = start_s + street.drive.stamp_ns(index) / 1e9
+            client.publish_scan(scan.points, scan.world_from_sensor, stamp_s)
+            client.flush(_FLUSH_TIMEOUT_S, pending=_PENDING)
+            report(index + 1, f"{index + 1} of {len(street.scans)} scans")
+        flush = client.flush(_FLUSH_TIMEOUT_S)
+    taken_in = time.monotonic()
+    status = wait_until_settled(client, _SETTLE_LIMIT_S)
+    return Intake(
+        scans=len(street.scans),
+        taken=flush.taken,
+        refused=flush.refused,
+        lost=flush.lost,
+        points=sum(len(scan.points) for scan in street.scans),
+        seconds=taken_in - started,
+        learning_s=time.monotonic() - started,
+        settled=status.settled,
+        samples_trained=status.samples_trained,
+    )
+
+
+def score(endpoint: str, street: Street) -> Scored:
+    """Compare the map with the exact street, and have the server write it to its store."""
+    rng = np.random.default_rng(_SEED)
+    points = rng.choice(street.probes.near, min(_RESTART_POINTS, len(street.probes.near)), axis=0)
+    scene = street.drive.scene
+    with connect(endpoint, MAP) as client, progress("scoring") as report:
+        report(0.0, "distances")
+        field = score_street(client.query_sdf, street.probes)
+        report(0.0, "mesh")
+        surface = client.mesh((scene.bounds[0].tolist(), scene.bounds[1].tolist()))
+        checkpoint = client.checkpoint()
+        answers = client.query_sdf(points)
+        parameters = client.status().parameters
+        report(0.0, "mesh against the exact surface")
+        settings = ScoreSettings(samples_max=_MESH_SAMPLES)
+        visible = street.drive.true_hits(_VISIBLE_VOXEL_M)
+        mesh = meshfile.Mesh(surface.vertices, surface.faces)
+        scores = score_against_scene(mesh, scene, visible, settings, rng)
+        report(0.0, f"{scores.samples:,} samples of the mesh")
+    return Scored(field, scores, surface, parameters, checkpoint, points, answers)
+
+
+def compare(endpoint: str, scored: Scored) -> Restart:
+    """Ask a restarted server what was asked before."""
+    with connect(endpoint, MAP) as client:
+        answers = client.query_sdf(scored.points)
+    change = np.abs(answers.sdf - scored.answers.sdf)
+    return Restart(
+        points=len(change),
+        sdf_difference_max_m=float(change.max()) if len(change) else 0.0,
+        statuses_changed=int((answers.status != scored.answers.status).sum()),
+    )
+
+
+def pack(scored: Scored, path: Path) -> MapSize:
+    """Write the map without the state that only training needs."""
+    packed = write_map(without_training(read_map(scored.checkpoint.path)), path)
+    return MapSize(packed.bytes, scored.checkpoint.bytes, scored.parameters)
+
+
+def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
+    """Save the mesh, and a picture of it."""
+    with progress("drawing") as report:
+        for path in paths:
+            report(0.0, path.name)
+            surface.save(path)
+        report(0.0, picture.name)
+        write_png(picture, render_mesh(surface.vertices, surface.faces))
