@@ -155,8 +155,7 @@ def test_agrees_with_slow_field_at_default_settings():
     xy = morton.decode(table.codes[rng.integers(0, len(table.codes), 40)], 2) * 0.2 - 409.6
     points = np.column_stack([xy, rng.uniform(-400, 400, 40)]) + rng.uniform(-0.2, 0.2, (40, 3))
     answer = MapEvaluator(record).query(points)
-    # Far from the centre a float32 position is good to 15 micrometres; frequencies are high.
-    np.testing.assert_allclose(answer.sdf, [corners.sdf(p) for p in points.tolist()], atol=5e-4)
+    np.testing.assert_allclose(answer.sdf, [corners.sdf(p) for p in points.tolist()], atol=1e-5)
 
 
 def test_gradient_is_that_of_the_field():

@@ -619,6 +619,13 @@ def test_total_is_limited():
     assert_same(read_map(io.BytesIO(data), max_bytes=10 * len(data)), random_record(14, points=300))
 
 
+def test_parts_outside_chunks_are_limited(monkeypatch):
+    data = file_bytes(random_record(14))
+    monkeypatch.setattr(mapfile_reader, "MAX_PART_BYTES", 500)
+    with pytest.raises(DamagedMapFileError, match="exceeds 500"):
+        read_bytes(rebuild(parts_of(data), metadata_of(data), use_chunking=False))
+
+
 def test_memory_error_is_named(monkeypatch):
     def out_of_memory(cursor):
         raise MemoryError

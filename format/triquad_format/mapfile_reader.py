@@ -16,6 +16,7 @@ from triquad_format.errors import (
 from triquad_format.map_parts import FRAME_ID, MANIFEST, PREFIX, TOPICS, UNITS, Part
 from triquad_format.mapfile_writer import (
     FORMAT_VERSION,
+    MAX_PART_BYTES,
     MESSAGE_ENCODING,
     METADATA_NAME,
 )
@@ -29,6 +30,8 @@ MAX_MAP_BYTES = 4 * 2**30
 
 KNOWN_FEATURES: frozenset[str] = frozenset()
 """The ``required_features`` that this reader understands."""
+
+_BLOCK_BYTES = 1 << 20
 
 REMEDY = "an older checkpoint beside it may be intact"
 
@@ -79,9 +82,12 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
 
 def _read(name: str, stream: BinaryIO, max_bytes: int) -> MapFile:
     with _named(name):
-        data = stream.read(max_bytes + 1)
-        if len(data) > max_bytes:
-            raise MapFileError(f"it is larger than the limit of {max_bytes} bytes")
+        # Block by block: one read of the limit's size would reserve all of it.
+        data = bytearray()
+        while block := stream.read(_BLOCK_BYTES):
+            data += block
+            if len(data) > max_bytes:
+                raise MapFileError(f"it is larger than the limit of {max_bytes} bytes")
         return _parse(memoryview(data), max_bytes)
 
 
@@ -152,6 +158,8 @@ def _known_parts(messages: Iterator[Message], passed: list[StoredPart]) -> Itera
     for message in messages:
         if not message.topic.startswith(PREFIX):
             continue
+        if len(message.data) > MAX_PART_BYTES:
+            raise DamagedMapFileError(f"a part {message.topic:.80} exceeds {MAX_PART_BYTES} bytes")
         digest = hashlib.sha256(message.data).digest()
         passed.append(StoredPart(message.topic, len(message.data), message.stored_bytes, digest))
         if passed[:-1] and passed[-2].topic == MANIFEST:
