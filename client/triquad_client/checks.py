@@ -12,11 +12,13 @@ from triquad_client.errors import InvalidInputError, InvalidScanError
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
 
+FARTHEST_M = 1e9
+
 _RIGID_TOLERANCE = 1e-3
 
 
 def query_points(points: ArrayLike) -> NDArray[np.float64]:
-    """Points [N, 3] as float64, all finite.
+    """Points [N, 3] as float64, all finite and at most ``FARTHEST_M`` from the map's origin.
 
     Raises:
         InvalidInputError: they are not.
@@ -26,6 +28,13 @@ def query_points(points: ArrayLike) -> NDArray[np.float64]:
     if bad.any():
         index = int(bad.argmax())
         raise InvalidInputError(f"point {index} is not finite: {array[index]}")
+    far = (np.abs(array) > FARTHEST_M).any(axis=1)
+    if far.any():
+        index = int(far.argmax())
+        raise InvalidInputError(
+            f"point {index} is {array[index]}, more than {FARTHEST_M:g} m from the map's origin; "
+            "are these metres of the map frame?",
+        )
     return array
 
 

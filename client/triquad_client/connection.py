@@ -228,8 +228,9 @@ def _configuration(endpoint: str, timeout_s: float, file: Path | None) -> zenoh.
     else:
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/timeout_ms", "0")  # one attempt, not retries
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("transport/shared_memory/enabled", "false")
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    config.insert_json5("connect/timeout_ms", str(int(timeout_s * 1000)))
+    config.insert_json5("transport/unicast/open_timeout", str(int(timeout_s * 1000)))
     return config

@@ -56,7 +56,8 @@ class SdfQueries:
         gradient: bool,
         epoch: int,
     ) -> Pending[SdfReply]:
-        origin = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
+        # The median, so that a few far points do not cost the others their precision.
+        origin = np.median(points, axis=0) if len(points) else np.zeros(3)
         offsets = (points - origin).astype(np.float32)
         request = SdfRequest(origin, offsets, gradient, epoch)
         return self._connection.send(keys.SDF, request, SdfReply)

@@ -47,29 +47,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    # Only now, since these need the server's extra.
     from triquad_server.errors import ListenError, ServerError, StoreError
-    from triquad_server.launch import LaunchOptions, Stop, run_server
     from triquad_server.network import NetworkOptions
     from triquad_server.settings import Settings, load_settings
 
-    stops: queue.SimpleQueue[Stop] = queue.SimpleQueue()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stops.put(Stop.ASKED))
     try:
-        launch = LaunchOptions(
-            check_name("map", options.map),
-            NetworkOptions(
-                tuple(options.listen),
-                tuple(options.connect),
-                options.mode,
-                options.config,
-                False if options.no_multicast_scouting else None,
-            ),
-            load_settings(options.settings) if options.settings else Settings(),
-            options.store,
-            options.device,
+        check_name("map", options.map)
+        settings = load_settings(options.settings) if options.settings else Settings()
+        # Only now, since it takes seconds to import.
+        from triquad_server.launch import LaunchOptions, Stop, run_server
+
+        network = NetworkOptions(
+            tuple(options.listen),
+            tuple(options.connect),
+            options.mode,
+            options.config,
+            False if options.no_multicast_scouting else None,
         )
+        launch = LaunchOptions(options.map, network, settings, options.store, options.device)
+        stops: queue.SimpleQueue[Stop] = queue.SimpleQueue()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stops.put(Stop.ASKED))
         why = run_server(launch, stops)
     except ListenError as error:
         _log.error("%s", error)
