@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import triquad_client
 import zenoh
 from numpy.typing import NDArray
 from triquad_format import keys, wire
@@ -69,6 +70,19 @@ def running_service(
         session.close()
         if opened:
             opened.close()
+
+
+@contextmanager
+def service_and_client(
+    settings: Settings = SMALL,
+    store: Path | None = None,
+) -> Iterator[triquad_client.Client]:
+    """A service in this process, and a client of it."""
+    with (
+        running_service(settings, store=store) as endpoint,
+        triquad_client.connect(endpoint) as client,
+    ):
+        yield client
 
 
 @contextmanager

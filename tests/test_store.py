@@ -1,0 +1,100 @@
+import logging
+
+import pytest
+import servers
+from triquad_format.errors import MapFileError
+from triquad_format.mapfile import read_map
+from triquad_format.region import MapRecord
+from triquad_server.errors import StoreError
+from triquad_server.store import Store
+
+
+def record(epoch: int) -> MapRecord:
+    return MapRecord("lab", epoch, servers.SMALL.field, ())
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path, "lab", keep=2)
+    yield store
+    store.close()
+
+
+def names(store: Store) -> list[str]:
+    return sorted(path.name for path in store.folder.iterdir() if path.name != "lock")
+
+
+def test_an_empty_store_has_nothing(store):
+    assert store.newest() is None
+
+
+def test_the_newest_checkpoints_are_kept_and_described(store):
+    for epoch in (1, 2, 10):
+        info = store.write(record(epoch))
+    assert names(store) == ["epoch-000000002.triquad", "epoch-000000010.triquad"]
+    restored = store.newest()
+    assert restored.record.epoch == restored.info.epoch == 10
+    assert restored.info == info
+    assert info.bytes == (store.folder / "epoch-000000010.triquad").stat().st_size
+    assert len(info.sha256) == 64
+
+
+def test_a_damaged_checkpoint_is_left_out_by_name_and_kept_aside(store, caplog):
+    store.write(record(1))
+    bad = store.folder / "epoch-000000002.triquad"
+    bad.write_bytes(b"not a map")
+    with caplog.at_level(logging.WARNING):
+        assert store.newest().record.epoch == 1
+    assert "epoch-000000002.triquad is damaged" in caplog.text
+    assert "epoch-000000001.triquad is used instead" in caplog.text
+    assert names(store) == ["epoch-000000001.triquad", "epoch-000000002.triquad.damaged"]
+    store.write(record(2))
+    store.write(record(3))
+    assert store.newest().record.epoch == 3
+
+
+def test_a_truncated_checkpoint_is_damaged(store):
+    store.write(record(1))
+    path = store.folder / "epoch-000000002.triquad"
+    store.write(record(2))
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(MapFileError):
+        read_map(path)
+    assert store.newest().record.epoch == 1
+
+
+def test_it_does_not_start_empty_where_all_checkpoints_are_damaged(store):
+    for epoch in (1, 2):
+        (store.folder / f"epoch-00000000{epoch}.triquad").write_bytes(b"")
+    with pytest.raises(StoreError, match="all 2 checkpoints"):
+        store.newest()
+    assert len(names(store)) == 2
+
+
+def test_other_files_are_left_alone(store):
+    (store.folder / "notes.txt").write_text("mine")
+    for epoch in range(5):
+        store.write(record(epoch))
+    assert "notes.txt" in names(store)
+    assert len(names(store)) == 3
+
+
+def test_two_servers_do_not_share_a_folder(store, tmp_path):
+    with pytest.raises(StoreError, match="in use"):
+        Store(tmp_path, "lab", keep=2)
+    Store(tmp_path, "other", keep=2).close()
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot be written"):
+        Store(tmp_path / "file", "lab", keep=2)
+
+
+def test_a_failed_write_leaves_the_older_checkpoints(store):
+    store.write(record(1))
+    (store.folder / "epoch-000000002.triquad").mkdir()
+    with pytest.raises(StoreError, match="epoch-000000002"):
+        store.write(record(2))
+    (store.folder / "epoch-000000002.triquad").rmdir()
+    assert store.newest().record.epoch == 1
