@@ -86,7 +86,7 @@ class Epoch:
         """Learnable numbers of all regions."""
         return sum(region.field.parameters for region in self.frozen_regions)
 
-    def query(self, points: NDArray[np.float64], gradient: bool) -> Answer:
+    def query(self, points: NDArray[np.float64], gradient: bool = False) -> Answer:
         """Signed distance, status and, on request, gradient at points [N, 3] of the map frame."""
         parts = [
             self._query(points[start : start + _CHUNK], gradient)

@@ -14,16 +14,7 @@ from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_format.region import Evidence as EvidenceRecord
 from triquad_format.status import Status
 
-from triquad_server.voxel_index import (
-    EMPTY,
-    Keys,
-    Rows,
-    find_slot,
-    new_index,
-    pack,
-    reindex,
-    unpack,
-)
+from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 Masks = NDArray[np.uint8]
 
@@ -34,27 +25,12 @@ _FREE = np.uint8(Status.FREE)
 _UNKNOWN = np.uint8(Status.UNKNOWN)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _block_row(keys: Keys, rows: Rows, block_keys: Keys, count: int, key: int) -> int:
-    """Row of a block, made at ``count`` where it is new; -1 where there is no more room."""
-    slot = find_slot(keys, key)
-    if keys[slot] == EMPTY:
-        if count == len(block_keys):
-            return -1
-        keys[slot] = key
-        rows[slot] = count
-        block_keys[count] = key
-    return int(rows[slot])
-
-
 @numba.njit(cache=True, nogil=True)
 def _mark(
     voxels: NDArray[np.float64],
     start: int,
     side: int,
-    keys: Keys,
-    rows: Rows,
-    block_keys: Keys,
+    index: Index,
     masks: Masks,
     count: int,
 ) -> tuple[int, int]:
@@ -65,7 +41,7 @@ def _mark(
         z = int(np.floor(voxels[i, 2]))
         if min(x, y, z) < 0 or max(x, y, z) >= side:
             continue
-        row = _block_row(keys, rows, block_keys, count, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
+        row = make_row(index, count, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
         if row < 0:
             return i, count
         count = max(count, row + 1)
@@ -80,9 +56,7 @@ def _carve(
     start: int,
     stop_short: float,
     side: int,
-    keys: Keys,
-    rows: Rows,
-    block_keys: Keys,
+    index: Index,
     masks: Masks,
     count: int,
 ) -> tuple[int, int]:
@@ -115,7 +89,7 @@ def _carve(
             if min(x, y, z) >= 0 and max(x, y, z) < side:
                 key = pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT)
                 if key != last_key:
-                    row = _block_row(keys, rows, block_keys, count, key)
+                    row = make_row(index, count, key)
                     if row < 0:
                         return i, count
                     count = max(count, row + 1)
@@ -137,13 +111,13 @@ def _carve(
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _bit(keys: Keys, rows: Rows, masks: Masks, side: int, x: int, y: int, z: int) -> bool:
+def _bit(index: Index, masks: Masks, side: int, x: int, y: int, z: int) -> bool:
     if min(x, y, z) < 0 or max(x, y, z) >= side:
         return False
-    slot = find_slot(keys, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
-    if keys[slot] == EMPTY:
+    row = find_row(index, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
+    if row < 0:
         return False
-    byte = masks[rows[slot], ((x & _LOW) << _SHIFT) | (y & _LOW)]
+    byte = masks[row, ((x & _LOW) << _SHIFT) | (y & _LOW)]
     return bool((byte >> (z & _LOW)) & 1)
 
 
@@ -152,8 +126,7 @@ def _status(
     voxels: NDArray[np.float64],
     reach: float,
     side: int,
-    keys: Keys,
-    rows: Rows,
+    index: Index,
     surface: Masks,
     free: Masks,
 ) -> NDArray[np.uint8]:
@@ -165,7 +138,7 @@ def _status(
         for x in range(int(low[0]), int(high[0]) + 1):
             for y in range(int(low[1]), int(high[1]) + 1):
                 for z in range(int(low[2]), int(high[2]) + 1):
-                    found = found or _bit(keys, rows, surface, side, x, y, z)
+                    found = found or _bit(index, surface, side, x, y, z)
         if found:
             status[i] = _SURFACE
             continue
@@ -174,16 +147,8 @@ def _status(
             int(np.floor(voxels[i, 1])),
             int(np.floor(voxels[i, 2])),
         )
-        status[i] = _FREE if _bit(keys, rows, free, side, x, y, z) else _UNKNOWN
+        status[i] = _FREE if _bit(index, free, side, x, y, z) else _UNKNOWN
     return status
-
-
-@numba.njit(cache=True, nogil=True)
-def _cells(keys: Keys) -> NDArray[np.int64]:
-    cells = np.empty((len(keys), 3), np.int64)
-    for i in range(len(keys)):
-        cells[i, 0], cells[i, 1], cells[i, 2] = unpack(keys[i])
-    return cells
 
 
 class Evidence:
@@ -191,29 +156,23 @@ class Evidence:
 
     def __init__(self, side: int) -> None:
         self._side = side
-        self._count = 0
-        self._allocate(256)
+        self._blocks = VoxelIndex(256)
+        self._surface = np.zeros((256, BLOCK_BYTES), np.uint8)
+        self._free = np.zeros((256, BLOCK_BYTES), np.uint8)
 
     @property
     def blocks(self) -> int:
         """Blocks in use."""
-        return self._count
+        return self._blocks.count
 
     def mark_surface(self, voxels: NDArray[np.float64]) -> None:
         """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out."""
         done = 0
         while done < len(voxels):
-            done, self._count = _mark(
-                voxels,
-                done,
-                self._side,
-                self._keys,
-                self._rows,
-                self._block_keys,
-                self._surface,
-                self._count,
-            )
-            self._reserve(done < len(voxels))
+            index, count = self._blocks.arrays, self._blocks.count
+            done, self._blocks.count = _mark(voxels, done, self._side, index, self._surface, count)
+            if done < len(voxels):
+                self._grow()
 
     def carve(
         self,
@@ -230,41 +189,35 @@ class Evidence:
         """
         done = 0
         while done < len(ends):
-            done, self._count = _carve(
+            index, count = self._blocks.arrays, self._blocks.count
+            done, self._blocks.count = _carve(
                 origin,
                 ends,
                 done,
                 stop_short,
                 self._side,
-                self._keys,
-                self._rows,
-                self._block_keys,
+                index,
                 self._free,
-                self._count,
+                count,
             )
-            self._reserve(done < len(ends))
+            if done < len(ends):
+                self._grow()
 
-    def status(
-        self,
-        voxels: NDArray[np.float64],
-        reach: float = 0.5,
-    ) -> NDArray[np.uint8]:
+    def status(self, voxels: NDArray[np.float64], reach: float = 0.5) -> NDArray[np.uint8]:
         """:class:`Status` values [N] at ``voxels`` [N, 3].
 
         ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
         """
-        return np.asarray(
-            _status(voxels, reach, self._side, self._keys, self._rows, self._surface, self._free),
-        )
+        index = self._blocks.arrays
+        return np.asarray(_status(voxels, reach, self._side, index, self._surface, self._free))
 
     def surface_cells(self) -> NDArray[np.int64]:
         """Blocks [B, 3], in units of blocks, that hold any seen surface."""
-        seen = self._surface[: self._count].any(axis=1)
-        return np.asarray(_cells(self._block_keys[: self._count][seen]))
+        return self._blocks.cells()[self._surface[: self.blocks].any(axis=1)]
 
     def clear(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
-        corners = _cells(self._block_keys[: self._count]) * BLOCK_VOXELS
+        corners = self._blocks.cells() * BLOCK_VOXELS
         near = ((corners < high) & (corners + BLOCK_VOXELS > low)).all(axis=1)
         offsets = np.stack(np.meshgrid(*[np.arange(BLOCK_VOXELS)] * 3, indexing="ij"), -1)
         for row in np.flatnonzero(near):
@@ -277,49 +230,33 @@ class Evidence:
     def copy(self) -> "Evidence":
         """A copy for reading, which later marks do not change."""
         twin = Evidence.__new__(Evidence)
-        twin._side, twin._count = self._side, self._count
-        twin._keys, twin._rows = self._keys.copy(), self._rows.copy()
-        twin._block_keys = self._block_keys[: self._count].copy()
-        twin._surface = self._surface[: self._count].copy()
-        twin._free = self._free[: self._count].copy()
+        twin._side, twin._blocks = self._side, self._blocks.copy()
+        twin._surface = self._surface[: self.blocks].copy()
+        twin._free = self._free[: self.blocks].copy()
         return twin
 
     def record(self) -> EvidenceRecord:
         """The evidence as the map file holds it; empty blocks are left out."""
-        used = np.flatnonzero(
-            (self._surface[: self._count] | self._free[: self._count]).any(axis=1),
-        )
-        codes = morton.encode(np.asarray(_cells(self._block_keys[used])))
+        surface, free = self._surface[: self.blocks], self._free[: self.blocks]
+        used = np.flatnonzero((surface | free).any(axis=1))
+        codes = morton.encode(self._blocks.cells()[used])
         order = np.argsort(codes)
         used = used[order]
-        return EvidenceRecord(codes[order], self._surface[used], self._free[used])
+        return EvidenceRecord(codes[order], surface[used], free[used])
 
     @classmethod
     def restore(cls, side: int, record: EvidenceRecord) -> "Evidence":
         """Evidence from its record."""
         evidence = cls(side)
-        cells = morton.decode(record.codes, 3)
-        evidence._allocate(max(256, 2 * len(cells)))
-        for row, (x, y, z) in enumerate(cells):
-            evidence._block_keys[row] = pack(x, y, z)
-        evidence._count = len(cells)
-        evidence._surface[: len(cells)] = record.surface
-        evidence._free[: len(cells)] = record.free
-        reindex(evidence._block_keys[: len(cells)], evidence._keys, evidence._rows)
+        evidence._blocks = VoxelIndex.of_cells(morton.decode(record.codes, 3))
+        shape = (evidence._blocks.capacity, BLOCK_BYTES)
+        evidence._surface, evidence._free = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+        evidence._surface[: evidence.blocks] = record.surface
+        evidence._free[: evidence.blocks] = record.free
         return evidence
 
-    def _allocate(self, capacity: int) -> None:
-        self._keys, self._rows = new_index(capacity)
-        self._block_keys = np.zeros(capacity, np.int64)
-        self._surface = np.zeros((capacity, BLOCK_BYTES), np.uint8)
-        self._free = np.zeros((capacity, BLOCK_BYTES), np.uint8)
-
-    def _reserve(self, full: bool) -> None:
-        """Double the room where a kernel stopped because it was ``full``."""
-        if not full:
-            return
-        count = self._count
-        old = self._block_keys[:count], self._surface[:count], self._free[:count]
-        self._allocate(2 * count)
-        self._block_keys[:count], self._surface[:count], self._free[:count] = old
-        reindex(self._block_keys[:count], self._keys, self._rows)
+    def _grow(self) -> None:
+        self._blocks.grow()
+        more = np.zeros((self._blocks.capacity - len(self._surface), BLOCK_BYTES), np.uint8)
+        self._surface = np.concatenate([self._surface, more])
+        self._free = np.concatenate([self._free, more])

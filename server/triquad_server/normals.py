@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_server.voxel_index import EMPTY, Keys, Rows, find_slot, new_index, pack, reindex
+from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
@@ -22,9 +22,7 @@ def _add(
     points: NDArray[np.float64],
     start: int,
     cell_m: float,
-    keys: Keys,
-    rows: Rows,
-    cell_keys: Keys,
+    index: Index,
     moments: Moments,
     count: int,
 ) -> tuple[int, int]:
@@ -33,16 +31,11 @@ def _add(
         x = int(np.floor(points[i, 0] / cell_m))
         y = int(np.floor(points[i, 1] / cell_m))
         z = int(np.floor(points[i, 2] / cell_m))
-        key = pack(x, y, z)
-        slot = find_slot(keys, key)
-        if keys[slot] == EMPTY:
-            if count == len(cell_keys):
-                return i, count
-            keys[slot] = key
-            rows[slot] = count
-            cell_keys[count] = key
-            count += 1
-        m = moments[rows[slot]]
+        row = make_row(index, count, pack(x, y, z))
+        if row < 0:
+            return i, count
+        count = max(count, row + 1)
+        m = moments[row]
         a = points[i, 0] - (x + 0.5) * cell_m
         b = points[i, 1] - (y + 0.5) * cell_m
         c = points[i, 2] - (z + 0.5) * cell_m
@@ -63,8 +56,7 @@ def _add(
 def _gather(
     point: NDArray[np.float64],
     cell_m: float,
-    keys: Keys,
-    rows: Rows,
+    index: Index,
     moments: Moments,
     total: NDArray[np.float64],
 ) -> None:
@@ -76,10 +68,10 @@ def _gather(
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
-                slot = find_slot(keys, pack(x + i, y + j, z + k))
-                if keys[slot] == EMPTY:
+                row = find_row(index, pack(x + i, y + j, z + k))
+                if row < 0:
                     continue
-                m = moments[rows[slot]]
+                m = moments[row]
                 a, b, c = i * cell_m, j * cell_m, k * cell_m
                 n = m[0]
                 total[0] += n
@@ -137,8 +129,7 @@ def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
 def _estimate(
     points: NDArray[np.float64],
     cell_m: float,
-    keys: Keys,
-    rows: Rows,
+    index: Index,
     moments: Moments,
     normals: NDArray[np.float64],
 ) -> None:
@@ -148,7 +139,7 @@ def _estimate(
     for i in range(len(points)):
         if not np.isnan(normals[i, 0]):
             continue
-        _gather(points[i], cell_m, keys, rows, moments, total)
+        _gather(points[i], cell_m, index, moments, total)
         if _plane_normal(total, normal):
             normals[i] = normal
 
@@ -158,40 +149,30 @@ class MomentGrid:
 
     def __init__(self, cell_m: float) -> None:
         self._cell_m = cell_m
-        self._count = 0
-        self._allocate(1024)
+        self._cells = VoxelIndex(1024)
+        self._moments = np.zeros((1024, 10))
 
     def add(self, points: NDArray[np.float64]) -> None:
         """Add points [N, 3], metres, map frame."""
         done = 0
         while done < len(points):
-            done, self._count = _add(
+            index, count = self._cells.arrays, self._cells.count
+            done, self._cells.count = _add(
                 points,
                 done,
                 self._cell_m,
-                self._keys,
-                self._rows,
-                self._cell_keys,
+                index,
                 self._moments,
-                self._count,
+                count,
             )
             if done < len(points):
-                self._grow()
+                self._cells.grow()
+                more = np.zeros((self._cells.capacity - len(self._moments), 10))
+                self._moments = np.concatenate([self._moments, more])
 
     def estimate(self, points: NDArray[np.float64], normals: NDArray[np.float64]) -> None:
         """Fill those of ``normals`` [N, 3] that are NaN, where the points lie on a plane."""
-        _estimate(points, self._cell_m, self._keys, self._rows, self._moments, normals)
-
-    def _allocate(self, capacity: int) -> None:
-        self._keys, self._rows = new_index(capacity)
-        self._cell_keys = np.zeros(capacity, np.int64)
-        self._moments = np.zeros((capacity, 10))
-
-    def _grow(self) -> None:
-        count, cell_keys, moments = self._count, self._cell_keys, self._moments
-        self._allocate(2 * count)
-        self._cell_keys[:count], self._moments[:count] = cell_keys, moments
-        reindex(self._cell_keys[:count], self._keys, self._rows)
+        _estimate(points, self._cell_m, self._cells.arrays, self._moments, normals)
 
 
 class SurfaceNormals:

@@ -1,8 +1,9 @@
 """A hash index of voxels in compiled code: 3-D cells of an unbounded lattice to row numbers.
 
-The kernels work on two arrays, ``keys`` and ``rows``, whose length is a power of two; they are
-shared by everything on the CPU that is sparse in space.
+Everything on the CPU that is sparse in space is kept in rows that such an index finds.
 """
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -16,10 +17,18 @@ Keys = NDArray[np.int64]
 Rows = NDArray[np.int32]
 
 
-def new_index(capacity: int) -> tuple[Keys, Rows]:
-    """Empty index arrays for up to ``capacity`` cells at a load of one half."""
-    size = 1 << max(4, int(2 * capacity - 1).bit_length())
-    return np.full(size, EMPTY), np.zeros(size, np.int32)
+class Index(NamedTuple):
+    """The arrays of an index, as kernels take them."""
+
+    keys: Keys  # [slots] EMPTY where there is none; the number of slots is a power of two
+    rows: Rows  # [slots]
+    row_keys: Keys  # [capacity] key of each row
+
+
+def _new_index(capacity: int) -> Index:
+    """Empty arrays for ``capacity`` cells, at a load of one half."""
+    slots = 1 << max(4, int(2 * capacity - 1).bit_length())
+    return Index(np.full(slots, EMPTY), np.zeros(slots, np.int32), np.zeros(capacity, np.int64))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -50,18 +59,90 @@ def find_slot(keys: Keys, key: int) -> int:
     return slot
 
 
-@numba.njit(cache=True, nogil=True)
-def reindex(keys: Keys, new_keys: Keys, new_rows: Rows) -> None:
-    """Fill a new, larger index with ``keys[i] -> i``."""
-    for row in range(len(keys)):
-        slot = find_slot(new_keys, keys[row])
-        new_keys[slot] = keys[row]
-        new_rows[slot] = row
+@numba.njit(cache=True, nogil=True, inline="always")
+def find_row(index: Index, key: int) -> int:
+    """Row of ``key``, -1 where it has none."""
+    slot = find_slot(index.keys, key)
+    return -1 if index.keys[slot] == EMPTY else int(index.rows[slot])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def make_row(index: Index, count: int, key: int) -> int:
+    """Row of ``key``; a new one is row ``count``, or -1 where there is no more room."""
+    slot = find_slot(index.keys, key)
+    if index.keys[slot] == EMPTY:
+        if count == len(index.row_keys):
+            return -1
+        index.keys[slot] = key
+        index.rows[slot] = count
+        index.row_keys[count] = key
+    return int(index.rows[slot])
 
 
 @numba.njit(cache=True, nogil=True)
-def first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Keys) -> NDArray[np.bool_]:
-    """Marks the first of the points [N, 3] in each cell; ``keys`` is an empty index."""
+def _reindex(index: Index, count: int) -> None:
+    for row in range(count):
+        slot = find_slot(index.keys, index.row_keys[row])
+        index.keys[slot] = index.row_keys[row]
+        index.rows[slot] = row
+
+
+@numba.njit(cache=True, nogil=True)
+def _cells(keys: Keys) -> NDArray[np.int64]:
+    cells = np.empty((len(keys), 3), np.int64)
+    for i in range(len(keys)):
+        cells[i, 0], cells[i, 1], cells[i, 2] = unpack(keys[i])
+    return cells
+
+
+class VoxelIndex:
+    """Cells in use, numbered as they come: row ``i`` of the owner's arrays belongs to cell ``i``.
+
+    Kernels receive :attr:`arrays` and return the new number of rows; the owner stores it in
+    :attr:`count`, and calls :meth:`grow` where a kernel stopped for want of room.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.count = 0
+        self.arrays = _new_index(capacity)
+
+    @property
+    def capacity(self) -> int:
+        """Rows that there is room for."""
+        return len(self.arrays.row_keys)
+
+    def cells(self) -> NDArray[np.int64]:
+        """The cells [count, 3], by row."""
+        return np.asarray(_cells(self.arrays.row_keys[: self.count]))
+
+    def grow(self) -> None:
+        """Double the room."""
+        self._refill(self.arrays.row_keys[: self.count], 2 * self.capacity)
+
+    def copy(self) -> "VoxelIndex":
+        """An independent copy."""
+        twin = VoxelIndex.__new__(VoxelIndex)
+        twin.count = self.count
+        twin.arrays = Index(*(array.copy() for array in self.arrays))
+        return twin
+
+    @classmethod
+    def of_cells(cls, cells: NDArray[np.int64]) -> "VoxelIndex":
+        """An index whose rows belong to different ``cells`` [N, 3], in their order."""
+        x, y, z = cells.T + CELL_LIMIT
+        index = cls(1)
+        index._refill((x << 42) | (y << 21) | z, max(256, 2 * len(cells)))
+        return index
+
+    def _refill(self, keys: Keys, capacity: int) -> None:
+        self.arrays = _new_index(capacity)
+        self.arrays.row_keys[: len(keys)] = keys
+        self.count = len(keys)
+        _reindex(self.arrays, self.count)
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Keys) -> NDArray[np.bool_]:
     chosen = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         key = pack(
@@ -78,5 +159,5 @@ def first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Keys) -> N
 
 def thin(points: NDArray[np.floating], cell_m: float) -> NDArray[np.bool_]:
     """Mask [N] that keeps one of the points [N, 3] per cell of side ``cell_m``, the first."""
-    keys, _ = new_index(len(points))
-    return np.asarray(first_per_cell(np.ascontiguousarray(points), cell_m, keys))
+    empty = _new_index(len(points))
+    return np.asarray(_first_per_cell(np.ascontiguousarray(points), cell_m, empty.keys))
