@@ -47,6 +47,8 @@ class Field:
 
     def grow(self, points: Tensor) -> None:
         """Make room for surface ``points`` [N, 3]; new feature vectors start at random."""
+        if not self._has_features:
+            return
         added = self.tree.grow(points)
         size = (added, self.settings.feature_size)
         self.features.append(self._normal(*size) * self.settings.feature_std)

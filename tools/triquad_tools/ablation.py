@@ -70,11 +70,12 @@ def run_variant(encoding: str, through: SimulatedDrive) -> Variant:
 def main(argv: list[str] | None = None) -> int:
     """Map with all variants and print a table."""
     parser = argparse.ArgumentParser(prog="triquad_tools.ablation", description=__doc__)
-    parser.add_argument("--scans", type=int, default=60, help="scans of the drive, 1 m apart")
+    parser.add_argument("--scans", type=int, default=60, help="scans of the drive")
+    parser.add_argument("--step", type=float, default=1.0, help="metres between scans")
     parser.add_argument("--seed", type=int, default=1, help="seed of the street")
     options = parser.parse_args(argv)
     scene = street(options.seed)
-    through = SimulatedDrive(scene, Lidar(), drive(scene, options.scans, 1.0))
+    through = SimulatedDrive(scene, Lidar(), drive(scene, options.scans, options.step))
     print(
         "encoding   parameters  samples  sdf error  angle  completion       accuracy         F"
         "\n                          (M)       (cm)  (deg)  (cm)  ratio %    (cm)  ratio %    %",
