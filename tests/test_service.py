@@ -166,7 +166,7 @@ def test_an_epoch_that_is_gone_is_told_apart(endpoint):
         assert peer.refusal(keys.TILE, TileRequest(0, 0, 0, 999)) == "epoch_gone"
 
 
-def test_tiles_make_a_closed_mesh(client):
+def test_tiles_make_one_mesh(client):
     learn(client)
     client.settle(servers.WAIT_S)
     listed = client.tiles()
@@ -174,11 +174,13 @@ def test_tiles_make_a_closed_mesh(client):
     mesh = client.mesh()
     distance = np.linalg.norm(mesh.vertices, axis=1)
     assert np.abs(distance - servers.RADIUS_M).mean() < 0.2  # after little training
-    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    _, uses = np.unique(edges, axis=0, return_counts=True)
-    assert (uses == 2).mean() > 0.98
     parts = [client.mesh_tile(*map(int, index)) for index in listed.tiles]
     assert sum(len(part.faces) for part in parts) >= len(mesh.faces)
+    assert sum(len(part.vertices) for part in parts) > len(mesh.vertices)
+    steps = mesh.vertices / listed.tile_side_m
+    border = mesh.vertices[(np.abs(steps - np.round(steps)) < 1e-6).any(axis=1)]
+    assert len(border) > 100
+    assert len(np.unique(np.round(border, 5), axis=0)) == len(border)
     assert mesh.epoch == listed.epoch
 
 

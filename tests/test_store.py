@@ -1,4 +1,5 @@
 import logging
+from contextlib import closing
 
 import pytest
 import servers
@@ -89,6 +90,15 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):
         Store(tmp_path / "file", "lab", keep=2)
+
+
+def test_what_a_killed_server_left_unfinished_goes(store, tmp_path):
+    store.write(record(1))
+    store.close()
+    (store.folder / ".epoch-000000002.triquad.0a1b2c3d.tmp").write_bytes(b"half")
+    with closing(Store(tmp_path, "lab", keep=2)) as again:
+        assert names(again) == ["epoch-000000001.triquad"]
+        assert again.newest().record.epoch == 1
 
 
 def test_a_failed_write_leaves_the_older_checkpoints(store):

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 import zenoh
 from triquad_format import keys, wire
-from triquad_format.errors import WireError
+from triquad_format.errors import FormatError, WireError
 from triquad_format.messages import ErrorReply
 from triquad_format.wire import Message
 
@@ -16,6 +16,7 @@ from triquad_client.errors import (
     BadReplyError,
     ClosedError,
     ConnectError,
+    InvalidInputError,
     NoReplyError,
     RefusedError,
     RequestTimeoutError,
@@ -187,8 +188,12 @@ def open_connection(
     Raises:
         ConnectError: nothing listens there, or it does not let us in.
         UnknownMapError: there is no such map.
+        InvalidInputError: there cannot be a map of this name.
     """
-    keys.check_name("map", map_name)
+    try:
+        keys.check_name("map", map_name)
+    except FormatError as error:
+        raise InvalidInputError(str(error)) from error
     try:
         session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except zenoh.ZError as error:

@@ -1,21 +1,15 @@
 """Map files that clients fetch in chunks."""
 
-import hashlib
-import logging
-import tempfile
+import io
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
-from pathlib import Path
 
 from triquad_format.mapfile import write_map
 from triquad_format.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
-from triquad_format.region import MapRecord
 
 from triquad_server.errors import RequestError
 from triquad_server.mapper_thread import MapperThread
-
-_log = logging.getLogger(__name__)
 
 CHUNK_BYTES = 2**20
 FILES_KEPT = 2
@@ -50,11 +44,11 @@ class MapDownloads:
             record = self._mapper.call(lambda mapper: mapper.record(True))
         else:
             record = newest.record()
-        data = _serialised(record)
-        sha256 = hashlib.sha256(data).hexdigest()
-        info = MapInfo(record.epoch, len(data), sha256, CHUNK_BYTES)
+        buffer = io.BytesIO()
+        written = write_map(record, buffer)
+        info = MapInfo(written.epoch, written.bytes, written.sha256, CHUNK_BYTES)
         with self._lock:
-            self._files[sha256] = _MapBytes(info, request.training, data)
+            self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())
             while len(self._files) > FILES_KEPT:
                 self._files.popitem(last=False)
         return info
@@ -72,10 +66,3 @@ class MapDownloads:
             )
         end = request.offset + CHUNK_BYTES
         return MapChunk(request.offset, file.data[request.offset : end])
-
-
-def _serialised(record: MapRecord) -> bytes:
-    with tempfile.TemporaryDirectory(prefix="triquad-") as folder:
-        path = Path(folder) / "map.triquad"
-        write_map(record, path)
-        return path.read_bytes()

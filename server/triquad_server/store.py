@@ -5,11 +5,12 @@ import logging
 import os
 import re
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from triquad_format.errors import MapFileError, UnsupportedMapFileError
+from triquad_format.errors import FormatError, MapFileError, UnsupportedMapFileError
 from triquad_format.mapfile import read_map, write_map
 from triquad_format.messages import CheckpointInfo
 from triquad_format.region import MapRecord
@@ -23,6 +24,7 @@ _log = logging.getLogger(__name__)
 
 _NAME = re.compile(r"epoch-(\d{9,19})\.triquad")
 _LOCK_NAME = "lock"
+_UNFINISHED = ".epoch-*.tmp"  # left by a server that was killed while it wrote
 _DAMAGED_SUFFIX = ".damaged"
 _READ_BYTES = 2**20
 
@@ -54,6 +56,8 @@ class Store:
         if not _locked(self._lock):
             self._lock.close()
             raise StoreError(f"store {self.folder} is in use by another server")
+        for unfinished in self.folder.glob(_UNFINISHED):
+            unfinished.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Let go of the folder."""
@@ -98,16 +102,16 @@ class Store:
         """
         path = self.folder / f"epoch-{record.epoch:09d}.triquad"
         try:
-            write_map(record, path)
-            info = _info(path)
-        except OSError as error:
+            file = write_map(record, path, stamp_ns=time.time_ns())
+            stamp_ns = path.stat().st_mtime_ns
+        except (FormatError, OSError) as error:
             raise StoreError(f"checkpoint {path} cannot be written: {error}") from error
         for old in self._checkpoints()[self._keep :]:
             try:
                 old.unlink()
             except OSError as error:
                 _log.warning("old checkpoint %s cannot be deleted: %s", old, error)
-        return info
+        return CheckpointInfo(str(path), file.bytes, file.epoch, file.sha256, stamp_ns)
 
     def _checkpoints(self) -> list[Path]:
         """Checkpoint files, newest first."""
