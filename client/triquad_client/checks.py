@@ -57,7 +57,7 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
         InvalidScanError: it is not.
     """
     try:
-        pose: NDArray[np.float64] = np.asarray(world_from_sensor, np.float64)
+        pose = np.asarray(world_from_sensor, np.float64)
     except (TypeError, ValueError) as error:
         raise InvalidScanError(f"world_from_sensor is not a matrix: {error}") from error
     if pose.shape != (4, 4):
@@ -75,7 +75,7 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
         raise InvalidScanError(
             f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?",
         )
-    exact = pose.copy()
+    exact: NDArray[np.float64] = pose.copy()
     exact[3] = (0, 0, 0, 1)
     return exact
 
