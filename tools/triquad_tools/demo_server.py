@@ -94,12 +94,10 @@ class DemoServer:
             raise self._failure(f"the server stopped with exit code {code}")
 
     def _wait_until_ready(self) -> None:
-        self._started.wait(_READY_TIMEOUT_S)
+        if not self._started.wait(_READY_TIMEOUT_S):
+            raise self._failure(f"the server is not ready after {_READY_TIMEOUT_S:g} s")
         if not self._ready:
-            ended = self._process.poll() is not None
-            raise self._failure(
-                "the server did not start" if ended else f"not ready after {_READY_TIMEOUT_S:g} s"
-            )
+            raise self._failure("the server did not start")
 
     def _failure(self, what: str) -> DemoServerError:
         return DemoServerError(f"{what}: {self._last_line}; its log is {self._options.log}")

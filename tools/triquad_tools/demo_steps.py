@@ -12,26 +12,30 @@ from triquad_format.crop import without_training
 from triquad_format.mapfile import read_map, write_map
 
 from triquad_tools import meshfile
+from triquad_tools.camera import Camera
 from triquad_tools.demo_probe import Probe, ProbeReport
 from triquad_tools.demo_results import Intake, MapSize, Restart
 from triquad_tools.lidar import SimulatedDrive, SimulatedScan
 from triquad_tools.map_scores import StreetProbes, StreetScores, score_street, street_probes
 from triquad_tools.metrics import MeshScores, ScoreSettings, score_against_scene
 from triquad_tools.progress import progress
-from triquad_tools.render import render_mesh, write_png
-from triquad_tools.settling import wait_until_settled
+from triquad_tools.render import height_colours, render_mesh, write_png
+from triquad_tools.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.street_drive import street_drive
 
 MAP = "demo"
 
 _SEED = 0  # of the points that are asked
-_PENDING = 4  # scans under way at most
-_FLUSH_TIMEOUT_S = 120.0
 _SETTLE_LIMIT_S = 70.0
 _QUERY_POINTS = 1_000
 _RESTART_POINTS = 50_000
 _MESH_SAMPLES = 3_000_000
 _VISIBLE_VOXEL_M = 0.05
+
+# The picture: over the start of the drive, down the street.
+_EYE_M = (-14.0, 0.8, 12.0)
+_TARGET_M = (17.0, -0.3, 0.3)
+_VIEW_DEG = 46.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ def learn(endpoint: str, street: Street, out: Path) -> Learnt:
     """Stream the scans and wait until they are learnt, while another process asks."""
     rng = np.random.default_rng(_SEED)
     asked = out / "query_points.npy"
-    np.save(asked, rng.choice(street.probes.near, _QUERY_POINTS))
+    np.save(asked, rng.permutation(street.probes.near)[:_QUERY_POINTS])
     try:
         with connect(endpoint, MAP) as client, Probe(endpoint, MAP, asked) as probe:
             intake = _stream(client, street)
@@ -95,9 +99,9 @@ def _stream(client: Client, street: Street) -> Intake:
         for index, scan in enumerate(street.scans):
             stamp_s = start_s + street.drive.stamp_ns(index) / 1e9
             client.publish_scan(scan.points, scan.world_from_sensor, stamp_s)
-            client.flush(_FLUSH_TIMEOUT_S, pending=_PENDING)
+            keep_few_pending(client, index + 1)
             report(index + 1, f"{index + 1} of {len(street.scans)} scans")
-        flush = client.flush(_FLUSH_TIMEOUT_S)
+        flush = client.flush(FLUSH_TIMEOUT_S)
     taken_in = time.monotonic()
     status = wait_until_settled(client, _SETTLE_LIMIT_S)
     return Intake(
@@ -116,7 +120,7 @@ def _stream(client: Client, street: Street) -> Intake:
 def score(endpoint: str, street: Street) -> Scored:
     """Compare the map with the exact street, and have the server write it to its store."""
     rng = np.random.default_rng(_SEED)
-    points = rng.choice(street.probes.near, min(_RESTART_POINTS, len(street.probes.near)), axis=0)
+    points = rng.permutation(street.probes.near)[:_RESTART_POINTS]
     scene = street.drive.scene
     with connect(endpoint, MAP) as client, progress("scoring") as report:
         report(0.0, "distances")
@@ -160,4 +164,7 @@ def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
             report(0.0, path.name)
             surface.save(path)
         report(0.0, picture.name)
-        write_png(picture, render_mesh(surface.vertices, surface.faces))
+        camera = Camera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
+        colours = height_colours(surface.vertices)
+        image = render_mesh(surface.vertices, surface.faces, camera=camera, colours=colours)
+        write_png(picture, image)

@@ -51,7 +51,7 @@ def _lines(title: str, total: float | None) -> Iterator[Report]:
 
     def report(done: float, note: str) -> None:
         nonlocal next_line, latest
-        share = "" if total is None else f"{done / max(total, 1e-9):4.0%} "
+        share = "" if total is None else f"{min(done / max(total, 1e-9), 1.0):.0%} "
         latest = f"{share}{note}".strip()
         if time.monotonic() >= next_line:
             next_line = time.monotonic() + _LINE_PERIOD_S

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from triquad_tools.arguments import count, not_negative, positive
 from triquad_tools.errors import ToolError
 from triquad_tools.progress import progress
+from triquad_tools.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 
 if TYPE_CHECKING:
     from triquad_client import Client, FlushReport
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
     from triquad_tools.kitti import KittiFolder
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
-
-_PENDING = 4  # scans under way at most, where the server sets the pace
-_FLUSH_TIMEOUT_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,6 @@ def _complain(message: str, code: int) -> int:
 
 
 def _settle(client: "Client") -> None:
-    from triquad_tools.settling import wait_until_settled
-
     status = wait_until_settled(client)
     print(f"settled: epoch {status.epoch}, {status.samples_trained / 1e6:.1f} M samples trained")
 
@@ -124,8 +120,10 @@ class _Publisher:
                 sent = self._publish(folder, index, range_min_m)
                 published += sent
                 skipped += not sent
+                if sent and self._pace.by_server:
+                    keep_few_pending(self._client, published)
                 report(done + 1, f"{done + 1} of {len(indices)} scans")
-            flush = self._client.flush(_FLUSH_TIMEOUT_S) if published else None
+            flush = self._client.flush(FLUSH_TIMEOUT_S) if published else None
         seconds = time.monotonic() - started
         after = self._client.status().scans_dropped
         refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
@@ -141,8 +139,6 @@ class _Publisher:
             return False
         stamp_s = int(folder.stamps_ns[index]) / 1e9
         self._client.publish_scan(points, folder.poses[index], stamp_s, self._source)
-        if self._pace.by_server:
-            self._client.flush(_FLUSH_TIMEOUT_S, pending=_PENDING)
         return True
 
 

@@ -1,4 +1,4 @@
-"""Waiting until a server has learnt what it was given."""
+"""Waiting for a server: until it has taken in scans, and until it has learnt them."""
 
 import time
 from typing import TYPE_CHECKING
@@ -9,6 +9,19 @@ if TYPE_CHECKING:
     from triquad_client import Client, ServerStatus
 
 _POLL_S = 0.5  # the server says how it is doing when it is asked, not when it changes
+
+FLUSH_TIMEOUT_S = 120.0
+
+_PENDING = 4
+
+
+def keep_few_pending(client: "Client", published: int) -> None:
+    """Call after each scan: lets 4 to 8 scans be under way, far fewer than a server queues.
+
+    Not after every scan, for the server publishes an epoch before it answers.
+    """
+    if published % _PENDING == 0:
+        client.flush(FLUSH_TIMEOUT_S, pending=_PENDING)
 
 
 def wait_until_settled(client: "Client", limit_s: float | None = None) -> "ServerStatus":
