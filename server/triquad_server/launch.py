@@ -15,6 +15,7 @@ from triquad_server.network import NetworkOptions, listen_endpoints, open_sessio
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.store import Store
+from triquad_server.warm_up import warm_up
 
 _log = logging.getLogger("triquad_server")
 
@@ -58,6 +59,8 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         if restored is not None:
             _log.info("restoring epoch %d from %s", restored.record.epoch, restored.info.path)
         record = restored.record if restored else None
+        _log.info("preparing compiled code: up to a minute at the very first start")
+        warm_up(options.settings, device)
         mapper = Mapper(options.map_name, options.settings, device, record)
         session = stack.enter_context(closing(open_session(options.network)))
         info = restored.info if restored else None

@@ -165,6 +165,6 @@ class Mapper:
             )
             share = self._settings.training.pool_samples // len(self._regions)
             for region in self._regions.values():
-                region.pool.limit(max(1, share))
+                region.pool.limit(max(2, share))
             self._structure_changed = True
         return self._regions[index]

@@ -1,9 +1,10 @@
 """Bounded memory of training samples, spread over the map.
 
-While there is room, all samples stay. Then each new one pushes out the most crowded of a few
+While there is room, all samples stay. Then each new one pushes out the more crowded of two
 candidates, so that places seen long ago keep theirs and places seen for long do not take over.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,6 @@ from torch import Tensor
 
 _BIN_M = 0.8
 _BINS = 1 << 18
-_CANDIDATES = 4
 _PRIMES = (73856093, 19349663, 83492791)
 
 
@@ -102,11 +102,18 @@ class ReplayPool:
         self._size = size
 
     def _crowded(self, count: int) -> Tensor:
-        """Up to ``count`` different places whose samples are the best to push out."""
-        candidates = self._random(self._size, _CANDIDATES * count).view(count, _CANDIDATES)
-        worst = self._crowd[self._bins[candidates]].argmax(dim=1, keepdim=True)
-        victims: Tensor = torch.unique(candidates.gather(1, worst)[:, 0])
-        return victims
+        """Up to ``count`` different places whose samples are the best to push out.
+
+        The pool is paired up at random, each place once, and the more crowded of a pair goes.
+        """
+        half = self._size // 2
+        count = min(count, half)
+        first, offset = self._random(half, 2).tolist()
+        places = torch.arange(count, device=self._points.device)
+        left = (first + places * _coprime(half)) % half
+        right = half + (left + offset) % half
+        crowded = self._crowd[self._bins[left]] > self._crowd[self._bins[right]]
+        return torch.where(crowded, left, right)
 
     def _random(self, below: int, count: int) -> Tensor:
         return torch.randint(
@@ -115,6 +122,14 @@ class ReplayPool:
             generator=self._generator,
             device=self._points.device,
         )
+
+
+def _coprime(size: int) -> int:
+    """A stride of about a golden section of ``size`` that visits every place once."""
+    stride = max(1, round(0.618 * size))
+    while math.gcd(stride, size) != 1:
+        stride += 1
+    return stride
 
 
 def _bin(points: Tensor) -> Tensor:
