@@ -69,3 +69,13 @@ def test_every_setting_is_read_somewhere() -> None:
 
 def test_parse_takes_nothing_as_defaults() -> None:
     assert parse_settings({}) == Settings()
+
+
+def test_the_document_lists_every_setting_with_its_default() -> None:
+    document = (ROOT / "docs" / "settings.md").read_text()
+    for part in dataclasses.fields(Settings):
+        section = document.split(f"## `[{part.name}]`")[1].split("\n## ")[0]
+        record = getattr(Settings(), part.name)
+        for entry in dataclasses.fields(type(record)):
+            value = repr(getattr(record, entry.name)).replace("'", '"')
+            assert f"| `{entry.name}` | `{value}` |" in section, f"{part.name}.{entry.name}"
