@@ -53,6 +53,12 @@ class Parameter:
         """Steps that each row took [rows] int32."""
         return self._steps[: self._count]
 
+    def snapshot(self) -> "Parameter":
+        """A copy of the values for reading, without optimiser state."""
+        twin = Parameter(self.values[:0])
+        twin._count, twin._values = self._count, self.values.clone()
+        return twin
+
     def append(self, values: Tensor) -> None:
         """Add rows with fresh optimiser state; that of the others stays."""
         count = self._count + len(values)

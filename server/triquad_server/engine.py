@@ -1,8 +1,5 @@
 """Two engines for one field: tensors on any device, compiled code on the CPU."""
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,11 +11,7 @@ from triquad_server import compiled_field
 from triquad_server.adam import EPSILON, Betas
 from triquad_server.field import Field
 from triquad_server.replay_pool import Batch
-
-_THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
-_POOL = ThreadPoolExecutor(_THREADS, thread_name_prefix="triquad-kernel")
-_MIN_SHARE = 512
-"""Points below which splitting work between threads costs more than it gains."""
+from triquad_server.threads import THREADS, split
 
 
 @dataclass(frozen=True)
@@ -93,7 +86,7 @@ class CompiledEngine:
                 gradients[first:last],
             )
 
-        _split(len(points), work)
+        split(len(points), work)
         scale = np.float32(self._field.settings.logit_scale_m)
         return FieldValues(logits * scale, gradients * scale)
 
@@ -105,11 +98,11 @@ class CompiledEngine:
         geometry, index, decoder = self._geometry(), self._index(), self._decoder()
         features = field.features.values.numpy()
         self._reserve(len(features))
-        sums = [_zeros_like(decoder) for _ in range(_THREADS)]
-        losses = np.zeros(_THREADS)
+        sums = [_zeros_like(decoder) for _ in range(THREADS)]
+        losses = np.zeros(THREADS)
 
         def work(first: int, last: int) -> None:
-            part = first * _THREADS // len(points)
+            part = first * THREADS // len(points)
             losses[part] = compiled_field.accumulate(
                 points[first:last],
                 targets[first:last],
@@ -123,7 +116,7 @@ class CompiledEngine:
                 self._touched[part],
             )
 
-        _split(len(points), work)
+        split(len(points), work)
         self._step_decoder(sums, rate, betas)
         self._step_features(rate, betas)
         return float(losses.sum())
@@ -162,14 +155,14 @@ class CompiledEngine:
                 EPSILON,
             )
 
-        _split(len(values), work)
+        split(len(values), work)
 
     def _reserve(self, rows: int) -> None:
         """Room for the sums of each thread; between steps they are all zero."""
         if not self._touched or len(self._touched[0]) < rows:
             size = self._field.settings.feature_size
-            self._feature_sums = [np.zeros((2 * rows, size), np.float32) for _ in range(_THREADS)]
-            self._touched = [np.zeros(2 * rows, np.uint8) for _ in range(_THREADS)]
+            self._feature_sums = [np.zeros((2 * rows, size), np.float32) for _ in range(THREADS)]
+            self._touched = [np.zeros(2 * rows, np.uint8) for _ in range(THREADS)]
 
     def _geometry(self) -> compiled_field.Geometry:
         settings = self._field.settings
@@ -202,13 +195,3 @@ class CompiledEngine:
 
 def _zeros_like(decoder: compiled_field.Decoder) -> compiled_field.Decoder:
     return compiled_field.Decoder(*(np.zeros_like(array) for array in decoder))
-
-
-def _split(count: int, work: Callable[[int, int], None]) -> None:
-    """Run ``work(first, last)`` over ``range(count)``, in parallel where it is worth it."""
-    parts = min(_THREADS, max(1, count // _MIN_SHARE))
-    bounds = [-(-count * part // parts) for part in range(parts + 1)]
-    others = [_POOL.submit(work, bounds[i], bounds[i + 1]) for i in range(1, parts)]
-    work(bounds[0], bounds[1])
-    for other in others:
-        other.result()

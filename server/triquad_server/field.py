@@ -102,9 +102,9 @@ class Field:
         twin.settings, twin.device = self.settings, self.device
         twin._generator = self._generator
         twin.tree = self.tree.copy()
-        twin.features = Parameter(self.features.values)
+        twin.features = self.features.snapshot()
         twin.frequencies = self.frequencies
-        twin.mlp = [Parameter(part.values) for part in self.mlp]
+        twin.mlp = [part.snapshot() for part in self.mlp]
         return twin
 
     @property

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_server.threads import split
 from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 _MIN_POINTS = 6
@@ -172,7 +173,12 @@ class MomentGrid:
 
     def estimate(self, points: NDArray[np.float64], normals: NDArray[np.float64]) -> None:
         """Fill those of ``normals`` [N, 3] that are NaN, where the points lie on a plane."""
-        _estimate(points, self._cell_m, self._cells.arrays, self._moments, normals)
+
+        def work(first: int, last: int) -> None:
+            part = slice(first, last)
+            _estimate(points[part], self._cell_m, self._cells.arrays, self._moments, normals[part])
+
+        split(len(points), work)
 
 
 class SurfaceNormals:

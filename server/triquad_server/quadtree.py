@@ -17,6 +17,7 @@ from triquad_format.region import AXES
 from triquad_server import morton
 from triquad_server.hash_table import HashTable
 
+_MIN_ROWS = 1024
 PLANE_BITS = 40
 """Keys of blocks are Morton codes below this bit, and the number of the plane above it."""
 
@@ -40,6 +41,8 @@ class TriQuadtree:
         self._device = device
         self._rows = 1
         self._vertices = [[HashTable(device) for _ in settings.levels] for _ in AXES]
+        self._codes = torch.zeros(_MIN_ROWS, dtype=torch.int64, device=device)  # by row
+        self._owners = torch.zeros(_MIN_ROWS, dtype=torch.uint8, device=device)  # table, by row
         self._blocks = HashTable(device)  # of all planes, see _block_key
         sides = [(1 << h) + 1 for h in range(settings.feature_levels)]  # vertices along a block
         self._starts = [sum(side**2 for side in sides[:h]) for h in range(len(sides))]
@@ -56,7 +59,9 @@ class TriQuadtree:
 
     def vertices(self, plane: int, h: int) -> tuple[Tensor, Tensor]:
         """Sorted Morton codes and rows of the vertices on a plane and the ``h``-th level."""
-        return self._vertices[plane][h].items()
+        rows = (self._owners[: self._rows] == self._owner(plane, h)).nonzero()[:, 0]
+        codes, order = torch.sort(self._codes[rows])
+        return codes, rows[order]
 
     @property
     def starts(self) -> list[int]:
@@ -74,10 +79,15 @@ class TriQuadtree:
         return self._block_rows
 
     def copy(self) -> "TriQuadtree":
-        """An independent copy."""
+        """A copy for reading: it does not grow, and does not change when this tree does.
+
+        It shares the rows so far, which never change, and does without the hash tables of the
+        vertices, which only growing needs.
+        """
         twin = TriQuadtree(self._settings, self._device)
         twin._rows = self._rows
-        twin._vertices = [[table.copy() for table in tables] for tables in self._vertices]
+        twin._vertices = []
+        twin._codes, twin._owners = self._codes, self._owners
         twin._blocks = self._blocks.copy()
         twin._block_rows = self._block_rows.clone()
         return twin
@@ -107,6 +117,7 @@ class TriQuadtree:
         rows = torch.arange(self._rows, self._rows + len(codes), device=self._device)
         table.insert(codes, rows)
         self._rows += len(codes)
+        self._note_owner(rows, codes, self._owner(plane, h))
         self._index(plane, h, codes, rows)
 
     def corners(self, points: Tensor) -> Corners:
@@ -141,6 +152,17 @@ class TriQuadtree:
             .transpose(1, 2)
             .reshape(count, levels, 12),
         )
+
+    def _owner(self, plane: int, h: int) -> int:
+        return 1 + plane * self._settings.feature_levels + h
+
+    def _note_owner(self, rows: Tensor, codes: Tensor, owner: int) -> None:
+        if self._rows > len(self._codes):
+            more = max(self._rows, 2 * len(self._codes)) - len(self._codes)
+            self._codes = torch.cat([self._codes, self._codes.new_zeros(more)])
+            self._owners = torch.cat([self._owners, self._owners.new_zeros(more)])
+        self._codes[rows] = codes
+        self._owners[rows] = owner
 
     def _leaf_coordinates(self, points: Tensor) -> Tensor:
         return points / self._settings.leaf_m + (1 << (self._settings.depth - 1))

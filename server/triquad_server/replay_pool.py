@@ -32,8 +32,8 @@ class ReplayPool:
         self._generator = torch.Generator(device).manual_seed(seed)
         self._points = torch.zeros((0, 3), device=device)
         self._labels = torch.zeros(0, device=device)
-        self._bins = torch.zeros(0, dtype=torch.int64, device=device)
-        self._crowd = torch.zeros(_BINS, dtype=torch.int64, device=device)
+        self._bins = torch.zeros(0, dtype=torch.int32, device=device)
+        self._crowd = torch.zeros(_BINS, dtype=torch.int32, device=device)
         self._fresh = torch.zeros(0, dtype=torch.int64, device=device)
 
     def __len__(self) -> int:
@@ -51,11 +51,13 @@ class ReplayPool:
             points, labels = points[: len(places)], labels[: len(places)]
         self._extend(self._size + room)
         replaced = places[room:]
-        self._crowd.index_add_(0, self._bins[replaced], torch.full_like(replaced, -1))
+        self._crowd.index_add_(
+            0, self._bins[replaced], torch.full_like(replaced, -1, dtype=torch.int32)
+        )
         self._points[places] = points
         self._labels[places] = labels
         self._bins[places] = _bin(points)
-        self._crowd.index_add_(0, self._bins[places], torch.ones_like(places))
+        self._crowd.index_add_(0, self._bins[places], torch.ones_like(places, dtype=torch.int32))
         self._fresh = places
 
     def draw(self, count: int, fresh: int) -> Batch:
@@ -135,4 +137,4 @@ def _coprime(size: int) -> int:
 def _bin(points: Tensor) -> Tensor:
     cells = (points / _BIN_M).floor().to(torch.int64)
     mixed: Tensor = cells[:, 0] * _PRIMES[0] ^ cells[:, 1] * _PRIMES[1] ^ cells[:, 2] * _PRIMES[2]
-    return mixed % _BINS
+    return (mixed % _BINS).to(torch.int32)
