@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_world import settings, settled_mapper, world
@@ -5,6 +7,7 @@ from triquad_format.evaluator import MapEvaluator
 from triquad_format.status import Status
 from triquad_server.epoch import Epoch
 from triquad_server.mapper import Mapper
+from triquad_server.settings import MeshSettings
 
 RNG = np.random.default_rng(0)
 
@@ -57,6 +60,22 @@ def test_no_points_give_an_empty_answer(epoch: Epoch) -> None:
     assert answer.sdf.shape == (0,)
     assert answer.gradient is not None
     assert answer.gradient.shape == (0, 3)
+
+
+def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
+    chosen = settings(visits=0.2)
+    small = replace(chosen, mesh=MeshSettings(cell_m=0.05, tile_cells=16, reach_m=0.2))
+    mapper = Mapper("test", small, "cpu")
+    scan = world(1).scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    epoch = mapper.publish()
+    low, high = np.array([3.0, -2.0, -1.0]), np.array([5.0, 2.0, 1.0])
+    listed = {tuple(tile) for tile in epoch.tiles(low, high).indices.tolist()}
+    side = small.mesh.tile_side_m
+    for offset in np.ndindex(3, 6, 3):
+        x, y, z = (np.floor(low / side).astype(int) + offset).tolist()
+        if len(epoch.mesh((x, y, z)).faces):
+            assert (x, y, z) in listed
 
 
 def test_an_empty_map_knows_nothing() -> None:

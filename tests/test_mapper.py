@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_world import settings, settle, settled_mapper, surface_error, world
@@ -148,6 +150,43 @@ def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
     after = surface_error(twin.publish(), world())
     assert during < before + 0.005, "the optimiser goes on where it was"
     assert after < before + 0.002, "what the scan did not see is not forgotten"
+
+
+def test_a_record_without_samples_owes_nothing() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    scan = world().scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    record = mapper.record(training=True)
+    emptied = []
+    for region in record.regions:
+        state = region.training
+        assert state is not None
+        state = replace(
+            state,
+            sample_points=state.sample_points[:0],
+            sample_labels=state.sample_labels[:0],
+        )
+        emptied.append(replace(region, training=state))
+    twin = Mapper("test", settings(), "cpu", replace(record, regions=tuple(emptied)))
+    assert twin.settled
+    twin.ingest(scan.points, scan.world_from_sensor)
+    twin.train()
+    assert twin.samples_trained > 0
+
+
+def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    for scan in world(2).scans:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    record = mapper.record(training=True)
+    assert len(record.regions) > 1
+    bounded = settings(pool_samples=4000)
+    twin = Mapper("test", bounded, "cpu", record)
+    assert twin.samples_kept <= 4000
+    twin.reset(np.array([5.0, -np.inf, -np.inf]), np.full(3, np.inf))
+    for scan in world(2).scans:
+        twin.ingest(scan.points, scan.world_from_sensor)
+    assert 1000 < twin.samples_kept <= 4000
 
 
 def test_what_is_owed_survives_a_restart() -> None:

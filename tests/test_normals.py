@@ -16,7 +16,7 @@ def test_the_normal_of_a_noisy_plane() -> None:
         normal /= np.linalg.norm(normal)
         normals = SurfaceNormals()
         points = plane(normal, 4000, 2.0, 0.01)
-        normals.add(points)
+        normals.add(points, np.zeros(3))
         found = normals.at(points)
         known = ~np.isnan(found[:, 0])
         assert known.mean() > 0.9
@@ -28,16 +28,16 @@ def test_the_normal_of_a_noisy_plane() -> None:
 def test_a_line_of_points_has_no_normal() -> None:
     normals = SurfaceNormals()
     line = np.linspace(0, 10, 400)[:, None] * np.array([1.0, 0.3, 0.0])
-    normals.add(line)
+    normals.add(line, np.zeros(3))
     assert np.isnan(normals.at(line)).all()
 
 
 def test_later_scans_fill_in_what_one_line_cannot_tell() -> None:
     normals = SurfaceNormals()
     lines = [np.stack([np.linspace(0, 8, 60), np.full(60, y), np.zeros(60)], 1) for y in (0, 0.4)]
-    normals.add(lines[0])
+    normals.add(lines[0], np.zeros(3))
     assert np.isnan(normals.at(lines[0])).all()
-    normals.add(lines[1])
+    normals.add(lines[1], np.zeros(3))
     found = normals.at(lines[0])
     known = ~np.isnan(found[:, 0])
     assert known.mean() > 0.8
@@ -47,5 +47,27 @@ def test_later_scans_fill_in_what_one_line_cannot_tell() -> None:
 def test_scattered_points_have_no_normal() -> None:
     normals = SurfaceNormals()
     points = RNG.uniform(-1, 1, (3000, 3))
-    normals.add(points)
+    normals.add(points, np.zeros(3))
     assert np.isnan(normals.at(points)[:, 0]).mean() > 0.95
+
+
+def test_memory_is_bounded_and_the_surroundings_stay_known() -> None:
+    normals = SurfaceNormals(max_cells=4000)
+    ground = np.zeros((40_000, 3))
+    for x in range(0, 200, 10):
+        ground[:, :2] = RNG.uniform([x - 10, -10], [x + 10, 10], (40_000, 2))
+        normals.add(ground, np.array([x, 0.0, 1.8]))
+    near = np.array([[x, y, 0.0] for x in (188.0, 190, 192) for y in (-1.0, 0, 1)])
+    np.testing.assert_allclose(np.abs(normals.at(near)[:, 2]), 1, atol=1e-6)
+    assert np.isnan(normals.at(np.zeros((1, 3)))).all(), "what lies far behind is forgotten"
+
+
+def test_forgetting_a_box() -> None:
+    normals = SurfaceNormals()
+    points = plane(np.array([0.0, 0.0, 1.0]), 8000, 3.0, 0.0)
+    normals.add(points, np.zeros(3))
+    middle = points.mean(axis=0)
+    normals.forget(middle - [9, 9, 9], middle + [0, 9, 9])
+    known = ~np.isnan(normals.at(points)[:, 0])
+    assert not known[points[:, 0] < middle[0] - 1].any()
+    assert known[points[:, 0] > middle[0] + 1].mean() > 0.9

@@ -59,6 +59,15 @@ def test_forgetting_a_box() -> None:
     assert len(pool) == 9000 - inside
 
 
+def test_the_smallest_pools_work() -> None:
+    for capacity in (1, 2, 3):
+        pool = ReplayPool(capacity, CPU, 0)
+        for count in (1, 1, 5):
+            pool.add(place(0, count), torch.zeros(count))
+        assert len(pool) == capacity
+        assert len(pool.draw(10, 5).labels) == 10
+
+
 def test_a_lower_limit_takes_effect_at_once() -> None:
     pool = ReplayPool(10_000, CPU, 0)
     pool.add(place(0, 9000), torch.zeros(9000))

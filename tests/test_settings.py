@@ -50,6 +50,23 @@ def test_errors_name_the_key_and_the_value(tmp_path: Path, text: str, words: lis
     assert all(word in str(error.value) for word in [*words, str(path)])
 
 
+@pytest.mark.parametrize(
+    ("sections", "words"),
+    [
+        ({"field": {"leaf_m": 0.01, "depth": 6}}, ["range_max_m", "leaf_m", "depth"]),
+        ({"scan": {"thin_m": 0.001, "range_max_m": 2000.0}}, ["thin_m", "range_max_m"]),
+        ({"field": {"leaf_m": 0.05}, "mesh": {"cell_m": 0.5}}, ["cell_m", "leaf_m"]),
+    ],
+)
+def test_settings_that_do_not_go_together_are_refused(
+    sections: dict[str, dict[str, float]],
+    words: list[str],
+) -> None:
+    with pytest.raises(SettingsError) as error:
+        parse_settings(sections)
+    assert all(word in str(error.value) for word in words)
+
+
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="nowhere.toml"):
         load_settings(tmp_path / "nowhere.toml")

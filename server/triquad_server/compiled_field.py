@@ -70,6 +70,39 @@ def _spread(bits: int) -> int:
     return bits
 
 
+class Scratch(NamedTuple):
+    """Room for what a kernel works out of one point."""
+
+    rows: Ints  # [12 H] feature rows of the vertices around
+    weights: Floats  # [12 H]
+    slopes: Floats  # [12 H, 2] derivatives of the weights, per metre
+    turns: Floats  # [6 m] phases of the Fourier features
+    x: Floats  # [input] of the MLP
+    gx: Floats  # [input] its gradient
+    h1: Floats  # [hidden] first layer
+    h2: Floats  # [hidden] second layer
+    g1: Floats  # [hidden] gradient before the ReLU of the first layer
+    g2: Floats  # [hidden] and of the second
+
+
+@numba.njit(cache=True, nogil=True)
+def _scratch(geometry: Geometry, decoder: Decoder) -> Scratch:
+    around = 12 * geometry.levels
+    hidden, inputs = decoder.w1.shape
+    return Scratch(
+        np.zeros(around, np.int32),
+        np.zeros(around, np.float32),
+        np.zeros((around, 2), np.float32),
+        np.zeros(6 * len(decoder.turns_per_m), np.float32),
+        np.zeros(inputs, np.float32),
+        np.zeros(inputs, np.float32),
+        np.zeros(hidden, np.float32),
+        np.zeros(hidden, np.float32),
+        np.zeros(hidden, np.float32),
+        np.zeros(hidden, np.float32),
+    )
+
+
 @numba.njit(cache=True, nogil=True)
 def _find_block(index: Index, key: int) -> int:
     mask = len(index.keys) - 1
@@ -273,16 +306,9 @@ def evaluate(
 ) -> None:
     """Fill ``logits`` [N] and, where not empty, ``gradients`` [N, 3] (per metre)."""
     size = features.shape[1]
-    inputs, hidden = decoder.w1.shape[1], decoder.w1.shape[0]
+    inputs = decoder.w1.shape[1]
     around = 12 * geometry.levels
-    rows = np.zeros(around, np.int32)
-    weights = np.zeros(around, np.float32)
-    slopes = np.zeros((around, 2), np.float32)
-    turns = np.zeros(6 * len(decoder.turns_per_m), np.float32)
-    x = np.zeros(inputs, np.float32)
-    gx = np.zeros(inputs, np.float32)
-    h1, h2 = np.zeros(hidden, np.float32), np.zeros(hidden, np.float32)
-    g1, g2 = np.zeros(hidden, np.float32), np.zeros(hidden, np.float32)
+    rows, weights, slopes, turns, x, gx, h1, h2, g1, g2 = _scratch(geometry, decoder)
     for i in range(len(points)):
         if geometry.levels > 0:
             _locate(points[i], geometry, index, rows, weights, slopes)
@@ -343,22 +369,16 @@ def accumulate(
     inputs, hidden = decoder.w1.shape[1], decoder.w1.shape[0]
     around = 12 * geometry.levels
     learnt = geometry.levels * size
-    rows = np.zeros(around, np.int32)
-    weights = np.zeros(around, np.float32)
-    slopes = np.zeros((around, 2), np.float32)
-    turns = np.zeros(6 * len(decoder.turns_per_m), np.float32)
-    x = np.zeros(inputs, np.float32)
-    gx = np.zeros(inputs, np.float32)
-    h1, h2 = np.zeros(hidden, np.float32), np.zeros(hidden, np.float32)
-    g1, g2 = np.zeros(hidden, np.float32), np.zeros(hidden, np.float32)
+    rows, weights, slopes, turns, x, gx, h1, h2, g1, g2 = _scratch(geometry, decoder)
     loss = 0.0
     for i in range(len(points)):
         if geometry.levels > 0:
             _locate(points[i], geometry, index, rows, weights, slopes)
         _encode(points[i], features, geometry, decoder, rows, weights, turns, x)
         logit = _decode(x, decoder, h1, h2)
-        squashed = 1 / (1 + np.exp(-logit))
-        loss += max(logit, np.float32(0)) - logit * targets[i] + np.log1p(np.exp(-abs(logit)))
+        tail = np.exp(-abs(logit))  # never overflows
+        squashed = (np.float32(1) if logit >= 0 else tail) / (1 + tail)
+        loss += max(logit, np.float32(0)) - logit * targets[i] + np.log1p(tail)
         slope = np.float32((squashed - targets[i]) * share)
         _backward_hidden(slope, decoder, h1, h2, g1, g2)
         sums.b3[0] += slope
@@ -381,47 +401,3 @@ def accumulate(
             start = ((at >> 2) % geometry.levels) * size
             _add_to_row(feature_sums, row, weights[at], gx, start)
     return float(loss * share)
-
-
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def step_rows(
-    first: int,
-    last: int,
-    touched: tuple[NDArray[np.uint8], ...],
-    sums: tuple[Floats, ...],
-    values: Floats,
-    means: Floats,
-    variances: Floats,
-    steps: Ints,
-    rate: float,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-) -> None:
-    """Adam on the touched rows in ``[first, last)``; clears their sums and marks."""
-    size = values.shape[1]
-    log_beta1, log_beta2 = np.log(beta1), np.log(beta2)
-    for row in range(first, last):
-        any_touched = False
-        for part in range(len(touched)):
-            any_touched = any_touched or touched[part][row] != 0
-        if not any_touched:
-            continue
-        for part in range(1, len(touched)):
-            if touched[part][row]:
-                for k in range(size):
-                    sums[0][row, k] += sums[part][row, k]
-                    sums[part][row, k] = 0
-        steps[row] += 1
-        # beta ** steps: the power itself compiles to a function that LLVM's runtime lacks here.
-        mean_scale = np.float32(rate / (1 - np.exp(steps[row] * log_beta1)))
-        variance_scale = np.float32(1 / (1 - np.exp(steps[row] * log_beta2)))
-        for k in range(size):
-            g = sums[0][row, k]
-            sums[0][row, k] = 0
-            means[row, k] += np.float32(1 - beta1) * (g - means[row, k])
-            variances[row, k] += np.float32(1 - beta2) * (g * g - variances[row, k])
-            deviation = np.sqrt(variances[row, k] * variance_scale) + np.float32(epsilon)
-            values[row, k] -= mean_scale * means[row, k] / deviation
-        for part in range(len(touched)):
-            touched[part][row] = 0

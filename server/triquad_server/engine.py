@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from triquad_server import compiled_field
 from triquad_server.adam import EPSILON, Betas
+from triquad_server.compiled_adam import step_rows
 from triquad_server.field import Field
 from triquad_server.replay_pool import Batch
 from triquad_server.threads import THREADS, split
@@ -32,11 +33,28 @@ class Engine(Protocol):
         """One optimiser step; returns the loss before it."""
 
 
-def make_engine(field: Field, compiled: bool | None = None) -> Engine:
-    """The engine for a field: compiled code on the CPU, tensors elsewhere, unless told."""
-    if compiled is None:
-        compiled = field.device.type == "cpu"
-    return CompiledEngine(field) if compiled else TorchEngine(field)
+class GradientSums:
+    """Room for the gradients of the feature rows, for each thread; all zero between steps.
+
+    Engines that are not trained at the same time share it.
+    """
+
+    def __init__(self) -> None:
+        self.features: tuple[NDArray[np.float32], ...] = ()  # per thread [rows, size]
+        self.touched: tuple[NDArray[np.uint8], ...] = ()  # per thread [rows]
+
+    def reserve(self, rows: int, size: int) -> None:
+        """Make room for ``rows`` of ``size`` numbers."""
+        if self.touched and len(self.touched[0]) >= rows and self.features[0].shape[1] == size:
+            return
+        room = rows + rows // 2
+        self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
+        self.touched = tuple(np.zeros(room, np.uint8) for _ in range(THREADS))
+
+
+def make_engine(field: Field, sums: GradientSums | None = None) -> Engine:
+    """The engine for a field: compiled code on the CPU, tensors elsewhere."""
+    return CompiledEngine(field, sums) if field.device.type == "cpu" else TorchEngine(field)
 
 
 class TorchEngine:
@@ -63,10 +81,9 @@ class TorchEngine:
 class CompiledEngine:
     """Compiled kernels over the field's own memory, on all cores."""
 
-    def __init__(self, field: Field) -> None:
+    def __init__(self, field: Field, sums: GradientSums | None = None) -> None:
         self._field = field
-        self._feature_sums: list[NDArray[np.float32]] = []
-        self._touched: list[NDArray[np.uint8]] = []
+        self._sums = sums or GradientSums()
 
     def evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
         """The field at points [N, 3], metres from the region's centre."""
@@ -97,7 +114,7 @@ class CompiledEngine:
         targets = torch.sigmoid(batch.labels / field.settings.logit_scale_m).numpy()
         geometry, index, decoder = self._geometry(), self._index(), self._decoder()
         features = field.features.values.numpy()
-        self._reserve(len(features))
+        self._sums.reserve(*features.shape)
         sums = [_zeros_like(decoder) for _ in range(THREADS)]
         losses = np.zeros(THREADS)
 
@@ -112,8 +129,8 @@ class CompiledEngine:
                 index,
                 decoder,
                 sums[part],
-                self._feature_sums[part],
-                self._touched[part],
+                self._sums.features[part],
+                self._sums.touched[part],
             )
 
         split(len(points), work)
@@ -137,10 +154,10 @@ class CompiledEngine:
         features = self._field.features
         values, means = features.values.numpy(), features.means.numpy()
         variances, steps = features.variances.numpy(), features.steps.numpy()
-        touched, sums = tuple(self._touched), tuple(self._feature_sums)
+        touched, sums = self._sums.touched, self._sums.features
 
         def work(first: int, last: int) -> None:
-            compiled_field.step_rows(
+            step_rows(
                 first,
                 last,
                 touched,
@@ -156,13 +173,6 @@ class CompiledEngine:
             )
 
         split(len(values), work)
-
-    def _reserve(self, rows: int) -> None:
-        """Room for the sums of each thread; between steps they are all zero."""
-        if not self._touched or len(self._touched[0]) < rows:
-            size = self._field.settings.feature_size
-            self._feature_sums = [np.zeros((2 * rows, size), np.float32) for _ in range(THREADS)]
-            self._touched = [np.zeros(2 * rows, np.uint8) for _ in range(THREADS)]
 
     def _geometry(self) -> compiled_field.Geometry:
         settings = self._field.settings

@@ -1,6 +1,5 @@
 """A published, immutable state of the map, and the questions it answers."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,8 +121,8 @@ class Epoch:
         """Tiles that hold seen surface and meet the box between two corners [3]."""
         changed: dict[tuple[int, int, int], int] = {}
         for region in self.frozen_regions:
-            for tile in self._surface_tiles(region):
-                changed[tile] = max(region.changed, changed.get(tile, 0))
+            for x, y, z in self._surface_tiles(region).tolist():
+                changed[x, y, z] = max(region.changed, changed.get((x, y, z), 0))
         indices = np.array(sorted(changed), np.int32).reshape(-1, 3)
         low = indices * self._mesh.tile_side_m
         meets = ((low <= maximum) & (low + self._mesh.tile_side_m >= minimum)).all(axis=1)
@@ -193,20 +192,18 @@ class Epoch:
             slopes.astype(np.float32) if gradient else None,
         )
 
-    def _surface_tiles(self, region: FrozenRegion) -> Iterator[tuple[int, int, int]]:
-        """Tiles that meet a block with seen surface, and half a voxel around it."""
+    def _surface_tiles(self, region: FrozenRegion) -> NDArray[np.int64]:
+        """Tiles [T, 3] that meet a block with seen surface, or what is meshed around it."""
         side = BLOCK_VOXELS * self._settings.leaf_m
-        reach = self._settings.leaf_m / 2
         corner = region.centre - self._settings.region_side_m / 2
-        low = region.evidence.surface_cells() * side + corner - reach
-        tiles: set[tuple[int, int, int]] = set()
-        for shift in np.ndindex(2, 2, 2):
-            ends = low + np.array(shift) * (side + 2 * reach)
-            tiles.update(
-                (x, y, z)
-                for x, y, z in np.floor(ends / self._mesh.tile_side_m).astype(int).tolist()
-            )
-        return iter(tiles)
+        low = region.evidence.surface_cells() * side + corner
+        first = np.floor((low - self._mesh.reach_m) / self._mesh.tile_side_m).astype(np.int64)
+        last = np.floor((low + side + self._mesh.reach_m) / self._mesh.tile_side_m).astype(np.int64)
+        tiles = [np.zeros((0, 3), np.int64)]
+        for offset in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
+            tile = first + offset
+            tiles.append(tile[(tile <= last).all(axis=1)])
+        return np.unique(np.concatenate(tiles), axis=0)
 
     def _voxels(self, region: FrozenRegion, points: NDArray[np.float64]) -> NDArray[np.float64]:
         half = 1 << (self._settings.depth - 1)

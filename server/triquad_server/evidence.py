@@ -139,6 +139,10 @@ def _status(
             for y in range(int(low[1]), int(high[1]) + 1):
                 for z in range(int(low[2]), int(high[2]) + 1):
                     found = found or _bit(index, surface, side, x, y, z)
+                if found:
+                    break
+            if found:
+                break
         if found:
             status[i] = _SURFACE
             continue

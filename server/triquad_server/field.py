@@ -72,7 +72,7 @@ class Field:
         """One optimiser step on ``points`` [N, 3] with signed distances ``labels`` [N] (metres).
 
         The loss is the cross entropy between the two distances squashed by a sigmoid
-        (3QFP, equation 5). Returns it, before the step, without waiting for the device.
+        (3QFP, equation 5). Returns it as it was before the step.
         """
         corners = self.tree.corners(points) if self._has_features else None
         encoded = self._gather(corners) if corners is not None else None

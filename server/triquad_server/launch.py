@@ -59,6 +59,8 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         if restored is not None:
             _log.info("restoring epoch %d from %s", restored.record.epoch, restored.info.path)
         record = restored.record if restored else None
+        if record is not None and record.settings != options.settings.field:
+            _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
         _log.info("preparing compiled code: up to a minute at the very first start")
         warm_up(options.settings, device)
         mapper = Mapper(options.map_name, options.settings, device, record)

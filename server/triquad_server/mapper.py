@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from triquad_format.region import MapRecord, RegionIndex
 
+from triquad_server.engine import GradientSums
 from triquad_server.epoch import Epoch, FrozenRegion, frozen_region
 from triquad_server.normals import SurfaceNormals
 from triquad_server.region_map import RegionMap
@@ -18,7 +19,7 @@ _LOSS_MEMORY = 0.95
 
 
 class Mapper:
-    """A map that grows and learns. It knows no threads, files or clocks."""
+    """A map that grows and learns. It knows no files and no clocks."""
 
     def __init__(
         self,
@@ -36,6 +37,7 @@ class Mapper:
             torch.set_num_threads(1)
         self._rng = np.random.default_rng(settings.training.seed)
         self._normals = SurfaceNormals()
+        self._sums = GradientSums()
         self._regions: dict[RegionIndex, RegionMap] = {}
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
@@ -48,7 +50,9 @@ class Mapper:
                 self._field_settings,
                 settings.training,
                 self._device,
+                self._sums,
             )
+        self._share_pool()
 
     @property
     def settled(self) -> bool:
@@ -71,7 +75,7 @@ class Mapper:
             ScanRefusedError: the scan cannot be used; the map is unchanged.
         """
         rays = usable_rays(points, world_from_sensor, self._settings.scan)
-        self._normals.add(rays.ends)
+        self._normals.add(rays.ends, rays.origin)
         normals = self._normals.at(rays.ends)
         samples = draw_samples(rays, normals, self._settings.scan, self._rng)
         for index in self._regions_around(rays.ends):
@@ -117,7 +121,8 @@ class Mapper:
                 del self._regions[index]
             elif ((minimum < high) & (maximum > low)).all():
                 region.forget(np.maximum(minimum, low), np.minimum(maximum, high))
-        self._normals = SurfaceNormals()
+        self._normals.forget(minimum, maximum)
+        self._share_pool()
         self._structure_changed = True
 
     def record(self, training: bool) -> MapRecord:
@@ -162,9 +167,14 @@ class Mapper:
                 self._field_settings,
                 self._settings.training,
                 self._device,
+                self._sums,
             )
-            share = self._settings.training.pool_samples // len(self._regions)
-            for region in self._regions.values():
-                region.pool.limit(max(2, share))
+            self._share_pool()
             self._structure_changed = True
         return self._regions[index]
+
+    def _share_pool(self) -> None:
+        """Give every region an equal part of the replay samples that may be kept."""
+        share = max(1, self._settings.training.pool_samples // max(1, len(self._regions)))
+        for region in self._regions.values():
+            region.pool.limit(share)

@@ -180,17 +180,54 @@ class MomentGrid:
 
         split(len(points), work)
 
+    def keep_nearest(self, place: NDArray[np.float64], cells: int) -> None:
+        """Keep the moments of the ``cells`` nearest to a ``place`` [3] only."""
+        distance = np.linalg.norm(self._centres() - place, axis=1)
+        self._keep(np.sort(np.argpartition(distance, cells)[:cells]))
+
+    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Drop the moments of cells between the corners ``low`` and ``high`` [3]."""
+        centres = self._centres()
+        self._keep(np.flatnonzero(((centres < low) | (centres > high)).any(axis=1)))
+
+    @property
+    def cells(self) -> int:
+        """Cells in use."""
+        return self._cells.count
+
+    def _centres(self) -> NDArray[np.float64]:
+        return np.asarray((self._cells.cells() + 0.5) * self._cell_m, np.float64)
+
+    def _keep(self, rows: NDArray[np.int64]) -> None:
+        kept = self._moments[rows]
+        self._cells = VoxelIndex.of_cells(self._cells.cells()[rows])
+        self._moments = np.zeros((self._cells.capacity, 10))
+        self._moments[: len(kept)] = kept
+
 
 class SurfaceNormals:
-    """Normals of the surfaces seen so far."""
+    """Normals of the surfaces around the sensor; those farthest from it go first."""
 
-    def __init__(self, fine_m: float = 0.15, coarse_m: float = 0.5) -> None:
+    def __init__(
+        self,
+        fine_m: float = 0.15,
+        coarse_m: float = 0.5,
+        max_cells: int = 300_000,  # of each grid, at some 110 bytes
+    ) -> None:
         self._grids = (MomentGrid(fine_m), MomentGrid(coarse_m))
+        self._max_cells = max_cells
 
-    def add(self, points: NDArray[np.float64]) -> None:
-        """Add the end points [N, 3] of a scan, metres, map frame."""
+    def add(self, points: NDArray[np.float64], sensor: NDArray[np.float64]) -> None:
+        """Add the end points [N, 3] of a scan from ``sensor`` [3], metres, map frame."""
         for grid in self._grids:
             grid.add(points)
+            if grid.cells > self._max_cells:
+                grid.keep_nearest(sensor, self._max_cells // 2)
+
+    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Forget the surfaces between the corners ``low`` and ``high`` [3]."""
+        for grid in self._grids:
+            grid.forget(low, high)
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit normals [N, 3] of either sign; NaN where no plane is known."""

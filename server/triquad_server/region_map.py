@@ -7,7 +7,7 @@ from triquad_format.field_settings import FieldSettings
 from triquad_format.region import Region, RegionIndex, TrainingState, region_centre
 
 from triquad_server.adam import Betas
-from triquad_server.engine import make_engine
+from triquad_server.engine import GradientSums, make_engine
 from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 from triquad_server.field_record import field_from_record, field_mlp, field_tables, training_moments
@@ -30,15 +30,17 @@ class RegionMap:
         field_settings: FieldSettings,
         training: TrainingSettings,
         device: torch.device,
+        sums: GradientSums,
     ) -> None:
         self.index = index
         self.centre = region_centre(field_settings, index)
         self._settings = field_settings
         self._training = training
         self._device = device
+        self._sums = sums
         seed = training.seed + hash(index) % 1_000_003
         self.field = Field(field_settings, device, seed)
-        self._engine = make_engine(self.field)
+        self._engine = make_engine(self.field, sums)
         self.evidence = Evidence(1 << field_settings.depth)
         self.pool = ReplayPool(training.pool_samples, device, seed)
         self.owed = 0  # training visits that new samples have paid for
@@ -58,10 +60,10 @@ class RegionMap:
         ends = rays.ends[self.covers(rays.ends)]
         self.field.grow(self._local(ends))
         self.evidence.mark_surface(self.voxels(ends))
-        chosen = rays.ends[thin(rays.ends, self._settings.leaf_m)]
+        all_ends = self.voxels(rays.ends)
         self.evidence.carve(
             self.voxels(rays.origin[None])[0],
-            self.voxels(chosen),
+            all_ends[thin(all_ends, 1.0)],
             _CARVE_SHORT_M / self._settings.leaf_m,
         )
         inside = self.covers(samples.points)
@@ -118,17 +120,19 @@ class RegionMap:
         field_settings: FieldSettings,
         training: TrainingSettings,
         device: torch.device,
+        sums: GradientSums,
     ) -> "RegionMap":
         """A region from its record; without training state its replay pool starts empty."""
-        region = cls(record.index, field_settings, training, device)
+        region = cls(record.index, field_settings, training, device, sums)
         region.field = field_from_record(record, field_settings, device, training.seed)
-        region._engine = make_engine(region.field)
+        region._engine = make_engine(region.field, sums)
         region.evidence = Evidence.restore(1 << field_settings.depth, record.evidence)
         if record.training is not None:
             points = torch.from_numpy(record.training.sample_points.astype(np.float32))
             labels = torch.from_numpy(record.training.sample_labels.astype(np.float32))
             region.pool.add(points.to(device), labels.to(device))
-            region.owed = record.training.visits_owed
+            owed = min(record.training.visits_owed, training.max_backlog)
+            region.owed = owed if len(region.pool) else 0
         return region
 
     def _training_state(self) -> TrainingState:

@@ -110,6 +110,8 @@ class ReplayPool:
         """
         half = self._size // 2
         count = min(count, half)
+        if count == 0:
+            return self._fresh[:0]
         first, offset = self._random(half, 2).tolist()
         places = torch.arange(count, device=self._points.device)
         left = (first + places * _coprime(half)) % half

@@ -59,8 +59,8 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         check_range("batch", self.batch, 1, 10_000_000)
         check_range("learning_rate", self.learning_rate, 0.0, 1.0)
-        check_range("beta1", self.beta1, 0.0, 0.9999)
-        check_range("beta2", self.beta2, 0.0, 0.99999)
+        check_range("beta1", self.beta1, 0.001, 0.9999)
+        check_range("beta2", self.beta2, 0.001, 0.99999)
         check_range("pool_samples", self.pool_samples, 1000, 1_000_000_000)
         check_range("fresh_share", self.fresh_share, 0.0, 1.0)
         check_range("visits", self.visits, 0.0, 1000.0)
@@ -104,7 +104,7 @@ class ServiceSettings:
     """Limits of the network service."""
 
     scan_queue: int = 32  # scans waiting; the oldest is pushed out, and counted
-    request_queue: int = 64  # requests waiting per operation
+    request_queue: int = 64  # requests waiting per group of operations
     query_workers: int = 2
     max_query_points: int = 1_000_000  # of one request
     publish_period_s: float = 0.5  # between epochs while the map changes
@@ -131,6 +131,30 @@ class Settings:
     mesh: MeshSettings = MeshSettings()
     store: StoreSettings = StoreSettings()
     service: ServiceSettings = ServiceSettings()
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are each in range but do not go together."""
+        reach_m = self.scan.range_max_m
+        _check_together(
+            self.field.region_pitch_m * 8 >= reach_m,
+            f"scan.range_max_m = {reach_m:g} reaches over too many regions of field.leaf_m = "
+            f"{self.field.leaf_m:g} and field.depth = {self.field.depth}: "
+            f"use at most {self.field.region_pitch_m * 8:g}, or larger regions",
+        )
+        _check_together(
+            self.scan.thin_m * 1e6 >= reach_m,
+            f"scan.thin_m = {self.scan.thin_m:g} is too fine for scan.range_max_m = {reach_m:g}",
+        )
+        _check_together(
+            4 * self.mesh.cell_m + self.mesh.reach_m <= 16 * self.field.leaf_m,
+            f"mesh.cell_m = {self.mesh.cell_m:g} and mesh.reach_m = {self.mesh.reach_m:g} are too "
+            f"coarse for field.leaf_m = {self.field.leaf_m:g}",
+        )
+
+
+def _check_together(fits: bool, otherwise: str) -> None:
+    if not fits:
+        raise SettingsError(otherwise)
 
 
 def load_settings(path: Path) -> Settings:

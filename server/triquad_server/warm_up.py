@@ -15,7 +15,8 @@ def warm_up(settings: Settings, device: str) -> None:
     Compiling takes the better part of a minute at the very first start; then the compiled code is
     found on disk.
     """
-    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    count = min(_DIRECTIONS, settings.scan.max_points)
+    directions = np.random.default_rng(0).normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     radius = min(max(_RADIUS_M, settings.scan.range_min_m), settings.scan.range_max_m)
     mapper = Mapper("warm-up", settings, device)
