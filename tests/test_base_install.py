@@ -19,3 +19,15 @@ def test_all_public_names_exist():
 
     for name in triquad_client.__all__:
         assert getattr(triquad_client, name) is not None
+
+
+def test_a_tool_whose_libraries_are_missing_says_what_to_install():
+    code = (
+        "import sys; sys.modules['numba'] = None; sys.modules['scipy'] = None\n"
+        "from triquad_tools import commands\n"
+        "sys.exit(commands.evaluate())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "is missing: install triquad[tools]" in done.stderr
+    assert "Traceback" not in done.stderr
