@@ -18,10 +18,12 @@ from triquad_format.messages import (
     FlushRequest,
     MapChunk,
     MapChunkRequest,
+    ResetRequest,
     SdfRequest,
     ServerStatus,
     TileRequest,
 )
+from triquad_server.store import Store
 
 POSE = np.eye(4)
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
@@ -257,6 +259,23 @@ def test_a_checkpoint_restores_the_same_answers(tmp_path):
     assert after.epoch == before.epoch
     assert np.array_equal(after.status, before.status)
     assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features are half precision
+
+
+def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_path, monkeypatch):
+    replies = []
+    write = Store.write
+
+    def reset_meanwhile(store, record):
+        with servers.raw_session(connect=endpoint) as session:
+            request = ResetRequest(np.full(3, -np.inf), np.full(3, np.inf))
+            replies.append(servers.RawPeer(session).ask(keys.RESET, wire.encode(request)))
+        return write(store, record)
+
+    with servers.running_service(store=tmp_path) as endpoint:
+        with triquad_client.connect(endpoint) as client:
+            learn(client)
+        monkeypatch.setattr(Store, "write", reset_meanwhile)
+    assert replies == [None]
 
 
 def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
