@@ -22,6 +22,7 @@ from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,
     MapFileError,
+    TooLargeMapFileError,
     UnsupportedMapFileError,
 )
 from triquad_format.field_settings import FieldSettings
@@ -612,9 +613,9 @@ def test_bombs_are_not_allocated():
 
 def test_total_is_limited():
     data = file_bytes(random_record(14, points=300))
-    with pytest.raises(MapFileError, match="limit"):
+    with pytest.raises(TooLargeMapFileError, match="limit"):
         read_map(io.BytesIO(data), max_bytes=len(data) + 100)
-    with pytest.raises(MapFileError, match="limit"):
+    with pytest.raises(TooLargeMapFileError, match="limit"):
         read_map(io.BytesIO(data), max_bytes=len(data) - 1)
     assert_same(read_map(io.BytesIO(data), max_bytes=10 * len(data)), random_record(14, points=300))
 
@@ -631,7 +632,7 @@ def test_memory_error_is_named(monkeypatch):
         raise MemoryError
 
     monkeypatch.setattr(mapfile_reader, "unpack_record", out_of_memory)
-    with pytest.raises(MapFileError, match="memory"):
+    with pytest.raises(TooLargeMapFileError, match="memory"):
         read_map(GOLDEN)
 
 
