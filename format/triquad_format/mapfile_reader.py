@@ -17,6 +17,7 @@ from triquad_format.errors import (
 from triquad_format.map_parts import FRAME_ID, MANIFEST, PREFIX, TOPICS, UNITS, Part
 from triquad_format.mapfile_writer import (
     FORMAT_VERSION,
+    MAX_MAP_BYTES,
     MAX_PART_BYTES,
     MESSAGE_ENCODING,
     METADATA_NAME,
@@ -25,9 +26,6 @@ from triquad_format.mcap_records import McapFile, Message
 from triquad_format.part_reader import PartCursor, unpack_manifest, unpack_record
 from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord
-
-MAX_MAP_BYTES = 4 * 2**30
-"""Limit on the size of a map file, and on its chunks' decompressed size together."""
 
 KNOWN_FEATURES: frozenset[str] = frozenset()
 """The ``required_features`` that this reader understands."""
