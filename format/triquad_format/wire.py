@@ -108,9 +108,6 @@ def _pack(name: str, annotation: Any, value: object) -> object:
             key: _pack(f"{name}.{key}", hint, getattr(value, key))
             for key, hint in annotation.annotations().items()
         }
-    if origin is list and isinstance(value, list):
-        (item,) = get_args(annotation)
-        return [_pack(f"{name}[{i}]", item, entry) for i, entry in enumerate(value)]
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)
         return {
@@ -136,9 +133,6 @@ def _unpack(name: str, annotation: Any, value: object) -> object:
         return annotation(
             **{key: _unpack(f"{name}.{key}", hint, value[key]) for key, hint in hints.items()},
         )
-    if origin is list and isinstance(value, list):
-        (item,) = get_args(annotation)
-        return [_unpack(f"{name}[{i}]", item, entry) for i, entry in enumerate(value)]
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)
         return {
