@@ -93,6 +93,7 @@ POSE = np.eye(4)
         (changed(servers.scan(), source="radar"), "key_source_mismatch"),
         (changed(servers.scan(), sequence=-1), "bad_sequence"),
         (changed(servers.scan(), sequence=2**62), "bad_sequence"),
+        (wire.encode(servers.scan(points=np.zeros((2_001_000, 3), np.float32))), "too_large"),
     ],
 )
 def test_scans_that_cannot_be_read_are_counted_by_reason(peer, client, scan, payload, reason):
@@ -151,6 +152,17 @@ def test_bad_points_among_good_ones_are_left_out_and_counted(peer, client, scan)
     assert np.isfinite(client.query_sdf(servers.sphere(50)).sdf).all()
 
 
+def test_a_source_whose_name_cannot_stand_in_a_key_is_refused(peer, client, scan):
+    before = client.status()
+    name = "a" * 65
+    peer.session.put(f"triquad/{peer.map_name}/scan/{name}", wire.encode(scan(source=name)))
+    peer.put(scan().source, wire.encode(scan()))
+    peer.flush(scan())
+    after = client.status()
+    assert added(before.scans_dropped, after.scans_dropped) == {"bad_source": 1}
+    assert name not in after.scans_lost
+
+
 def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
     before = client.status()
     source = scan().source
@@ -180,6 +192,7 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
             SdfRequest(ORIGIN, np.zeros((10_000_000, 3), np.float32), False, 0),
             "too_large",
         ),
+        *((operation, bytes(12_010_000), "too_large") for operation in keys.OPERATIONS),
         (keys.TILE, TileRequest(2**62, 0, 0, 0), "bad_request"),
         (keys.TILE, TileRequest(0, -(2**63), 0, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),

@@ -3,6 +3,7 @@
 import hashlib
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -24,7 +25,7 @@ from triquad_client import (
     TriquadError,
     UnknownMapError,
 )
-from triquad_client.connection import open_connection
+from triquad_client.connection import open_connection, retried
 from triquad_format import keys, wire
 from triquad_format.messages import (
     ErrorReply,
@@ -109,7 +110,9 @@ def test_two_maps_on_one_network_do_not_disturb_each_other():
 def wait_for_maps(client: triquad_client.Client, names: list[str]) -> None:
     """Two routers exchange what they know some time after they are up."""
     pause = threading.Event()
-    while client.maps() != names:
+    deadline = time.monotonic() + servers.WAIT_S
+    while (found := client.maps()) != names:
+        assert time.monotonic() < deadline, f"found {found}, not {names}"
         pause.wait(0.05)
 
 
@@ -355,3 +358,20 @@ def test_a_zenoh_configuration_file_is_used(endpoint, tmp_path):
         triquad_client.connect(endpoint, config=file)
     with pytest.raises(ConnectError):
         open_connection(endpoint, servers.MAP, 1.0, tmp_path / "missing.json5")
+
+
+def test_only_the_expected_refusal_is_asked_again_and_not_for_ever():
+    asked = []
+
+    def refuse(code: str, times: int) -> int:
+        asked.append(code)
+        if len(asked) <= times:
+            raise RefusedError(code, "")
+        return len(asked)
+
+    assert retried("epoch_gone", lambda: refuse("epoch_gone", 2)) == 3
+    for code, attempts in (("epoch_gone", 3), ("busy", 1)):
+        asked.clear()
+        with pytest.raises(RefusedError):
+            retried("epoch_gone", lambda code=code: refuse(code, 100))
+        assert len(asked) == attempts

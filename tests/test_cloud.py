@@ -1,8 +1,9 @@
 from pathlib import Path
 
 import numpy as np
-from triquad_tools.cloud import is_withheld, merged, points_in_range, world_points
+from triquad_tools.cloud import is_withheld, points_in_range, world_points
 from triquad_tools.kitti import read_folder, write_folder
+from triquad_tools.voxel import merged
 
 
 def test_the_last_of_every_few_scans_is_withheld() -> None:

@@ -7,7 +7,6 @@ import servers
 import triquad_client
 from triquad_tools import evaluate, replay
 from triquad_tools.kitti import write_folder
-from triquad_tools.meshfile import Mesh, write_mesh
 from triquad_tools.street_drive import street_drive
 
 SCANS = 9
@@ -16,7 +15,8 @@ EVERY = 3  # withheld
 
 def _plate(path: Path, x: tuple[float, float], y: tuple[float, float], z: float) -> Path:
     corners = [[x[0], y[0], z], [x[1], y[0], z], [x[1], y[1], z], [x[0], y[1], z]]
-    write_mesh(path, Mesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])))
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    triquad_client.Mesh(np.array(corners, float), faces, 1).save(path)
     return path
 
 
@@ -35,7 +35,7 @@ def _evaluate(capsys, *arguments: object) -> dict:
 def test_a_plate_scores_its_distance_from_a_cloud(tmp_path, capsys, suffix) -> None:
     mesh = _plate(tmp_path / f"plate{suffix}", (0, 4), (0, 2), 0.05)
     cloud = tmp_path / "cloud.ply"
-    write_mesh(cloud, Mesh(_grid(), np.empty((0, 3), np.int64)))
+    triquad_client.Mesh(_grid(), np.empty((0, 3), np.int32), 1).save(cloud)
     scores = _evaluate(capsys, "mesh", mesh, "--reference", cloud)["mesh"]
     assert scores["accuracy_m"] == pytest.approx(0.05, abs=0.002)
     assert scores["completion_m"] == pytest.approx(0.05, abs=0.002)
@@ -137,7 +137,7 @@ def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder) -
 
     mesh = _plate(tmp_path / "plate.ply", (0, 1), (0, 1), 0.0)
     cloud = tmp_path / "cloud.ply"
-    write_mesh(cloud, Mesh(_grid(), np.empty((0, 3), np.int64)))
+    triquad_client.Mesh(_grid(), np.empty((0, 3), np.int32), 1).save(cloud)
     assert "no such file" in refusal("mesh", tmp_path / "no.ply", "--street", 1)
     assert "has no faces" in refusal("mesh", cloud, "--reference", cloud)
     assert "no.ply" in refusal("mesh", mesh, "--reference", tmp_path / "no.ply")

@@ -2,9 +2,11 @@ import contextlib
 import dataclasses
 import hashlib
 import io
+import math
 import os
 import struct
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import msgpack
@@ -16,16 +18,19 @@ from hypothesis import strategies as st
 from map_records import SMALL, assert_same, random_record
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from triquad_format import mapfile_reader
-from triquad_format.array import pack_array
+from triquad_format import map_parts, mapfile_reader
+from triquad_format.array import pack_array, unpack_array
 from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,
     MapFileError,
+    TooLargeMapFileError,
     UnsupportedMapFileError,
 )
 from triquad_format.field_settings import FieldSettings
 from triquad_format.map_parts import (
+    MAX_CODE_BYTES,
+    ROWS_PER_PART,
     Part,
     pack_manifest,
     shuffle,
@@ -34,8 +39,9 @@ from triquad_format.map_parts import (
     unshuffle_codes,
 )
 from triquad_format.mapfile import MapFileInfo, read_map, read_map_file, write_map
+from triquad_format.mapfile_writer import MAX_PART_BYTES
 from triquad_format.mcap_records import MAX_CHUNK_BYTES
-from triquad_format.region import MapRecord
+from triquad_format.region import BLOCK_BYTES, MapRecord
 
 GOLDEN = Path(__file__).parent / "golden" / "map_v1.triquad"
 
@@ -133,12 +139,74 @@ def test_regions_that_saw_nothing():
     assert_same(read_bytes(file_bytes(record)), record)
 
 
-def test_default_settings_and_many_samples(monkeypatch):
-    monkeypatch.setattr("triquad_format.map_parts.SAMPLES_PER_PART", 100)
-    record = random_record(2, settings=FieldSettings(), points=350)
-    data = file_bytes(record)
-    assert sum(part.topic == "/triquad/samples" for part in parts_of(data)) == 4
+@pytest.mark.parametrize("dtype", ["<f2", "<f4"])
+def test_tables_larger_than_a_part_are_split(monkeypatch, dtype):
+    monkeypatch.setattr(map_parts, "ROWS_PER_PART", 100)
+    record = random_record(2, settings=FieldSettings(), points=350, feature_dtype=dtype)
+    data = file_bytes(record, feature_dtype=dtype)
+    (region,) = record.regions
+    tables = sum(math.ceil(len(table.codes) / 100) for table in region.tables)
+    blocks = math.ceil(len(region.evidence.codes) / 100)
+    found = Counter(part.topic for part in parts_of(data))
+    assert tables > len(region.tables)
+    assert blocks > 1
+    assert found["/triquad/vertices"] == found["/triquad/moments"] == tables
+    assert found["/triquad/evidence"] == blocks
+    assert found["/triquad/samples"] == 4
     assert_same(read_bytes(data), record)
+
+
+def test_parts_of_the_widest_rows_keep_the_limit():
+    widest = FieldSettings(feature_size=64)
+    row = np.zeros((1, widest.feature_size), "<f4")
+    assert ROWS_PER_PART * (2 * row.nbytes + 4) < MAX_PART_BYTES  # moments
+    assert ROWS_PER_PART * (2 * BLOCK_BYTES + MAX_CODE_BYTES) < MAX_PART_BYTES  # evidence
+
+
+def split_file(monkeypatch):
+    monkeypatch.setattr(map_parts, "ROWS_PER_PART", 20)
+    return file_bytes(random_record(21))
+
+
+def set_shorter(key, axis):
+    """Cut the last row off one column of a part."""
+
+    def edit(body):
+        planes = unpack_array(key, body[key])
+        body[key] = pack_array(np.ascontiguousarray(np.delete(planes, -1, axis)))
+
+    return edit
+
+
+def all_of(*edits):
+    return lambda body: [edit(body) for edit in edits]
+
+
+@pytest.mark.parametrize(
+    ("topic", "edit"),
+    [
+        ("/triquad/vertices", set_shorter("codes", 1)),
+        ("/triquad/vertices", all_of(set_shorter("codes", 1), set_shorter("features", 1))),
+        ("/triquad/vertices", set_shorter("features", 2)),
+        ("/triquad/vertices", lambda b: b.update(level=6)),
+        ("/triquad/moments", set_shorter("steps", 1)),
+        ("/triquad/evidence", set_shorter("free", 0)),
+        ("/triquad/samples", all_of(set_shorter("points", 1), set_shorter("labels", 1))),
+    ],
+)
+def test_portions_that_do_not_fit_together_are_refused(monkeypatch, topic, edit):
+    data = split_file(monkeypatch)
+    assert_same(read_bytes(data), random_record(21))
+    with pytest.raises(DamagedMapFileError):
+        read_bytes(edited(data, topic, edit, number=1))
+
+
+def test_codes_increase_over_all_portions_of_a_table(monkeypatch):
+    data = split_file(monkeypatch)
+    first = next(p for p in parts_of(data) if p.topic == "/triquad/vertices")
+    codes = msgpack.unpackb(first.payload)["codes"]
+    with pytest.raises(DamagedMapFileError, match="increasing"):
+        read_bytes(edited(data, first.topic, lambda b: b.update(codes=codes), number=1))
 
 
 @settings(max_examples=30, deadline=None)
@@ -362,7 +430,10 @@ def test_parts_missing_reordered_doubled_swapped():
 
 
 def test_swap_of_equal_parts_of_two_maps():
-    one, other = (parts_of(file_bytes(random_record(seed))) for seed in (7, 8))
+    changed = random_record(7)
+    for table in changed.regions[0].tables:
+        table.features[:] *= -1
+    one, other = (parts_of(file_bytes(record)) for record in (random_record(7), changed))
     mixed = [*one[:2], *other[2:-1], one[-1]]
     with pytest.raises(DamagedMapFileError, match="not the one that the manifest lists"):
         read_bytes(rebuild(mixed, metadata_of(file_bytes(random_record(7)))))
@@ -484,6 +555,14 @@ HOSTILE = {
     "region: index": ("/triquad/region", set_field("region", [0, 0])),
     "region: index too large": ("/triquad/region", set_field("region", [2**40, 0, 0])),
     "region: other index": ("/triquad/region", set_field("region", [5, 5, 5])),
+    "region: no vertex counts": ("/triquad/region", lambda b: b.pop("vertices")),
+    "region: vertex counts": ("/triquad/region", lambda b: b["vertices"].__setitem__(0, 2**62)),
+    "region: too few vertex counts": ("/triquad/region", lambda b: b["vertices"].pop()),
+    "region: a vertex count is a bool": (
+        "/triquad/region",
+        lambda b: b["vertices"].__setitem__(0, True),
+    ),
+    "region: blocks": ("/triquad/region", set_field("blocks", 0)),
     "region: weights": ("/triquad/region", set_field("weights", [])),
     "region: weight": ("/triquad/region", lambda b: b["weights"].__setitem__(0, 7)),
     "region: frequencies": (
@@ -612,9 +691,9 @@ def test_bombs_are_not_allocated():
 
 def test_total_is_limited():
     data = file_bytes(random_record(14, points=300))
-    with pytest.raises(MapFileError, match="limit"):
+    with pytest.raises(TooLargeMapFileError, match="limit"):
         read_map(io.BytesIO(data), max_bytes=len(data) + 100)
-    with pytest.raises(MapFileError, match="limit"):
+    with pytest.raises(TooLargeMapFileError, match="limit"):
         read_map(io.BytesIO(data), max_bytes=len(data) - 1)
     assert_same(read_map(io.BytesIO(data), max_bytes=10 * len(data)), random_record(14, points=300))
 
@@ -631,7 +710,7 @@ def test_memory_error_is_named(monkeypatch):
         raise MemoryError
 
     monkeypatch.setattr(mapfile_reader, "unpack_record", out_of_memory)
-    with pytest.raises(MapFileError, match="memory"):
+    with pytest.raises(TooLargeMapFileError, match="memory"):
         read_map(GOLDEN)
 
 
@@ -664,6 +743,18 @@ def test_features_beyond_half_precision(tmp_path):
     write_map(record, tmp_path / "map.triquad", feature_dtype="<f4")
     with pytest.raises(FormatError, match="feature_dtype"):
         write_map(record, tmp_path / "map.triquad", feature_dtype="<f8")
+
+
+def test_total_limit_holds_while_writing(monkeypatch, tmp_path):
+    path = tmp_path / "map.triquad"
+    write_map(random_record(17), path)
+    size = path.stat().st_size
+    for limit in (2000, size - 1):
+        monkeypatch.setattr("triquad_format.mapfile_writer.MAX_MAP_BYTES", limit)
+        with pytest.raises(FormatError, match=f"at most {limit}"):
+            write_map(random_record(18), path)
+    assert_same(read_map(path), random_record(17))
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_part_limit(monkeypatch, tmp_path):

@@ -1,11 +1,13 @@
+import errno
 import logging
 from contextlib import closing
 
 import pytest
 import servers
-from triquad_format.errors import MapFileError
+from triquad_format.errors import MapFileError, TooLargeMapFileError
 from triquad_format.mapfile import read_map
 from triquad_format.region import MapRecord
+from triquad_server import store as store_module
 from triquad_server.errors import StoreError
 from triquad_server.store import Store
 
@@ -62,6 +64,60 @@ def test_a_truncated_checkpoint_is_damaged(store):
     with pytest.raises(MapFileError):
         read_map(path)
     assert store.newest().record.epoch == 1
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.EIO, "Input/output error"),
+        OSError(errno.EMFILE, "Too many open files"),
+        PermissionError(errno.EACCES, "Permission denied"),
+        TooLargeMapFileError("it is larger than the limit"),
+    ],
+)
+def test_a_sound_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkeypatch, error):
+    for epoch in (1, 2):
+        store.write(record(epoch))
+    before = names(store)
+
+    def fail(path):
+        raise error
+
+    monkeypatch.setattr(store_module, "read_map", fail)
+    with pytest.raises(StoreError, match="000000002.triquad cannot be read"):
+        store.newest()
+    assert names(store) == before
+
+
+def test_a_folder_that_cannot_be_listed_is_an_error_of_the_store(store, monkeypatch):
+    monkeypatch.setattr(store, "folder", store.folder / "gone")
+    with pytest.raises(StoreError, match="cannot be read"):
+        store.newest()
+    with pytest.raises(StoreError):
+        store.write(record(1))
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(errno.ENOSPC, "No space left")])
+def test_what_keeps_a_checkpoint_from_being_written_is_an_error_of_the_store(
+    store, monkeypatch, error
+):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(store_module, "write_map", fail)
+    with pytest.raises(StoreError, match="cannot be written"):
+        store.write(record(1))
+
+
+def test_a_damaged_file_of_a_higher_number_does_not_push_out_a_sound_one(store):
+    store.write(record(1))
+    for epoch in (8, 9):
+        (store.folder / f"epoch-00000000{epoch}.triquad").write_bytes(b"damaged")
+    store.write(record(2))
+    assert names(store)[:2] == ["epoch-000000001.triquad", "epoch-000000002.triquad"]
+    store.write(record(3))
+    assert names(store)[:2] == ["epoch-000000002.triquad", "epoch-000000003.triquad"]
+    assert store.newest().record.epoch == 3
 
 
 def test_it_does_not_start_empty_where_all_checkpoints_are_damaged(store):

@@ -28,8 +28,11 @@ PARTS_IN_FLIGHT = 4
 
 _LIVELINESS_TIMEOUT_S = 3.0
 
+_ATTEMPTS = 3
+
 ItemT = TypeVar("ItemT")
 ReplyT = TypeVar("ReplyT", bound=Message)
+ResultT = TypeVar("ResultT")
 
 
 class Pending(Generic[ReplyT]):
@@ -225,6 +228,20 @@ def in_flight(
             yield waiting.popleft().result()
     while waiting:
         yield waiting.popleft().result()
+
+
+def retried(code: str, ask: Callable[[], ResultT]) -> ResultT:
+    """What ``ask`` returns; where the server refuses with ``code``, it is asked a few times anew.
+
+    For questions of several requests, which the server can forget while they are under way.
+    """
+    for _ in range(_ATTEMPTS - 1):
+        try:
+            return ask()
+        except RefusedError as error:
+            if error.code != code:
+                raise
+    return ask()
 
 
 def _configuration(endpoint: str, timeout_s: float, file: Path | None) -> zenoh.Config:

@@ -9,8 +9,8 @@ from typing import IO
 from triquad_format import keys
 from triquad_format.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
 
-from triquad_client.connection import Connection, Pending, in_flight
-from triquad_client.errors import DownloadError, RefusedError
+from triquad_client.connection import Connection, Pending, in_flight, retried
+from triquad_client.errors import DownloadError
 
 _PREPARE_TIMEOUT_S = 120.0
 """The server writes the file before it answers."""
@@ -28,14 +28,8 @@ class MapDownload:
         Raises:
             DownloadError: the bytes are not those the server announced.
         """
-        for last in (False, False, True):
-            try:
-                return self._fetch(path, training)
-            except RefusedError as error:
-                # Newer map files pushed this one out of the server: take the newest.
-                if error.code != "chunk_gone" or last:
-                    raise
-        raise AssertionError("unreachable")
+        # Newer map files may push this one out of the server: then the newest is taken.
+        return retried("chunk_gone", lambda: self._fetch(path, training))
 
     def _fetch(self, path: Path, training: bool) -> MapInfo:
         info = self._connection.ask(

@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 from triquad_format import keys
 from triquad_format.messages import Tile, TileList, TileListRequest, TileRequest
 
-from triquad_client.connection import Connection, Pending, in_flight
-from triquad_client.errors import RefusedError
+from triquad_client.connection import Connection, Pending, in_flight, retried
 from triquad_client.mesh import Mesh
 from triquad_client.welding import compacted, welded
 
@@ -29,13 +28,7 @@ class Meshes:
 
     def mesh(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Mesh:
         """The faces whose centroids lie in the box between two corners [3], from one epoch."""
-        for last in (False, False, True):
-            try:
-                return self._mesh(minimum, maximum)
-            except RefusedError as error:
-                if error.code != "epoch_gone" or last:
-                    raise
-        raise AssertionError("unreachable")
+        return retried("epoch_gone", lambda: self._mesh(minimum, maximum))
 
     def _mesh(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Mesh:
         listed = self.tiles(minimum, maximum)

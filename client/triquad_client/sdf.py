@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from triquad_format import keys
 from triquad_format.messages import SdfReply, SdfRequest
 
-from triquad_client.connection import Connection, Pending, in_flight
-from triquad_client.errors import RefusedError
+from triquad_client.connection import Connection, Pending, in_flight, retried
 
 PART_POINTS = 100_000
 """Points of one request; a message of this size takes some milliseconds."""
@@ -32,14 +31,8 @@ class SdfQueries:
 
     def query(self, points: NDArray[np.float64], gradient: bool) -> SdfResult:
         """The answer for ``points`` [N, 3] of the map frame."""
-        for last in (False, False, True):
-            try:
-                return self._query(points, gradient)
-            except RefusedError as error:
-                # The map went on while the parts were under way: ask for all of it again.
-                if error.code != "epoch_gone" or last:
-                    raise
-        raise AssertionError("unreachable")
+        # The map may go on while the parts are under way: then all of it is asked again.
+        return retried("epoch_gone", lambda: self._query(points, gradient))
 
     def _query(self, points: NDArray[np.float64], gradient: bool) -> SdfResult:
         first = self._send(points[:PART_POINTS], gradient, 0).result()

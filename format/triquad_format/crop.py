@@ -39,7 +39,7 @@ def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> Ma
     """What a map needs to answer inside a box, to the last bit as before.
 
     Regions whose cube meets the box stay, with the vertices whose hat functions reach into it,
-    the evidence in it, and the replay samples in it.
+    the evidence in it, and the replay samples in it with their share of the visits owed.
 
     Args:
         record: the map.
@@ -123,6 +123,7 @@ def _crop_training(
 ) -> TrainingState:
     leaves = training.sample_points / settings.leaf_m + (1 << (settings.depth - 1))
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))
+    owed = training.visits_owed * len(inside)  # rounded up below, so that none is forgotten
     return dataclasses.replace(
         training,
         table_means=_rows(training.table_means, kept),
@@ -132,6 +133,7 @@ def _crop_training(
         ),
         sample_points=training.sample_points[inside],
         sample_labels=training.sample_labels[inside],
+        visits_owed=-(-owed // max(len(leaves), 1)),
     )
 
 

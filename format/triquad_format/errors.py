@@ -25,5 +25,9 @@ class UnsupportedMapFileError(MapFileError):
     """A sound map file that needs a newer reader; the text names what is missing."""
 
 
+class TooLargeMapFileError(MapFileError):
+    """A map file above the limit given for its size, or above the memory there is."""
+
+
 class SettingsError(FormatError):
     """A setting that is unknown or out of range."""

@@ -34,7 +34,8 @@ UNITS = "m"
 MAX_CODE_BYTES = 6
 """Bytes of the widest difference between two neighbouring Morton codes."""
 
-SAMPLES_PER_PART = 1 << 20
+ROWS_PER_PART = 1 << 18
+"""Rows of the largest part: of the widest rows that settings allow, they fill 131 MiB."""
 
 FEATURE_DTYPES = ("<f2", "<f4")
 
@@ -129,17 +130,25 @@ def _pack_region(region: Region, feature_dtype: str) -> Iterator[Part]:
             "frequencies": pack_array(region.frequencies),
             "weights": [pack_array(weight) for weight in region.mlp.weights],
             "biases": [pack_array(bias) for bias in region.mlp.biases],
+            "vertices": [len(table.codes) for table in region.tables],
+            "blocks": len(region.evidence.codes),
             "training": region.training is not None,
         },
     )
     for table in region.tables:
-        yield _pack_table(index, table, feature_dtype)
-    yield _pack_evidence(index, region.evidence)
+        yield from _pack_table(index, table, feature_dtype)
+    yield from _pack_evidence(index, region.evidence)
     if region.training is not None:
         yield from _pack_training(index, region.tables, region.training)
 
 
-def _pack_table(index: list[int], table: VertexTable, feature_dtype: str) -> Part:
+def _portions(count: int) -> Iterator[slice]:
+    """The rows of each part of a table of ``count`` rows; an empty table has one part."""
+    for first in range(0, max(count, 1), ROWS_PER_PART):
+        yield slice(first, first + ROWS_PER_PART)
+
+
+def _pack_table(index: list[int], table: VertexTable, feature_dtype: str) -> Iterator[Part]:
     with np.errstate(over="ignore"):
         features = table.features.astype(feature_dtype)
     if not np.isfinite(features).all():
@@ -147,24 +156,26 @@ def _pack_table(index: list[int], table: VertexTable, feature_dtype: str) -> Par
             f"region {index}: features of plane {table.plane}, level {table.level} reach "
             f"{np.abs(table.features).max()}, which {feature_dtype} does not hold; use '<f4'",
         )
-    body = {
-        "region": index,
-        "plane": table.plane,
-        "level": table.level,
-        "codes": pack_array(shuffle_codes(table.codes)),
-        "features": pack_array(shuffle(features)),
-    }
-    return _part(VERTICES, body)
+    for rows in _portions(len(table.codes)):
+        body = {
+            "region": index,
+            "plane": table.plane,
+            "level": table.level,
+            "codes": pack_array(shuffle_codes(table.codes[rows])),
+            "features": pack_array(shuffle(features[rows])),
+        }
+        yield _part(VERTICES, body)
 
 
-def _pack_evidence(index: list[int], evidence: Evidence) -> Part:
-    body = {
-        "region": index,
-        "codes": pack_array(shuffle_codes(evidence.codes)),
-        "surface": pack_array(evidence.surface),
-        "free": pack_array(evidence.free),
-    }
-    return _part(EVIDENCE, body)
+def _pack_evidence(index: list[int], evidence: Evidence) -> Iterator[Part]:
+    for rows in _portions(len(evidence.codes)):
+        body = {
+            "region": index,
+            "codes": pack_array(shuffle_codes(evidence.codes[rows])),
+            "surface": pack_array(evidence.surface[rows]),
+            "free": pack_array(evidence.free[rows]),
+        }
+        yield _part(EVIDENCE, body)
 
 
 def _pack_training(
@@ -182,18 +193,18 @@ def _pack_training(
             "samples": count,
         },
     )
-    for row, table in enumerate(tables):
-        body = {
-            "region": index,
-            "plane": table.plane,
-            "level": table.level,
-            "means": pack_array(shuffle(training.table_means[row])),
-            "variances": pack_array(shuffle(training.table_variances[row])),
-            "steps": pack_array(shuffle(training.table_steps[row])),
-        }
-        yield _part(MOMENTS, body)
-    for first in range(0, max(count, 1), SAMPLES_PER_PART):
-        rows = slice(first, first + SAMPLES_PER_PART)
+    for number, table in enumerate(tables):
+        for rows in _portions(len(table.codes)):
+            body = {
+                "region": index,
+                "plane": table.plane,
+                "level": table.level,
+                "means": pack_array(shuffle(training.table_means[number][rows])),
+                "variances": pack_array(shuffle(training.table_variances[number][rows])),
+                "steps": pack_array(shuffle(training.table_steps[number][rows])),
+            }
+            yield _part(MOMENTS, body)
+    for rows in _portions(count):
         body = {
             "region": index,
             "points": pack_array(shuffle(training.sample_points[rows])),

@@ -2,13 +2,12 @@
 
 from triquad_format.mapfile_reader import (
     KNOWN_FEATURES,
-    MAX_MAP_BYTES,
     MapFile,
     StoredPart,
     read_map,
     read_map_file,
 )
-from triquad_format.mapfile_writer import FORMAT_VERSION, MapFileInfo, write_map
+from triquad_format.mapfile_writer import FORMAT_VERSION, MAX_MAP_BYTES, MapFileInfo, write_map
 
 SUFFIX = ".triquad"
 

@@ -11,11 +11,13 @@ from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,
     MapFileError,
+    TooLargeMapFileError,
     UnsupportedMapFileError,
 )
 from triquad_format.map_parts import FRAME_ID, MANIFEST, PREFIX, TOPICS, UNITS, Part
 from triquad_format.mapfile_writer import (
     FORMAT_VERSION,
+    MAX_MAP_BYTES,
     MAX_PART_BYTES,
     MESSAGE_ENCODING,
     METADATA_NAME,
@@ -24,9 +26,6 @@ from triquad_format.mcap_records import McapFile, Message
 from triquad_format.part_reader import PartCursor, unpack_manifest, unpack_record
 from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord
-
-MAX_MAP_BYTES = 4 * 2**30
-"""Limit on the size of a map file, and on its chunks' decompressed size together."""
 
 KNOWN_FEATURES: frozenset[str] = frozenset()
 """The ``required_features`` that this reader understands."""
@@ -71,7 +70,8 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
     Raises:
         DamagedMapFileError: bytes are missing or altered.
         UnsupportedMapFileError: the file needs a newer reader.
-        MapFileError: it is not a map file, or exceeds ``max_bytes``.
+        TooLargeMapFileError: it exceeds ``max_bytes``, or the memory there is.
+        MapFileError: it is not a map file.
         OSError: the file cannot be read.
     """
     if isinstance(source, (str, Path)):
@@ -87,7 +87,7 @@ def _read(name: str, stream: BinaryIO, max_bytes: int) -> MapFile:
         while block := stream.read(_BLOCK_BYTES):
             data += block
             if len(data) > max_bytes:
-                raise MapFileError(f"it is larger than the limit of {max_bytes} bytes")
+                raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
         return _parse(memoryview(data), max_bytes)
 
 
@@ -96,8 +96,8 @@ def _named(name: str) -> Iterator[None]:
     """Put the file's name and, for damage, the remedy into what is raised."""
     try:
         yield
-    except UnsupportedMapFileError as error:
-        raise UnsupportedMapFileError(f"{name}: {error}") from error
+    except (UnsupportedMapFileError, TooLargeMapFileError) as error:
+        raise type(error)(f"{name}: {error}") from error
     except DamagedMapFileError as error:
         raise DamagedMapFileError(f"{name} is damaged: {error}; {REMEDY}") from error
     except MapFileError as error:
@@ -105,7 +105,7 @@ def _named(name: str) -> Iterator[None]:
     except FormatError as error:
         raise DamagedMapFileError(f"{name} is damaged: {error}; {REMEDY}") from error
     except MemoryError as error:
-        raise MapFileError(f"{name}: the map does not fit into memory") from error
+        raise TooLargeMapFileError(f"{name}: the map does not fit into memory") from error
 
 
 def _parse(data: memoryview, max_bytes: int) -> MapFile:

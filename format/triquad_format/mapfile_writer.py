@@ -32,6 +32,12 @@ METADATA_NAME = "triquad"
 MESSAGE_ENCODING = "msgpack"
 MAX_PART_BYTES = MAX_CHUNK_BYTES - 65_536
 
+MAX_MAP_BYTES = 4 * 2**30
+"""Limit on the size of a map file, and on its chunks' decompressed size together."""
+
+_MCAP_BYTES = 256
+"""What MCAP adds to a part within its chunk takes less."""
+
 
 @dataclass(frozen=True)
 class MapFileInfo:
@@ -61,7 +67,7 @@ def write_map(
         stamp_ns: time of creation, nanoseconds since 1970; left out, the file holds no time.
 
     Raises:
-        FormatError: the record is not sound, or a part of it exceeds a limit of the format.
+        FormatError: the record is not sound, or exceeds a limit of the format.
         OSError: the file cannot be written.
     """
     if feature_dtype not in FEATURE_DTYPES:
@@ -111,18 +117,29 @@ def _write(
     writer.start(profile="", library=f"triquad {__version__}")
     writer.add_metadata(METADATA_NAME, _metadata(record, stamp_ns))
     channels: dict[str, int] = {}
+    total = 0
     for sequence, part in enumerate(_parts(record, feature_dtype)):
         if len(part.payload) > MAX_PART_BYTES:
             raise FormatError(
                 f"the part {part.topic} has {len(part.payload)} bytes; "
                 f"a map file holds parts of at most {MAX_PART_BYTES}",
             )
+        total += len(part.payload) + _MCAP_BYTES
+        _check_total(total)
         if part.topic not in channels:
             channels[part.topic] = writer.register_channel(part.topic, MESSAGE_ENCODING, 0)
         time = stamp_ns or 0
         writer.add_message(channels[part.topic], time, part.payload, time, sequence)
     writer.finish()  # type: ignore[no-untyped-call]
+    _check_total(measured.tell())
     return measured.info(record.epoch)
+
+
+def _check_total(size: int) -> None:
+    if size > MAX_MAP_BYTES:
+        raise FormatError(
+            f"the map takes {size} bytes or more; a map file holds at most {MAX_MAP_BYTES}",
+        )
 
 
 def _parts(record: MapRecord, feature_dtype: str) -> Iterator[Part]:

@@ -11,7 +11,12 @@ from dataclasses import dataclass
 
 import zstandard
 
-from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
+from triquad_format.errors import (
+    DamagedMapFileError,
+    MapFileError,
+    TooLargeMapFileError,
+    UnsupportedMapFileError,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -206,7 +211,7 @@ def _decompress(record: Record, max_bytes: int) -> memoryview:
     if size > MAX_CHUNK_BYTES:
         raise DamagedMapFileError(f"{where} declares {size} bytes; the limit is {MAX_CHUNK_BYTES}")
     if size > max_bytes:
-        raise MapFileError(f"{where} takes the map over the limit given for its size")
+        raise TooLargeMapFileError(f"{where} takes the map over the limit given for its size")
     if compression == "":
         chunk = stored
     elif compression == "zstd":

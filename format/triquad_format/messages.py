@@ -2,6 +2,7 @@
 
 Positions are ``float32`` offsets from a ``float64`` origin, so that a map in large coordinates
 (UTM, say) loses nothing on the way. ``epoch`` in a request pins an epoch; 0 asks for the newest.
+Numbers of epochs compare only within one ``ServerStatus.server``.
 """
 
 from dataclasses import dataclass
@@ -76,7 +77,8 @@ class TileList(Message):
     epoch: int
     tile_side_m: float
     tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
-    changed: Epochs  # [T] epoch in which each tile last changed
+    # [T] each tile last changed no later than this; at present, the last change of its region
+    changed: Epochs
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class Tile(Message):
     """Answer to :class:`TileRequest`."""
 
     epoch: int
-    changed: int  # epoch in which the tile last changed
+    changed: int  # as in TileList
     origin: Point  # metres, map frame: the tile's minimum corner
     vertices: Positions  # [V, 3] metres, relative to origin
     faces: Faces  # [F, 3], counter-clockwise seen from free space

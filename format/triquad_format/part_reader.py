@@ -3,7 +3,7 @@
 import dataclasses
 import reprlib
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import msgpack
@@ -44,7 +44,11 @@ from triquad_format.region import (
 MAX_REGION_INDEX = 2**31 - 1
 _LAYERS = 3
 _MAX_ITEMS = 64
-_MAX_STRING_BYTES = 4096
+_MAX_KEY_BYTES = 4096
+"""Of any string in a part; a message on the wire may hold longer ones."""
+
+_Columns = tuple[NDArray[Any], ...]
+"""What one part, or all parts of a table together, hold of it: columns of equal length."""
 
 
 class PartBody:
@@ -55,7 +59,7 @@ class PartBody:
         try:
             body = msgpack.unpackb(
                 part.payload,
-                max_str_len=_MAX_STRING_BYTES,
+                max_str_len=_MAX_KEY_BYTES,
                 max_array_len=max_items,
                 max_map_len=_MAX_ITEMS,
                 max_ext_len=0,
@@ -87,6 +91,17 @@ class PartBody:
         if not 0 <= value < 2**63:
             raise DamagedMapFileError(f"{self._topic}: {key} = {value} is not a count")
         return value
+
+    def counts(self, key: str, length: int) -> list[int]:
+        """A list of ``length`` numbers in ``[0, 2**63)``."""
+        values: list[Any] = self.value(key, list)
+        if len(values) != length or not all(
+            type(value) is int and 0 <= value < 2**63 for value in values
+        ):
+            raise DamagedMapFileError(
+                f"{self._topic}: {key} = {reprlib.repr(values)} is not a list of {length} counts",
+            )
+        return values
 
     def index(self) -> RegionIndex:
         """The index of the region to which the part belongs."""
@@ -203,11 +218,15 @@ def _unpack_region(cursor: PartCursor, settings: FieldSettings) -> Region:
     body = cursor.take(REGION)
     index = body.index()
     places = [(plane, level) for plane in range(len(AXES)) for level in settings.levels]
-    tables = tuple(_unpack_table(cursor, index, *place) for place in places)
-    evidence = _unpack_evidence(cursor, index)
+    counts = body.counts("vertices", len(places))
+    tables = tuple(
+        _unpack_table(cursor, index, place, count)
+        for place, count in zip(places, counts, strict=True)
+    )
+    evidence = _unpack_evidence(cursor, index, body.count("blocks"))
     training = None
     if body.value("training", bool):
-        training = _unpack_training(cursor, index, places)
+        training = _unpack_training(cursor, index, places, counts)
     return Region(
         index=index,
         frequencies=body.array("frequencies", "<f4", None),
@@ -225,39 +244,70 @@ def _take_of_region(cursor: PartCursor, topic: str, index: RegionIndex) -> PartB
     return body
 
 
-def _unpack_table(cursor: PartCursor, index: RegionIndex, plane: int, level: int) -> VertexTable:
-    body = _take_of_region(cursor, VERTICES, index)
-    body.expect("plane", plane)
-    body.expect("level", level)
-    return VertexTable(plane, level, body.codes("codes"), body.floats("features", None, None))
+def _take_rows(
+    cursor: PartCursor,
+    topic: str,
+    index: RegionIndex,
+    count: int,
+    read: Callable[[PartBody], _Columns],
+) -> _Columns:
+    """The columns of a table of ``count`` rows, from as many parts as it was split into."""
+    portions: list[_Columns] = []
+    found = 0
+    while not portions or found < count:
+        columns = read(_take_of_region(cursor, topic, index))
+        rows = len(columns[0])
+        if any(len(column) != rows for column in columns):
+            raise DamagedMapFileError(f"{topic}: columns of region {index} differ in length")
+        if portions and (rows == 0 or _kinds(columns) != _kinds(portions[0])):
+            raise DamagedMapFileError(f"{topic}: a part of region {index} does not fit the first")
+        portions.append(columns)
+        found += rows
+    if found != count:
+        raise DamagedMapFileError(f"{topic}: region {index} has {found} rows, not {count}")
+    if len(portions) == 1:
+        return portions[0]
+    return tuple(np.concatenate(column) for column in zip(*portions, strict=True))
 
 
-def _unpack_evidence(cursor: PartCursor, index: RegionIndex) -> Evidence:
-    body = _take_of_region(cursor, EVIDENCE, index)
-    return Evidence(
-        codes=body.codes("codes"),
-        surface=body.array("surface", "|u1", None, BLOCK_BYTES),
-        free=body.array("free", "|u1", None, BLOCK_BYTES),
-    )
+def _kinds(columns: _Columns) -> list[tuple[np.dtype[Any], tuple[int, ...]]]:
+    return [(column.dtype, column.shape[1:]) for column in columns]
+
+
+def _unpack_table(
+    cursor: PartCursor, index: RegionIndex, place: tuple[int, int], count: int
+) -> VertexTable:
+    def read(body: PartBody) -> _Columns:
+        _expect_place(body, place)
+        return body.codes("codes"), body.floats("features", None, None)
+
+    return VertexTable(*place, *_take_rows(cursor, VERTICES, index, count, read))
+
+
+def _unpack_evidence(cursor: PartCursor, index: RegionIndex, count: int) -> Evidence:
+    def read(body: PartBody) -> _Columns:
+        masks = [body.array(key, "|u1", None, BLOCK_BYTES) for key in ("surface", "free")]
+        return body.codes("codes"), *masks
+
+    return Evidence(*_take_rows(cursor, EVIDENCE, index, count, read))
 
 
 def _unpack_training(
-    cursor: PartCursor, index: RegionIndex, places: list[tuple[int, int]]
+    cursor: PartCursor,
+    index: RegionIndex,
+    places: list[tuple[int, int]],
+    counts: list[int],
 ) -> TrainingState:
     body = _take_of_region(cursor, TRAINING, index)
-    means, variances, steps = [], [], []
-    for plane, level in places:
-        moments = _take_of_region(cursor, MOMENTS, index)
-        moments.expect("plane", plane)
-        moments.expect("level", level)
-        means.append(moments.floats("means", None, None))
-        variances.append(moments.floats("variances", None, None))
-        steps.append(unshuffle(moments.array("steps", "|u1", 4, None), "<i4"))
+    moments = [
+        _unpack_moments(cursor, index, place, count)
+        for place, count in zip(places, counts, strict=True)
+    ]
     points, labels = _unpack_samples(cursor, index, body.count("samples"))
     return TrainingState(
-        table_means=tuple(means),
-        table_variances=tuple(variances),
-        table_steps=typing.cast(tuple[NDArray[np.int32], ...], tuple(steps)),
+        table_means=tuple(columns[0] for columns in moments),
+        table_variances=tuple(columns[1] for columns in moments),
+        table_steps=tuple(columns[2] for columns in moments),
         mlp_means=body.arrays("mlp_means", 2 * _LAYERS),
         mlp_variances=body.arrays("mlp_variances", 2 * _LAYERS),
         mlp_steps=body.count("mlp_steps"),
@@ -267,19 +317,26 @@ def _unpack_training(
     )
 
 
-def _unpack_samples(
-    cursor: PartCursor, index: RegionIndex, count: int
-) -> tuple[NDArray[np.float32], NDArray[np.floating]]:
-    points: list[NDArray[np.float32]] = []
-    labels: list[NDArray[np.floating]] = []
-    found = 0
-    while not points or found < count:
-        body = _take_of_region(cursor, SAMPLES, index)
-        points.append(unshuffle(body.array("points", "|u1", 4, None, 3), "<f4"))  # type: ignore[arg-type]
-        labels.append(body.floats("labels", len(points[-1])))
-        if points[1:] and (len(points[-1]) == 0 or labels[-1].dtype != labels[0].dtype):
-            raise DamagedMapFileError(f"{SAMPLES}: a part of region {index} does not fit the first")
-        found += len(points[-1])
-    if found != count:
-        raise DamagedMapFileError(f"{SAMPLES}: region {index} has {found}, not {count} samples")
-    return np.concatenate(points), np.concatenate(labels)
+def _unpack_moments(
+    cursor: PartCursor, index: RegionIndex, place: tuple[int, int], count: int
+) -> _Columns:
+    def read(body: PartBody) -> _Columns:
+        _expect_place(body, place)
+        means, variances = (body.floats(key, None, None) for key in ("means", "variances"))
+        return means, variances, unshuffle(body.array("steps", "|u1", 4, None), "<i4")
+
+    return _take_rows(cursor, MOMENTS, index, count, read)
+
+
+def _expect_place(body: PartBody, place: tuple[int, int]) -> None:
+    """Refuse a part of another plane or level."""
+    body.expect("plane", place[0])
+    body.expect("level", place[1])
+
+
+def _unpack_samples(cursor: PartCursor, index: RegionIndex, count: int) -> _Columns:
+    def read(body: PartBody) -> _Columns:
+        points = unshuffle(body.array("points", "|u1", 4, None, 3), "<f4")
+        return points, body.floats("labels", None)
+
+    return _take_rows(cursor, SAMPLES, index, count, read)

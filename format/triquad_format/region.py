@@ -20,8 +20,6 @@ from triquad_format.field_settings import FieldSettings
 AXES = ((0, 1), (0, 2), (1, 2))
 """Coordinate axes of the planes XY, XZ and YZ."""
 
-PLANE_NAMES = ("xy", "xz", "yz")
-
 BLOCK_VOXELS = 8
 """Voxels along the side of an evidence block."""
 
@@ -51,7 +49,7 @@ class Mlp:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What rays have shown, as bit masks of 0.2 m voxels in sparse blocks."""
+    """What rays have shown, as bit masks of voxels with the side of a leaf, in sparse blocks."""
 
     codes: NDArray[np.int64]  # [B] 3-D Morton codes of blocks, strictly increasing
     surface: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray ended in the voxel

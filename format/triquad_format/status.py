@@ -13,4 +13,4 @@ class Status(IntEnum):
     """Rays have passed through here."""
 
     SURFACE = 2
-    """Within the band around seen surfaces in which the distance is trained."""
+    """Within half a voxel of one in which a ray ended: there the distance is trained."""

@@ -18,7 +18,7 @@ from triquad_format.errors import ProtocolVersionError, WireError
 
 PROTOCOL_VERSION = 1
 MAX_MESSAGE_BYTES = 256 * 2**20
-_MAX_STRING_BYTES = 65_536
+_MAX_TEXT_BYTES = 65_536
 _MAX_ITEMS = 65_536
 
 MessageT = TypeVar("MessageT", bound="Message")
@@ -80,7 +80,7 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
     try:
         body = msgpack.unpackb(
             payload,
-            max_str_len=_MAX_STRING_BYTES,
+            max_str_len=_MAX_TEXT_BYTES,
             max_array_len=_MAX_ITEMS,
             max_map_len=_MAX_ITEMS,
         )
@@ -108,9 +108,6 @@ def _pack(name: str, annotation: Any, value: object) -> object:
             key: _pack(f"{name}.{key}", hint, getattr(value, key))
             for key, hint in annotation.annotations().items()
         }
-    if origin is list and isinstance(value, list):
-        (item,) = get_args(annotation)
-        return [_pack(f"{name}[{i}]", item, entry) for i, entry in enumerate(value)]
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)
         return {
@@ -136,9 +133,6 @@ def _unpack(name: str, annotation: Any, value: object) -> object:
         return annotation(
             **{key: _unpack(f"{name}.{key}", hint, value[key]) for key, hint in hints.items()},
         )
-    if origin is list and isinstance(value, list):
-        (item,) = get_args(annotation)
-        return [_unpack(f"{name}[{i}]", item, entry) for i, entry in enumerate(value)]
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)
         return {

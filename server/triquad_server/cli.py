@@ -21,7 +21,8 @@ exit codes:
   1  an unexpected error; the log has the details
   2  wrong usage or settings, or a missing extra (install triquad[server])
   3  cannot listen on an endpoint (port in use), or cannot connect to one
-  4  the store cannot be used: not writable, in use, or all checkpoints are damaged
+  4  the store cannot be used: not readable or writable, in use, all checkpoints are damaged,
+     or the newest needs a newer release or more memory
 """
 
 _NEEDED = ("torch", "numba", "skimage")

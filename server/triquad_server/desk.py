@@ -38,9 +38,14 @@ class RequestDesk:
         operations: dict[str, Handler],
         workers: int,
         limit: int,
+        max_bytes: int,
         refused: Tally,
     ) -> None:
-        """Begin to serve ``operations`` (handlers by operation of :mod:`triquad_format.keys`)."""
+        """Begin to serve ``operations`` (handlers by operation of :mod:`triquad_format.keys`).
+
+        At most ``limit`` requests wait, each of at most ``max_bytes``.
+        """
+        self._max_bytes = max_bytes
         self._jobs: queue.Queue[_Job | None] = queue.Queue(limit)
         self._refused = refused
         self._queryables: list[zenoh.Queryable[Any]] = []
@@ -78,6 +83,10 @@ class RequestDesk:
         """Empty the channel at once: a full one would stall the network's threads."""
         for query in queryable:
             request = Request(query, key, self._refused)
+            if request.size > self._max_bytes:
+                text = f"{request.size} bytes exceed the limit of {self._max_bytes}: split it"
+                request.refuse("too_large", text)
+                continue
             try:
                 self._jobs.put_nowait(_Job(request, handler))
             except queue.Full:

@@ -1,15 +1,20 @@
 """Flush requests: held, without holding up any worker, until their scans show in the map."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from triquad_format import keys
+from triquad_format.errors import FormatError
 from triquad_format.messages import FlushRequest
 
 from triquad_server.errors import RequestError
 from triquad_server.request import Request
-from triquad_server.sources import SourceLedger
+from triquad_server.sources import MAX_SEQUENCE, SourceLedger
+
+_log = logging.getLogger(__name__)
 
 ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived so long after the flush request, which travels the same way behind
@@ -63,13 +68,9 @@ class FlushDesk:
         """Take over a request; it is answered once its scan is settled.
 
         Raises:
-            RequestError: its time-out is out of range, or too many are held.
+            RequestError: a field is out of range, or too many are held.
         """
-        if not 0 <= asks.timeout_s <= self._timeout_max_s:
-            raise RequestError(
-                "bad_request",
-                f"timeout_s = {asks.timeout_s} is out of range: use 0 to {self._timeout_max_s:g}",
-            )
+        self._check(asks)
         now = time.monotonic()
         with self._ledger.changed:
             if self._stopping or len(self._held) >= self._limit:
@@ -77,6 +78,23 @@ class FlushDesk:
             held = _Held(request, asks, now + ARRIVAL_GRACE_S, now + asks.timeout_s)
             self._held.append(held)
             self._ledger.changed.notify_all()
+
+    def _check(self, asks: FlushRequest) -> None:
+        try:
+            keys.check_name("source", asks.source)
+        except FormatError as error:
+            raise RequestError("bad_request", str(error)) from error
+        if not 0 <= asks.sequence < MAX_SEQUENCE:
+            raise RequestError(
+                "bad_request",
+                f"sequence = {asks.sequence} is out of range: use 0 to {MAX_SEQUENCE - 1}",
+            )
+        # Written so that NaN is refused as well.
+        if not 0 <= asks.timeout_s <= self._timeout_max_s:
+            raise RequestError(
+                "bad_request",
+                f"timeout_s = {asks.timeout_s} is out of range: use 0 to {self._timeout_max_s:g}",
+            )
 
     def _run(self) -> None:
         while True:
@@ -87,7 +105,7 @@ class FlushDesk:
                     break
                 held = list(self._held)
             for entry in held:
-                if self._answer(entry):
+                if self._ended(entry):
                     with self._ledger.changed:
                         self._held.remove(entry)
         for entry in self._held:
@@ -97,14 +115,24 @@ class FlushDesk:
         asks = entry.asks
         return self._ledger.outcome(asks.source, asks.session, asks.sequence) is not None
 
+    def _ended(self, entry: _Held) -> bool:
+        """As :meth:`_answer`; a defect ends this request only, not the thread of all others."""
+        try:
+            return self._answer(entry)
+        except Exception as error:
+            _log.exception("a flush request met a defect")
+            entry.request.refuse("internal", f"{type(error).__name__}: {error}")
+            return True
+
     def _answer(self, entry: _Held) -> bool:
         """Answer a request if it is time; False where it goes on waiting."""
         asks = entry.asks
         scan = (asks.source, asks.session, asks.sequence)
         now = time.monotonic()
         if not self._ledger.arrived(*scan) and now >= entry.give_up_at:
-            self._ledger.give_up(*scan)
-        reply = self._ledger.outcome(*scan)
+            reply = self._ledger.give_up(*scan)
+        else:
+            reply = self._ledger.outcome(*scan)
         if reply is not None:
             entry.request.answer(reply)
             return True

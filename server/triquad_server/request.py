@@ -27,6 +27,12 @@ class Request:
         self._key = key
         self._refused = refused
 
+    @property
+    def size(self) -> int:
+        """Bytes of the payload."""
+        payload = self._query.payload
+        return 0 if payload is None else len(payload)
+
     def read(self, kind: type[RequestT]) -> RequestT:
         """The request's message.
 

@@ -7,13 +7,16 @@ from collections.abc import Callable
 
 import zenoh
 from triquad_format import keys, wire
-from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.errors import FormatError, ProtocolVersionError, WireError
 from triquad_format.messages import Scan
 
 from triquad_server.sources import SourceLedger
 from triquad_server.tally import Tally
 
 _log = logging.getLogger(__name__)
+
+_POINT_BYTES = 12
+_OTHER_BYTES = 4096  # all of a scan's message but its points takes less
 
 
 class ScanQueue:
@@ -42,6 +45,14 @@ class ScanQueue:
             if pushed_out is not None:
                 self._ledger.push_out(pushed_out)
 
+    def refuse(self, scan: Scan, reason: str, text: str) -> None:
+        """Account for a scan that arrived but is not let in."""
+        with self._lock:
+            backwards = self._ledger.arrive(scan)
+            if backwards is None:
+                self._ledger.refuse(scan, text)
+            self._dropped.add(backwards or reason)
+
     def take(self) -> Scan | None:
         """The oldest waiting scan; it counts as waiting until the next one is asked for."""
         with self._lock:
@@ -57,11 +68,17 @@ class ScanIntake:
         session: zenoh.Session,
         map_name: str,
         limit: int,
+        max_points: int,
         queue: ScanQueue,
         dropped: Tally,
         arrived: Callable[[], None],
     ) -> None:
-        """Begin to receive; ``arrived`` is called after each scan that was queued."""
+        """Begin to receive; ``arrived`` is called after each scan that was queued.
+
+        Scans of more than ``max_points`` points are refused here, so that the queue, whose limit
+        is a number of scans, is bounded in bytes too.
+        """
+        self._max_points = max_points
         self._queue = queue
         self._dropped = dropped
         self._arrived = arrived
@@ -81,24 +98,42 @@ class ScanIntake:
     def _run(self) -> None:
         for sample in self._subscriber:
             try:
-                self._receive(str(sample.key_expr), sample.payload.to_bytes())
+                self._receive(str(sample.key_expr), sample.payload)
             except Exception:  # a defect must not stop the intake of all other scans
                 self._dropped.add("internal")
                 _log.exception("a scan on %s could not be received", sample.key_expr)
             self._arrived()
 
-    def _receive(self, key: str, payload: bytes) -> None:
+    def _receive(self, key: str, payload: zenoh.ZBytes) -> None:
+        max_bytes = self._max_points * _POINT_BYTES + _OTHER_BYTES
+        if len(payload) > max_bytes:
+            self._drop("too_large", key, f"{len(payload)} bytes exceed {max_bytes}")
+            return
         try:
-            scan = wire.decode(Scan, payload)
+            scan = wire.decode(Scan, payload.to_bytes())
         except ProtocolVersionError as error:
             self._drop("bad_version", key, error)
         except WireError as error:
             self._drop("decode", key, error)
         else:
-            if key.rsplit("/", 1)[1] == scan.source:
-                self._queue.put(scan)
-            else:
-                self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
+            self._enter(key, scan)
+
+    def _enter(self, key: str, scan: Scan) -> None:
+        """Put a decoded scan into the queue, where it may be there."""
+        if key.rsplit("/", 1)[1] != scan.source:
+            self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
+            return
+        try:
+            keys.check_name("source", scan.source)
+        except FormatError as error:
+            self._drop("bad_source", key, error)
+            return
+        points = len(scan.points)
+        if points > self._max_points:
+            text = f"{points} points exceed the limit of {self._max_points}"
+            self._queue.refuse(scan, "too_many_points", text)
+            return
+        self._queue.put(scan)
 
     def _drop(self, reason: str, key: str, cause: object) -> None:
         self._dropped.add(reason)

@@ -37,6 +37,9 @@ from triquad_server.sources import SourceLedger
 from triquad_server.store import Store
 from triquad_server.tally import Tally
 
+_POINT_BYTES = 12
+_OTHER_BYTES = 4096  # all of a request's message but its points takes less
+
 
 @dataclass(frozen=True)
 class ServedMap:
@@ -115,9 +118,11 @@ class Service:
             self._mapper,
             checkpoints,
         )
-        self._open_desks(health, checkpoints)
+        self._open_desks(health)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
+        # Closed before the last checkpoint is written: it shows every reset that was answered.
+        self._open_admin_desk(checkpoints)
         self._parts.callback(self._mapper.rest)
         self._open_intake()
         self._parts.callback(Heartbeat(self._session, identity.map_name, health).close)
@@ -151,19 +156,19 @@ class Service:
             self._session,
             self._served.name,
             self._settings.service.scan_queue,
+            self._settings.scan.max_points,
             self._scans,
             self._counts.scans_dropped,
             self._mapper.wake,
         )
         self._parts.callback(intake.close)
 
-    def _open_desks(self, health: Health, checkpoints: Checkpoints) -> None:
+    def _open_desks(self, health: Health) -> None:
         """One desk per group of operations, so that none waits for a slower one."""
         limits = self._settings.service
         sdf = SdfQueries(self._mapper.epochs, self._gate, limits.max_query_points)
         tiles = TileQueries(self._mapper.epochs, self._settings.mesh.tile_side_m)
         downloads = MapDownloads(self._mapper)
-        resets = Resets(self._mapper)
         flush = FlushDesk(
             self._ledger,
             self._mapper.publish_soon,
@@ -191,6 +196,9 @@ class Service:
                 keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
             },
         )
+
+    def _open_admin_desk(self, checkpoints: Checkpoints) -> None:
+        resets = Resets(self._mapper)
         self._open_desk(
             {
                 keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
@@ -199,12 +207,14 @@ class Service:
         )
 
     def _open_desk(self, operations: dict[str, Handler], workers: int = 1) -> None:
+        limits = self._settings.service
         desk = RequestDesk(
             self._session,
             self._served.name,
             operations,
             workers,
-            self._settings.service.request_queue,
+            limits.request_queue,
+            limits.max_query_points * _POINT_BYTES + _OTHER_BYTES,
             self._counts.requests_refused,
         )
         self._parts.callback(desk.close)

@@ -103,10 +103,18 @@ class SourceLedger:
                 track.unpublished = None
             self.changed.notify_all()
 
-    def give_up(self, source: str, session: int, sequence: int) -> None:
-        """Count what has not arrived up to ``sequence`` as lost."""
+    def give_up(self, source: str, session: int, sequence: int) -> FlushReply | None:
+        """Count what has not arrived up to ``sequence`` as lost; the outcome, as :meth:`outcome`.
+
+        A session that was never heard of is answered but not remembered: questions must not push
+        out the sessions that send scans.
+        """
         with self.changed:
-            self._track(source, session).lose_up_to(sequence)
+            track = self._tracks.get((source, session))
+            if track is None:
+                return FlushReply(0, 0, sequence + 1, None)
+            track.lose_up_to(sequence)
+            return self.outcome(source, session, sequence)
 
     def arrived(self, source: str, session: int, sequence: int) -> bool:
         """Whether a scan, or a later one of its session, arrived."""

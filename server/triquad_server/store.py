@@ -1,24 +1,27 @@
 """Checkpoints on disk: one folder per map, the newest few map files in it."""
 
+import fcntl
 import hashlib
 import logging
 import os
 import re
-import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from triquad_format.errors import FormatError, MapFileError, UnsupportedMapFileError
+from triquad_format.errors import (
+    FormatError,
+    MapFileError,
+    TooLargeMapFileError,
+    UnsupportedMapFileError,
+)
 from triquad_format.mapfile import read_map, write_map
 from triquad_format.messages import CheckpointInfo
 from triquad_format.region import MapRecord
 
 from triquad_server.errors import StoreError
-
-if sys.platform != "win32":
-    import fcntl
 
 _log = logging.getLogger(__name__)
 
@@ -56,8 +59,7 @@ class Store:
         if not _locked(self._lock):
             self._lock.close()
             raise StoreError(f"store {self.folder} is in use by another server")
-        for unfinished in self.folder.glob(_UNFINISHED):
-            unfinished.unlink(missing_ok=True)
+        _delete(self.folder.glob(_UNFINISHED))
 
     def close(self) -> None:
         """Let go of the folder."""
@@ -69,21 +71,21 @@ class Store:
         Damaged ones are renamed, so that they are kept but never count as checkpoints again.
 
         Raises:
-            StoreError: there are checkpoints but all are damaged, or the newest one needs a
-                newer release.
+            StoreError: there are checkpoints but all are damaged; or the newest one cannot be
+                read for a reason that says nothing against the file: it needs a newer release,
+                it is too large, or the system refuses.
         """
         damaged: list[Path] = []
-        for path in self._checkpoints():
-            try:
-                restored = Restored(read_map(path), _info(path))
-            except UnsupportedMapFileError as error:
-                raise StoreError(f"checkpoint {path} needs a newer release: {error}") from error
-            except (MapFileError, OSError) as error:
-                _log.warning("checkpoint %s is damaged and left out: %s", path, error)
+        try:
+            checkpoints = self._checkpoints()
+        except OSError as error:
+            raise StoreError(f"store {self.folder} cannot be read: {error}") from error
+        for _, path in checkpoints:
+            restored = _read(path)
+            if restored is None:
                 damaged.append(path)
                 continue
-            for bad in damaged:
-                bad.rename(bad.with_name(bad.name + _DAMAGED_SUFFIX))
+            _set_aside(damaged)
             if damaged:
                 _log.warning("the older checkpoint %s is used instead", path)
             return restored
@@ -102,25 +104,59 @@ class Store:
         """
         path = self.folder / f"epoch-{record.epoch:09d}.triquad"
         try:
+            older = [path for number, path in self._checkpoints() if number < record.epoch]
             file = write_map(record, path, stamp_ns=time.time_ns())
             stamp_ns = path.stat().st_mtime_ns
         except (FormatError, OSError) as error:
             raise StoreError(f"checkpoint {path} cannot be written: {error}") from error
-        for old in self._checkpoints()[self._keep :]:
-            try:
-                old.unlink()
-            except OSError as error:
-                _log.warning("old checkpoint %s cannot be deleted: %s", old, error)
+        except MemoryError as error:
+            raise StoreError(f"checkpoint {path} cannot be written: out of memory") from error
+        # Only older ones are counted and deleted: what bears a higher number is damaged, or not
+        # this server's, and must not push out a sound checkpoint.
+        _delete(older[self._keep - 1 :])
         return CheckpointInfo(str(path), file.bytes, file.epoch, file.sha256, stamp_ns)
 
-    def _checkpoints(self) -> list[Path]:
-        """Checkpoint files, newest first."""
+    def _checkpoints(self) -> list[tuple[int, Path]]:
+        """Checkpoint files with their numbers, newest first."""
         found = [
             (int(match[1]), path)
             for path in self.folder.iterdir()
             if (match := _NAME.fullmatch(path.name))
         ]
-        return [path for _, path in sorted(found, reverse=True)]
+        return sorted(found, reverse=True)
+
+
+def _delete(paths: Iterable[Path]) -> None:
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            _log.warning("%s is not needed, but cannot be deleted: %s", path, error)
+
+
+def _read(path: Path) -> Restored | None:
+    """A checkpoint, or ``None`` where it is damaged.
+
+    Raises:
+        StoreError: it cannot be read now, though it may well be sound.
+    """
+    try:
+        return Restored(read_map(path), _info(path))
+    except UnsupportedMapFileError as error:
+        raise StoreError(f"checkpoint {path} needs a newer release: {error}") from error
+    except (TooLargeMapFileError, OSError) as error:
+        raise StoreError(f"checkpoint {path} cannot be read: {error}") from error
+    except MapFileError as error:
+        _log.warning("checkpoint %s is damaged and left out: %s", path, error)
+        return None
+
+
+def _set_aside(damaged: list[Path]) -> None:
+    try:
+        for path in damaged:
+            path.rename(path.with_name(path.name + _DAMAGED_SUFFIX))
+    except OSError as error:
+        raise StoreError(f"the damaged {path} cannot be renamed: {error}") from error
 
 
 def _info(path: Path) -> CheckpointInfo:
@@ -137,8 +173,6 @@ def _info(path: Path) -> CheckpointInfo:
 
 def _locked(file: IO[bytes]) -> bool:
     """Lock a file for this process; the system lets go of it however the process ends."""
-    if sys.platform == "win32":
-        return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

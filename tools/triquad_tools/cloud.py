@@ -1,14 +1,9 @@
 """Points of recorded scans in the world frame."""
 
-from collections.abc import Iterable
-
 import numpy as np
 from numpy.typing import NDArray
 
 from triquad_tools.kitti import KittiFolder
-from triquad_tools.voxel import thin
-
-_MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 
 
 def is_withheld(index: int, every: int) -> bool:
@@ -39,13 +34,3 @@ def world_points(
     pose = folder.poses[index]
     world: NDArray[np.float64] = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     return world
-
-
-def merged(clouds: Iterable[NDArray[np.float64]], voxel_m: float) -> NDArray[np.float64]:
-    """All clouds as one ``[N, 3]``, one point per voxel of side ``voxel_m``."""
-    held = [np.empty((0, 3))]  # the first is what is merged so far
-    for cloud in clouds:
-        held.append(thin(cloud, voxel_m))
-        if sum(map(len, held[1:])) > max(len(held[0]), _MERGED_POINTS):
-            held = [thin(np.concatenate(held), voxel_m)]
-    return thin(np.concatenate(held), voxel_m)

@@ -22,4 +22,4 @@ class StampError(ToolError):
 
 
 class MeshFileError(ToolError):
-    """A mesh file that cannot be read or written."""
+    """A mesh file that cannot be read."""

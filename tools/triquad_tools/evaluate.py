@@ -118,9 +118,10 @@ def _at_withheld(options: argparse.Namespace) -> Results:
 
 def _reference(path: Path, voxel_m: float, range_min_m: float) -> Any:
     """The points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
-    from triquad_tools.cloud import merged, world_points
+    from triquad_tools.cloud import world_points
     from triquad_tools.kitti import read_folder
     from triquad_tools.meshfile import read_mesh
+    from triquad_tools.voxel import merged
 
     if path.is_dir():
         folder = read_folder(path)

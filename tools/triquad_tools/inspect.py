@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from triquad_tools.errors import ToolError
+
 if TYPE_CHECKING:
     from triquad_format.mapfile import MapFile
     from triquad_format.region import MapRecord, Region
@@ -19,7 +21,7 @@ _READER_CHECKS = (
 )
 
 
-class InspectError(Exception):
+class InspectError(ToolError):
     """A check beyond those of the reader that a map file fails."""
 
 

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_tools.scene import Scene
-from triquad_tools.voxel import thin
+from triquad_tools.voxel import merged
 
 _SENSOR_HEIGHT_M = 1.8
 _LANE_M = 1.6  # lateral offset of the lane from the middle of the road
 _WEAVE_M = 0.3
-_MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 _TILT_RAD = math.radians(1.0)  # of the gentle roll and pitch
 
 
@@ -100,12 +99,7 @@ class SimulatedDrive:
 
         The noise-free hits of all scans, one per voxel of side ``voxel_m``.
         """
-        clouds = [np.empty((0, 3))]  # the first is what is merged so far
-        for scan in self:
-            clouds.append(thin(scan.true_hits, voxel_m))
-            if sum(map(len, clouds[1:])) > max(len(clouds[0]), _MERGED_POINTS):
-                clouds = [thin(np.concatenate(clouds), voxel_m)]
-        return thin(np.concatenate(clouds), voxel_m)
+        return merged((scan.true_hits for scan in self), voxel_m)
 
 
 def drive(scene: Scene, n_scans: int, step_m: float) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Meshes as PLY and GLB files."""
+"""Meshes from PLY and GLB files; :meth:`triquad_client.Mesh.save` writes them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_tools.errors import MeshFileError
-
-_PLY_TYPES = {"<f4": "float", "<f8": "double"}
 
 # glTF has y up; maps have z up.
 _GLTF_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -21,16 +19,6 @@ class Mesh:
 
     vertices: NDArray[np.floating]  # [V, 3] metres, map frame
     faces: NDArray[np.integer]  # [F, 3] rows of vertices, counter-clockwise seen from outside
-
-
-def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh in the format that the suffix names: ``.ply`` or ``.glb``."""
-    if path.suffix == ".ply":
-        path.write_bytes(ply_bytes(mesh))
-    elif path.suffix == ".glb":
-        path.write_bytes(_glb_bytes(mesh))
-    else:
-        raise MeshFileError(f"{path}: meshes are written as .ply or .glb, not {path.suffix!r}")
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -54,36 +42,3 @@ def read_mesh(path: Path) -> Mesh:
     if path.suffix == ".glb":
         vertices = vertices @ _GLTF_FROM_MAP
     return Mesh(vertices, faces)
-
-
-def ply_bytes(mesh: Mesh) -> bytes:
-    """A mesh as a binary little-endian PLY file; float64 vertices stay float64."""
-    little = np.ascontiguousarray(mesh.vertices)
-    little = little.astype(little.dtype.newbyteorder("<"), copy=False)
-    if little.dtype.str not in _PLY_TYPES:
-        raise MeshFileError(f"vertices are float32 or float64, not {little.dtype}")
-    kind = _PLY_TYPES[little.dtype.str]
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment triquad",
-        f"element vertex {len(little)}",
-        *(f"property {kind} {axis}" for axis in "xyz"),
-    ]
-    corners = np.empty(len(mesh.faces), np.dtype([("count", "u1"), ("rows", "<i4", 3)]))
-    corners["count"] = 3
-    corners["rows"] = mesh.faces
-    if len(mesh.faces):
-        header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
-    header += ["end_header", ""]
-    return "\n".join(header).encode() + little.tobytes() + corners.tobytes()
-
-
-def _glb_bytes(mesh: Mesh) -> bytes:
-    import trimesh  # slow to import
-
-    if not len(mesh.faces):
-        raise MeshFileError("a mesh without faces cannot be written as .glb; use .ply")
-    turned = mesh.vertices @ _GLTF_FROM_MAP.T
-    data: Any = trimesh.Trimesh(turned, mesh.faces, process=False).export(file_type="glb")
-    return bytes(data)
