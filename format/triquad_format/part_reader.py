@@ -44,8 +44,7 @@ from triquad_format.region import (
 MAX_REGION_INDEX = 2**31 - 1
 _LAYERS = 3
 _MAX_ITEMS = 64
-_MAX_KEY_BYTES = 4096
-"""Of any string in a part; a message on the wire may hold longer ones."""
+_MAX_PART_STRING_BYTES = 4096
 
 _Columns = tuple[NDArray[Any], ...]
 """What one part, or all parts of a table together, hold of it: columns of equal length."""
@@ -59,7 +58,7 @@ class PartBody:
         try:
             body = msgpack.unpackb(
                 part.payload,
-                max_str_len=_MAX_KEY_BYTES,
+                max_str_len=_MAX_PART_STRING_BYTES,
                 max_array_len=max_items,
                 max_map_len=_MAX_ITEMS,
                 max_ext_len=0,

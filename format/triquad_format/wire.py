@@ -18,7 +18,7 @@ from triquad_format.errors import ProtocolVersionError, WireError
 
 PROTOCOL_VERSION = 1
 MAX_MESSAGE_BYTES = 256 * 2**20
-_MAX_TEXT_BYTES = 65_536
+_MAX_WIRE_STRING_BYTES = 65_536
 _MAX_ITEMS = 65_536
 
 MessageT = TypeVar("MessageT", bound="Message")
@@ -80,7 +80,7 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
     try:
         body = msgpack.unpackb(
             payload,
-            max_str_len=_MAX_TEXT_BYTES,
+            max_str_len=_MAX_WIRE_STRING_BYTES,
             max_array_len=_MAX_ITEMS,
             max_map_len=_MAX_ITEMS,
         )

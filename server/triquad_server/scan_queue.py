@@ -10,13 +10,11 @@ from triquad_format import keys, wire
 from triquad_format.errors import FormatError, ProtocolVersionError, WireError
 from triquad_format.messages import Scan
 
+from triquad_server.payload import payload_limit
 from triquad_server.sources import SourceLedger
 from triquad_server.tally import Tally
 
 _log = logging.getLogger(__name__)
-
-_POINT_BYTES = 12
-_OTHER_BYTES = 4096  # all of a scan's message but its points takes less
 
 
 class ScanQueue:
@@ -105,7 +103,7 @@ class ScanIntake:
             self._arrived()
 
     def _receive(self, key: str, payload: zenoh.ZBytes) -> None:
-        max_bytes = self._max_points * _POINT_BYTES + _OTHER_BYTES
+        max_bytes = payload_limit(self._max_points)
         if len(payload) > max_bytes:
             self._drop("too_large", key, f"{len(payload)} bytes exceed {max_bytes}")
             return

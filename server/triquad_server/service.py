@@ -30,15 +30,13 @@ from triquad_server.health import Counts, Health, Identity
 from triquad_server.heartbeat import Heartbeat
 from triquad_server.mapper import Mapper
 from triquad_server.mapper_thread import MapperInputs, MapperThread
+from triquad_server.payload import payload_limit
 from triquad_server.requests import Resets, SdfQueries, TileQueries, answering
 from triquad_server.scan_queue import ScanIntake, ScanQueue
 from triquad_server.settings import Settings
 from triquad_server.sources import SourceLedger
 from triquad_server.store import Store
 from triquad_server.tally import Tally
-
-_POINT_BYTES = 12
-_OTHER_BYTES = 4096  # all of a request's message but its points takes less
 
 
 @dataclass(frozen=True)
@@ -214,7 +212,7 @@ class Service:
             operations,
             workers,
             limits.request_queue,
-            limits.max_query_points * _POINT_BYTES + _OTHER_BYTES,
+            payload_limit(limits.max_query_points),
             self._counts.requests_refused,
         )
         self._parts.callback(desk.close)
