@@ -121,7 +121,7 @@ def _evidence_box(record: "MapRecord", region: "Region") -> list[list[float]] | 
     corner = region_centre(settings, region.index) - settings.region_side_m / 2
     side_m = settings.leaf_m * BLOCK_VOXELS
     low, high = blocks.min(axis=0), blocks.max(axis=0) + 1
-    return [(corner + low * side_m).tolist(), (corner + high * side_m).tolist()]
+    return [(corner + low * side_m).round(6).tolist(), (corner + high * side_m).round(6).tolist()]
 
 
 def _describe_parts(file: "MapFile") -> dict[str, dict[str, int]]:
