@@ -119,6 +119,15 @@ def test_an_epoch_does_not_change_while_training_goes_on() -> None:
     assert later.vertices > epoch.vertices
 
 
+def test_the_number_of_regions_is_bounded() -> None:
+    mapper = Mapper("test", settings(max_regions=2), "cpu")
+    scan = world().scans[0]
+    with pytest.raises(ScanRefusedError) as refusal:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    assert refusal.value.reason == "too_many_regions"
+    assert mapper.publish().regions == 0
+
+
 def test_a_refused_scan_changes_nothing() -> None:
     mapper = Mapper("test", settings(), "cpu")
     epoch = mapper.publish()

@@ -40,6 +40,11 @@ def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
         ("field = 3\n", ["field", "3"]),
         ("[field\n", ["settings.toml"]),
         ("[scan]\nrange_min_m = nan\n", ["range_min_m", "nan"]),
+        ("[training]\nseed = -1\n", ["seed", "-1"]),
+        (f"[field]\nleaf_m = 1{'0' * 400}\n", ["leaf_m", "64 bits"]),
+        (f"[field]\ndepth = 1{'0' * 400}\n", ["depth", "64 bits"]),
+        (f"[field]\ndepth = 1{'0' * 5000}\n", ["settings.toml"]),
+        (f"a = {'[' * 5000}\n", ["settings.toml"]),
     ],
 )
 def test_errors_name_the_key_and_the_value(tmp_path: Path, text: str, words: list[str]) -> None:

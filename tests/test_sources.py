@@ -130,3 +130,18 @@ def test_waiting_for_an_outcome_ends_with_the_publication():
             lambda: ledger.outcome(*SOURCE, 0) is not None, servers.WAIT_S
         )
     publisher.join()
+
+
+def test_a_scan_turned_away_says_nothing_of_those_that_wait() -> None:
+    ledger = SourceLedger()
+    first, second = servers.scan(sequence=0), servers.scan(sequence=1)
+    ledger.arrive(first)
+    ledger.arrive(second)
+    ledger.turn_away(second, "too many points")
+    asked = (first.source, first.session, 1)
+    assert ledger.outcome(*asked) is None, "the first still waits"
+    ledger.take(first)
+    ledger.publish()
+    outcome = ledger.outcome(*asked)
+    assert outcome is not None
+    assert (outcome.taken, outcome.refused, outcome.lost) == (1, 1, 0)

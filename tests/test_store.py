@@ -164,3 +164,22 @@ def test_a_failed_write_leaves_the_older_checkpoints(store):
         store.write(record(2))
     (store.folder / "epoch-000000002.triquad").rmdir()
     assert store.newest().record.epoch == 1
+
+
+def test_a_checkpoint_under_a_wrong_number_does_not_pass_for_a_later_one(store, caplog):
+    store.write(record(3))
+    sound = store.folder / "epoch-000000003.triquad"
+    (store.folder / "epoch-000000009.triquad").write_bytes(sound.read_bytes())
+    with caplog.at_level(logging.WARNING):
+        restored = store.newest()
+    assert restored.info.epoch == restored.record.epoch == 3
+    assert "epoch-000000009.triquad holds epoch 3" in caplog.text
+    store.write(record(4))
+    assert store.newest().record.epoch == 4
+
+
+def test_a_number_of_more_than_64_bits_is_not_a_checkpoint(store):
+    store.write(record(3))
+    sound = store.folder / "epoch-000000003.triquad"
+    (store.folder / "epoch-9999999999999999999.triquad").write_bytes(sound.read_bytes())
+    assert store.newest().info.epoch == 3

@@ -99,15 +99,17 @@ def _check_training(settings: FieldSettings, region: Region, training: TrainingS
             raise FormatError("table steps: a number is negative")
     _check_arrays("mlp means", training.mlp_means, _mlp_shapes(settings))
     _check_arrays("mlp variances", training.mlp_variances, _mlp_shapes(settings), low=0.0)
-    _check_count("mlp steps", training.mlp_steps)
+    _check_count("mlp steps", training.mlp_steps, 2**31)
     _check_count("visits owed", training.visits_owed)
     samples = len(training.sample_points)
     _check_floats("sample points", training.sample_points, ("<f4",), (samples, 3))
+    if np.abs(training.sample_points).max(initial=0) > settings.region_side_m:
+        raise FormatError("sample points: one lies far outside its region")
     _check_floats("sample labels", training.sample_labels, _FLOATS, (samples,))
 
 
-def _check_count(name: str, count: int) -> None:
-    if not 0 <= count < 2**63:
+def _check_count(name: str, count: int, limit: int = 2**63) -> None:
+    if not 0 <= count < limit:
         raise FormatError(f"{name} = {count} is not a count")
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from triquad_format.array import ArraySpec, pack_array, unpack_array
 from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.structure import check_structure
 
 PROTOCOL_VERSION = 1
 MAX_MESSAGE_BYTES = 256 * 2**20
@@ -77,6 +78,7 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
 def _unpack_map(payload: bytes) -> dict[str, object]:
     if len(payload) > MAX_MESSAGE_BYTES:
         raise WireError(f"message of {len(payload)} bytes exceeds {MAX_MESSAGE_BYTES}")
+    check_structure(payload)
     try:
         body = msgpack.unpackb(
             payload,

@@ -12,7 +12,7 @@ from triquad_server.epoch import Epoch, FrozenRegion, frozen_region
 from triquad_server.normals import SurfaceNormals
 from triquad_server.region_map import RegionMap
 from triquad_server.sampling import draw_samples
-from triquad_server.scan import IngestReport, usable_rays
+from triquad_server.scan import IngestReport, ScanRefusedError, usable_rays
 from triquad_server.settings import Settings
 
 _LOSS_MEMORY = 0.95
@@ -75,10 +75,12 @@ class Mapper:
             ScanRefusedError: the scan cannot be used; the map is unchanged.
         """
         rays = usable_rays(points, world_from_sensor, self._settings.scan)
+        around = self._regions_around(rays.ends)
+        self._check_regions(around)
         self._normals.add(rays.ends, rays.origin)
         normals = self._normals.at(rays.ends)
         samples = draw_samples(rays, normals, self._settings.scan, self._rng)
-        for index in self._regions_around(rays.ends):
+        for index in around:
             self._region(index).take_in(rays, samples)
         return rays.report
 
@@ -159,6 +161,16 @@ class Mapper:
             for index in itertools.product(x, y, z)
             if (np.abs(points - np.multiply(index, pitch)) < half).all(axis=1).any()
         ]
+
+    def _check_regions(self, wanted: list[RegionIndex]) -> None:
+        limit = self._settings.training.max_regions
+        count = len(self._regions.keys() | set(wanted))
+        if count > limit:
+            raise ScanRefusedError(
+                "too_many_regions",
+                f"the scan would make {count} regions of the map, more than "
+                f"training.max_regions = {limit}",
+            )
 
     def _region(self, index: RegionIndex) -> RegionMap:
         if index not in self._regions:

@@ -48,7 +48,7 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
         raise ScanRefusedError(
             "pose_not_finite", f"the pose has values that are not finite: {pose}"
         )
-    rotation = pose[:3, :3]
+    rotation = np.clip(pose[:3, :3], -2, 2)  # no larger number can be part of a rotation
     skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if skew > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or (pose[3] != (0, 0, 0, 1)).any():
         raise ScanRefusedError(

@@ -48,7 +48,7 @@ class ScanQueue:
         with self._lock:
             backwards = self._ledger.arrive(scan)
             if backwards is None:
-                self._ledger.refuse(scan, text)
+                self._ledger.turn_away(scan, text)
             self._dropped.add(backwards or reason)
 
     def take(self) -> Scan | None:
@@ -118,7 +118,7 @@ class ScanIntake:
 
     def _enter(self, key: str, scan: Scan) -> None:
         """Put a decoded scan into the queue, where it may be there."""
-        if key.rsplit("/", 1)[1] != scan.source:
+        if key.rpartition("/")[2] != scan.source:
             self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
             return
         try:

@@ -27,7 +27,7 @@ class ScanSettings:
     truncation_m: float = 0.3  # half width of the band around the end point
     free_from: float = 0.3  # free samples begin at this share of the range
     behind_m: float = 0.8  # and end this far behind the end point
-    max_points: int = 2_000_000  # a larger scan is refused
+    max_points: int = 500_000  # a larger scan is refused
 
     def __post_init__(self) -> None:
         check_range("range_min_m", self.range_min_m, 0.0, 1e3)
@@ -54,6 +54,7 @@ class TrainingSettings:
     visits: float = 8.0  # training visits that each new sample pays for
     max_backlog: int = 12_000_000  # visits owed at most, per region
     cooldown: float = 1.0  # the rate falls once less than this many visits a kept sample are owed
+    max_regions: int = 256  # of the map; a scan that would need more is refused
     seed: int = 42
 
     def __post_init__(self) -> None:
@@ -65,6 +66,8 @@ class TrainingSettings:
         check_range("fresh_share", self.fresh_share, 0.0, 1.0)
         check_range("visits", self.visits, 0.0, 1000.0)
         check_range("cooldown", self.cooldown, 0.001, 1000.0)
+        check_range("max_regions", self.max_regions, 1, 1_000_000)
+        check_range("seed", self.seed, 0, 2**31)
         check_range("max_backlog", self.max_backlog, 1, 10_000_000_000)
 
 
@@ -166,7 +169,7 @@ def load_settings(path: Path) -> Settings:
     """
     try:
         sections = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SettingsError(f"settings file {path}: {error}") from error
     try:
         return parse_settings(sections)
@@ -195,6 +198,8 @@ def _parse_section(section: str, record: type[Any], table: dict[str, Any]) -> An
         if key not in known:
             raise SettingsError(f"unknown key {key!r} in [{section}]; known are {', '.join(known)}")
         wanted = known[key]
+        if type(value) is int and abs(value) >= 2**63:
+            raise SettingsError(f"{section}.{key} is a number of more than 64 bits")
         if wanted is float and type(value) is int:
             value = float(value)
         if type(value) is not wanted:

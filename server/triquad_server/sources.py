@@ -91,6 +91,17 @@ class SourceLedger:
         with self.changed:
             self._leave_queue(scan).refuse(f"scan {scan.sequence}: {text}")
 
+    def turn_away(self, scan: Scan, text: str) -> None:
+        """Note that a scan that just arrived is not let into the queue.
+
+        Earlier ones may still wait there, so it says nothing of them.
+        """
+        with self.changed:
+            track = self._track(scan.source, scan.session)
+            track.waiting = max(0, track.waiting - 1)
+            track.refuse(f"scan {scan.sequence}: {text}")
+            self.changed.notify_all()
+
     def push_out(self, scan: Scan) -> None:
         """Note that a scan was pushed out of the full queue."""
         with self.changed:

@@ -25,7 +25,7 @@ from triquad_server.errors import StoreError
 
 _log = logging.getLogger(__name__)
 
-_NAME = re.compile(r"epoch-(\d{9,19})\.triquad")
+_NAME = re.compile(r"epoch-(\d{9,18})\.triquad")
 _LOCK_NAME = "lock"
 _UNFINISHED = ".epoch-*.tmp"  # left by a server that was killed while it wrote
 _DAMAGED_SUFFIX = ".damaged"
@@ -102,7 +102,7 @@ class Store:
         Raises:
             StoreError: it could not be written; the older ones are untouched.
         """
-        path = self.folder / f"epoch-{record.epoch:09d}.triquad"
+        path = self.folder / _name(record.epoch)
         try:
             older = [path for number, path in self._checkpoints() if number < record.epoch]
             file = write_map(record, path, stamp_ns=time.time_ns())
@@ -126,6 +126,10 @@ class Store:
         return sorted(found, reverse=True)
 
 
+def _name(epoch: int) -> str:
+    return f"epoch-{epoch:09d}.triquad"
+
+
 def _delete(paths: Iterable[Path]) -> None:
     for path in paths:
         try:
@@ -135,13 +139,13 @@ def _delete(paths: Iterable[Path]) -> None:
 
 
 def _read(path: Path) -> Restored | None:
-    """A checkpoint, or ``None`` where it is damaged.
+    """A checkpoint, or ``None`` where it is damaged or not what its name says.
 
     Raises:
         StoreError: it cannot be read now, though it may well be sound.
     """
     try:
-        return Restored(read_map(path), _info(path))
+        restored = Restored(read_map(path), _info(path))
     except UnsupportedMapFileError as error:
         raise StoreError(f"checkpoint {path} needs a newer release: {error}") from error
     except (TooLargeMapFileError, OSError) as error:
@@ -149,6 +153,16 @@ def _read(path: Path) -> Restored | None:
     except MapFileError as error:
         _log.warning("checkpoint %s is damaged and left out: %s", path, error)
         return None
+    held = restored.record.epoch
+    if held != restored.info.epoch:
+        _log.warning(
+            "checkpoint %s holds epoch %d and is left out; name it %s to use it",
+            path,
+            held,
+            _name(held),
+        )
+        return None
+    return restored
 
 
 def _set_aside(damaged: list[Path]) -> None:
