@@ -51,12 +51,16 @@ def _run(options: argparse.Namespace) -> int:
     from triquad_server.errors import ListenError, ServerError, StoreError
     from triquad_server.network import NetworkOptions
     from triquad_server.settings import Settings, load_settings
+    from triquad_server.stop import Stop, Stops
 
     try:
         check_name("map", options.map)
         settings = load_settings(options.settings) if options.settings else Settings()
+        stops: Stops = queue.SimpleQueue()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stops.put(Stop.ASKED))
         # Only now, since it takes seconds to import.
-        from triquad_server.launch import LaunchOptions, Stop, run_server
+        from triquad_server.launch import LaunchOptions, run_server
 
         network = NetworkOptions(
             tuple(options.listen),
@@ -66,9 +70,6 @@ def _run(options: argparse.Namespace) -> int:
             False if options.no_multicast_scouting else None,
         )
         launch = LaunchOptions(options.map, network, settings, options.store, options.device)
-        stops: queue.SimpleQueue[Stop] = queue.SimpleQueue()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stops.put(Stop.ASKED))
         why = run_server(launch, stops)
     except ListenError as error:
         _log.error("%s", error)

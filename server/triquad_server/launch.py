@@ -1,10 +1,8 @@
 """Starting and stopping a server process."""
 
 import logging
-import queue
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 
 import torch
@@ -14,21 +12,11 @@ from triquad_server.mapper import Mapper
 from triquad_server.network import NetworkOptions, listen_endpoints, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
+from triquad_server.stop import Stop, Stops
 from triquad_server.store import Store
 from triquad_server.warm_up import warm_up
 
 _log = logging.getLogger("triquad_server")
-
-
-class Stop(Enum):
-    """Why a server stops."""
-
-    ASKED = "asked to"
-    DEFECT = "by a defect"
-
-
-Stops = queue.SimpleQueue[Stop]
-"""Where signals and defects ask the server to stop; may be put to from a signal handler."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +47,8 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         if restored is not None:
             _log.info("restoring epoch %d from %s", restored.record.epoch, restored.info.path)
         record = restored.record if restored else None
+        if record is not None and record.name != options.map_name:
+            _log.warning("the checkpoint is of a map named '%s'", record.name)
         if record is not None and record.settings != options.settings.field:
             _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
         _log.info("preparing compiled code: up to a minute at the very first start")
