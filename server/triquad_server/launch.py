@@ -12,7 +12,7 @@ from triquad_server.mapper import Mapper
 from triquad_server.network import NetworkOptions, listen_endpoints, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
-from triquad_server.stop import Stop, Stops
+from triquad_server.stop import Stop, Stops, wait_for_stop
 from triquad_server.store import Store
 from triquad_server.warm_up import warm_up
 
@@ -60,7 +60,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         service = Service(session, served, options.settings, lambda: stops.put(Stop.DEFECT))
         stack.enter_context(closing(service))
         _log_ready(options, service.epoch, device)
-        why = stops.get()
+        why = wait_for_stop(stops)
         _log.info("stopping, %s", why.value)
     _log.info("stopped")
     return why

@@ -1,6 +1,7 @@
 """Why a server process stops; quick to import, so that signals are heeded from the start."""
 
 import queue
+from contextlib import suppress
 from enum import Enum
 
 
@@ -13,3 +14,16 @@ class Stop(Enum):
 
 Stops = queue.SimpleQueue[Stop]
 """Where signals and defects ask the server to stop; may be put to from a signal handler."""
+
+_LOOK_S = 0.5
+
+
+def wait_for_stop(stops: Stops) -> Stop:
+    """Wait on the main thread until something asks the server to stop.
+
+    The system may deliver a signal to any thread, a library's too, and its Python handler runs once
+    the main thread does: so that thread must not block for good.
+    """
+    while True:
+        with suppress(queue.Empty):
+            return stops.get(timeout=_LOOK_S)
