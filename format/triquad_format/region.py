@@ -99,3 +99,12 @@ class MapRecord:
 def region_centre(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:
     """Centre [3] of a region in the map frame, metres."""
     return np.asarray(index, np.float64) * settings.region_pitch_m
+
+
+def voxel_coordinates(
+    settings: FieldSettings,
+    centre: NDArray[np.float64],
+    points: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Points [N, 3] of the map frame in evidence voxels of the region at ``centre`` [3]."""
+    return (points - centre) / settings.leaf_m + (1 << (settings.depth - 1))

@@ -77,8 +77,8 @@ class Parameter:
         self.variances.copy_(variances)
         self.steps.copy_(steps)
 
-    def step(self, rows: Tensor, gradient: Tensor, rates: Tensor | float, betas: Betas) -> None:
-        """One step of ``rows`` [T] along ``gradient`` [T, ...] at learning ``rates`` ([T, 1])."""
+    def step(self, rows: Tensor, gradient: Tensor, rate: float, betas: Betas) -> None:
+        """One step of ``rows`` [T] along ``gradient`` [T, ...] at a learning ``rate``."""
         self._steps[rows] += 1
         age = self._steps[rows].to(gradient.dtype).reshape(-1, *[1] * (gradient.dim() - 1))
         means = self._means[rows].lerp_(gradient, 1 - betas.mean)
@@ -87,7 +87,7 @@ class Parameter:
         self._variances[rows] = variances
         mean = means / (1 - betas.mean**age)
         deviation = (variances / (1 - betas.variance**age)).sqrt_()
-        self._values[rows] -= rates * mean / (deviation + EPSILON)
+        self._values[rows] -= rate * mean / (deviation + EPSILON)
 
 
 def _grown(tensor: Tensor, capacity: int) -> Tensor:

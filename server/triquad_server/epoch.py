@@ -8,16 +8,16 @@ from triquad_format.field_settings import FieldSettings
 from triquad_format.region import (
     BLOCK_VOXELS,
     MapRecord,
-    Region,
     RegionIndex,
     region_centre,
+    voxel_coordinates,
 )
 from triquad_format.status import Status
 
 from triquad_server.engine import Engine, make_engine
 from triquad_server.evidence import Evidence
 from triquad_server.field import Field
-from triquad_server.field_record import field_mlp, field_tables
+from triquad_server.field_record import region_record
 from triquad_server.mesher import TileMesh, mesh_tile
 from triquad_server.settings import MeshSettings
 
@@ -114,7 +114,8 @@ class Epoch:
         for region in self.frozen_regions:
             mine = (owners == region.index).all(axis=1)
             if mine.any():
-                status[mine] = region.evidence.status(self._voxels(region, points[mine]), reach)
+                voxels = voxel_coordinates(self._settings, region.centre, points[mine])
+                status[mine] = region.evidence.status(voxels, reach)
         return status
 
     def tiles(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> TileSet:
@@ -149,14 +150,7 @@ class Epoch:
     def record(self) -> MapRecord:
         """The epoch as a map file holds it, without training state."""
         regions = tuple(
-            Region(
-                index=region.index,
-                frequencies=region.field.frequencies.cpu().numpy(),
-                mlp=field_mlp(region.field),
-                tables=field_tables(region.field),
-                evidence=region.evidence.record(),
-                training=None,
-            )
+            region_record(region.index, region.field, region.evidence, training=None)
             for region in self.frozen_regions
         )
         return MapRecord(self._name, self.number, self._settings, regions)
@@ -204,10 +198,6 @@ class Epoch:
             tile = first + offset
             tiles.append(tile[(tile <= last).all(axis=1)])
         return np.unique(np.concatenate(tiles), axis=0)
-
-    def _voxels(self, region: FrozenRegion, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        half = 1 << (self._settings.depth - 1)
-        return (points - region.centre) / self._settings.leaf_m + half
 
 
 def frozen_region(

@@ -8,9 +8,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.field_settings import FieldSettings
-from triquad_format.region import AXES, Mlp, Region, VertexTable
+from triquad_format.region import AXES, Mlp, Region, RegionIndex, TrainingState, VertexTable
 
 from triquad_server.adam import Parameter
+from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 
 
@@ -28,6 +29,23 @@ class Moments:
     def as_fields(self) -> dict[str, Any]:
         """The moments by name, as :class:`triquad_format.region.TrainingState` has them."""
         return dict(vars(self))
+
+
+def region_record(
+    index: RegionIndex,
+    field: Field,
+    evidence: Evidence,
+    training: TrainingState | None,
+) -> Region:
+    """A region as plain arrays that share nothing with ``field`` and ``evidence``."""
+    return Region(
+        index=index,
+        frequencies=_array(field.frequencies),
+        mlp=field_mlp(field),
+        tables=field_tables(field),
+        evidence=evidence.record(),
+        training=training,
+    )
 
 
 def field_tables(field: Field) -> tuple[VertexTable, ...]:

@@ -52,11 +52,6 @@ class TriQuadtree:
             device=device,
         )
 
-    @property
-    def rows(self) -> int:
-        """Rows in use, the reserved one included."""
-        return self._rows
-
     def vertices(self, plane: int, h: int) -> tuple[Tensor, Tensor]:
         """Sorted Morton codes and rows of the vertices on a plane and the ``h``-th level."""
         rows = (self._owners[: self._rows] == self._owner(plane, h)).nonzero()[:, 0]

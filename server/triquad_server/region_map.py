@@ -4,13 +4,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
-from triquad_format.region import Region, RegionIndex, TrainingState, region_centre
+from triquad_format.region import (
+    Region,
+    RegionIndex,
+    TrainingState,
+    region_centre,
+    voxel_coordinates,
+)
 
 from triquad_server.adam import Betas
 from triquad_server.engine import GradientSums, make_engine
 from triquad_server.evidence import Evidence
 from triquad_server.field import Field
-from triquad_server.field_record import field_from_record, field_mlp, field_tables, training_moments
+from triquad_server.field_record import field_from_record, region_record, training_moments
 from triquad_server.replay_pool import ReplayPool
 from triquad_server.sampling import Samples
 from triquad_server.scan import Rays
@@ -37,7 +43,6 @@ class RegionMap:
         self._settings = field_settings
         self._training = training
         self._device = device
-        self._sums = sums
         seed = training.seed + hash(index) % 1_000_003
         self.field = Field(field_settings, device, seed)
         self._engine = make_engine(self.field, sums)
@@ -99,19 +104,12 @@ class RegionMap:
 
     def voxels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Voxel coordinates [N, 3] of points."""
-        half = 1 << (self._settings.depth - 1)
-        return (points - self.centre) / self._settings.leaf_m + half
+        return voxel_coordinates(self._settings, self.centre, points)
 
     def record(self, training: bool) -> Region:
         """The region as plain arrays, sharing nothing with this one."""
-        return Region(
-            index=self.index,
-            frequencies=self.field.frequencies.cpu().numpy().copy(),
-            mlp=field_mlp(self.field),
-            tables=field_tables(self.field),
-            evidence=self.evidence.record(),
-            training=self._training_state() if training else None,
-        )
+        state = self._training_state() if training else None
+        return region_record(self.index, self.field, self.evidence, state)
 
     @classmethod
     def restore(
