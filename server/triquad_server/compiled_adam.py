@@ -1,51 +1,103 @@
 """Adam in compiled code: the step of :mod:`triquad_server.adam`, on the rows that were touched."""
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_server.adam import EPSILON, Betas
+from triquad_server.compiled_field import Touched
+from triquad_server.feature_rows import move_row, prefetch_row
+
 Floats = NDArray[np.float32]
+
+_NEGLIGIBLE = 1e-8
+_MAX_CORRECTED = 1 << 20
+_AHEAD = 12  # rows that are brought into the cache before their turn
+
+
+class Moments(NamedTuple):
+    """Rows of values with their optimiser state."""
+
+    values: Floats  # [rows, size]
+    means: Floats  # [rows, size]
+    variances: Floats  # [rows, size]
+    steps: NDArray[np.int32]  # [rows]
+
+
+class Rates(NamedTuple):
+    """How far a step goes."""
+
+    rate: float  # learning rate
+    beta1: float
+    beta2: float
+    mean_scales: Floats  # [n] correction of the mean after 1, 2, ... steps; the last for more
+    variance_scales: Floats  # [n] and of the variance
+
+
+def rates(rate: float, betas: Betas) -> Rates:
+    """The numbers of a step; the corrections are tabulated until they no longer matter."""
+    slowest = max(betas.mean, betas.variance)
+    count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
+    ages = np.arange(1, count + 1)
+    return Rates(
+        rate,
+        betas.mean,
+        betas.variance,
+        (1 / (1 - betas.mean**ages)).astype(np.float32),
+        (1 / (1 - betas.variance**ages)).astype(np.float32),
+    )
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def step_row(row: int, gradients: Floats, moments: Moments, rates: Rates) -> None:
+    """One step of a row along its gradient, which is cleared."""
+    moments.steps[row] += 1
+    age = min(moments.steps[row], len(rates.mean_scales)) - 1
+    move_row(
+        gradients,
+        moments.values,
+        moments.means,
+        moments.variances,
+        row,
+        (np.float32(1 - rates.beta1), np.float32(1 - rates.beta2)),
+        (np.float32(rates.rate) * rates.mean_scales[age], rates.variance_scales[age]),
+        np.float32(EPSILON),
+    )
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def step_rows(
-    first: int,
-    last: int,
-    touched: tuple[NDArray[np.uint8], ...],
+def step_touched(
+    part: int,
+    count: int,
+    step: int,
+    touched: tuple[Touched, ...],
     sums: tuple[Floats, ...],
-    values: Floats,
-    means: Floats,
-    variances: Floats,
-    steps: NDArray[np.int32],
-    rate: float,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
+    moments: Moments,
+    rates: Rates,
 ) -> None:
-    """Adam on the touched rows in ``[first, last)``; clears their sums and marks."""
-    size = values.shape[1]
-    log_beta1, log_beta2 = np.log(beta1), np.log(beta2)
-    for row in range(first, last):
-        any_touched = False
-        for part in range(len(touched)):
-            any_touched = any_touched or touched[part][row] != 0
-        if not any_touched:
-            continue
-        for part in range(1, len(touched)):
-            if touched[part][row]:
-                for k in range(size):
-                    sums[0][row, k] += sums[part][row, k]
-                    sums[part][row, k] = 0
-        steps[row] += 1
-        # beta ** steps: the power itself compiles to a function that LLVM's runtime lacks here.
-        mean_scale = np.float32(rate / (1 - np.exp(steps[row] * log_beta1)))
-        variance_scale = np.float32(1 / (1 - np.exp(steps[row] * log_beta2)))
-        for k in range(size):
-            g = sums[0][row, k]
-            sums[0][row, k] = 0
-            means[row, k] += np.float32(1 - beta1) * (g - means[row, k])
-            variances[row, k] += np.float32(1 - beta2) * (g * g - variances[row, k])
-            deviation = np.sqrt(variances[row, k] * variance_scale) + np.float32(epsilon)
-            values[row, k] -= mean_scale * means[row, k] / deviation
-        for part in range(len(touched)):
-            touched[part][row] = 0
+    """Adam on the ``count`` rows that the thread ``part`` touched; clears their sums.
+
+    A row that several threads touched is left to the first of them.
+    """
+    rows = touched[part].rows
+    for i in range(count):
+        ahead = rows[min(i + _AHEAD, count - 1)]
+        prefetch_row(sums[part], ahead)
+        prefetch_row(moments.values, ahead)
+        prefetch_row(moments.means, ahead)
+        prefetch_row(moments.variances, ahead)
+        row = rows[i]
+        mine = True
+        for other in range(len(touched)):
+            if other == part or touched[other].stamps[row] != step:
+                continue
+            if other < part:
+                mine = False
+                break
+            for k in range(sums[part].shape[1]):
+                sums[part][row, k] += sums[other][row, k]
+                sums[other][row, k] = 0
+        if mine:
+            step_row(row, sums[part], moments, rates)

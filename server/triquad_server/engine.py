@@ -8,11 +8,16 @@ import torch
 from numpy.typing import NDArray
 
 from triquad_server import compiled_field
-from triquad_server.adam import EPSILON, Betas
-from triquad_server.compiled_adam import step_rows
+from triquad_server.adam import Betas, Parameter
+from triquad_server.compiled_adam import Moments, Rates, rates, step_row, step_touched
+from triquad_server.compiled_encoding import Geometry, Index
+from triquad_server.compiled_field import CompiledField, Touched
+from triquad_server.compiled_mlp import Mlp
 from triquad_server.field import Field
 from triquad_server.replay_pool import Batch
-from triquad_server.threads import THREADS, split
+from triquad_server.threads import ANSWERS, THREADS, TRAINING, share
+
+_LAST_STEP = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -41,15 +46,20 @@ class GradientSums:
 
     def __init__(self) -> None:
         self.features: tuple[NDArray[np.float32], ...] = ()  # per thread [rows, size]
-        self.touched: tuple[NDArray[np.uint8], ...] = ()  # per thread [rows]
+        self.touched: tuple[Touched, ...] = ()  # per thread
+        self.step = 0
 
-    def reserve(self, rows: int, size: int) -> None:
-        """Make room for ``rows`` of ``size`` numbers."""
-        if self.touched and len(self.touched[0]) >= rows and self.features[0].shape[1] == size:
-            return
-        room = rows + rows // 2
-        self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
-        self.touched = tuple(np.zeros(room, np.uint8) for _ in range(THREADS))
+    def begin(self, rows: int, size: int) -> None:
+        """Make room for a step with ``rows`` of ``size`` numbers."""
+        self.step += 1
+        known = self.features[0].shape if self.features else (0, 0)
+        if known[0] < rows or known[1] != size or self.step == _LAST_STEP:
+            room = rows + rows // 4
+            self.step = 1
+            self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
+            self.touched = tuple(
+                Touched(np.zeros(room, np.int32), np.zeros(room, np.int32)) for _ in range(THREADS)
+            )
 
 
 def make_engine(field: Field, sums: GradientSums | None = None) -> Engine:
@@ -87,121 +97,90 @@ class CompiledEngine:
 
     def evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
         """The field at points [N, 3], metres from the region's centre."""
-        geometry, index, decoder = self._geometry(), self._index(), self._decoder()
-        features = self._field.features.values.numpy()
+        field = self._compiled()
         logits = np.empty(len(points), np.float32)
         gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
 
         def work(first: int, last: int) -> None:
-            compiled_field.evaluate(
-                points[first:last],
-                features,
-                geometry,
-                index,
-                decoder,
-                logits[first:last],
-                gradients[first:last],
-            )
+            part = slice(first, last)
+            compiled_field.evaluate(points[part], field, logits[part], gradients[part])
 
-        split(len(points), work)
+        ANSWERS.split(len(points), work)
         scale = np.float32(self._field.settings.logit_scale_m)
         return FieldValues(logits * scale, gradients * scale)
 
     def train(self, batch: Batch, rate: float, betas: Betas) -> float:
         """One optimiser step; returns the loss before it."""
-        field = self._field
         points = batch.points.numpy()
-        targets = torch.sigmoid(batch.labels / field.settings.logit_scale_m).numpy()
-        geometry, index, decoder = self._geometry(), self._index(), self._decoder()
-        features = field.features.values.numpy()
-        self._sums.reserve(*features.shape)
-        sums = [_zeros_like(decoder) for _ in range(THREADS)]
-        losses = np.zeros(THREADS)
+        targets = torch.sigmoid(batch.labels / self._field.settings.logit_scale_m).numpy()
+        field = self._compiled()
+        sums = self._sums
+        sums.begin(*field.features.shape)
+        mlp_sums = [Mlp(*map(np.zeros_like, field.mlp)) for _ in range(THREADS)]
+        counts = [0] * THREADS
+        losses = [0.0] * THREADS
 
-        def work(first: int, last: int) -> None:
-            part = first * THREADS // len(points)
-            losses[part] = compiled_field.accumulate(
-                points[first:last],
-                targets[first:last],
+        def work(part: int) -> None:
+            mine = slice(*share(len(points), part))
+            counts[part], losses[part] = compiled_field.accumulate(
+                points[mine],
+                targets[mine],
                 1.0 / len(points),
-                features,
-                geometry,
-                index,
-                decoder,
-                sums[part],
-                self._sums.features[part],
-                self._sums.touched[part],
+                field,
+                mlp_sums[part],
+                sums.features[part],
+                sums.touched[part],
+                sums.step,
             )
 
-        split(len(points), work)
-        self._step_decoder(sums, rate, betas)
-        self._step_features(rate, betas)
-        return float(losses.sum())
+        TRAINING.each(work)
+        how_far = rates(rate, betas)
+        self._step_mlp(mlp_sums, how_far)
+        moments = _moments(self._field.features)
+        TRAINING.each(
+            lambda part: step_touched(
+                part, counts[part], sums.step, sums.touched, sums.features, moments, how_far
+            ),
+        )
+        return sum(losses)
 
-    def _step_decoder(
-        self,
-        sums: list[compiled_field.Decoder],
-        rate: float,
-        betas: Betas,
-    ) -> None:
-        only = torch.zeros(1, dtype=torch.int64)
+    def _step_mlp(self, sums: list[Mlp], how_far: Rates) -> None:
         for part, parameter in enumerate(self._field.mlp):
-            total = np.sum([thread[part] for thread in sums], axis=0)
-            gradient = torch.from_numpy(np.ascontiguousarray(total.T))
-            parameter.step(only, gradient.reshape(parameter.values.shape), rate, betas)
+            gradient = np.sum([thread[part] for thread in sums], axis=0).reshape(1, -1)
+            step_row(0, gradient, _moments(parameter), how_far)
 
-    def _step_features(self, rate: float, betas: Betas) -> None:
-        features = self._field.features
-        values, means = features.values.numpy(), features.means.numpy()
-        variances, steps = features.variances.numpy(), features.steps.numpy()
-        touched, sums = self._sums.touched, self._sums.features
-
-        def work(first: int, last: int) -> None:
-            step_rows(
-                first,
-                last,
-                touched,
-                sums,
-                values,
-                means,
-                variances,
-                steps,
-                rate,
-                betas.mean,
-                betas.variance,
-                EPSILON,
-            )
-
-        split(len(values), work)
-
-    def _geometry(self) -> compiled_field.Geometry:
-        settings = self._field.settings
-        return compiled_field.Geometry(
+    def _compiled(self) -> CompiledField:
+        settings, tree = self._field.settings, self._field.tree
+        geometry = Geometry(
             np.float32(settings.leaf_m),
             np.float32(1 << (settings.depth - 1)),
             settings.feature_levels if settings.encoding != "fourier" else 0,
             1 << settings.levels[0],
         )
-
-    def _index(self) -> compiled_field.Index:
-        tree = self._field.tree
-        return compiled_field.Index(
+        index = Index(
             tree.blocks.keys.numpy(),
             tree.blocks.rows.numpy(),
             tree.blocks.shift,
             tree.block_rows.numpy(),
             np.array(tree.starts, np.int64),
         )
-
-    def _decoder(self) -> compiled_field.Decoder:
-        settings = self._field.settings
-        arrays = [np.ascontiguousarray(part.values[0].numpy().T) for part in self._field.mlp]
+        w1, b1, w2, b2, w3, b3 = (part.values[0].numpy() for part in self._field.mlp)
         turns = self._field.frequencies.numpy() / np.float32(settings.region_side_m / 2)
-        if settings.encoding == "features":
-            turns = turns[:0]
-        w1, b1, w2, b2, w3, b3 = arrays
-        return compiled_field.Decoder(w1, b1, w2, b2, w3.reshape(-1), b3, turns)
+        return CompiledField(
+            geometry,
+            index,
+            self._field.features.values.numpy(),
+            Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
+            turns if settings.encoding != "features" else turns[:0],
+        )
 
 
-def _zeros_like(decoder: compiled_field.Decoder) -> compiled_field.Decoder:
-    return compiled_field.Decoder(*(np.zeros_like(array) for array in decoder))
+def _moments(parameter: Parameter) -> Moments:
+    """A parameter as kernels take it: rows of numbers."""
+    count = len(parameter)
+    return Moments(
+        parameter.values.numpy().reshape(count, -1),
+        parameter.means.numpy().reshape(count, -1),
+        parameter.variances.numpy().reshape(count, -1),
+        parameter.steps.numpy(),
+    )

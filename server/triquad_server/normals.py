@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_server.threads import split
+from triquad_server.threads import ANSWERS
 from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 _MIN_POINTS = 6
@@ -178,7 +178,7 @@ class MomentGrid:
             part = slice(first, last)
             _estimate(points[part], self._cell_m, self._cells.arrays, self._moments, normals[part])
 
-        split(len(points), work)
+        ANSWERS.split(len(points), work)
 
     def keep_nearest(self, place: NDArray[np.float64], cells: int) -> None:
         """Keep the moments of the ``cells`` nearest to a ``place`` [3] only."""
