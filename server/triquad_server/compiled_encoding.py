@@ -209,7 +209,8 @@ def _cosine(turns: float) -> float:
     p = p * v + np.float32(81.605249)
     p = p * v + np.float32(-41.341702)
     p = p * v + np.float32(6.2831853)
-    return p * u
+    cosine: float = p * u
+    return cosine
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)

@@ -5,7 +5,8 @@ where a loop over a row reads one array and writes another that might be the sam
 spelt out here; rows of another length are loops.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import numba
 import numpy as np
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
-_kernel_code: Any = intrinsic  # typed as if callers passed the typing context, which they do not
+# The stub has it as if callers passed the typing context, which they do not.
+_kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., None]]", intrinsic)
 
 _LANES = 8
 _VECTOR = ir.VectorType(ir.FloatType(), _LANES)
