@@ -29,9 +29,9 @@ MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
 SMALL = Settings(
     field=FieldSettings(depth=7),
-    training=TrainingSettings(batch=2048, visits=1.0, pool_samples=100_000),
+    training=TrainingSettings(batch=2048, visits=6.0, pool_segments=20_000),
 )
-SMALL_TOML = "[field]\ndepth = 7\n[training]\nbatch = 2048\nvisits = 1.0\npool_samples = 100000\n"
+SMALL_TOML = "[field]\ndepth = 7\n[training]\nbatch = 2048\nvisits = 6.0\npool_segments = 20000\n"
 RADIUS_M = 4.0
 
 

@@ -7,7 +7,7 @@ from triquad_format.field_settings import FieldSettings
 from triquad_server.adam import Betas
 from triquad_server.engine import CompiledEngine, TorchEngine, make_engine
 from triquad_server.field import Field
-from triquad_server.replay_pool import Batch
+from triquad_server.sampling import Batch
 
 CPU = torch.device("cpu")
 CASES = [
@@ -22,10 +22,16 @@ CASES = [
 def trained(settings: FieldSettings) -> Field:
     field = Field(settings, CPU, 3)
     batch = samples(settings, 4000)
-    field.grow(batch.points)
+    field.grow(leaves(settings, batch))
     for _ in range(3):
         field.train(batch.points, batch.labels, 0.01, Betas(0.9, 0.99))
     return field
+
+
+def leaves(settings: FieldSettings, batch: Batch) -> np.ndarray:
+    """The leaves of the batch's points, which lie inside the cube."""
+    points = batch.points.numpy()
+    return np.floor(points / settings.leaf_m).astype(np.int64) + 2 ** (settings.depth - 1)
 
 
 def samples(settings: FieldSettings, count: int, seed: int = 0) -> Batch:
@@ -73,7 +79,7 @@ def test_training_goes_on_after_growth() -> None:
     engine = make_engine(field)
     batch = samples(settings, 2048, seed=5)
     before = len(field.features)
-    field.grow(batch.points)
+    field.grow(leaves(settings, batch))
     assert len(field.features) > before
     losses = [engine.train(batch, 0.01, Betas(0.9, 0.99)) for _ in range(60)]
     assert losses[-1] < losses[0]

@@ -14,7 +14,7 @@ RNG = np.random.default_rng(0)
 
 @pytest.fixture(scope="module")
 def epoch() -> Epoch:
-    return settled_mapper(settings(visits=0.5), world(3)).publish()
+    return settled_mapper(settings(visits=3.0), world(3)).publish()
 
 
 def test_the_numpy_evaluator_gives_the_same_answers(epoch: Epoch) -> None:
@@ -63,7 +63,7 @@ def test_no_points_give_an_empty_answer(epoch: Epoch) -> None:
 
 
 def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
-    chosen = settings(visits=0.2)
+    chosen = settings(visits=1.2)
     small = replace(chosen, mesh=MeshSettings(cell_m=0.05, tile_cells=16, reach_m=0.2))
     mapper = Mapper("test", small, "cpu")
     scan = world(1).scans[0]

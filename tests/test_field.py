@@ -24,9 +24,16 @@ def grown(settings: FieldSettings, seed: int = 0, points: int = 300) -> Field:
     field = Field(settings, CPU, seed)
     generator = torch.Generator().manual_seed(seed)
     half = settings.region_side_m / 2
-    field.grow((torch.rand((points, 3), generator=generator) * 2 - 1) * half * 0.3)
+    field.grow(
+        leaves(settings, (torch.rand((points, 3), generator=generator) * 2 - 1) * half * 0.3)
+    )
     field.features.values[1:] *= 20  # so that features matter
     return field
+
+
+def leaves(settings: FieldSettings, points: torch.Tensor) -> np.ndarray:
+    """The leaves [N, 3] that hold points, which lie inside the cube."""
+    return np.floor(points.numpy() / settings.leaf_m).astype(np.int64) + 2 ** (settings.depth - 1)
 
 
 def slow_sdf(field: Field, point: np.ndarray) -> float:
@@ -100,10 +107,34 @@ def test_the_field_is_continuous_across_cells() -> None:
 def test_vertices_are_those_of_the_nodes_that_points_project_into() -> None:
     settings = small()
     field = Field(settings, CPU, 0)
-    field.grow(torch.tensor([[0.05, 0.05, 0.05]]))
+    field.grow(np.array([[70, 80, 90]]))
     assert field.vertices == 3 * settings.feature_levels * 4
-    field.grow(torch.tensor([[0.07, 0.02, 0.11]]))
+    field.grow(np.array([[70, 80, 90]] * 3))
     assert field.vertices == 3 * settings.feature_levels * 4, "the same nodes again"
+
+
+def test_the_tree_holds_the_vertices_of_all_nodes_and_no_others() -> None:
+    settings = small(depth=7)
+    field = Field(settings, CPU, 0)
+    rng = np.random.default_rng(0)
+    chosen = rng.integers(0, 2**settings.depth, (3000, 3))
+    for part in np.array_split(chosen, 7):
+        field.grow(part)
+    for plane, axes in enumerate(AXES):
+        for h, level in enumerate(settings.levels):
+            nodes = chosen[:, list(axes)] >> (settings.depth - level)
+            expected = {
+                int(morton.encode(node + [i, j]))
+                for node in np.unique(nodes, axis=0)
+                for i in (0, 1)
+                for j in (0, 1)
+            }
+            codes, rows = field.tree.table(plane, h)
+            assert codes.tolist() == sorted(expected)
+            assert len(np.unique(rows)) == len(rows)
+    assert field.vertices == sum(
+        len(field.tree.table(plane, h)[0]) for plane in range(3) for h in range(3)
+    )
 
 
 def test_growing_keeps_values_and_optimiser_state() -> None:
@@ -114,7 +145,7 @@ def test_growing_keeps_values_and_optimiser_state() -> None:
     variances, steps = field.features.variances.clone(), field.features.steps.clone()
     count = len(field.features)
     assert steps.max() == 1
-    field.grow((torch.rand((500, 3)) * 2 - 1) * 12)
+    field.grow(leaves(field.settings, (torch.rand((500, 3)) * 2 - 1) * 12))
     assert len(field.features) > count
     assert torch.equal(field.features.values[:count], before[0])
     assert torch.equal(field.features.means[:count], before[1])
@@ -131,7 +162,7 @@ def test_training_learns_a_plane(encoding: str) -> None:
     field = Field(settings, CPU, 1)
     generator = torch.Generator().manual_seed(1)
     ground = (torch.rand((4000, 3), generator=generator) * 2 - 1) * torch.tensor([6.0, 6.0, 0.0])
-    field.grow(ground)
+    field.grow(leaves(settings, ground))
     for _ in range(150):
         chosen = torch.randint(len(ground), (2048,), generator=generator)
         height = (torch.rand(2048, generator=generator) * 2 - 1) * 0.3
@@ -157,7 +188,7 @@ def test_a_copy_does_not_change() -> None:
     twin = field.copy()
     before = twin.sdf(points)
     field.train(points, points[:, 2], 0.01, BETAS)
-    field.grow(points)
+    field.grow(leaves(field.settings, points))
     assert torch.equal(twin.sdf(points), before)
     assert not torch.equal(field.sdf(points), before)
 
@@ -170,9 +201,8 @@ def test_the_gpu_gives_the_same_values() -> None:
     twin.frequencies = field.frequencies.cuda()
     for plane in range(3):
         for h in range(field.settings.feature_levels):
-            codes, rows = field.tree.vertices(plane, h)
-            twin.tree.add_vertices(plane, h, codes.cuda())
-            twin.features.append(field.features.values[rows].cuda())
+            codes, rows = field.tree.table(plane, h)
+            twin.restore(plane, h, codes, field.features.values[torch.from_numpy(rows)].cuda())
     for part, other in zip(twin.mlp, field.mlp, strict=True):
         part.values.copy_(other.values)
     points = (torch.rand((500, 3)) * 2 - 1) * 7

@@ -72,7 +72,7 @@ def test_ghost_cells_are_unknown(mapped: Mapper) -> None:
 
 def test_regions_meet_without_hole_or_step() -> None:
     """The sensor drives over the border of two regions; the ground must go on."""
-    chosen = parse_settings({"field": {"depth": 7}, "training": {"batch": 4096, "visits": 3.0}})
+    chosen = parse_settings({"field": {"depth": 7}, "training": {"batch": 4096, "visits": 18.0}})
     border = chosen.field.region_pitch_m / 2
     drive_through = world(8)
     moved = np.eye(4)
@@ -149,7 +149,7 @@ def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
         atol=1e-5,
     )
     np.testing.assert_array_equal(restored.status(points), epoch.status(points))
-    assert twin.samples_kept > 0
+    assert twin.segments_kept > 0
     scan = world().scans[0]
     before = surface_error(restored, world())
     twin.ingest(scan.points, scan.world_from_sensor)
@@ -189,13 +189,13 @@ def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
         mapper.ingest(scan.points, scan.world_from_sensor)
     record = mapper.record(training=True)
     assert len(record.regions) > 1
-    bounded = settings(pool_samples=4000)
+    bounded = settings(pool_segments=4000)
     twin = Mapper("test", bounded, "cpu", record)
-    assert twin.samples_kept <= 4000
+    assert twin.segments_kept <= 4000
     twin.reset(np.array([5.0, -np.inf, -np.inf]), np.full(3, np.inf))
     for scan in world(2).scans:
         twin.ingest(scan.points, scan.world_from_sensor)
-    assert 1000 < twin.samples_kept <= 4000
+    assert 1000 < twin.segments_kept <= 4000
 
 
 def test_what_is_owed_survives_a_restart() -> None:
@@ -207,7 +207,7 @@ def test_what_is_owed_survives_a_restart() -> None:
 
 
 def test_a_place_left_behind_is_not_forgotten() -> None:
-    chosen = settings(pool_samples=150_000)
+    chosen = settings(pool_segments=75_000)
     here = world(3)
     mapper = settled_mapper(chosen, here)
     before = surface_error(mapper.publish(), here)
@@ -216,12 +216,12 @@ def test_a_place_left_behind_is_not_forgotten() -> None:
         for _ in range(10):
             mapper.train()
     settle(mapper)
-    assert mapper.samples_kept <= 150_000
+    assert mapper.segments_kept <= 75_000
     assert surface_error(mapper.publish(), here) < before + 0.004
 
 
 def test_reset_forgets_a_box_and_everything() -> None:
-    mapper = settled_mapper(settings(visits=0.5), world(2))
+    mapper = settled_mapper(settings(visits=3.0), world(2))
     hits = world(2).hits
     low, high = np.array([-5.0, -50, -5]), np.array([0.0, 50, 50])
     mapper.reset(low, high)
@@ -233,7 +233,7 @@ def test_reset_forgets_a_box_and_everything() -> None:
     assert (status[outside] == Status.SURFACE).mean() > 0.99
     mapper.reset(*EVERYWHERE)
     assert mapper.publish().regions == 0
-    assert mapper.samples_kept == 0
+    assert mapper.segments_kept == 0
     scan = world(2).scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
     assert mapper.publish().regions > 0
@@ -241,7 +241,7 @@ def test_reset_forgets_a_box_and_everything() -> None:
 
 @pytest.mark.parametrize("encoding", ["features", "fourier"])
 def test_the_parts_of_the_field_can_be_switched(encoding: str) -> None:
-    chosen = settings(visits=0.5)
+    chosen = settings(visits=3.0)
     field = type(chosen.field)(depth=8, encoding=encoding)
     mapper = Mapper("test", type(chosen)(field=field, training=chosen.training), "cpu")
     scan = world().scans[0]

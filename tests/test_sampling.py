@@ -1,8 +1,13 @@
 import numpy as np
 import pytest
-from triquad_server.sampling import draw_samples
+import torch
+from triquad_server.sampling import Batch, Placement, draw_ordered_samples, draw_samples
 from triquad_server.scan import IngestReport, Rays
+from triquad_server.segments import ray_segments
 from triquad_server.settings import ScanSettings
+
+HALF_SIDE_M = 400.0
+CENTRE = np.array([10.0, -20.0, 3.0])
 
 
 def rays_to_ground(count: int = 500, height_m: float = 2.0) -> Rays:
@@ -12,40 +17,76 @@ def rays_to_ground(count: int = 500, height_m: float = 2.0) -> Rays:
     return Rays(np.array([0, 0, height_m]), ends, IngestReport(count, {}))
 
 
-def draw(normals: np.ndarray, **changes: float) -> tuple[np.ndarray, np.ndarray, Rays]:
+def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placement:
+    return Placement(settings.surface_share, settings.spread_m, settings.truncation_m, half_side_m)
+
+
+def draw(engine: str, segments: np.ndarray, chosen: np.ndarray, placement: Placement) -> Batch:
+    if engine == "compiled":
+        return draw_ordered_samples(segments, chosen, placement, np.random.default_rng(1))
+    generator = torch.Generator().manual_seed(1)
+    return draw_samples(torch.from_numpy(segments[chosen]), placement, generator)
+
+
+ENGINES = pytest.mark.parametrize("engine", ["compiled", "tensors"])
+
+
+@ENGINES
+def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> None:
+    settings = ScanSettings()
     rays = rays_to_ground()
-    settings = ScanSettings(**changes)
-    samples = draw_samples(rays, normals, settings, np.random.default_rng(1))
-    count = settings.surface_samples + settings.free_samples
-    return samples.points.reshape(-1, count, 3), samples.labels.reshape(-1, count), rays
-
-
-def test_with_normals_the_label_is_the_distance_to_the_plane() -> None:
-    points, labels, _ = draw(np.tile([0.0, 0.0, -1.0], (500, 1)))
-    assert abs(labels - points[..., 2]).max() < 0.05, "up to the least cosine"
+    down = np.tile([0.0, 0.0, -1.0], (500, 1))
+    segments = ray_segments(rays, down, CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, segments, np.arange(500).repeat(20), placed(settings))
+    heights = batch.points[:, 2].numpy() + CENTRE[2]
+    labels = batch.labels.numpy()
+    assert abs(labels - heights).max() < 0.05, "up to the least cosine"
     far = np.abs(labels) > 1e-3
-    assert (np.sign(labels) == np.sign(points[..., 2]))[far].all(), "positive above the ground"
+    assert (np.sign(labels) == np.sign(heights))[far].all(), "positive above the ground"
 
 
-def test_without_normals_the_label_is_the_distance_along_the_ray() -> None:
-    points, labels, rays = draw(np.full((500, 3), np.nan))
-    distance = np.linalg.norm(points - rays.ends[:, None], axis=2)
-    np.testing.assert_allclose(np.abs(labels), distance, atol=1e-5)
-    assert (np.sign(labels) == np.sign(points[..., 2]))[distance > 1e-3].all()
+@ENGINES
+def test_without_normals_the_label_is_the_distance_along_the_ray(engine: str) -> None:
+    settings = ScanSettings()
+    rays = rays_to_ground(1)
+    segments = ray_segments(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, segments, np.zeros(3000, np.int64), placed(settings))
+    points = batch.points.numpy() + CENTRE
+    distance = np.linalg.norm(points - rays.ends[0], axis=1)
+    np.testing.assert_allclose(np.abs(batch.labels.numpy()), distance, atol=1e-4)
+    assert (np.sign(batch.labels.numpy()) == np.sign(points[:, 2]))[distance > 1e-3].all()
 
 
-def test_samples_lie_where_the_settings_say() -> None:
-    points, _, rays = draw(np.full((500, 3), np.nan), surface_samples=4, free_samples=2)
-    ranges = np.linalg.norm(rays.ends - rays.origin, axis=1)[:, None]
-    reach = np.linalg.norm(points - rays.origin, axis=2)
-    near, free = reach[:, :4] - ranges, reach[:, 4:]
-    assert np.abs(near).max() <= 0.3 + 1e-9
-    assert np.abs(near).max() > 0.29
-    assert (free >= 0.3 * ranges - 1e-9).all()
-    assert (free <= ranges + 0.8 + 1e-9).all()
+@ENGINES
+def test_samples_lie_where_the_settings_say(engine: str) -> None:
+    settings = ScanSettings(surface_share=0.7, spread_m=0.1)
+    rays = rays_to_ground(1)
+    range_m = np.linalg.norm(rays.ends[0] - rays.origin)
+    segments = ray_segments(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, segments, np.zeros(20_000, np.int64), placed(settings))
+    reach = np.linalg.norm(batch.points.numpy() + CENTRE - rays.origin, axis=1)
+    assert reach.min() >= 0.3 * range_m - 1e-4
+    assert reach.max() <= range_m + 0.8 + 1e-4
+    near = np.abs(reach - range_m) <= 0.3
+    free_near = 0.6 / (0.7 * range_m + 0.8)  # of the free samples that lie there by chance
+    assert near.mean() == pytest.approx(0.7 + 0.3 * free_near, abs=0.02)
+    assert np.std(reach[near] - range_m) == pytest.approx(0.1, abs=0.02)
 
 
-@pytest.mark.parametrize("free", [0, 1])
-def test_free_samples_can_be_left_out(free: int) -> None:
-    points, _, _ = draw(np.full((500, 3), np.nan), free_samples=free)
-    assert points.shape[1] == 3 + free
+@ENGINES
+def test_samples_stay_inside_the_cube(engine: str) -> None:
+    settings = ScanSettings()
+    half = 8.0
+    rays = rays_to_ground()
+    segments = ray_segments(rays, np.full((500, 3), np.nan), np.zeros(3), half, settings)
+    ending = (np.abs(rays.ends) < half).all(axis=1).sum()
+    assert len(segments) > ending, "rays that only pass through teach free space"
+    batch = draw(engine, segments, np.arange(len(segments)).repeat(10), placed(settings, half))
+    assert np.abs(batch.points.numpy()).max() <= half + 1e-4
+
+
+def test_rays_that_miss_the_cube_teach_nothing() -> None:
+    far = np.array([0.0, 500.0, 0.0])
+    rays = rays_to_ground()
+    segments = ray_segments(rays, np.full((500, 3), np.nan), far, 20.0, ScanSettings())
+    assert len(segments) == 0

@@ -13,7 +13,7 @@ def test_the_defaults_are_the_published_ones() -> None:
     field, scan = Settings().field, Settings().scan
     assert (field.leaf_m, field.depth, field.feature_levels, field.feature_size) == (0.2, 12, 3, 8)
     assert (field.frequencies, field.frequency_variance, field.hidden) == (16, 50.0, 32)
-    assert (scan.surface_samples, scan.free_samples, scan.truncation_m) == (3, 3, 0.3)
+    assert (scan.surface_share, scan.truncation_m) == (0.5, 0.3)
     assert field.region_side_m == pytest.approx(819.2)
     assert field.input_size == 120
 

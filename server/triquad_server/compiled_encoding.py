@@ -12,20 +12,12 @@ from numpy.typing import NDArray
 from triquad_format.region import AXES
 
 from triquad_server.feature_rows import add_rows, add_to_row, prefetch_row
-from triquad_server.hash_table import EMPTY, MULTIPLIER
-from triquad_server.quadtree import PLANE_BITS
+from triquad_server.quadtree import Shape, Vertices, block_key
 from triquad_server.tile import TILE, Tile
+from triquad_server.voxel_index import EMPTY, find_row
 
 Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
 
-_SPREAD = (
-    (16, 0x0000FFFF0000FFFF),
-    (8, 0x00FF00FF00FF00FF),
-    (4, 0x0F0F0F0F0F0F0F0F),
-    (2, 0x3333333333333333),
-    (1, 0x5555555555555555),
-)
 _AXES = np.array(AXES)
 _TURN = np.float32(2 * np.pi)
 
@@ -36,35 +28,18 @@ class Geometry(NamedTuple):
     leaf_m: float
     half_side: float  # of the cube, in leaves
     levels: int  # H, or 0 where the field has no features
-    block_limit: int  # blocks along the side of the cube
-
-
-class Index(NamedTuple):
-    """The block index of the three planes (see :mod:`triquad_server.quadtree`)."""
-
-    keys: NDArray[np.int64]  # [slots]
-    numbers: NDArray[np.int64]  # [slots]
-    shift: int  # of the hash
-    rows: Ints  # [blocks, vertices of a block]
-    starts: NDArray[np.int64]  # [H] first vertex of each level within a block
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _spread(bits: int) -> int:
-    for shift, mask in _SPREAD:
-        bits = (bits | (bits << shift)) & mask
-    return bits
+    shape: Shape  # of the trees
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def locate(tile: Tile, geometry: Geometry, index: Index, features: Floats) -> None:
+def locate(tile: Tile, geometry: Geometry, vertices: Vertices, features: Floats) -> None:
     """The cells around the tile's points, and the rows of their vertices."""
     for plane in range(3):
-        _find_blocks(tile, plane, geometry, index)
-        _find_cells(tile, plane, geometry, index)
+        _find_blocks(tile, plane, geometry, vertices)
+        _find_cells(tile, plane, geometry)
     for t in range(TILE):
         for plane in range(3):
-            block = index.rows[tile.blocks[plane, t]]
+            block = vertices.rows[tile.blocks[plane, t]]
             for h in range(geometry.levels):
                 at = plane * geometry.levels + h
                 corner = tile.corners[at, t]
@@ -76,38 +51,32 @@ def locate(tile: Tile, geometry: Geometry, index: Index, features: Floats) -> No
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _find_blocks(tile: Tile, plane: int, geometry: Geometry, index: Index) -> None:
+def _find_blocks(tile: Tile, plane: int, geometry: Geometry, vertices: Vertices) -> None:
     first, second = _AXES[plane, 0], _AXES[plane, 1]
     scale = np.float32(1 << (geometry.levels - 1))
-    limit = geometry.block_limit
+    limit = geometry.shape.limit
     for t in range(TILE):
         u = (tile.points[first, t] / geometry.leaf_m + geometry.half_side) / scale
         v = (tile.points[second, t] / geometry.leaf_m + geometry.half_side) / scale
         floor_u, floor_v = np.floor(u), np.floor(v)
         block_u, block_v = np.int64(floor_u), np.int64(floor_v)
         inside = (block_u >= 0) & (block_v >= 0) & (block_u < limit) & (block_v < limit)
-        key = _spread(block_u) | (_spread(block_v) << 1) | (plane << PLANE_BITS)
-        tile.keys[t] = key if inside else EMPTY
+        tile.keys[t] = block_key(plane, block_u, block_v) if inside else EMPTY
         tile.local[0, t] = u - floor_u
         tile.local[1, t] = v - floor_v
-    mask = len(index.keys) - 1
     for t in range(TILE):
-        key = tile.keys[t]
-        slot = ((key * MULTIPLIER) >> index.shift) & mask
-        while index.keys[slot] != key and index.keys[slot] != EMPTY:
-            slot = (slot + 1) & mask
-        number = index.numbers[slot] if index.keys[slot] != EMPTY else 0
+        number = max(0, find_row(vertices.blocks, tile.keys[t]))
         tile.blocks[plane, t] = number
-        prefetch_row(index.rows, number)
+        prefetch_row(vertices.rows, number)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _find_cells(tile: Tile, plane: int, geometry: Geometry, index: Index) -> None:
+def _find_cells(tile: Tile, plane: int, geometry: Geometry) -> None:
     for h in range(geometry.levels):
         at = plane * geometry.levels + h
         cells = np.float32(1 << h)
         side = np.int32((1 << h) + 1)
-        start = np.int32(index.starts[h])
+        start = np.int32(geometry.shape.starts[h])
         for t in range(TILE):
             u, v = tile.local[0, t] * cells, tile.local[1, t] * cells
             cell_u, cell_v = np.int32(u), np.int32(v)

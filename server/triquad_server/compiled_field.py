@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from triquad_server.compiled_encoding import (
     Geometry,
-    Index,
     add_feature_gradient,
     add_feature_slopes,
     add_wave_slopes,
@@ -22,6 +21,7 @@ from triquad_server.compiled_encoding import (
     wave,
 )
 from triquad_server.compiled_mlp import Mlp, add_weight_gradient, backward, forward, turned
+from triquad_server.quadtree import Vertices
 from triquad_server.tile import TILE, Tile, load, new_tile
 
 Floats = NDArray[np.float32]
@@ -32,7 +32,7 @@ class CompiledField(NamedTuple):
     """A field as kernels take it."""
 
     geometry: Geometry
-    tree: Index
+    vertices: Vertices
     features: Floats  # [rows, d]
     mlp: Mlp
     turns_per_m: Floats  # [m] Fourier frequencies, empty where the field has none
@@ -55,7 +55,7 @@ def _tile_for(field: CompiledField) -> Tile:
 def _forward(tile: Tile, field: CompiledField) -> None:
     levels = field.geometry.levels
     if levels > 0:
-        locate(tile, field.geometry, field.tree, field.features)
+        locate(tile, field.geometry, field.vertices, field.features)
         interpolate(tile, levels, field.features)
     wave(tile, levels * field.features.shape[1], field.turns_per_m)
     forward(tile, field.mlp)

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from triquad_server import compiled_field
 from triquad_server.adam import Betas, Parameter
 from triquad_server.compiled_adam import Moments, Rates, rates, step_row, step_touched
-from triquad_server.compiled_encoding import Geometry, Index
+from triquad_server.compiled_encoding import Geometry
 from triquad_server.compiled_field import CompiledField, Touched
 from triquad_server.compiled_mlp import Mlp
 from triquad_server.field import Field
-from triquad_server.replay_pool import Batch
+from triquad_server.sampling import Batch
 from triquad_server.threads import ANSWERS, THREADS, TRAINING, share
 
 _LAST_STEP = 2**31 - 1
@@ -155,20 +155,13 @@ class CompiledEngine:
             np.float32(settings.leaf_m),
             np.float32(1 << (settings.depth - 1)),
             settings.feature_levels if settings.encoding != "fourier" else 0,
-            1 << settings.levels[0],
-        )
-        index = Index(
-            tree.blocks.keys.numpy(),
-            tree.blocks.rows.numpy(),
-            tree.blocks.shift,
-            tree.block_rows.numpy(),
-            np.array(tree.starts, np.int64),
+            tree.shape,
         )
         w1, b1, w2, b2, w3, b3 = (part.values[0].numpy() for part in self._field.mlp)
         turns = self._field.frequencies.numpy() / np.float32(settings.region_side_m / 2)
         return CompiledField(
             geometry,
-            index,
+            tree.vertices,
             self._field.features.values.numpy(),
             Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
             turns if settings.encoding != "features" else turns[:0],

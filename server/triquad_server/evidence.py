@@ -14,6 +14,7 @@ from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_format.region import Evidence as EvidenceRecord
 from triquad_format.status import Status
 
+from triquad_server.threads import ANSWERS
 from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 Masks = NDArray[np.uint8]
@@ -33,8 +34,13 @@ def _mark(
     index: Index,
     masks: Masks,
     count: int,
-) -> tuple[int, int]:
-    """Set the bits of the voxels holding points; returns (points done, blocks in use)."""
+    new: NDArray[np.int64],
+    found: int,
+) -> tuple[int, int, int]:
+    """Set the bits of the voxels holding points, and collect those that were not set before.
+
+    Returns (points done, blocks in use, voxels collected).
+    """
     for i in range(start, len(voxels)):
         x = int(np.floor(voxels[i, 0]))
         y = int(np.floor(voxels[i, 1]))
@@ -43,10 +49,26 @@ def _mark(
             continue
         row = make_row(index, count, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
         if row < 0:
-            return i, count
+            return i, count, found
         count = max(count, row + 1)
-        masks[row, ((x & _LOW) << _SHIFT) | (y & _LOW)] |= np.uint8(1 << (z & _LOW))
-    return len(voxels), count
+        byte = ((x & _LOW) << _SHIFT) | (y & _LOW)
+        bit = np.uint8(1 << (z & _LOW))
+        if not masks[row, byte] & bit:
+            masks[row, byte] |= bit
+            new[found, 0], new[found, 1], new[found, 2] = x, y, z
+            found += 1
+    return len(voxels), count, found
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _crossing(origin: float, direction: float) -> tuple[int, float, float]:
+    """Which way a ray steps on an axis, how far apart its crossings are, and how far the first."""
+    if direction == 0:
+        return 1, np.inf, np.inf
+    fraction = origin - np.floor(origin)
+    if direction > 0:
+        return 1, 1 / direction, (1 - fraction) / direction
+    return -1, -1 / direction, -fraction / direction
 
 
 @numba.njit(cache=True, nogil=True)
@@ -65,60 +87,60 @@ def _carve(
     Each ray ends ``stop_short`` voxels before its end point. Returns (rays done, blocks in use).
     """
     for i in range(start, len(ends)):
-        direction = ends[i] - origin
-        length = np.sqrt((direction * direction).sum())
+        dx, dy, dz = ends[i, 0] - origin[0], ends[i, 1] - origin[1], ends[i, 2] - origin[2]
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if length <= stop_short:
             continue
-        direction /= length
         reach = length - stop_short
         x, y, z = int(np.floor(origin[0])), int(np.floor(origin[1])), int(np.floor(origin[2]))
-        step = np.empty(3, np.int64)
-        delta = np.empty(3)
-        crossing = np.empty(3)
-        for axis in range(3):
-            step[axis] = 1 if direction[axis] > 0 else -1
-            delta[axis] = np.inf if direction[axis] == 0 else 1 / abs(direction[axis])
-            fraction = origin[axis] - np.floor(origin[axis])
-            if direction[axis] > 0:
-                fraction = 1 - fraction
-            crossing[axis] = np.inf if direction[axis] == 0 else fraction * delta[axis]
-        last_key = np.int64(-2)
-        row = 0
+        step_x, apart_x, next_x = _crossing(origin[0], dx / length)
+        step_y, apart_y, next_y = _crossing(origin[1], dy / length)
+        step_z, apart_z, next_z = _crossing(origin[2], dz / length)
+        row = -1
+        entered = True  # another block
         travelled = 0.0
         while travelled <= reach:
-            if min(x, y, z) >= 0 and max(x, y, z) < side:
-                key = pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT)
-                if key != last_key:
-                    row = make_row(index, count, key)
+            if entered:
+                row = -1
+                if min(x, y, z) >= 0 and max(x, y, z) < side:
+                    row = make_row(index, count, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
                     if row < 0:
                         return i, count
                     count = max(count, row + 1)
-                    last_key = key
+            if row >= 0:
                 masks[row, ((x & _LOW) << _SHIFT) | (y & _LOW)] |= np.uint8(1 << (z & _LOW))
-            if crossing[0] <= crossing[1] and crossing[0] <= crossing[2]:
-                travelled = crossing[0]
-                crossing[0] += delta[0]
-                x += step[0]
-            elif crossing[1] <= crossing[2]:
-                travelled = crossing[1]
-                crossing[1] += delta[1]
-                y += step[1]
+            if next_x <= next_y and next_x <= next_z:
+                travelled = next_x
+                next_x += apart_x
+                x += step_x
+                entered = (x & _LOW) == (0 if step_x > 0 else _LOW)
+            elif next_y <= next_z:
+                travelled = next_y
+                next_y += apart_y
+                y += step_y
+                entered = (y & _LOW) == (0 if step_y > 0 else _LOW)
             else:
-                travelled = crossing[2]
-                crossing[2] += delta[2]
-                z += step[2]
+                travelled = next_z
+                next_z += apart_z
+                z += step_z
+                entered = (z & _LOW) == (0 if step_z > 0 else _LOW)
     return len(ends), count
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _bit(index: Index, masks: Masks, side: int, x: int, y: int, z: int) -> bool:
+def _block_of(index: Index, x: int, y: int, z: int, side: int) -> int:
+    """Row of the block that holds a voxel, -1 where there is none."""
     if min(x, y, z) < 0 or max(x, y, z) >= side:
-        return False
-    row = find_row(index, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
-    if row < 0:
-        return False
+        return -1
+    return find_row(index, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _bit(masks: Masks, row: int, x: int, y: int, z: int) -> int:
+    """Whether the bit of a voxel is set in the block ``row``: 0 or 1."""
     byte = masks[row, ((x & _LOW) << _SHIFT) | (y & _LOW)]
-    return bool((byte >> (z & _LOW)) & 1)
+    bit: int = (byte >> (z & _LOW)) & 1
+    return bit
 
 
 @numba.njit(cache=True, nogil=True)
@@ -129,30 +151,34 @@ def _status(
     index: Index,
     surface: Masks,
     free: Masks,
-) -> NDArray[np.uint8]:
-    status = np.empty(len(voxels), np.uint8)
+    status: NDArray[np.uint8],
+) -> None:
     for i in range(len(voxels)):
-        low = np.floor(voxels[i] - reach)
-        high = np.floor(voxels[i] + reach)
-        found = False
-        for x in range(int(low[0]), int(high[0]) + 1):
-            for y in range(int(low[1]), int(high[1]) + 1):
-                for z in range(int(low[2]), int(high[2]) + 1):
-                    found = found or _bit(index, surface, side, x, y, z)
-                if found:
-                    break
-            if found:
-                break
+        x0, x1 = int(np.floor(voxels[i, 0] - reach)), int(np.floor(voxels[i, 0] + reach))
+        y0, y1 = int(np.floor(voxels[i, 1] - reach)), int(np.floor(voxels[i, 1] + reach))
+        z0, z1 = int(np.floor(voxels[i, 2] - reach)), int(np.floor(voxels[i, 2] + reach))
+        found = 0
+        row = _block_of(index, x0, y0, z0, side)
+        block = (x0 >> _SHIFT, y0 >> _SHIFT, z0 >> _SHIFT)
+        for x in range(x0, x1 + 1):
+            for y in range(y0, y1 + 1):
+                for z in range(z0, z1 + 1):
+                    here = (x >> _SHIFT, y >> _SHIFT, z >> _SHIFT)
+                    if here != block:
+                        row = _block_of(index, x, y, z, side)
+                        block = here
+                    if row >= 0:
+                        found |= _bit(surface, row, x, y, z)
+        status[i] = _UNKNOWN
         if found:
             status[i] = _SURFACE
             continue
-        x, y, z = (
-            int(np.floor(voxels[i, 0])),
-            int(np.floor(voxels[i, 1])),
-            int(np.floor(voxels[i, 2])),
-        )
-        status[i] = _FREE if _bit(index, free, side, x, y, z) else _UNKNOWN
-    return status
+        x = int(np.floor(voxels[i, 0]))
+        y = int(np.floor(voxels[i, 1]))
+        z = int(np.floor(voxels[i, 2]))
+        row = _block_of(index, x, y, z, side)
+        if row >= 0 and _bit(free, row, x, y, z):
+            status[i] = _FREE
 
 
 class Evidence:
@@ -169,14 +195,28 @@ class Evidence:
         """Blocks in use."""
         return self._blocks.count
 
-    def mark_surface(self, voxels: NDArray[np.float64]) -> None:
-        """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out."""
-        done = 0
+    def mark_surface(self, voxels: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out.
+
+        Returns:
+            The voxels [M, 3] in which no ray had ended before.
+        """
+        new = np.empty((len(voxels), 3), np.int64)
+        done = found = 0
         while done < len(voxels):
-            index, count = self._blocks.arrays, self._blocks.count
-            done, self._blocks.count = _mark(voxels, done, self._side, index, self._surface, count)
+            done, self._blocks.count, found = _mark(
+                voxels,
+                done,
+                self._side,
+                self._blocks.arrays,
+                self._surface,
+                self._blocks.count,
+                new,
+                found,
+            )
             if done < len(voxels):
                 self._grow()
+        return new[:found]
 
     def carve(
         self,
@@ -212,8 +252,22 @@ class Evidence:
 
         ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
         """
-        index = self._blocks.arrays
-        return np.asarray(_status(voxels, reach, self._side, index, self._surface, self._free))
+        status = np.empty(len(voxels), np.uint8)
+
+        def work(first: int, last: int) -> None:
+            part = slice(first, last)
+            _status(
+                voxels[part],
+                reach,
+                self._side,
+                self._blocks.arrays,
+                self._surface,
+                self._free,
+                status[part],
+            )
+
+        ANSWERS.split(len(voxels), work)
+        return status
 
     def surface_cells(self) -> NDArray[np.int64]:
         """Blocks [B, 3], in units of blocks, that hold any seen surface."""

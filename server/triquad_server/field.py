@@ -8,13 +8,16 @@ are appended; the MLP turns both into a logit, which is the signed distance in u
 
 import math
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.field_settings import FieldSettings
 
 from triquad_server.adam import Betas, Parameter
-from triquad_server.quadtree import Corners, TriQuadtree
+from triquad_server.corners import CornerIndex, Corners
+from triquad_server.quadtree import TriQuadtree
 
 
 class Field:
@@ -27,7 +30,8 @@ class Field:
         self.settings = settings
         self._generator = torch.Generator(device).manual_seed(seed)
         self.device = device
-        self.tree = TriQuadtree(settings, device)
+        self.tree = TriQuadtree(settings)
+        self._corners: CornerIndex | None = None
         self.features = Parameter(torch.zeros((1, settings.feature_size), device=device))
         self.frequencies = self._normal(settings.frequencies) * math.sqrt(
             settings.frequency_variance,
@@ -45,11 +49,15 @@ class Field:
         """Vertices on all planes and levels."""
         return len(self.features) - 1
 
-    def grow(self, points: Tensor) -> None:
-        """Make room for surface ``points`` [N, 3]; new feature vectors start at random."""
+    def grow(self, leaves: NDArray[np.int64]) -> None:
+        """Make room for surfaces in ``leaves`` [N, 3]; new feature vectors start at random.
+
+        Leaves are int64 coordinates in ``[0, 2**depth)``, as evidence voxels.
+        """
         if not self._has_features:
             return
-        added = self.tree.grow(points)
+        added = self.tree.grow(leaves)
+        self._corners = None
         size = (added, self.settings.feature_size)
         self.features.append(self._normal(*size) * self.settings.feature_std)
 
@@ -74,7 +82,7 @@ class Field:
         The loss is the cross entropy between the two distances squashed by a sigmoid
         (3QFP, equation 5). Returns it as it was before the step.
         """
-        corners = self.tree.corners(points) if self._has_features else None
+        corners = self._around(points) if self._has_features else None
         encoded = self._gather(corners) if corners is not None else None
         if encoded is not None:
             encoded.requires_grad_()
@@ -96,12 +104,19 @@ class Field:
             self._step_features(corners, encoded.grad, rate, betas)
         return loss.detach()
 
+    def restore(self, plane: int, h: int, codes: NDArray[np.int64], features: Tensor) -> None:
+        """Add the vertices ``codes`` [V] of one level with their ``features`` [V, d]."""
+        self.tree.restore(plane, h, codes)
+        self.features.append(features)
+        self._corners = None
+
     def copy(self) -> "Field":
         """A copy for reading, which later training does not change."""
         twin = Field.__new__(Field)
         twin.settings, twin.device = self.settings, self.device
         twin._generator = self._generator
         twin.tree = self.tree.copy()
+        twin._corners = self._corners
         twin.features = self.features.snapshot()
         twin.frequencies = self.frequencies
         twin.mlp = [part.snapshot() for part in self.mlp]
@@ -111,8 +126,13 @@ class Field:
     def _has_features(self) -> bool:
         return self.settings.encoding != "fourier"
 
+    def _around(self, points: Tensor) -> Corners:
+        if self._corners is None:
+            self._corners = CornerIndex(self.tree, self.settings, self.device)
+        return self._corners.around(points)
+
     def _interpolate(self, points: Tensor) -> Tensor | None:
-        return self._gather(self.tree.corners(points)) if self._has_features else None
+        return self._gather(self._around(points)) if self._has_features else None
 
     def _gather(self, corners: Corners) -> Tensor:
         """Interpolated features [N, H * d], summed over the planes."""

@@ -53,9 +53,9 @@ def field_tables(field: Field) -> tuple[VertexTable, ...]:
     tables = []
     for plane in range(len(AXES)):
         for h, level in enumerate(field.settings.levels):
-            codes, rows = field.tree.vertices(plane, h)
-            features = field.features.values[rows]
-            tables.append(VertexTable(plane, level, _array(codes), _array(features)))
+            codes, rows = field.tree.table(plane, h)
+            features = field.features.values[torch.from_numpy(rows)]
+            tables.append(VertexTable(plane, level, codes, _array(features)))
     return tuple(tables)
 
 
@@ -69,7 +69,7 @@ def training_moments(field: Field) -> Moments:
     """The optimiser's state."""
     features = field.features
     rows = [
-        field.tree.vertices(plane, h)[1]
+        torch.from_numpy(field.tree.table(plane, h)[1])
         for plane in range(len(AXES))
         for h in range(field.settings.feature_levels)
     ]
@@ -95,8 +95,8 @@ def field_from_record(
     field.frequencies = _tensor(record.frequencies, device)
     for table in record.tables:
         h = table.level - settings.levels[0]
-        field.tree.add_vertices(table.plane, h, _tensor(table.codes, device))
-        field.features.append(_tensor(table.features.astype(np.float32), device))
+        features = _tensor(table.features.astype(np.float32), device)
+        field.restore(table.plane, h, table.codes.astype(np.int64), features)
     parts = zip(record.mlp.weights, record.mlp.biases, strict=True)
     field.mlp = [Parameter(_tensor(array, device)[None]) for pair in parts for array in pair]
     if record.training is not None:

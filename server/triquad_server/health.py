@@ -74,7 +74,7 @@ class Health:
             points_dropped=self._counts.points_dropped.counts(),
             requests_refused=self._counts.requests_refused.counts(),
             samples_trained=progress.samples_trained,
-            samples_kept=progress.samples_kept,
+            segments_kept=progress.segments_kept,
             loss=float(progress.loss),
             regions=epoch.regions,
             vertices=epoch.vertices,

@@ -1,6 +1,8 @@
 """The live map: takes in scans, trains, publishes epochs. Owned by one thread."""
 
 import itertools
+import math
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,12 +12,13 @@ from triquad_format.region import MapRecord, RegionIndex
 from triquad_server.engine import GradientSums
 from triquad_server.epoch import Epoch, FrozenRegion, frozen_region
 from triquad_server.normals import SurfaceNormals
-from triquad_server.region_map import RegionMap
-from triquad_server.sampling import draw_samples
+from triquad_server.region_map import RegionMap, RegionSetup
 from triquad_server.scan import IngestReport, ScanRefusedError, usable_rays
 from triquad_server.settings import Settings
+from triquad_server.threads import ANSWERS
 
 _LOSS_MEMORY = 0.95
+_POOL_STEP = 1.1
 
 
 class Mapper:
@@ -35,9 +38,14 @@ class Mapper:
         if self._device.type == "cpu":
             # Its threads spin between operations, and would take the cores from the kernels.
             torch.set_num_threads(1)
-        self._rng = np.random.default_rng(settings.training.seed)
         self._normals = SurfaceNormals()
-        self._sums = GradientSums()
+        self._setup = RegionSetup(
+            self._field_settings,
+            settings.scan,
+            settings.training,
+            self._device,
+            GradientSums(),
+        )
         self._regions: dict[RegionIndex, RegionMap] = {}
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
@@ -45,13 +53,7 @@ class Mapper:
         self.samples_trained = 0
         self.loss = 0.0
         for region in record.regions if record else ():
-            self._regions[region.index] = RegionMap.restore(
-                region,
-                self._field_settings,
-                settings.training,
-                self._device,
-                self._sums,
-            )
+            self._regions[region.index] = RegionMap.restore(region, self._setup)
         self._share_pool()
 
     @property
@@ -60,8 +62,8 @@ class Mapper:
         return not any(region.owed for region in self._regions.values())
 
     @property
-    def samples_kept(self) -> int:
-        """Samples in the replay pools."""
+    def segments_kept(self) -> int:
+        """Segments in the replay pools."""
         return sum(len(region.pool) for region in self._regions.values())
 
     def ingest(
@@ -77,11 +79,18 @@ class Mapper:
         rays = usable_rays(points, world_from_sensor, self._settings.scan)
         around = self._regions_around(rays.ends)
         self._check_regions(around)
-        self._normals.add(rays.ends, rays.origin)
-        normals = self._normals.at(rays.ends)
-        samples = draw_samples(rays, normals, self._settings.scan, self._rng)
-        for index in around:
-            self._region(index).take_in(rays, samples)
+        regions = [self._region(index) for index in around]
+        for region in regions:
+            region.see(rays)
+        carving = [ANSWERS.beside(partial(region.carve, rays)) for region in regions]
+        try:
+            normals = self._normals.add(rays.ends, rays.origin)
+            for region in regions:
+                region.learn(rays, normals)
+            self._share_pool()
+        finally:
+            for work in carving:
+                work.result()
         return rays.report
 
     def train(self) -> None:
@@ -153,12 +162,17 @@ class Mapper:
         """Regions whose cubes hold any of the points."""
         pitch = self._field_settings.region_pitch_m
         half = self._field_settings.region_side_m / 2
-        low = np.ceil((points.min(axis=0) - half) / pitch).astype(int)
-        high = np.floor((points.max(axis=0) + half) / pitch).astype(int)
+        least = np.array([points[:, axis].min() for axis in range(3)])
+        greatest = np.array([points[:, axis].max() for axis in range(3)])
+        low = np.floor((least - half) / pitch).astype(int) + 1
+        high = np.ceil((greatest + half) / pitch).astype(int) - 1
         x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
+        around = list(itertools.product(x, y, z))
+        if len(around) == 1:
+            return around
         return [
             index
-            for index in itertools.product(x, y, z)
+            for index in around
             if (np.abs(points - np.multiply(index, pitch)) < half).all(axis=1).any()
         ]
 
@@ -174,19 +188,20 @@ class Mapper:
 
     def _region(self, index: RegionIndex) -> RegionMap:
         if index not in self._regions:
-            self._regions[index] = RegionMap(
-                index,
-                self._field_settings,
-                self._settings.training,
-                self._device,
-                self._sums,
-            )
+            self._regions[index] = RegionMap(index, self._setup)
             self._share_pool()
             self._structure_changed = True
         return self._regions[index]
 
     def _share_pool(self) -> None:
-        """Give every region an equal part of the replay samples that may be kept."""
-        share = max(1, self._settings.training.pool_samples // max(1, len(self._regions)))
+        """Let the regions keep as many segments as they were offered, all up to one limit."""
+        left = self._settings.training.pool_segments
+        offered = sorted(region.pool.offered for region in self._regions.values())
+        limit = left
+        for position, count in enumerate(offered):
+            limit = max(1, left // (len(offered) - position))
+            left -= min(count, limit)
+        # In coarse steps: to lower it is dear.
+        limit = int(_POOL_STEP ** math.floor(math.log(limit, _POOL_STEP)))
         for region in self._regions.values():
-            region.pool.limit(share)
+            region.pool.limit(max(1, limit))

@@ -34,7 +34,7 @@ class Progress:
     settled: bool = True  # nothing is left to learn, and the newest epoch shows all
     scans_taken: int = 0
     samples_trained: int = 0
-    samples_kept: int = 0
+    segments_kept: int = 0
     loss: float = 0.0
 
 
@@ -211,7 +211,7 @@ class MapperThread:
             self._mapper.settled and not self._unpublished,
             self._scans_taken,
             self._mapper.samples_trained,
-            self._mapper.samples_kept,
+            self._mapper.segments_kept,
             self._mapper.loss,
         )
 

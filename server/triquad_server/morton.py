@@ -9,13 +9,6 @@ _SPREAD = (
     (2, 0x3333333333333333),
     (1, 0x5555555555555555),
 )
-_GATHER = (
-    (1, 0x3333333333333333),
-    (2, 0x0F0F0F0F0F0F0F0F),
-    (4, 0x00FF00FF00FF00FF),
-    (8, 0x0000FFFF0000FFFF),
-    (16, 0x00000000FFFFFFFF),
-)
 
 
 def encode(first: Tensor, second: Tensor) -> Tensor:
@@ -23,19 +16,7 @@ def encode(first: Tensor, second: Tensor) -> Tensor:
     return _spread(first) | (_spread(second) << 1)
 
 
-def decode(codes: Tensor) -> tuple[Tensor, Tensor]:
-    """The coordinates of 2-D Morton codes; the inverse of :func:`encode`."""
-    return _gather(codes), _gather(codes >> 1)
-
-
 def _spread(bits: Tensor) -> Tensor:
     for shift, mask in _SPREAD:
         bits = (bits | (bits << shift)) & mask
-    return bits
-
-
-def _gather(bits: Tensor) -> Tensor:
-    bits = bits & _SPREAD[-1][1]
-    for shift, mask in _GATHER:
-        bits = (bits | (bits >> shift)) & mask
     return bits

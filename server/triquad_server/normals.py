@@ -1,7 +1,8 @@
 """Surface normals from the scans so far: moments of the end points in two sparse grids.
 
-A scan alone cannot tell the normal of far ground, where it is a few lines of points; the moments
-of many scans can. The fine grid serves where it has a plane, the coarse one where it has not.
+Points in one cell share a normal, that of all points in the 27 cells around. A scan alone cannot
+tell the normal of far ground, where it is a few lines of points; the moments of many scans can. The
+fine grid serves where it has a plane, the coarse one where it has not.
 """
 
 import numba
@@ -9,13 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_server.threads import ANSWERS
-from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
+from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
 _MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
+_RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
 
 Moments = NDArray[np.float64]
+Rows = NDArray[np.int32]
+Counts = NDArray[np.float64]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -25,6 +29,7 @@ def _add(
     cell_m: float,
     index: Index,
     moments: Moments,
+    rows: Rows,
     count: int,
 ) -> tuple[int, int]:
     """Add points to the moments [cells, 10] of their cells, relative to the cells' centres."""
@@ -36,6 +41,7 @@ def _add(
         if row < 0:
             return i, count
         count = max(count, row + 1)
+        rows[i] = row
         m = moments[row]
         a = points[i, 0] - (x + 0.5) * cell_m
         b = points[i, 1] - (y + 0.5) * cell_m
@@ -55,24 +61,22 @@ def _add(
 
 @numba.njit(cache=True, nogil=True)
 def _gather(
-    point: NDArray[np.float64],
+    row: int,
     cell_m: float,
     index: Index,
     moments: Moments,
     total: NDArray[np.float64],
 ) -> None:
-    """Sum the moments of the 27 cells around a point, relative to its cell's centre."""
+    """Sum the moments of the 27 cells around that of a row, relative to its centre."""
     total[:] = 0
-    x = int(np.floor(point[0] / cell_m))
-    y = int(np.floor(point[1] / cell_m))
-    z = int(np.floor(point[2] / cell_m))
+    x, y, z = unpack(index.row_keys[row])
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
-                row = find_row(index, pack(x + i, y + j, z + k))
-                if row < 0:
+                near = find_row(index, pack(x + i, y + j, z + k))
+                if near < 0:
                     continue
-                m = moments[row]
+                m = moments[near]
                 a, b, c = i * cell_m, j * cell_m, k * cell_m
                 n = m[0]
                 total[0] += n
@@ -127,22 +131,41 @@ def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
+def _outdated(rows: Rows, normals: NDArray[np.float64], moments: Moments, basis: Counts) -> Rows:
+    """Cells of points without a normal whose own is of far fewer points than there are.
+
+    Their ``basis`` is brought up to date.
+    """
+    outdated = np.empty(len(rows), np.int32)
+    count = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        if np.isnan(normals[i, 0]) and moments[row, 0] >= _RENEWAL * basis[row]:
+            basis[row] = moments[row, 0]
+            outdated[count] = row
+            count += 1
+    return outdated[:count]
+
+
+@numba.njit(cache=True, nogil=True)
 def _estimate(
-    points: NDArray[np.float64],
-    cell_m: float,
-    index: Index,
-    moments: Moments,
-    normals: NDArray[np.float64],
+    rows: Rows, cell_m: float, index: Index, moments: Moments, normals: NDArray[np.float64]
 ) -> None:
-    """Fill in the normals that are NaN and that this grid knows."""
+    """Set the normals [cells, 3] of cells; NaN where there is no plane."""
     total = np.empty(10)
-    normal = np.empty(3)
-    for i in range(len(points)):
-        if not np.isnan(normals[i, 0]):
-            continue
-        _gather(points[i], cell_m, index, moments, total)
-        if _plane_normal(total, normal):
-            normals[i] = normal
+    for row in rows:
+        _gather(row, cell_m, index, moments, total)
+        if not _plane_normal(total, normals[row]):
+            normals[row] = np.nan
+
+
+@numba.njit(cache=True, nogil=True)
+def _adopt(rows: Rows, of_cells: NDArray[np.float64], normals: NDArray[np.float64]) -> None:
+    """Replace those of ``normals`` that are NaN by those of their cells."""
+    for i in range(len(rows)):
+        if np.isnan(normals[i, 0]):
+            for axis in range(3):
+                normals[i, axis] = of_cells[rows[i], axis]
 
 
 class MomentGrid:
@@ -152,9 +175,12 @@ class MomentGrid:
         self._cell_m = cell_m
         self._cells = VoxelIndex(1024)
         self._moments = np.zeros((1024, 10))
+        self._normals = np.zeros((1024, 3))
+        self._basis = np.zeros(1024)  # points in each cell when its normal was estimated
 
-    def add(self, points: NDArray[np.float64]) -> None:
-        """Add points [N, 3], metres, map frame."""
+    def add(self, points: NDArray[np.float64]) -> Rows:
+        """Add points [N, 3], metres, map frame; returns the row of each one's cell."""
+        rows = np.empty(len(points), np.int32)
         done = 0
         while done < len(points):
             index, count = self._cells.arrays, self._cells.count
@@ -164,21 +190,24 @@ class MomentGrid:
                 self._cell_m,
                 index,
                 self._moments,
+                rows,
                 count,
             )
             if done < len(points):
                 self._cells.grow()
-                more = np.zeros((self._cells.capacity - len(self._moments), 10))
-                self._moments = np.concatenate([self._moments, more])
+                self._refit(slice(None))
+        return rows
 
-    def estimate(self, points: NDArray[np.float64], normals: NDArray[np.float64]) -> None:
-        """Fill those of ``normals`` [N, 3] that are NaN, where the points lie on a plane."""
+    def fill(self, normals: NDArray[np.float64], rows: Rows) -> None:
+        """Replace those of ``normals`` [N, 3] that are NaN by those of the cells ``rows`` [N]."""
+        outdated = _outdated(rows, normals, self._moments, self._basis)
 
         def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            _estimate(points[part], self._cell_m, self._cells.arrays, self._moments, normals[part])
+            part = outdated[first:last]
+            _estimate(part, self._cell_m, self._cells.arrays, self._moments, self._normals)
 
-        ANSWERS.split(len(points), work)
+        ANSWERS.split(len(outdated), work)
+        _adopt(rows, self._normals, normals)
 
     def keep_nearest(self, place: NDArray[np.float64], cells: int) -> None:
         """Keep the moments of the ``cells`` nearest to a ``place`` [3] only."""
@@ -199,10 +228,21 @@ class MomentGrid:
         return np.asarray((self._cells.cells() + 0.5) * self._cell_m, np.float64)
 
     def _keep(self, rows: NDArray[np.int64]) -> None:
-        kept = self._moments[rows]
         self._cells = VoxelIndex.of_cells(self._cells.cells()[rows])
-        self._moments = np.zeros((self._cells.capacity, 10))
-        self._moments[: len(kept)] = kept
+        self._refit(rows)
+
+    def _refit(self, rows: NDArray[np.int64] | slice) -> None:
+        """Keep some rows, with as much room as the cells have."""
+        capacity = self._cells.capacity
+        self._moments = _refitted(self._moments[rows], capacity)
+        self._normals = _refitted(self._normals[rows], capacity)
+        self._basis = _refitted(self._basis[rows], capacity)
+
+
+def _refitted(array: NDArray[np.float64], capacity: int) -> NDArray[np.float64]:
+    fitted = np.zeros((capacity, *array.shape[1:]))
+    fitted[: len(array)] = array
+    return fitted
 
 
 class SurfaceNormals:
@@ -212,26 +252,25 @@ class SurfaceNormals:
         self,
         fine_m: float = 0.15,
         coarse_m: float = 0.5,
-        max_cells: int = 300_000,  # of each grid, at some 110 bytes
+        max_cells: int = 300_000,  # of each grid, at some 150 bytes
     ) -> None:
         self._grids = (MomentGrid(fine_m), MomentGrid(coarse_m))
         self._max_cells = max_cells
 
-    def add(self, points: NDArray[np.float64], sensor: NDArray[np.float64]) -> None:
-        """Add the end points [N, 3] of a scan from ``sensor`` [3], metres, map frame."""
+    def add(self, points: NDArray[np.float64], sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Add the end points [N, 3] of a scan from ``sensor`` [3], metres, map frame.
+
+        Returns:
+            Unit normals [N, 3] of either sign at the points; NaN where no plane is known.
+        """
+        normals = np.full(points.shape, np.nan)
         for grid in self._grids:
-            grid.add(points)
+            grid.fill(normals, grid.add(points))
             if grid.cells > self._max_cells:
                 grid.keep_nearest(sensor, self._max_cells // 2)
+        return normals
 
     def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Forget the surfaces between the corners ``low`` and ``high`` [3]."""
         for grid in self._grids:
             grid.forget(low, high)
-
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unit normals [N, 3] of either sign; NaN where no plane is known."""
-        normals = np.full(points.shape, np.nan)
-        for grid in self._grids:
-            grid.estimate(points, normals)
-        return normals

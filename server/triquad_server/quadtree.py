@@ -1,221 +1,238 @@
 """The three planar quadtrees of a region: which vertices exist, and which a point lies between.
 
-Vertices are owned by hash tables, one per plane and level, keyed by 2-D Morton code (3QFP,
-section III-A). Looking up 4 vertices on 3 planes and H levels would cost 12 H probes a point, so
-each plane also has an index derived from those tables: its *blocks*, the nodes of the coarsest
-level that carries features, each with the rows of all vertices within it (4 + 9 + 25 for H = 3).
-One probe per plane then finds them all.
+A vertex is keyed by plane, level and 2-D Morton code (3QFP, section III-A). One hash table per
+plane and level would cost 12 H probes a point, so vertices are kept by *block*, a node of the
+coarsest level that carries features: a block holds the rows of all vertices within it and on its
+border (4 + 9 + 25 for H = 3), and one probe per plane finds them all. A vertex on a border is in
+all blocks that it touches.
 """
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format import morton
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import AXES
 
-from triquad_server import morton
-from triquad_server.hash_table import HashTable
+from triquad_server.voxel_index import Index, VoxelIndex, make_row
 
-_MIN_ROWS = 1024
+_AXES = np.array(AXES)
 PLANE_BITS = 40
 """Keys of blocks are Morton codes below this bit, and the number of the plane above it."""
 
+_NO_BLOCK = -2  # key of row 0, which is found by no other
+_MIN_CAPACITY = 256
+_NEW_BLOCKS = 27  # at most, of a leaf: 9 on each plane
+_NEW_ROWS = 48  # and as many vertices: 4 on each plane and level
 
-@dataclass(frozen=True)
-class Corners:
-    """The vertices around N points, on all planes, for each of H levels (coarsest first)."""
+Ints = NDArray[np.int32]
+Codes = NDArray[np.int64]
 
-    rows: Tensor  # [N, H, 12] int32 rows of the feature table; 0 stands for an absent vertex
-    weights: Tensor  # [N, H, 12] bilinear weights; differentiable in the points
+
+class Vertices(NamedTuple):
+    """The arrays of a tree that grow with it, as kernels take them."""
+
+    blocks: Index  # rows of ``rows``, by the key of a block
+    rows: Ints  # [blocks, vertices of a block] of the feature table; 0 for an absent vertex
+    codes: Codes  # [rows] Morton code of each vertex
+    owners: NDArray[np.uint8]  # [rows] its plane and level: ``1 + plane * H + h``
+
+
+class Shape(NamedTuple):
+    """The numbers of a tree that never change."""
+
+    levels: int  # H
+    limit: int  # blocks along the side of the cube
+    starts: Codes  # [H] first vertex of each level within a block
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def spread(bits: int) -> int:
+    """The lower 32 bits of a number, each followed by a zero: half of a 2-D Morton code."""
+    for shift, mask in (
+        (16, 0x0000FFFF0000FFFF),
+        (8, 0x00FF00FF00FF00FF),
+        (4, 0x0F0F0F0F0F0F0F0F),
+        (2, 0x3333333333333333),
+        (1, 0x5555555555555555),
+    ):
+        bits = (bits | (bits << shift)) & mask
+    return bits
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def block_key(plane: int, u: int, v: int) -> int:
+    """Key of the block ``(u, v)`` on a plane."""
+    return spread(u) | (spread(v) << 1) | (plane << PLANE_BITS)
+
+
+@numba.njit(cache=True, nogil=True)
+def _enter(
+    shape: Shape,
+    vertices: Vertices,
+    plane: int,
+    h: int,
+    u: int,
+    v: int,
+    row: int,
+    count: int,
+) -> int:
+    """Give ``row`` to vertex ``(u, v)`` in all blocks that it touches; returns the blocks now."""
+    side = (1 << h) + 1
+    for block_u in range((u - 1) >> h, (u >> h) + 1):
+        for block_v in range((v - 1) >> h, (v >> h) + 1):
+            if min(block_u, block_v) < 0 or max(block_u, block_v) >= shape.limit:
+                continue
+            block = make_row(vertices.blocks, count, block_key(plane, block_u, block_v))
+            count = max(count, block + 1)
+            local = (u - (block_u << h)) * side + v - (block_v << h)
+            vertices.rows[block, shape.starts[h] + local] = row
+    vertices.codes[row] = spread(u) | (spread(v) << 1)
+    vertices.owners[row] = 1 + plane * shape.levels + h
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _grow(
+    shape: Shape,
+    vertices: Vertices,
+    leaves: Codes,
+    start: int,
+    blocks: int,
+    rows: int,
+) -> tuple[int, int, int]:
+    """Make the nodes that ``leaves`` project into; returns (leaves done, blocks, rows)."""
+    for i in range(start, len(leaves)):
+        if blocks + _NEW_BLOCKS > len(vertices.rows) or rows + _NEW_ROWS > len(vertices.codes):
+            return i, blocks, rows
+        for plane in range(3):
+            u, v = leaves[i, _AXES[plane, 0]], leaves[i, _AXES[plane, 1]]
+            for h in range(shape.levels):
+                down = shape.levels - 1 - h
+                node_u, node_v = u >> down, v >> down
+                block_u, block_v = node_u >> h, node_v >> h
+                block = make_row(vertices.blocks, blocks, block_key(plane, block_u, block_v))
+                blocks = max(blocks, block + 1)
+                for corner in range(4):
+                    corner_u, corner_v = node_u + (corner & 1), node_v + (corner >> 1)
+                    local = (corner_u - (block_u << h)) * ((1 << h) + 1) + corner_v - (block_v << h)
+                    if vertices.rows[block, shape.starts[h] + local] == 0:
+                        blocks = _enter(shape, vertices, plane, h, corner_u, corner_v, rows, blocks)
+                        rows += 1
+    return len(leaves), blocks, rows
+
+
+@numba.njit(cache=True, nogil=True)
+def _restore(
+    shape: Shape,
+    vertices: Vertices,
+    plane: int,
+    h: int,
+    coordinates: Codes,
+    start: int,
+    blocks: int,
+    rows: int,
+) -> tuple[int, int, int]:
+    """Give the next rows to vertices [V, 2]; returns (vertices done, blocks, rows)."""
+    for i in range(start, len(coordinates)):
+        if blocks + _NEW_BLOCKS > len(vertices.rows) or rows + _NEW_ROWS > len(vertices.codes):
+            return i, blocks, rows
+        u, v = coordinates[i, 0], coordinates[i, 1]
+        blocks = _enter(shape, vertices, plane, h, u, v, rows, blocks)
+        rows += 1
+    return len(coordinates), blocks, rows
 
 
 class TriQuadtree:
     """Existing vertices of the three planes, and the rows of the feature table they own.
 
-    Row 0 is reserved for absent vertices.
+    Row 0 is reserved for absent vertices, and so is block 0, in which all are absent.
     """
 
-    def __init__(self, settings: FieldSettings, device: torch.device) -> None:
+    def __init__(self, settings: FieldSettings) -> None:
         self._settings = settings
-        self._device = device
-        self._rows = 1
-        self._vertices = [[HashTable(device) for _ in settings.levels] for _ in AXES]
-        self._codes = torch.zeros(_MIN_ROWS, dtype=torch.int64, device=device)  # by row
-        self._owners = torch.zeros(_MIN_ROWS, dtype=torch.uint8, device=device)  # table, by row
-        self._blocks = HashTable(device)  # of all planes, see _block_key
         sides = [(1 << h) + 1 for h in range(settings.feature_levels)]  # vertices along a block
-        self._starts = [sum(side**2 for side in sides[:h]) for h in range(len(sides))]
-        self._block_rows = torch.zeros(
-            (1, sum(side**2 for side in sides)),
-            dtype=torch.int32,
-            device=device,
+        starts = np.cumsum([0, *(side**2 for side in sides)])
+        self.shape = Shape(settings.feature_levels, 1 << settings.levels[0], starts[:-1])
+        self._rows = 1
+        self._blocks = VoxelIndex(_MIN_CAPACITY)
+        self._blocks.arrays.row_keys[0] = _NO_BLOCK
+        self._blocks.count = 1
+        self.vertices = Vertices(
+            self._blocks.arrays,
+            np.zeros((_MIN_CAPACITY, starts[-1]), np.int32),
+            np.zeros(_MIN_CAPACITY, np.int64),
+            np.zeros(_MIN_CAPACITY, np.uint8),
         )
 
-    def vertices(self, plane: int, h: int) -> tuple[Tensor, Tensor]:
+    def table(self, plane: int, h: int) -> tuple[Codes, Codes]:
         """Sorted Morton codes and rows of the vertices on a plane and the ``h``-th level."""
-        rows = (self._owners[: self._rows] == self._owner(plane, h)).nonzero()[:, 0]
-        codes, order = torch.sort(self._codes[rows])
-        return codes, rows[order]
-
-    @property
-    def starts(self) -> list[int]:
-        """Where the vertices of each level begin within a block."""
-        return self._starts
-
-    @property
-    def blocks(self) -> HashTable:
-        """Numbers of the blocks, by plane and Morton code: see :data:`PLANE_BITS`."""
-        return self._blocks
-
-    @property
-    def block_rows(self) -> Tensor:
-        """Rows [blocks, vertices of a block] of the feature table, int32."""
-        return self._block_rows
+        owner = 1 + plane * self._settings.feature_levels + h
+        rows = np.flatnonzero(self.vertices.owners[: self._rows] == owner)
+        codes = self.vertices.codes[rows]
+        order = np.argsort(codes)
+        return codes[order], rows[order]
 
     def copy(self) -> "TriQuadtree":
-        """A copy for reading: it does not grow, and does not change when this tree does.
-
-        It shares the rows so far, which never change, and does without the hash tables of the
-        vertices, which only growing needs.
-        """
-        twin = TriQuadtree(self._settings, self._device)
+        """A copy for reading, which does not change when this tree grows."""
+        twin = TriQuadtree(self._settings)
         twin._rows = self._rows
-        twin._vertices = []
-        twin._codes, twin._owners = self._codes, self._owners
         twin._blocks = self._blocks.copy()
-        twin._block_rows = self._block_rows.clone()
+        # Codes and owners of rows never change.
+        twin.vertices = self.vertices._replace(
+            blocks=twin._blocks.arrays, rows=self.vertices.rows[: self._blocks.count].copy()
+        )
         return twin
 
-    def grow(self, points: Tensor) -> int:
-        """Make the nodes into which surface ``points`` [N, 3] project; returns the new rows.
+    def grow(self, leaves: Codes) -> int:
+        """Make the nodes into which ``leaves`` project; returns how many rows are new.
 
-        Points are in metres from the region's centre; those outside its cube are left out.
+        Leaves are int64 coordinates [N, 3] in ``[0, 2**depth)``.
         """
         before = self._rows
-        leaves = self._leaf_coordinates(points).floor().to(torch.int64)
-        side = 1 << self._settings.depth
-        leaves = leaves[((leaves >= 0) & (leaves < side)).all(dim=1)]
-        for plane, (first, second) in enumerate(AXES):
-            nodes = torch.unique(morton.encode(leaves[:, first], leaves[:, second]))
-            for h in reversed(range(self._settings.feature_levels)):
-                self.add_vertices(plane, h, _node_vertices(nodes))
-                nodes = torch.unique(nodes >> 2)
+        done = 0
+        while done < len(leaves):
+            done, self._blocks.count, self._rows = _grow(
+                self.shape, self.vertices, leaves, done, self._blocks.count, self._rows
+            )
+            if done < len(leaves):
+                self._make_room()
         return self._rows - before
 
-    def add_vertices(self, plane: int, h: int, codes: Tensor) -> None:
-        """Give rows to those of the vertices ``codes`` (unique) that have none yet."""
-        table = self._vertices[plane][h]
-        codes = codes[table.lookup(codes) == 0]
-        if len(codes) == 0:
-            return
-        rows = torch.arange(self._rows, self._rows + len(codes), device=self._device)
-        table.insert(codes, rows)
-        self._rows += len(codes)
-        self._note_owner(rows, codes, self._owner(plane, h))
-        self._index(plane, h, codes, rows)
+    def restore(self, plane: int, h: int, codes: Codes) -> None:
+        """Give the next rows to the vertices ``codes`` [V] of one level, in their order."""
+        coordinates = morton.decode(codes, 2)
+        done = 0
+        while done < len(coordinates):
+            done, self._blocks.count, self._rows = _restore(
+                self.shape,
+                self.vertices,
+                plane,
+                h,
+                coordinates,
+                done,
+                self._blocks.count,
+                self._rows,
+            )
+            if done < len(coordinates):
+                self._make_room()
 
-    def corners(self, points: Tensor) -> Corners:
-        """Vertices around ``points`` [N, 3] (metres from the centre) and their weights."""
-        levels = self._settings.feature_levels
-        leaf = self._leaf_coordinates(points)
-        rows = []
-        weights = []
-        for plane, axes in enumerate(AXES):
-            uv = leaf[:, list(axes)] / (1 << (levels - 1))  # in blocks
-            block = uv.detach().floor()
-            number = self._find_blocks(plane, block.to(torch.int64))
-            plane_rows = self._block_rows[number]
-            local = uv - block
-            for h in range(levels):
-                scaled = local * (1 << h)
-                cell = scaled.detach().floor()
-                t = scaled - cell
-                side = (1 << h) + 1
-                corner = self._starts[h] + (cell[:, 0] * side + cell[:, 1]).to(torch.int64)
-                offsets = corner[:, None] + corner.new_tensor([0, side, 1, side + 1])
-                rows.append(plane_rows.gather(1, offsets))
-                weights.append(_bilinear(t))
-        count = len(points)
-        return Corners(
-            torch.stack(rows, 1)
-            .view(count, len(AXES), levels, 4)
-            .transpose(1, 2)
-            .reshape(count, levels, 12),
-            torch.stack(weights, 1)
-            .view(count, len(AXES), levels, 4)
-            .transpose(1, 2)
-            .reshape(count, levels, 12),
-        )
-
-    def _owner(self, plane: int, h: int) -> int:
-        return 1 + plane * self._settings.feature_levels + h
-
-    def _note_owner(self, rows: Tensor, codes: Tensor, owner: int) -> None:
-        if self._rows > len(self._codes):
-            more = max(self._rows, 2 * len(self._codes)) - len(self._codes)
-            self._codes = torch.cat([self._codes, self._codes.new_zeros(more)])
-            self._owners = torch.cat([self._owners, self._owners.new_zeros(more)])
-        self._codes[rows] = codes
-        self._owners[rows] = owner
-
-    def _leaf_coordinates(self, points: Tensor) -> Tensor:
-        return points / self._settings.leaf_m + (1 << (self._settings.depth - 1))
-
-    def _find_blocks(self, plane: int, block: Tensor) -> Tensor:
-        side = 1 << self._settings.levels[0]
-        inside = ((block >= 0) & (block < side)).all(dim=1)
-        block = block.clamp(0, side - 1)
-        numbers = self._blocks.lookup(_block_key(plane, block[:, 0], block[:, 1]))
-        return numbers * inside
-
-    def _index(self, plane: int, h: int, codes: Tensor, rows: Tensor) -> None:
-        """Enter new vertices of one level into every block that touches them."""
-        first, second = morton.decode(codes)
-        side = (1 << h) + 1
-        limit = 1 << self._settings.levels[0]
-        for before_first in (0, 1):
-            for before_second in (0, 1):
-                # A vertex on a block's lower border also is on the upper border of its neighbour.
-                block_first = (first - before_first) >> h
-                block_second = (second - before_second) >> h
-                local_first = first - (block_first << h)
-                local_second = second - (block_second << h)
-                inside = (block_first >= 0) & (block_first < limit)
-                inside &= (block_second >= 0) & (block_second < limit)
-                block = _block_key(plane, block_first[inside], block_second[inside])
-                offset = self._starts[h] + local_first[inside] * side + local_second[inside]
-                numbers = self._make_blocks(block)
-                self._block_rows[numbers, offset] = rows[inside].to(torch.int32)
-
-    def _make_blocks(self, keys: Tensor) -> Tensor:
-        """Numbers of the blocks ``keys``, made where they do not exist."""
-        missing = torch.unique(keys[self._blocks.lookup(keys) == 0])
-        if len(missing):
-            first = len(self._blocks) + 1
-            last = first + len(missing)
-            self._blocks.insert(missing, torch.arange(first, last, device=self._device))
-            if last > len(self._block_rows):
-                grown = self._block_rows.new_zeros((2 * last, self._block_rows.shape[1]))
-                grown[: len(self._block_rows)] = self._block_rows
-                self._block_rows = grown
-        return self._blocks.lookup(keys)
+    def _make_room(self) -> None:
+        """Make room for what one more leaf may need."""
+        if self._blocks.count + _NEW_BLOCKS > self._blocks.capacity:
+            self._blocks.grow()
+            self.vertices = self.vertices._replace(
+                blocks=self._blocks.arrays, rows=_doubled(self.vertices.rows)
+            )
+        if self._rows + _NEW_ROWS > len(self.vertices.codes):
+            self.vertices = self.vertices._replace(
+                codes=_doubled(self.vertices.codes), owners=_doubled(self.vertices.owners)
+            )
 
 
-def _block_key(plane: int, first: Tensor, second: Tensor) -> Tensor:
-    key: Tensor = morton.encode(first, second) + (plane << PLANE_BITS)
-    return key
-
-
-def _node_vertices(nodes: Tensor) -> Tensor:
-    """Unique Morton codes of the 4 vertices of each node."""
-    first, second = morton.decode(nodes)
-    corners = [morton.encode(first + i, second + j) for i in (0, 1) for j in (0, 1)]
-    vertices: Tensor = torch.unique(torch.cat(corners))
-    return vertices
-
-
-def _bilinear(t: Tensor) -> Tensor:
-    """Weights [N, 4] of the vertices (0, 0), (1, 0), (0, 1), (1, 1) at fractions ``t`` [N, 2]."""
-    a, b = t[:, 0], t[:, 1]
-    return torch.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], 1)
+def _doubled(array: NDArray[Any]) -> NDArray[Any]:
+    grown = np.zeros((2 * len(array), *array.shape[1:]), array.dtype)
+    grown[: len(array)] = array
+    return grown

@@ -1,5 +1,7 @@
 """One region of the live map: its field, its evidence and what it still has to learn."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,67 +20,81 @@ from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 from triquad_server.field_record import field_from_record, region_record, training_moments
 from triquad_server.replay_pool import ReplayPool
-from triquad_server.sampling import Samples
+from triquad_server.sampling import Placement
 from triquad_server.scan import Rays
-from triquad_server.settings import TrainingSettings
+from triquad_server.segments import ray_segments, sample_segments
+from triquad_server.settings import ScanSettings, TrainingSettings
 from triquad_server.voxel_index import thin
 
 _CARVE_SHORT_M = 0.1
 _CHECKPOINT_SAMPLES = 1_000_000
 
 
+@dataclass(frozen=True)
+class RegionSetup:
+    """What the regions of a map have in common."""
+
+    field: FieldSettings
+    scan: ScanSettings
+    training: TrainingSettings
+    device: torch.device
+    sums: GradientSums
+
+
 class RegionMap:
     """A region that is being mapped. Everything public is in the map frame."""
 
-    def __init__(
-        self,
-        index: RegionIndex,
-        field_settings: FieldSettings,
-        training: TrainingSettings,
-        device: torch.device,
-        sums: GradientSums,
-    ) -> None:
+    def __init__(self, index: RegionIndex, setup: RegionSetup) -> None:
         self.index = index
-        self.centre = region_centre(field_settings, index)
-        self._settings = field_settings
-        self._training = training
-        self._device = device
-        seed = training.seed + hash(index) % 1_000_003
-        self.field = Field(field_settings, device, seed)
-        self._engine = make_engine(self.field, sums)
-        self.evidence = Evidence(1 << field_settings.depth)
-        self.pool = ReplayPool(training.pool_samples, device, seed)
-        self.owed = 0  # training visits that new samples have paid for
+        self.centre = region_centre(setup.field, index)
+        self._setup = setup
+        self._settings = setup.field
+        self._training = setup.training
+        self._device = setup.device
+        seed = setup.training.seed + hash(index) % 1_000_003
+        self.field = Field(setup.field, setup.device, seed)
+        self._engine = make_engine(self.field, setup.sums)
+        self.evidence = Evidence(1 << setup.field.depth)
+        placement = Placement(
+            setup.scan.surface_share,
+            setup.scan.spread_m,
+            setup.scan.truncation_m,
+            setup.field.region_side_m / 2,
+        )
+        self.pool = ReplayPool(setup.training.pool_segments, placement, setup.device, seed)
+        self.owed = 0  # training visits that new segments have paid for
         self._fresh_owed = 0  # those of them meant for the newest scans
         self.changed = True  # since it was last published
 
-    def covers(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of the points [N, 3] lie in this region's cube."""
-        half = self._settings.region_side_m / 2
-        return np.asarray((np.abs(points - self.centre) < half).all(axis=1))
+    def see(self, rays: Rays) -> None:
+        """Note where the rays ended, and grow the field there; outside the cube nothing is."""
+        new = self.evidence.mark_surface(self.voxels(rays.ends))
+        # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
+        self.field.grow(new)
+        self.changed = True
 
-    def take_in(self, rays: Rays, samples: Samples) -> None:
-        """Learn of a scan: grow the field, note the evidence, keep the samples.
-
-        Samples and end points outside the cube are left out; rays may cross it from anywhere.
-        """
-        ends = rays.ends[self.covers(rays.ends)]
-        self.field.grow(self._local(ends))
-        self.evidence.mark_surface(self.voxels(ends))
-        all_ends = self.voxels(rays.ends)
+    def carve(self, rays: Rays) -> None:
+        """Note the free space that the rays crossed, wherever they come from and end."""
+        ends = self.voxels(rays.ends)
         self.evidence.carve(
             self.voxels(rays.origin[None])[0],
-            all_ends[thin(all_ends, 1.0)],
+            ends[thin(ends, 1.0)],
             _CARVE_SHORT_M / self._settings.leaf_m,
         )
-        inside = self.covers(samples.points)
-        if inside.any():
-            labels = torch.from_numpy(samples.labels[inside]).to(self._device)
-            self.pool.add(self._local(samples.points[inside]), labels)
-            visits = int(inside.sum() * self._training.visits)
-            self.owed = min(self.owed + visits, self._training.max_backlog)
-            self._fresh_owed = int(visits * self._training.fresh_share)
-        self.changed = True
+
+    def learn(self, rays: Rays, normals: NDArray[np.float64]) -> None:
+        """Keep what the rays teach, to be trained on.
+
+        ``normals`` [N, 3] are those at the rays' ends, NaN where unknown.
+        """
+        half = self._settings.region_side_m / 2
+        segments = ray_segments(rays, normals, self.centre, half, self._setup.scan)
+        if len(segments) == 0:
+            return
+        self.pool.add(segments)
+        visits = int(len(segments) * self._training.visits)
+        self.owed = min(self.owed + visits, self._training.max_backlog)
+        self._fresh_owed = int(visits * self._training.fresh_share)
 
     def train(self) -> float:
         """One optimiser step; returns the loss."""
@@ -96,8 +112,7 @@ class RegionMap:
     def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Forget evidence and samples between two corners [3]."""
         self.evidence.clear(self.voxels(low[None])[0], self.voxels(high[None])[0])
-        corners = self._local(np.stack([low, high]))
-        self.pool.forget(corners[0], corners[1])
+        self.pool.forget(low - self.centre, high - self.centre)
         if len(self.pool) == 0:
             self.owed = 0
         self.changed = True
@@ -112,24 +127,17 @@ class RegionMap:
         return region_record(self.index, self.field, self.evidence, state)
 
     @classmethod
-    def restore(
-        cls,
-        record: Region,
-        field_settings: FieldSettings,
-        training: TrainingSettings,
-        device: torch.device,
-        sums: GradientSums,
-    ) -> "RegionMap":
+    def restore(cls, record: Region, setup: RegionSetup) -> "RegionMap":
         """A region from its record; without training state its replay pool starts empty."""
-        region = cls(record.index, field_settings, training, device, sums)
-        region.field = field_from_record(record, field_settings, device, training.seed)
-        region._engine = make_engine(region.field, sums)
-        region.evidence = Evidence.restore(1 << field_settings.depth, record.evidence)
+        region = cls(record.index, setup)
+        region.field = field_from_record(record, setup.field, setup.device, setup.training.seed)
+        region._engine = make_engine(region.field, setup.sums)
+        region.evidence = Evidence.restore(1 << setup.field.depth, record.evidence)
         if record.training is not None:
-            points = torch.from_numpy(record.training.sample_points.astype(np.float32))
-            labels = torch.from_numpy(record.training.sample_labels.astype(np.float32))
-            region.pool.add(points.to(device), labels.to(device))
-            owed = min(record.training.visits_owed, training.max_backlog)
+            state = record.training
+            segments = sample_segments(state.sample_points, state.sample_labels)
+            region.pool.add(segments)
+            owed = min(state.visits_owed, setup.training.max_backlog)
             region.owed = owed if len(region.pool) else 0
         return region
 
@@ -146,6 +154,3 @@ class RegionMap:
     def _cooling(self) -> float:
         """Share of the learning rate: falls as less is owed, so that the field settles."""
         return min(1.0, max(0.02, self.owed / (self._training.cooldown * max(1, len(self.pool)))))
-
-    def _local(self, points: NDArray[np.float64]) -> torch.Tensor:
-        return torch.from_numpy((points - self.centre).astype(np.float32)).to(self._device)

@@ -1,131 +1,165 @@
-"""Bounded memory of training samples, spread over the map.
+"""Bounded memory of what rays have taught, spread over the map.
 
-While there is room, all samples stay. Then each new one pushes out the more crowded of two
+While there is room, all segments stay. Then each new one pushes out the more crowded of two
 candidates, so that places seen long ago keep theirs and places seen for long do not take over.
 """
 
 import math
-from dataclasses import dataclass
 
+import numba
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+from triquad_server.sampling import Batch, Placement, draw_ordered_samples, draw_samples
+from triquad_server.segments import COLUMNS, END
 
 _BIN_M = 0.8
 _BINS = 1 << 18
-_PRIMES = (73856093, 19349663, 83492791)
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+Places = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Samples to train on."""
+@numba.njit(cache=True, nogil=True)
+def _bin(segment: Floats) -> int:
+    mixed: int = np.int64(0)
+    for axis, prime in enumerate((73856093, 19349663, 83492791)):
+        mixed ^= int(np.floor(segment[END + axis] / _BIN_M)) * prime
+    return mixed & (_BINS - 1)
 
-    points: Tensor  # [B, 3] metres from the region's centre
-    labels: Tensor  # [B] metres
+
+@numba.njit(cache=True, nogil=True)
+def _crowded(
+    size: int, count: int, first: int, stride: int, offset: int, bins: Ints, crowd: Ints
+) -> Places:
+    """Different places whose segments are the best to push out, ``count <= size // 2`` of them.
+
+    The pool is paired up, each place once, and the more crowded of a pair goes.
+    """
+    half = size // 2
+    chosen = np.empty(count, np.int64)
+    for i in range(count):
+        left = (first + i * stride) % half
+        right = half + (left + offset) % half
+        chosen[i] = left if crowd[bins[left]] > crowd[bins[right]] else right
+    return chosen
+
+
+@numba.njit(cache=True, nogil=True)
+def _put(new: Floats, places: Places, used: int, segments: Floats, bins: Ints, crowd: Ints) -> None:
+    """Put new segments into places; those below ``used`` hold one that is pushed out."""
+    for i in range(len(places)):
+        place = places[i]
+        if place < used:
+            crowd[bins[place]] -= 1
+        segments[place] = new[i]
+        bins[place] = _bin(new[i])
+        crowd[bins[place]] += 1
 
 
 class ReplayPool:
-    """Samples of one region; the newest can be drawn apart from the others."""
+    """Segments of one region; the newest can be drawn from apart from the others."""
 
-    def __init__(self, capacity: int, device: torch.device, seed: int) -> None:
+    def __init__(
+        self, capacity: int, placement: Placement, device: torch.device, seed: int
+    ) -> None:
         self._capacity = capacity
+        self._placement = placement
+        self._device = device
         self._size = 0
+        self.offered = 0  # segments so far, those included that were not kept
+        self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator(device).manual_seed(seed)
-        self._points = torch.zeros((0, 3), device=device)
-        self._labels = torch.zeros(0, device=device)
-        self._bins = torch.zeros(0, dtype=torch.int32, device=device)
-        self._crowd = torch.zeros(_BINS, dtype=torch.int32, device=device)
-        self._fresh = torch.zeros(0, dtype=torch.int64, device=device)
+        self._segments = np.zeros((0, COLUMNS), np.float32)
+        self._twin: Tensor | None = None  # of the segments, on a device of its own
+        self._bins = np.zeros(0, np.int32)
+        self._crowd = np.zeros(_BINS, np.int32)
+        self._fresh = np.zeros(0, np.int64)
 
     def __len__(self) -> int:
         return self._size
 
-    def add(self, points: Tensor, labels: Tensor) -> None:
-        """Take in samples: ``points`` [S, 3], ``labels`` [S]; they become the newest."""
-        if len(points) > self._capacity:
-            chosen = self._random(len(points), self._capacity)
-            points, labels = points[chosen], labels[chosen]
-        room = min(len(points), self._capacity - self._size)
-        places = torch.arange(self._size, self._size + room, device=points.device)
-        if room < len(points):
-            places = torch.cat([places, self._crowded(len(points) - room)])
-            points, labels = points[: len(places)], labels[: len(places)]
-        self._extend(self._size + room)
-        replaced = places[room:]
-        self._crowd.index_add_(
-            0, self._bins[replaced], torch.full_like(replaced, -1, dtype=torch.int32)
-        )
-        self._points[places] = points
-        self._labels[places] = labels
-        self._bins[places] = _bin(points)
-        self._crowd.index_add_(0, self._bins[places], torch.ones_like(places, dtype=torch.int32))
+    def add(self, segments: Floats) -> None:
+        """Take in ``segments`` [S, COLUMNS]; they become the newest."""
+        self.offered += len(segments)
+        if len(segments) > self._capacity:
+            segments = segments[self._rng.integers(len(segments), size=self._capacity)]
+        used = self._size
+        room = min(len(segments), self._capacity - used)
+        places = np.arange(used, used + room)
+        if room < len(segments):
+            places = np.concatenate([places, self._crowded(len(segments) - room)])
+            segments = segments[: len(places)]
+        self._extend(used + room)
+        _put(segments, places, used, self._segments, self._bins, self._crowd)
+        if self._twin is not None:
+            new = torch.from_numpy(segments).to(self._device)
+            self._twin[torch.from_numpy(places).to(self._device)] = new
         self._fresh = places
 
     def draw(self, count: int, fresh: int) -> Batch:
-        """``count`` samples at random, the first ``fresh`` of them from the newest."""
-        places = self._random(self._size, count)
+        """``count`` samples on segments at random, ``fresh`` of them on the newest."""
+        places = self._rng.integers(self._size, size=count)
         if fresh and len(self._fresh):
-            places[:fresh] = self._fresh[self._random(len(self._fresh), fresh)]
-        return Batch(self._points[places], self._labels[places])
+            places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
+        return self._draw(places)
 
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
         self._capacity = capacity
         if self._size > capacity:
-            order = torch.randperm(
-                self._size, generator=self._generator, device=self._points.device
-            )
-            self._keep(order[:capacity])
+            self._keep(self._rng.permutation(self._size)[:capacity])
 
-    def forget(self, low: Tensor, high: Tensor) -> None:
-        """Drop the samples between the corners ``low`` and ``high`` [3]."""
-        points = self._points[: self._size]
-        inside = ((points >= low) & (points <= high)).all(dim=1)
-        self._keep((~inside).nonzero()[:, 0])
+    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Drop the segments that end between the corners ``low`` and ``high`` [3]."""
+        ends = self._segments[: self._size, END : END + 3]
+        self._keep(np.flatnonzero(~((ends >= low) & (ends <= high)).all(axis=1)))
+        self.offered = self._size
 
     def sample(self, count: int) -> Batch:
-        """At most ``count`` samples, without repetition: what a checkpoint keeps."""
-        order = torch.randperm(self._size, generator=self._generator, device=self._points.device)
-        return Batch(self._points[order[:count]], self._labels[order[:count]])
+        """Samples on at most ``count`` segments, one on each: what a checkpoint keeps."""
+        return self._draw(self._rng.permutation(self._size)[:count])
 
-    def _keep(self, places: Tensor) -> None:
-        self._points = self._points[places]
-        self._labels = self._labels[places]
+    def _draw(self, places: Places) -> Batch:
+        if self._twin is None:
+            return draw_ordered_samples(self._segments, places, self._placement, self._rng)
+        chosen = self._twin[torch.from_numpy(places).to(self._device)]
+        return draw_samples(chosen, self._placement, self._generator)
+
+    def _keep(self, places: Places) -> None:
+        self._segments = self._segments[places]
         self._bins = self._bins[places]
-        self._crowd.zero_().index_add_(0, self._bins, torch.ones_like(self._bins))
+        self._crowd = np.bincount(self._bins, minlength=_BINS).astype(np.int32)
         self._size = len(places)
         self._fresh = self._fresh[:0]
+        self._copy_to_device()
 
     def _extend(self, size: int) -> None:
-        if size > len(self._points):
-            room = min(self._capacity, max(size, 2 * len(self._points))) - len(self._points)
-            self._points = torch.cat([self._points, self._points.new_zeros((room, 3))])
-            self._labels = torch.cat([self._labels, self._labels.new_zeros(room)])
-            self._bins = torch.cat([self._bins, self._bins.new_zeros(room)])
+        if size > len(self._segments):
+            room = min(self._capacity, max(size, 2 * len(self._segments)))
+            segments = np.zeros((room, COLUMNS), np.float32)
+            segments[: self._size] = self._segments[: self._size]
+            bins = np.zeros(room, np.int32)
+            bins[: self._size] = self._bins[: self._size]
+            self._segments, self._bins = segments, bins
+            self._copy_to_device()
         self._size = size
 
-    def _crowded(self, count: int) -> Tensor:
-        """Up to ``count`` different places whose samples are the best to push out.
+    def _copy_to_device(self) -> None:
+        if self._device.type != "cpu":
+            self._twin = torch.from_numpy(self._segments).to(self._device)
 
-        The pool is paired up at random, each place once, and the more crowded of a pair goes.
-        """
+    def _crowded(self, count: int) -> Places:
         half = self._size // 2
         count = min(count, half)
         if count == 0:
             return self._fresh[:0]
-        first, offset = self._random(half, 2).tolist()
-        places = torch.arange(count, device=self._points.device)
-        left = (first + places * _coprime(half)) % half
-        right = half + (left + offset) % half
-        crowded = self._crowd[self._bins[left]] > self._crowd[self._bins[right]]
-        return torch.where(crowded, left, right)
-
-    def _random(self, below: int, count: int) -> Tensor:
-        return torch.randint(
-            below,
-            (count,),
-            generator=self._generator,
-            device=self._points.device,
-        )
+        first, offset = self._rng.integers(half, size=2)
+        stride = _coprime(half)
+        return _crowded(self._size, count, first, stride, offset, self._bins, self._crowd)
 
 
 def _coprime(size: int) -> int:
@@ -134,9 +168,3 @@ def _coprime(size: int) -> int:
     while math.gcd(stride, size) != 1:
         stride += 1
     return stride
-
-
-def _bin(points: Tensor) -> Tensor:
-    cells = (points / _BIN_M).floor().to(torch.int64)
-    mixed: Tensor = cells[:, 0] * _PRIMES[0] ^ cells[:, 1] * _PRIMES[1] ^ cells[:, 2] * _PRIMES[2]
-    return (mixed % _BINS).to(torch.int32)

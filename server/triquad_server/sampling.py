@@ -1,59 +1,115 @@
-"""Training samples along rays (3QFP, section III-C)."""
+"""Training samples drawn along segments (3QFP, section III-C).
+
+Every draw makes new ones: a segment that is trained on again teaches other points of its ray.
+"""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numba
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from triquad_server.scan import Rays
-from triquad_server.settings import ScanSettings
+from triquad_server.segments import DIRECTION, END, FREE_FROM, FREE_TO, LABEL, SLOPE
 
-_MIN_COSINE = 0.05
+Floats = NDArray[np.float32]
+
+_CELLS = 256
+"""Cells from the centre of the cube to its face, by which samples are put in order."""
+
+
+class Placement(NamedTuple):
+    """Where on their segments samples lie."""
+
+    surface_share: float  # of the samples that lie around the end points
+    spread_m: float  # standard deviation of those
+    truncation_m: float  # and how far off they lie at most
+    half_side_m: float  # of the region's cube: samples lie inside
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Points with signed distances."""
+class Batch:
+    """Samples to train on."""
 
-    points: NDArray[np.float64]  # [S, 3] metres, map frame
-    labels: NDArray[np.float32]  # [S] metres, positive in front of the surface
+    points: Tensor  # [B, 3] metres from the region's centre
+    labels: Tensor  # [B] signed distances, metres
 
 
-def draw_samples(
-    rays: Rays,
-    normals: NDArray[np.float64],
-    settings: ScanSettings,
-    rng: np.random.Generator,
-) -> Samples:
-    """Samples near the end points of rays and in the free space before them.
-
-    The published label is the distance to the end point along the ray, which is too large where
-    the ray meets the surface at an angle. Where the surface's normal is known, the label here is
-    the distance to its plane.
-
-    Args:
-        rays: N rays.
-        normals: [N, 3] unit normals at the end points, NaN where unknown.
-        settings: numbers of samples and their ranges.
-        rng: source of the random positions.
-    """
-    along = rays.ends - rays.origin
-    ranges = np.linalg.norm(along, axis=1)
-    directions = along / ranges[:, None]
-    cosines = np.abs((directions * normals).sum(axis=1))
-    cosines = np.where(np.isnan(cosines), 1.0, np.maximum(cosines, _MIN_COSINE))
-
-    count = len(ranges)
-    near = rng.uniform(
-        -settings.truncation_m,
-        settings.truncation_m,
-        (count, settings.surface_samples),
+def draw_samples(segments: Tensor, placement: Placement, generator: torch.Generator) -> Batch:
+    """One sample on each of the ``segments`` [B, COLUMNS], on their device."""
+    kinds, places = torch.rand((2, len(segments)), generator=generator, device=segments.device)
+    near = torch.randn(len(segments), generator=generator, device=segments.device)
+    near = (near * placement.spread_m).clamp(-placement.truncation_m, placement.truncation_m)
+    ends, directions = segments[:, END : END + 3], segments[:, DIRECTION : DIRECTION + 3]
+    first, last = segments[:, FREE_FROM], segments[:, FREE_TO]
+    outside = ((ends + near[:, None] * directions).abs() >= placement.half_side_m).any(dim=1)
+    free = first + places * (last - first)
+    offsets = torch.where((kinds < placement.surface_share) & ~outside, near, free)
+    return Batch(
+        ends + offsets[:, None] * directions,
+        segments[:, LABEL] - offsets * segments[:, SLOPE],
     )
-    first = settings.free_from * ranges[:, None]
-    last = ranges[:, None] + settings.behind_m
-    free = rng.uniform(first, last, (count, settings.free_samples)) - ranges[:, None]
-    offsets = np.concatenate([near, free], axis=1)  # behind the end point, along the ray
 
-    points = rays.ends[:, None] + offsets[..., None] * directions[:, None]
-    labels = -offsets * cosines[:, None]
-    return Samples(points.reshape(-1, 3), labels.reshape(-1).astype(np.float32))
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _every_third_bit(number: int) -> int:
+    """The 10 bits of a number, each followed by two zeros."""
+    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+        number = (number | (number << shift)) & mask
+    return number
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw(
+    segments: Floats,
+    chosen: NDArray[np.int64],
+    placement: Placement,
+    kinds: Floats,
+    places: Floats,
+    near: Floats,
+    samples: Floats,
+    cells: NDArray[np.int64],
+) -> None:
+    cell_m = placement.half_side_m / _CELLS
+    for i in range(len(chosen)):
+        row = segments[chosen[i]]
+        offset = near[i] * placement.spread_m
+        offset = min(max(offset, -placement.truncation_m), placement.truncation_m)
+        outside = False
+        for axis in range(3):
+            place = row[END + axis] + offset * row[DIRECTION + axis]
+            outside = outside or abs(place) >= placement.half_side_m
+        if outside or kinds[i] >= placement.surface_share:
+            offset = row[FREE_FROM] + places[i] * (row[FREE_TO] - row[FREE_FROM])
+        cell = np.int64(0)
+        for axis in range(3):
+            place = row[END + axis] + offset * row[DIRECTION + axis]
+            samples[i, axis] = place
+            cell |= _every_third_bit(int(place / cell_m) + _CELLS) << axis
+        samples[i, 3] = row[LABEL] - offset * row[SLOPE]
+        cells[i] = cell
+
+
+def draw_ordered_samples(
+    segments: Floats,
+    chosen: NDArray[np.int64],
+    placement: Placement,
+    rng: np.random.Generator,
+) -> Batch:
+    """As :func:`draw_samples` for the segments ``chosen`` [B], in compiled code.
+
+    Neighbours in space follow each other, and find in the cache what the last one fetched.
+    """
+    count = len(chosen)
+    samples = np.empty((count, 4), np.float32)
+    cells = np.empty(count, np.int64)
+    kinds, places = rng.random((2, count), np.float32)
+    near = rng.standard_normal(count, np.float32)
+    _draw(segments, chosen, placement, kinds, places, near, samples, cells)
+    samples = samples[np.argsort(cells)]
+    return Batch(
+        torch.from_numpy(np.ascontiguousarray(samples[:, :3])),
+        torch.from_numpy(np.ascontiguousarray(samples[:, 3])),
+    )

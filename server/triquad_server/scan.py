@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from triquad_server.settings import ScanSettings
-from triquad_server.voxel_index import thin
+from triquad_server.voxel_index import Keys, empty_keys, enter
 
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
@@ -65,6 +66,32 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
         )
 
 
+@numba.njit(cache=True, nogil=True)
+def _select(
+    points: NDArray[np.float32],
+    range_min_m: float,
+    range_max_m: float,
+    thin_m: float,
+    keys: Keys,
+) -> tuple[NDArray[np.float64], int, int, int]:
+    """The points that are used; how many are not finite, too near and too far."""
+    kept = np.empty((len(points), 3))
+    count = not_finite = too_near = too_far = 0
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        distance = np.sqrt(x * x + y * y + z * z)
+        if not np.isfinite(distance):
+            not_finite += 1
+        elif distance < range_min_m:
+            too_near += 1
+        elif distance > range_max_m:
+            too_far += 1
+        elif enter(keys, x, y, z, thin_m):
+            kept[count, 0], kept[count, 1], kept[count, 2] = x, y, z
+            count += 1
+    return kept[:count], not_finite, too_near, too_far
+
+
 def usable_rays(
     points: NDArray[np.float32],
     world_from_sensor: NDArray[np.float64],
@@ -88,18 +115,14 @@ def usable_rays(
             "too_many_points",
             f"{len(points)} points exceed scan.max_points = {settings.max_points}",
         )
-    finite = np.isfinite(points).all(axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        distance = np.linalg.norm(points, axis=1)
-    near = finite & (distance < settings.range_min_m)
-    far = finite & (distance > settings.range_max_m)
-    kept = points[finite & ~near & ~far].astype(np.float64)
-    kept = kept[thin(kept, settings.thin_m)]
-    dropped = {
-        "not_finite": int((~finite).sum()),
-        "too_near": int(near.sum()),
-        "too_far": int(far.sum()),
-    }
+    kept, not_finite, too_near, too_far = _select(
+        np.ascontiguousarray(points),
+        settings.range_min_m,
+        settings.range_max_m,
+        settings.thin_m,
+        empty_keys(len(points)),
+    )
+    dropped = {"not_finite": not_finite, "too_near": too_near, "too_far": too_far}
     if len(kept) == 0:
         raise ScanRefusedError(
             "empty",

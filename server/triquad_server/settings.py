@@ -17,14 +17,14 @@ else:
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """Which points of a scan are used, and which samples its rays give."""
+    """Which points of a scan are used, and where its rays are sampled."""
 
     range_min_m: float = 1.5
     range_max_m: float = 50.0
     thin_m: float = 0.05  # one point is kept per voxel of this side
-    surface_samples: int = 3  # N_s, per ray
-    free_samples: int = 3  # N_f, per ray
-    truncation_m: float = 0.3  # half width of the band around the end point
+    surface_share: float = 0.5  # of the training samples that lie around end points
+    spread_m: float = 0.08  # standard deviation of their distance from them, along the ray
+    truncation_m: float = 0.3  # and how far from them they lie at most
     free_from: float = 0.3  # free samples begin at this share of the range
     behind_m: float = 0.8  # and end this far behind the end point
     max_points: int = 500_000  # a larger scan is refused
@@ -33,8 +33,8 @@ class ScanSettings:
         check_range("range_min_m", self.range_min_m, 0.0, 1e3)
         check_range("range_max_m", self.range_max_m, self.range_min_m, 1e4)
         check_range("thin_m", self.thin_m, 1e-3, 10.0)
-        check_range("surface_samples", self.surface_samples, 1, 64)
-        check_range("free_samples", self.free_samples, 0, 64)
+        check_range("surface_share", self.surface_share, 0.01, 1.0)
+        check_range("spread_m", self.spread_m, 1e-3, 10.0)
         check_range("truncation_m", self.truncation_m, 0.01, 10.0)
         check_range("free_from", self.free_from, 0.0, 1.0)
         check_range("behind_m", self.behind_m, 0.0, 100.0)
@@ -49,11 +49,11 @@ class TrainingSettings:
     learning_rate: float = 0.01
     beta1: float = 0.9
     beta2: float = 0.99
-    pool_samples: int = 4_000_000  # replay samples kept, over the whole map
+    pool_segments: int = 1_500_000  # what so many rays taught is kept, over the whole map
     fresh_share: float = 0.5  # of a batch, drawn from the newest scans while they stream in
-    visits: float = 8.0  # training visits that each new sample pays for
-    max_backlog: int = 12_000_000  # visits owed at most, per region
-    cooldown: float = 1.0  # the rate falls once less than this many visits a kept sample are owed
+    visits: float = 24.0  # training samples that each new segment pays for
+    max_backlog: int = 12_000_000  # samples owed at most, per region
+    cooldown: float = 1.0  # the rate falls once less than this many samples a kept segment are owed
     max_regions: int = 256  # of the map; a scan that would need more is refused
     seed: int = 42
 
@@ -62,7 +62,7 @@ class TrainingSettings:
         check_range("learning_rate", self.learning_rate, 0.0, 1.0)
         check_range("beta1", self.beta1, 0.001, 0.9999)
         check_range("beta2", self.beta2, 0.001, 0.99999)
-        check_range("pool_samples", self.pool_samples, 1000, 1_000_000_000)
+        check_range("pool_segments", self.pool_segments, 100, 1_000_000_000)
         check_range("fresh_share", self.fresh_share, 0.0, 1.0)
         check_range("visits", self.visits, 0.0, 1000.0)
         check_range("cooldown", self.cooldown, 0.001, 1000.0)

@@ -4,7 +4,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
 """Threads that share the work: one per core that this process may use."""
@@ -36,6 +36,10 @@ class Team:
         """Run ``work(first, last)`` over ``range(count)``, in parallel where it is worth it."""
         parts = min(THREADS, max(1, count // _MIN_SHARE))
         self._run(lambda part: work(*share(count, part, parts)), parts)
+
+    def beside(self, work: Callable[[], None]) -> "Future[None]":
+        """Run ``work()`` beside the caller, who waits for the result later."""
+        return self._pool.submit(work)
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
         # The caller has other things to do at once: a patient team does all work itself.

@@ -1,6 +1,6 @@
 """A hash index of voxels in compiled code: 3-D cells of an unbounded lattice to row numbers.
 
-Everything on the CPU that is sparse in space is kept in rows that such an index finds.
+Everything that is sparse in space is kept in rows that such an index finds.
 """
 
 from typing import NamedTuple
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 EMPTY = np.int64(-1)
+MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed number
 CELL_LIMIT = 1 << 20
 """Cells lie in ``[-CELL_LIMIT, CELL_LIMIT)`` on each axis."""
 
@@ -25,10 +26,15 @@ class Index(NamedTuple):
     row_keys: Keys  # [capacity] key of each row
 
 
+def empty_keys(cells: int) -> Keys:
+    """Slots of a set with room for so many cells, at a load of one half; see :func:`enter`."""
+    return np.full(1 << max(4, int(2 * cells - 1).bit_length()), EMPTY)
+
+
 def _new_index(capacity: int) -> Index:
-    """Empty arrays for ``capacity`` cells, at a load of one half."""
-    slots = 1 << max(4, int(2 * capacity - 1).bit_length())
-    return Index(np.full(slots, EMPTY), np.zeros(slots, np.int32), np.zeros(capacity, np.int64))
+    """Empty arrays for ``capacity`` cells."""
+    keys = empty_keys(capacity)
+    return Index(keys, np.zeros(len(keys), np.int32), np.zeros(capacity, np.int64))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -52,8 +58,7 @@ def unpack(key: int) -> tuple[int, int, int]:
 def find_slot(keys: Keys, key: int) -> int:
     """Slot that holds ``key``, or the empty slot where it belongs."""
     mask = len(keys) - 1
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot: int = np.int64(mixed >> np.uint64(32)) & mask
+    slot: int = ((key * MULTIPLIER) >> 32) & mask
     while keys[slot] != key and keys[slot] != EMPTY:
         slot = (slot + 1) & mask
     return slot
@@ -85,6 +90,18 @@ def _reindex(index: Index, count: int) -> None:
         slot = find_slot(index.keys, index.row_keys[row])
         index.keys[slot] = index.row_keys[row]
         index.rows[slot] = row
+
+
+@numba.njit(cache=True, nogil=True)
+def longest_probe(index: Index) -> int:
+    """Slots that the look-up of any key in the index may have to read."""
+    mask = len(index.keys) - 1
+    longest = 0
+    for slot in range(len(index.keys)):
+        if index.keys[slot] != EMPTY:
+            home = ((index.keys[slot] * MULTIPLIER) >> 32) & mask
+            longest = max(longest, ((slot - home) & mask) + 1)
+    return longest
 
 
 @numba.njit(cache=True, nogil=True)
@@ -141,23 +158,27 @@ class VoxelIndex:
         _reindex(self.arrays, self.count)
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def enter(keys: Keys, x: float, y: float, z: float, cell_m: float) -> bool:
+    """Put the cell of a point into a set; False where it is there already."""
+    key = pack(int(np.floor(x / cell_m)), int(np.floor(y / cell_m)), int(np.floor(z / cell_m)))
+    slot = find_slot(keys, key)
+    if keys[slot] == key:
+        return False
+    keys[slot] = key
+    return True
+
+
 @numba.njit(cache=True, nogil=True)
 def _first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Keys) -> NDArray[np.bool_]:
     chosen = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
-        key = pack(
-            int(np.floor(points[i, 0] / cell_m)),
-            int(np.floor(points[i, 1] / cell_m)),
-            int(np.floor(points[i, 2] / cell_m)),
-        )
-        slot = find_slot(keys, key)
-        if keys[slot] == EMPTY:
-            keys[slot] = key
-            chosen[i] = True
+        chosen[i] = enter(keys, points[i, 0], points[i, 1], points[i, 2], cell_m)
     return chosen
 
 
 def thin(points: NDArray[np.floating], cell_m: float) -> NDArray[np.bool_]:
     """Mask [N] that keeps one of the points [N, 3] per cell of side ``cell_m``, the first."""
-    empty = _new_index(len(points))
-    return np.asarray(_first_per_cell(np.ascontiguousarray(points), cell_m, empty.keys))
+    return np.asarray(
+        _first_per_cell(np.ascontiguousarray(points), cell_m, empty_keys(len(points)))
+    )
