@@ -18,6 +18,7 @@ from triquad_server.sampling import Batch
 from triquad_server.threads import ANSWERS, THREADS, TRAINING, share
 
 _LAST_STEP = 2**31 - 1
+_CHUNK = 131_072  # points that tensors are made for at a time
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,16 @@ class TorchEngine:
 
     def evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
         """The field at points [N, 3], metres from the region's centre."""
+        parts = [
+            self._evaluate(points[start : start + _CHUNK], gradient)
+            for start in range(0, max(1, len(points)), _CHUNK)
+        ]
+        return FieldValues(
+            np.concatenate([part.sdf for part in parts]),
+            np.concatenate([part.gradient for part in parts]),
+        )
+
+    def _evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
         tensor = torch.from_numpy(points).to(self._field.device)
         if gradient:
             value, slope = self._field.sdf_and_gradient(tensor)

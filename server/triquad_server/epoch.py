@@ -14,14 +14,13 @@ from triquad_format.region import (
 )
 from triquad_format.status import Status
 
-from triquad_server.engine import Engine, make_engine
+from triquad_server.engine import Engine, FieldValues, make_engine
 from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 from triquad_server.field_record import region_record
 from triquad_server.mesher import TileMesh, mesh_tile
+from triquad_server.region_lattice import Owners, RegionLattice
 from triquad_server.settings import MeshSettings
-
-_CHUNK = 65_536
 
 
 @dataclass(frozen=True)
@@ -69,6 +68,7 @@ class Epoch:
         self._name = name
         self._settings = settings
         self._mesh = mesh
+        self._lattice = RegionLattice(settings, [region.index for region in regions])
 
     @property
     def regions(self) -> int:
@@ -87,16 +87,16 @@ class Epoch:
 
     def query(self, points: NDArray[np.float64], gradient: bool = False) -> Answer:
         """Signed distance, status and, on request, gradient at points [N, 3] of the map frame."""
-        parts = [
-            self._query(points[start : start + _CHUNK], gradient)
-            for start in range(0, max(1, len(points)), _CHUNK)
-        ]
-        gradients = [part.gradient for part in parts if part.gradient is not None]
-        return Answer(
-            np.concatenate([part.sdf for part in parts]),
-            np.concatenate([part.status for part in parts]),
-            np.concatenate(gradients) if gradient else None,
-        )
+        points = np.ascontiguousarray(points)
+        owners = self._lattice.owners(points)
+        values = self._values(points, owners, gradient)
+        status = self._status(points, owners)
+        return Answer(values.sdf, status, values.gradient if gradient else None)
+
+    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Signed distances [N] alone at points [N, 3] of the map frame."""
+        points = np.ascontiguousarray(points)
+        return self._values(points, self._lattice.owners(points), gradient=False).sdf
 
     def status(
         self,
@@ -108,15 +108,9 @@ class Epoch:
         ``SURFACE`` reaches ``reach_m`` beyond the voxels in which rays ended; half a voxel if
         not given.
         """
+        points = np.ascontiguousarray(points)
         reach = 0.5 if reach_m is None else reach_m / self._settings.leaf_m
-        owners = np.floor(points / self._settings.region_pitch_m + 0.5)
-        status = np.full(len(points), Status.UNKNOWN, np.uint8)
-        for region in self.frozen_regions:
-            mine = (owners == region.index).all(axis=1)
-            if mine.any():
-                voxels = voxel_coordinates(self._settings, region.centre, points[mine])
-                status[mine] = region.evidence.status(voxels, reach)
-        return status
+        return self._status(points, self._lattice.owners(points), reach)
 
     def tiles(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> TileSet:
         """Tiles that hold seen surface and meet the box between two corners [3]."""
@@ -155,7 +149,32 @@ class Epoch:
         )
         return MapRecord(self._name, self.number, self._settings, regions)
 
-    def _query(self, points: NDArray[np.float64], gradient: bool) -> Answer:
+    def _values(self, points: NDArray[np.float64], owners: Owners, gradient: bool) -> FieldValues:
+        count = len(points)
+        values = FieldValues(
+            np.full(count, np.nan, np.float32),
+            np.full((count if gradient else 0, 3), np.nan, np.float32),
+        )
+        for owned in owners.groups():
+            region = self.frozen_regions[owned.region]
+            local = (points[owned.points] - region.centre).astype(np.float32)
+            _put(values, owned.points, region.engine.evaluate(local, gradient))
+        shared = np.flatnonzero(owners.shared)
+        if len(shared):
+            _put(values, shared, self._blend(points[shared], gradient))
+        return values
+
+    def _status(
+        self, points: NDArray[np.float64], owners: Owners, reach: float = 0.5
+    ) -> NDArray[np.uint8]:
+        status = np.full(len(points), Status.UNKNOWN, np.uint8)
+        for owned in owners.groups():
+            region = self.frozen_regions[owned.region]
+            voxels = voxel_coordinates(self._settings, region.centre, points[owned.points])
+            status[owned.points] = region.evidence.status(voxels, reach)
+        return status
+
+    def _blend(self, points: NDArray[np.float64], gradient: bool) -> FieldValues:
         """Blend the regions that cover each point, so that there is no step where they overlap."""
         half = self._settings.region_side_m / 2
         weight_sum = np.zeros(len(points))
@@ -180,11 +199,8 @@ class Epoch:
         with np.errstate(invalid="ignore", divide="ignore"):
             sdf = value_sum / weight_sum
             slopes = (slope_sum - sdf[:, None] * tilt_sum) / weight_sum[:, None]
-        return Answer(
-            sdf.astype(np.float32),
-            self.status(points),
-            slopes.astype(np.float32) if gradient else None,
-        )
+        slopes = slopes[: len(points) if gradient else 0]
+        return FieldValues(sdf.astype(np.float32), slopes.astype(np.float32))
 
     def _surface_tiles(self, region: FrozenRegion) -> NDArray[np.int64]:
         """Tiles [T, 3] that meet a block with seen surface, or what is meshed around it."""
@@ -217,6 +233,13 @@ def frozen_region(
         evidence.copy(),
         changed,
     )
+
+
+def _put(values: FieldValues, where: slice | NDArray[np.int64], new: FieldValues) -> None:
+    """Put ``new`` values in their places."""
+    values.sdf[where] = new.sdf
+    if len(values.gradient):
+        values.gradient[where] = new.gradient
 
 
 def _ramp_gradient(

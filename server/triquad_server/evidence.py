@@ -169,6 +169,8 @@ def _status(
                         block = here
                     if row >= 0:
                         found |= _bit(surface, row, x, y, z)
+            if found:
+                break
         status[i] = _UNKNOWN
         if found:
             status[i] = _SURFACE

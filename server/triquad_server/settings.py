@@ -77,7 +77,7 @@ class MeshSettings:
 
     cell_m: float = 0.1
     tile_cells: int = 64  # along the side of a tile
-    reach_m: float = 0.1  # cells are meshed up to this far from voxels with seen surface
+    reach_m: float = 0.02  # faces lie at most this far from voxels with seen surface
 
     def __post_init__(self) -> None:
         check_range("cell_m", self.cell_m, 0.01, 10.0)
