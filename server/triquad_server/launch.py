@@ -1,6 +1,7 @@
 """Starting and stopping a server process."""
 
 import logging
+import sys
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,10 @@ from triquad_server.store import Store
 from triquad_server.warm_up import warm_up
 
 _log = logging.getLogger("triquad_server")
+
+_SWITCH_INTERVAL_S = 0.0005
+"""How long a thread may hold the interpreter while another waits: a query is to be answered in a
+few milliseconds, which is Python's default for a single turn."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         ServerError: the server cannot start; subclasses tell what is in the way.
     """
     device = choose_device(options.device)
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     with ExitStack() as stack:
         store = None
         restored = None

@@ -62,6 +62,11 @@ class Mapper:
         return not any(region.owed for region in self._regions.values())
 
     @property
+    def regions(self) -> list[RegionMap]:
+        """The regions, for looking at."""
+        return list(self._regions.values())
+
+    @property
     def segments_kept(self) -> int:
         """Segments in the replay pools."""
         return sum(len(region.pool) for region in self._regions.values())

@@ -4,6 +4,11 @@ import importlib
 import sys
 
 
+def bench() -> int:
+    """``triquad-bench``."""
+    return _run("triquad-bench", "triquad_tools.bench")
+
+
 def demo() -> int:
     """``triquad-demo``."""
     return _run("triquad-demo", "triquad_tools.demo")

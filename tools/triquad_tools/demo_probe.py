@@ -51,9 +51,10 @@ class ProbeReport:
 class Probe:
     """The planner's process; leaving the ``with`` statement ends it in any case."""
 
-    def __init__(self, endpoint: str, map_name: str, points: Path) -> None:
+    def __init__(self, endpoint: str, map_name: str, points: Path, gradient: bool = False) -> None:
         """Start to ask for ``points``, an ``.npy`` file ``[N, 3]``."""
         command = [sys.executable, "-m", __name__, endpoint, map_name, str(points)]
+        command += ["gradient"] if gradient else []
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -86,7 +87,12 @@ class Probe:
         return ProbeReport(**json.loads(output))
 
 
-def ask_until(stop: threading.Event, client: "Client", points: NDArray[np.float64]) -> ProbeReport:
+def ask_until(
+    stop: threading.Event,
+    client: "Client",
+    points: NDArray[np.float64],
+    gradient: bool = False,
+) -> ProbeReport:
     """Ask for distances at ``points`` [N, 3] until ``stop`` is set."""
     from triquad_client import TriquadError
 
@@ -97,7 +103,7 @@ def ask_until(stop: threading.Event, client: "Client", points: NDArray[np.float6
     while not stop.is_set():
         started = time.perf_counter()
         try:
-            epochs.append(client.query_sdf(points).epoch)
+            epochs.append(client.query_sdf(points, gradient).epoch)
             latencies_s.append(time.perf_counter() - started)
         except TriquadError as error:
             errors += 1
@@ -128,11 +134,11 @@ def _report(
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the process; ``argv`` is endpoint, map and file of points."""
+    """Run the process; ``argv`` is endpoint, map, file of points and perhaps "gradient"."""
     from triquad_client import connect
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    endpoint, map_name, points = argv
+    endpoint, map_name, points, *gradient = argv
     stop = threading.Event()
 
     def wait_for_end() -> None:
@@ -141,7 +147,7 @@ def main(argv: Sequence[str]) -> int:
 
     threading.Thread(target=wait_for_end, daemon=True).start()
     with connect(endpoint, map_name) as client:
-        report = ask_until(stop, client, np.load(points))
+        report = ask_until(stop, client, np.load(points), bool(gradient))
     print(json.dumps(asdict(report)))
     return 0
 

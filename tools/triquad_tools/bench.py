@@ -1,0 +1,128 @@
+"""``triquad-bench``: how fast and how good triquad is on this machine."""
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from triquad_tools.arguments import seed
+from triquad_tools.errors import ToolError
+
+if TYPE_CHECKING:
+    from triquad_tools.bench_figures import Figure
+
+OK, FAILED, BAD_INPUT = 0, 1, 2
+
+PARTS = ("core", "server", "growth")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool: 0 done, whatever the figures; 1 a part failed; 2 wrong usage."""
+    options = _parser().parse_args(argv)
+    from triquad_client import TriquadError
+
+    try:
+        figures = measure(options.parts or list(PARTS), options.seed)
+    except (ToolError, TriquadError, OSError) as error:
+        return _complain(str(error), FAILED)
+    except KeyboardInterrupt:
+        return _complain("interrupted", FAILED)
+    _present(figures, options)
+    return OK
+
+
+def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
+    """The figures of some parts on one street."""
+    from triquad_tools.bench_core import measure_core
+    from triquad_tools.bench_server import measure_server
+    from triquad_tools.bench_street import bench_street
+
+    figures: list[Figure] = []
+    if "core" in parts or "server" in parts:
+        made = bench_street(street_seed)
+        if "server" in parts:
+            figures += measure_server(made)
+        if "core" in parts:
+            figures += measure_core(made)
+    if "growth" in parts:
+        figures += _growth(street_seed)
+    return figures
+
+
+def _growth(street_seed: int) -> "list[Figure]":
+    """Measured in a process of its own, whose memory nothing else has used."""
+    from triquad_tools.bench_figures import Figure
+
+    command = [sys.executable, "-m", "triquad_tools.bench_growth", str(street_seed)]
+    result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if result.returncode != 0:
+        raise ToolError(f"the part growth ended with exit code {result.returncode}")
+    return [Figure(**entry) for entry in json.loads(result.stdout)]
+
+
+def machine() -> str:
+    """The machine in words."""
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                name = line.partition(":")[2].strip()
+                break
+    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def _present(figures: "list[Figure]", options: argparse.Namespace) -> None:
+    from triquad_tools.bench_figures import markdown
+    from triquad_tools.report import Row, json_text, print_table
+
+    title = f"{datetime.date.today().isoformat()}, {machine()}, street {options.seed}"
+    rows = [
+        Row(figure.name, f"{figure.value:.3g} {figure.unit}".rstrip(), _note(figure))
+        for figure in figures
+    ]
+    print_table(title, rows)
+    if options.json is not None:
+        result = {"title": title, "figures": [asdict(figure) for figure in figures]}
+        options.json.write_text(json_text(result) + "\n", encoding="utf-8")
+    if options.record is not None:
+        with options.record.open("a", encoding="utf-8") as page:
+            page.write("\n" + markdown(title, figures))
+
+
+def _note(figure: "Figure") -> str:
+    if not figure.wanted:
+        return ""
+    return f"{figure.wanted}: {'yes' if figure.kept else 'NO'}"
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"triquad-bench: {message}", file=sys.stderr)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="triquad-bench",
+        description="Measure triquad on this machine, on a simulated street: a server under a "
+        "10 Hz lidar, its core against eager torch, and a map that grows to 16 regions. Takes "
+        "some minutes; nothing else should run meanwhile.",
+        epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
+    )
+    add = parser.add_argument
+    add("parts", nargs="*", choices=[*PARTS, []], metavar="PART", help=f"of {', '.join(PARTS)}")
+    add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
+    add("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    add("--record", type=Path, metavar="FILE.md", help="add a table to this page")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

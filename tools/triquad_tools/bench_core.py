@@ -1,0 +1,119 @@
+"""``triquad-bench`` in this process: taking in scans, training, queries, publishing.
+
+The baseline is the engine of tensors with automatic differentiation, on all cores.
+"""
+
+import os
+import statistics
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from triquad_format.status import Status
+from triquad_server.adam import Betas
+from triquad_server.engine import TorchEngine
+from triquad_server.epoch import Epoch
+from triquad_server.mapper import Mapper
+from triquad_server.region_map import RegionMap
+from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
+
+from triquad_tools.bench_figures import Figure, compare, seconds
+from triquad_tools.bench_street import BenchStreet
+from triquad_tools.progress import progress
+
+_QUERY_POINTS = 100_000
+_ROUNDS = 9
+_SETTLE_SCANS = 20  # the first scans, which meet nothing but new surface, are not typical
+
+
+def measure_core(made: BenchStreet) -> list[Figure]:
+    """Figures of the map's core."""
+    settings = Settings()
+    warm_up(settings, "cpu")
+    mapper = Mapper("bench", settings, "cpu")
+    with progress("core", 5) as report:
+        report(0, "taking in scans")
+        ingest_s = [
+            seconds(partial(mapper.ingest, scan.points, scan.world_from_sensor))
+            for scan in made.scans
+        ]
+        for _ in range(200):
+            mapper.train()
+        epoch = mapper.publish()
+        points = seen_points(epoch, made, np.random.default_rng(0))
+        region = max(mapper.regions, key=lambda region: region.field.parameters)
+        # The mapper leaves torch one thread; the baseline may use all.
+        torch.set_num_threads(os.cpu_count() or 1)
+        report(1, "training")
+        figures = _training(region, settings)
+        report(2, "queries")
+        figures += _queries(epoch, region, points)
+        torch.set_num_threads(1)
+        report(3, "publishing")
+        figures.append(_publishing(mapper))
+    typical = statistics.median(ingest_s[_SETTLE_SCANS:])
+    points_mean = float(np.mean([len(scan.points) for scan in made.scans]))
+    return [
+        Figure("parameters of the map", epoch.parameters / 1e6, "M"),
+        Figure(f"take in a scan of {points_mean:,.0f} points", 1e3 * typical, "ms", at_most=30),
+        *figures,
+    ]
+
+
+def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Random points [N, 3] of what rays have shown of the street, free or surface."""
+    low, high = made.drive.scene.bounds
+    found: list[NDArray[np.float64]] = []
+    while sum(map(len, found)) < _QUERY_POINTS:
+        points = rng.uniform(low, high, (_QUERY_POINTS, 3))
+        found.append(points[epoch.status(points) != Status.UNKNOWN])
+    return np.concatenate(found)[:_QUERY_POINTS]
+
+
+def _training(region: RegionMap, settings: Settings) -> list[Figure]:
+    training = settings.training
+    engine = TorchEngine(region.field)
+    betas = Betas(training.beta1, training.beta2)
+    rate = 1e-4  # so slow that the field stays what it is
+
+    def baseline() -> None:
+        engine.train(region.pool.draw(training.batch, 0), rate, betas)
+
+    step = compare(region.train, baseline, _ROUNDS, repeats=15)
+    return [
+        Figure("training", training.batch / step.seconds / 1e6, "M samples/s", at_least=1.0),
+        Figure("training, times eager torch", step.ratio, "", at_least=8),
+    ]
+
+
+def _queries(epoch: Epoch, region: RegionMap, points: NDArray[np.float64]) -> list[Figure]:
+    engine = TorchEngine(region.field)
+    local = (points - region.centre).astype(np.float32)
+    plain = compare(
+        lambda: epoch.query(points), lambda: engine.evaluate(local, False), _ROUNDS, repeats=5
+    )
+    steep = compare(
+        lambda: epoch.query(points, gradient=True),
+        lambda: engine.evaluate(local, True),
+        _ROUNDS,
+        repeats=5,
+    )
+    rate = len(points) / plain.seconds / 1e6
+    steep_rate = len(points) / steep.seconds / 1e6
+    return [
+        Figure("SDF queries with status", rate, "M points/s", at_least=2.5),
+        Figure("SDF queries, times eager torch", plain.ratio, "", at_least=6),
+        Figure("SDF and gradient", steep_rate, "M points/s"),
+        Figure("SDF and gradient, share of the SDF rate", steep_rate / rate, "", at_least=0.5),
+        Figure("SDF and gradient, times eager torch", steep.ratio, ""),
+    ]
+
+
+def _publishing(mapper: Mapper) -> Figure:
+    times = []
+    for _ in range(_ROUNDS):
+        mapper.train()
+        times.append(seconds(mapper.publish))
+    return Figure("publish an epoch", 1e3 * statistics.median(times), "ms")
