@@ -21,7 +21,7 @@ def test_the_normal_of_a_noisy_plane() -> None:
         assert known.mean() > 0.9
         angles = np.degrees(np.arccos(np.clip(np.abs(found[known] @ normal), 0, 1)))
         assert np.median(angles) < 4
-        np.testing.assert_allclose(np.linalg.norm(found[known], axis=1), 1, atol=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(found[known], axis=1), 1, atol=1e-5)
 
 
 def test_a_line_of_points_has_no_normal() -> None:
@@ -38,7 +38,7 @@ def test_later_scans_fill_in_what_one_line_cannot_tell() -> None:
     found = normals.add(lines[0], np.zeros(3))
     known = ~np.isnan(found[:, 0])
     assert known.mean() > 0.8
-    np.testing.assert_allclose(np.abs(found[known][:, 2]), 1, atol=1e-6)
+    np.testing.assert_allclose(np.abs(found[known][:, 2]), 1, atol=1e-5)
 
 
 def test_scattered_points_have_no_normal() -> None:
@@ -55,7 +55,7 @@ def test_memory_is_bounded_and_the_surroundings_stay_known() -> None:
         normals.add(ground, np.array([x, 0.0, 1.8]))
     near = np.array([[x, y, 0.0] for x in (188.0, 190, 192) for y in (-1.0, 0, 1)])
     sensor = np.array([190.0, 0.0, 1.8])
-    np.testing.assert_allclose(np.abs(normals.add(near, sensor)[:, 2]), 1, atol=1e-6)
+    np.testing.assert_allclose(np.abs(normals.add(near, sensor)[:, 2]), 1, atol=1e-5)
     behind = normals.add(np.zeros((1, 3)), sensor)
     assert np.isnan(behind).all(), "what lies far behind is forgotten"
 

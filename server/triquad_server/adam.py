@@ -68,7 +68,10 @@ class Parameter:
             self._means = _grown(self._means, capacity)
             self._variances = _grown(self._variances, capacity)
             self._steps = _grown(self._steps, capacity)
-        self._values[self._count : count] = values
+        new = slice(self._count, count)
+        self._values[new] = values
+        for state in (self._means, self._variances, self._steps):
+            state[new] = 0
         self._count = count
 
     def restore(self, means: Tensor, variances: Tensor, steps: Tensor) -> None:
@@ -91,6 +94,7 @@ class Parameter:
 
 
 def _grown(tensor: Tensor, capacity: int) -> Tensor:
-    grown = tensor.new_zeros((capacity, *tensor.shape[1:]))
+    # What nothing has been written to takes no memory.
+    grown = tensor.new_empty((capacity, *tensor.shape[1:]))
     grown[: len(tensor)] = tensor
     return grown

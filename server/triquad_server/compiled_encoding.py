@@ -100,13 +100,18 @@ def interpolate(tile: Tile, levels: int, features: Floats) -> None:
     tile.features[:] = 0
     for t in range(TILE):
         for at in range(3 * levels):
-            rows = tile.rows[t, 4 * at : 4 * at + 4]
+            first = 4 * at
             add_rows(
                 tile.features,
                 t,
                 (at % levels) * size,
                 features,
-                (rows[0], rows[1], rows[2], rows[3]),
+                (
+                    tile.rows[t, first],
+                    tile.rows[t, first + 1],
+                    tile.rows[t, first + 2],
+                    tile.rows[t, first + 3],
+                ),
                 _weights(tile, at, t),
             )
     for k in range(levels * size):

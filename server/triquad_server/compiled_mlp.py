@@ -57,23 +57,31 @@ def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
 def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
     """``sums += x @ g.T`` for x [K, T], g [J, T], sums [K, J]."""
     inputs, outputs = sums.shape
-    for k in range(inputs):
-        j = 0
-        while j + 4 <= outputs:
+    even, fourth = inputs - inputs % 2, outputs - outputs % 4
+    for k in range(0, even, 2):  # 2 rows by 4, so that what is read serves several products
+        for j in range(0, fourth, 4):
             s0, s1, s2, s3 = _ZERO, _ZERO, _ZERO, _ZERO
+            t0, t1, t2, t3 = _ZERO, _ZERO, _ZERO, _ZERO
             for t in range(TILE):
                 s0 += x[k, t] * g[j, t]
                 s1 += x[k, t] * g[j + 1, t]
                 s2 += x[k, t] * g[j + 2, t]
                 s3 += x[k, t] * g[j + 3, t]
+                t0 += x[k + 1, t] * g[j, t]
+                t1 += x[k + 1, t] * g[j + 1, t]
+                t2 += x[k + 1, t] * g[j + 2, t]
+                t3 += x[k + 1, t] * g[j + 3, t]
             sums[k, j] += s0
             sums[k, j + 1] += s1
             sums[k, j + 2] += s2
             sums[k, j + 3] += s3
-            j += 4
-        while j < outputs:
+            sums[k + 1, j] += t0
+            sums[k + 1, j + 1] += t1
+            sums[k + 1, j + 2] += t2
+            sums[k + 1, j + 3] += t3
+    for k in range(inputs):
+        for j in range(fourth if k < even else 0, outputs):
             sums[k, j] += _dot(x[k], g[j])
-            j += 1
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)

@@ -15,7 +15,7 @@ from triquad_server.compiled_field import CompiledField, Touched
 from triquad_server.compiled_mlp import Mlp
 from triquad_server.field import Field
 from triquad_server.sampling import Batch
-from triquad_server.threads import ANSWERS, THREADS, TRAINING, share
+from triquad_server.threads import MAPPING, THREADS, share
 
 _LAST_STEP = 2**31 - 1
 _CHUNK = 131_072  # points that tensors are made for at a time
@@ -107,16 +107,11 @@ class CompiledEngine:
         self._sums = sums or GradientSums()
 
     def evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
-        """The field at points [N, 3], metres from the region's centre."""
+        """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
         field = self._compiled()
         logits = np.empty(len(points), np.float32)
         gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
-
-        def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            compiled_field.evaluate(points[part], field, logits[part], gradients[part])
-
-        ANSWERS.split(len(points), work)
+        compiled_field.evaluate(points, field, logits, gradients)
         scale = np.float32(self._field.settings.logit_scale_m)
         return FieldValues(logits * scale, gradients * scale)
 
@@ -144,11 +139,11 @@ class CompiledEngine:
                 sums.step,
             )
 
-        TRAINING.each(work)
+        MAPPING.each(work)
         how_far = rates(rate, betas)
         self._step_mlp(mlp_sums, how_far)
         moments = _moments(self._field.features)
-        TRAINING.each(
+        MAPPING.each(
             lambda part: step_touched(
                 part, counts[part], sums.step, sums.touched, sums.features, moments, how_far
             ),

@@ -21,6 +21,7 @@ from triquad_server.field_record import region_record
 from triquad_server.mesher import TileMesh, mesh_tile
 from triquad_server.region_lattice import Owners, RegionLattice
 from triquad_server.settings import MeshSettings
+from triquad_server.threads import ANSWERS
 
 
 @dataclass(frozen=True)
@@ -87,16 +88,36 @@ class Epoch:
 
     def query(self, points: NDArray[np.float64], gradient: bool = False) -> Answer:
         """Signed distance, status and, on request, gradient at points [N, 3] of the map frame."""
-        points = np.ascontiguousarray(points)
-        owners = self._lattice.owners(points)
-        values = self._values(points, owners, gradient)
-        status = self._status(points, owners)
-        return Answer(values.sdf, status, values.gradient if gradient else None)
+        count = len(points)
+        answer = Answer(
+            np.empty(count, np.float32),
+            np.empty(count, np.uint8),
+            np.empty((count, 3), np.float32) if gradient else None,
+        )
+
+        def work(first: int, last: int) -> None:
+            part = slice(first, last)
+            owners = self._lattice.owners(points[part])
+            values = self._values(points[part], owners, gradient)
+            answer.sdf[part] = values.sdf
+            if answer.gradient is not None:
+                answer.gradient[part] = values.gradient
+            answer.status[part] = self._status(points[part], owners)
+
+        ANSWERS.split(count, work)
+        return answer
 
     def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
         """Signed distances [N] alone at points [N, 3] of the map frame."""
-        points = np.ascontiguousarray(points)
-        return self._values(points, self._lattice.owners(points), gradient=False).sdf
+        distances = np.empty(len(points), np.float32)
+
+        def work(first: int, last: int) -> None:
+            part = slice(first, last)
+            owners = self._lattice.owners(points[part])
+            distances[part] = self._values(points[part], owners, gradient=False).sdf
+
+        ANSWERS.split(len(points), work)
+        return distances
 
     def status(
         self,
@@ -108,9 +129,15 @@ class Epoch:
         ``SURFACE`` reaches ``reach_m`` beyond the voxels in which rays ended; half a voxel if
         not given.
         """
-        points = np.ascontiguousarray(points)
         reach = 0.5 if reach_m is None else reach_m / self._settings.leaf_m
-        return self._status(points, self._lattice.owners(points), reach)
+        status = np.empty(len(points), np.uint8)
+
+        def work(first: int, last: int) -> None:
+            part = slice(first, last)
+            status[part] = self._status(points[part], self._lattice.owners(points[part]), reach)
+
+        ANSWERS.split(len(points), work)
+        return status
 
     def tiles(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> TileSet:
         """Tiles that hold seen surface and meet the box between two corners [3]."""

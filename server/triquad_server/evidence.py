@@ -14,7 +14,6 @@ from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_format.region import Evidence as EvidenceRecord
 from triquad_format.status import Status
 
-from triquad_server.threads import ANSWERS
 from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 Masks = NDArray[np.uint8]
@@ -188,6 +187,7 @@ class Evidence:
 
     def __init__(self, side: int) -> None:
         self._side = side
+        self._twin: Evidence | None = None  # a copy for reading, until anything is recorded
         self._blocks = VoxelIndex(256)
         self._surface = np.zeros((256, BLOCK_BYTES), np.uint8)
         self._free = np.zeros((256, BLOCK_BYTES), np.uint8)
@@ -203,6 +203,7 @@ class Evidence:
         Returns:
             The voxels [M, 3] in which no ray had ended before.
         """
+        self._twin = None
         new = np.empty((len(voxels), 3), np.int64)
         done = found = 0
         while done < len(voxels):
@@ -233,6 +234,7 @@ class Evidence:
             ends: end points of the rays.
             stop_short: voxels before its end point where a ray stops to prove free space.
         """
+        self._twin = None
         done = 0
         while done < len(ends):
             index, count = self._blocks.arrays, self._blocks.count
@@ -255,20 +257,8 @@ class Evidence:
         ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
         """
         status = np.empty(len(voxels), np.uint8)
-
-        def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            _status(
-                voxels[part],
-                reach,
-                self._side,
-                self._blocks.arrays,
-                self._surface,
-                self._free,
-                status[part],
-            )
-
-        ANSWERS.split(len(voxels), work)
+        index = self._blocks.arrays
+        _status(voxels, reach, self._side, index, self._surface, self._free, status)
         return status
 
     def surface_cells(self) -> NDArray[np.int64]:
@@ -277,6 +267,7 @@ class Evidence:
 
     def clear(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
+        self._twin = None
         corners = self._blocks.cells() * BLOCK_VOXELS
         near = ((corners < high) & (corners + BLOCK_VOXELS > low)).all(axis=1)
         offsets = np.stack(np.meshgrid(*[np.arange(BLOCK_VOXELS)] * 3, indexing="ij"), -1)
@@ -289,11 +280,13 @@ class Evidence:
 
     def copy(self) -> "Evidence":
         """A copy for reading, which later marks do not change."""
-        twin = Evidence.__new__(Evidence)
-        twin._side, twin._blocks = self._side, self._blocks.copy()
-        twin._surface = self._surface[: self.blocks].copy()
-        twin._free = self._free[: self.blocks].copy()
-        return twin
+        if self._twin is None:
+            twin = Evidence(self._side)
+            twin._blocks = self._blocks.copy()
+            twin._surface = self._surface[: self.blocks].copy()
+            twin._free = self._free[: self.blocks].copy()
+            self._twin = twin
+        return self._twin
 
     def record(self) -> EvidenceRecord:
         """The evidence as the map file holds it; empty blocks are left out."""

@@ -10,6 +10,7 @@ import torch
 
 from triquad_server.errors import ServerError
 from triquad_server.mapper import Mapper
+from triquad_server.memory import give_back_early
 from triquad_server.network import NetworkOptions, listen_endpoints, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
@@ -43,6 +44,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     """
     device = choose_device(options.device)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    give_back_early()
     with ExitStack() as stack:
         store = None
         restored = None

@@ -15,7 +15,7 @@ from triquad_server.normals import SurfaceNormals
 from triquad_server.region_map import RegionMap, RegionSetup
 from triquad_server.scan import IngestReport, ScanRefusedError, usable_rays
 from triquad_server.settings import Settings
-from triquad_server.threads import ANSWERS
+from triquad_server.threads import MAPPING
 
 _LOSS_MEMORY = 0.95
 _POOL_STEP = 1.1
@@ -87,7 +87,7 @@ class Mapper:
         regions = [self._region(index) for index in around]
         for region in regions:
             region.see(rays)
-        carving = [ANSWERS.beside(partial(region.carve, rays)) for region in regions]
+        carving = [MAPPING.beside(partial(region.carve, rays)) for region in regions]
         try:
             normals = self._normals.add(rays.ends, rays.origin)
             for region in regions:

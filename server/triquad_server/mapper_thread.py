@@ -17,6 +17,7 @@ from triquad_server.scan import ScanRefusedError
 from triquad_server.scan_queue import ScanQueue
 from triquad_server.sources import SourceLedger
 from triquad_server.tally import Tally
+from triquad_server.threads import PATIENCE, be_patient
 
 _log = logging.getLogger(__name__)
 
@@ -127,6 +128,7 @@ class MapperThread:
         return future.result()
 
     def _run(self) -> None:
+        be_patient(PATIENCE)
         try:
             while not self._stopping.is_set():
                 self._turn()

@@ -9,17 +9,19 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_server.threads import ANSWERS
+from triquad_server.threads import MAPPING
 from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
 _MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
+_FULL = 65_536  # points of a cell, above which older ones count for less
 _RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
 
-Moments = NDArray[np.float64]
+Moments = NDArray[np.float32]
+Normals = NDArray[np.float32]
 Rows = NDArray[np.int32]
-Counts = NDArray[np.float64]
+Counts = NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -56,6 +58,8 @@ def _add(
         m[7] += b * b
         m[8] += b * c
         m[9] += c * c
+        if m[0] > _FULL:
+            m *= np.float32(0.5)
     return len(points), count
 
 
@@ -148,19 +152,18 @@ def _outdated(rows: Rows, normals: NDArray[np.float64], moments: Moments, basis:
 
 
 @numba.njit(cache=True, nogil=True)
-def _estimate(
-    rows: Rows, cell_m: float, index: Index, moments: Moments, normals: NDArray[np.float64]
-) -> None:
+def _estimate(rows: Rows, cell_m: float, index: Index, moments: Moments, normals: Normals) -> None:
     """Set the normals [cells, 3] of cells; NaN where there is no plane."""
-    total = np.empty(10)
+    total, normal = np.empty(10), np.empty(3)
     for row in rows:
         _gather(row, cell_m, index, moments, total)
-        if not _plane_normal(total, normals[row]):
-            normals[row] = np.nan
+        if not _plane_normal(total, normal):
+            normal[:] = np.nan
+        normals[row] = normal
 
 
 @numba.njit(cache=True, nogil=True)
-def _adopt(rows: Rows, of_cells: NDArray[np.float64], normals: NDArray[np.float64]) -> None:
+def _adopt(rows: Rows, of_cells: Normals, normals: NDArray[np.float64]) -> None:
     """Replace those of ``normals`` that are NaN by those of their cells."""
     for i in range(len(rows)):
         if np.isnan(normals[i, 0]):
@@ -174,9 +177,11 @@ class MomentGrid:
     def __init__(self, cell_m: float) -> None:
         self._cell_m = cell_m
         self._cells = VoxelIndex(1024)
-        self._moments = np.zeros((1024, 10))
-        self._normals = np.zeros((1024, 3))
-        self._basis = np.zeros(1024)  # points in each cell when its normal was estimated
+        self._moments = np.zeros((1024, 10), np.float32)
+        self._normals = np.zeros((1024, 3), np.float32)
+        self._basis = np.zeros(
+            1024, np.float32
+        )  # points in each cell when its normal was estimated
 
     def add(self, points: NDArray[np.float64]) -> Rows:
         """Add points [N, 3], metres, map frame; returns the row of each one's cell."""
@@ -206,7 +211,7 @@ class MomentGrid:
             part = outdated[first:last]
             _estimate(part, self._cell_m, self._cells.arrays, self._moments, self._normals)
 
-        ANSWERS.split(len(outdated), work)
+        MAPPING.split(len(outdated), work)
         _adopt(rows, self._normals, normals)
 
     def keep_nearest(self, place: NDArray[np.float64], cells: int) -> None:
@@ -239,8 +244,8 @@ class MomentGrid:
         self._basis = _refitted(self._basis[rows], capacity)
 
 
-def _refitted(array: NDArray[np.float64], capacity: int) -> NDArray[np.float64]:
-    fitted = np.zeros((capacity, *array.shape[1:]))
+def _refitted(array: NDArray[np.float32], capacity: int) -> NDArray[np.float32]:
+    fitted = np.zeros((capacity, *array.shape[1:]), np.float32)
     fitted[: len(array)] = array
     return fitted
 
@@ -252,7 +257,7 @@ class SurfaceNormals:
         self,
         fine_m: float = 0.15,
         coarse_m: float = 0.5,
-        max_cells: int = 300_000,  # of each grid, at some 150 bytes
+        max_cells: int = 200_000,  # of each grid, at some 100 bytes
     ) -> None:
         self._grids = (MomentGrid(fine_m), MomentGrid(coarse_m))
         self._max_cells = max_cells

@@ -157,6 +157,7 @@ class TriQuadtree:
         starts = np.cumsum([0, *(side**2 for side in sides)])
         self.shape = Shape(settings.feature_levels, 1 << settings.levels[0], starts[:-1])
         self._rows = 1
+        self._twin: TriQuadtree | None = None  # a copy for reading, until this tree grows
         self._blocks = VoxelIndex(_MIN_CAPACITY)
         self._blocks.arrays.row_keys[0] = _NO_BLOCK
         self._blocks.count = 1
@@ -177,6 +178,8 @@ class TriQuadtree:
 
     def copy(self) -> "TriQuadtree":
         """A copy for reading, which does not change when this tree grows."""
+        if self._twin is not None:
+            return self._twin
         twin = TriQuadtree(self._settings)
         twin._rows = self._rows
         twin._blocks = self._blocks.copy()
@@ -184,6 +187,7 @@ class TriQuadtree:
         twin.vertices = self.vertices._replace(
             blocks=twin._blocks.arrays, rows=self.vertices.rows[: self._blocks.count].copy()
         )
+        self._twin = twin
         return twin
 
     def grow(self, leaves: Codes) -> int:
@@ -191,6 +195,8 @@ class TriQuadtree:
 
         Leaves are int64 coordinates [N, 3] in ``[0, 2**depth)``.
         """
+        if len(leaves):
+            self._twin = None
         before = self._rows
         done = 0
         while done < len(leaves):
@@ -204,6 +210,7 @@ class TriQuadtree:
     def restore(self, plane: int, h: int, codes: Codes) -> None:
         """Give the next rows to the vertices ``codes`` [V] of one level, in their order."""
         coordinates = morton.decode(codes, 2)
+        self._twin = None
         done = 0
         while done < len(coordinates):
             done, self._blocks.count, self._rows = _restore(

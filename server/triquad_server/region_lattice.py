@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import RegionIndex
 
-from triquad_server.threads import ANSWERS
 from triquad_server.voxel_index import CELL_LIMIT, Index, VoxelIndex, find_row, pack
 
 _NOBODY = -1
@@ -40,6 +39,27 @@ def _find_owners(
         shared[i] = off > core_m
 
 
+@numba.njit(cache=True, nogil=True)
+def _sorted_by(
+    regions: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The points in the order of their regions, and where each of ``count`` regions begins.
+
+    Points without a region come first.
+    """
+    starts = np.zeros(count + 2, np.int64)
+    for region in regions:
+        starts[region + 2] += 1
+    for i in range(1, count + 2):
+        starts[i] += starts[i - 1]
+    order = np.empty(len(regions), np.int64)
+    free = starts[:-1].copy()
+    for i in range(len(regions)):
+        order[free[regions[i] + 1]] = i
+        free[regions[i] + 1] += 1
+    return order, starts[1:]
+
+
 @dataclass(frozen=True)
 class Owned:
     """Points of a query that one region answers for."""
@@ -64,10 +84,10 @@ class Owners:
             if first >= 0:
                 yield Owned(first, slice(None))
             return
-        order = np.argsort(self.regions, kind="stable")
-        for region in np.unique(self.regions[self.regions >= 0]).tolist():
-            ends = np.searchsorted(self.regions, [region, region + 1], sorter=order)
-            yield Owned(region, order[ends[0] : ends[1]])
+        order, starts = _sorted_by(self.regions, last + 1)
+        for region in range(last + 1):
+            if starts[region] < starts[region + 1]:
+                yield Owned(region, order[starts[region] : starts[region + 1]])
 
 
 class RegionLattice:
@@ -82,17 +102,6 @@ class RegionLattice:
     def owners(self, points: NDArray[np.float64]) -> Owners:
         """Who answers for points [N, 3], metres, map frame."""
         found = Owners(np.empty(len(points), np.int32), np.empty(len(points), np.bool_))
-
-        def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            _find_owners(
-                points[part],
-                self._pitch_m,
-                self._core_m,
-                self._index,
-                found.regions[part],
-                found.shared[part],
-            )
-
-        ANSWERS.split(len(points), work)
+        points = np.ascontiguousarray(points)
+        _find_owners(points, self._pitch_m, self._core_m, self._index, found.regions, found.shared)
         return found

@@ -12,12 +12,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from triquad_server.feature_rows import prefetch_row
+from triquad_server.quadtree import spread
 from triquad_server.segments import DIRECTION, END, FREE_FROM, FREE_TO, LABEL, SLOPE
+from triquad_server.threads import MAPPING
 
 Floats = NDArray[np.float32]
 
-_CELLS = 256
+_CELLS = 128
 """Cells from the centre of the cube to its face, by which samples are put in order."""
+
+_AHEAD = 16  # segments that are brought into the cache before their turn
 
 
 class Placement(NamedTuple):
@@ -53,14 +58,6 @@ def draw_samples(segments: Tensor, placement: Placement, generator: torch.Genera
     )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _every_third_bit(number: int) -> int:
-    """The 10 bits of a number, each followed by two zeros."""
-    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
-        number = (number | (number << shift)) & mask
-    return number
-
-
 @numba.njit(cache=True, nogil=True)
 def _draw(
     segments: Floats,
@@ -72,8 +69,10 @@ def _draw(
     samples: Floats,
     cells: NDArray[np.int64],
 ) -> None:
-    cell_m = placement.half_side_m / _CELLS
+    """Fill in the samples [B, 4], points and labels, and the cells [B] that hold them."""
+    per_m = _CELLS / placement.half_side_m
     for i in range(len(chosen)):
+        prefetch_row(segments, chosen[min(i + _AHEAD, len(chosen) - 1)])
         row = segments[chosen[i]]
         offset = near[i] * placement.spread_m
         offset = min(max(offset, -placement.truncation_m), placement.truncation_m)
@@ -83,13 +82,30 @@ def _draw(
             outside = outside or abs(place) >= placement.half_side_m
         if outside or kinds[i] >= placement.surface_share:
             offset = row[FREE_FROM] + places[i] * (row[FREE_TO] - row[FREE_FROM])
-        cell = np.int64(0)
         for axis in range(3):
-            place = row[END + axis] + offset * row[DIRECTION + axis]
-            samples[i, axis] = place
-            cell |= _every_third_bit(int(place / cell_m) + _CELLS) << axis
+            samples[i, axis] = row[END + axis] + offset * row[DIRECTION + axis]
         samples[i, 3] = row[LABEL] - offset * row[SLOPE]
-        cells[i] = cell
+        u = min(max(int(samples[i, 0] * per_m + _CELLS), 0), 2 * _CELLS - 1)
+        v = min(max(int(samples[i, 1] * per_m + _CELLS), 0), 2 * _CELLS - 1)
+        cells[i] = spread(u) | (spread(v) << 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_order(samples: Floats, cells: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Points [B, 3] and labels [B] in the order of their cells (a counting sort)."""
+    starts = np.zeros((2 * _CELLS) ** 2 + 1, np.int32)
+    for cell in cells:
+        starts[cell + 1] += 1
+    for i in range(1, len(starts)):
+        starts[i] += starts[i - 1]
+    points, labels = np.empty((len(cells), 3), np.float32), np.empty(len(cells), np.float32)
+    for i in range(len(cells)):
+        place = starts[cells[i]]
+        starts[cells[i]] += 1
+        for axis in range(3):
+            points[place, axis] = samples[i, axis]
+        labels[place] = samples[i, 3]
+    return points, labels
 
 
 def draw_ordered_samples(
@@ -107,9 +123,20 @@ def draw_ordered_samples(
     cells = np.empty(count, np.int64)
     kinds, places = rng.random((2, count), np.float32)
     near = rng.standard_normal(count, np.float32)
-    _draw(segments, chosen, placement, kinds, places, near, samples, cells)
-    samples = samples[np.argsort(cells)]
-    return Batch(
-        torch.from_numpy(np.ascontiguousarray(samples[:, :3])),
-        torch.from_numpy(np.ascontiguousarray(samples[:, 3])),
-    )
+
+    def work(first: int, last: int) -> None:
+        part = slice(first, last)
+        _draw(
+            segments,
+            chosen[part],
+            placement,
+            kinds[part],
+            places[part],
+            near[part],
+            samples[part],
+            cells[part],
+        )
+
+    MAPPING.split(count, work)
+    points, labels = _in_order(samples, cells)
+    return Batch(torch.from_numpy(points), torch.from_numpy(labels))

@@ -45,11 +45,11 @@ class ScanSettings:
 class TrainingSettings:
     """How the field is trained."""
 
-    batch: int = 8192  # samples per step
+    batch: int = 16_384  # samples per step
     learning_rate: float = 0.01
     beta1: float = 0.9
     beta2: float = 0.99
-    pool_segments: int = 1_500_000  # what so many rays taught is kept, over the whole map
+    pool_segments: int = 1_200_000  # what so many rays taught is kept, over the whole map
     fresh_share: float = 0.5  # of a batch, drawn from the newest scans while they stream in
     visits: float = 24.0  # training samples that each new segment pays for
     max_backlog: int = 12_000_000  # samples owed at most, per region

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -11,21 +12,17 @@ THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity"
 
 _MIN_SHARE = 2048
 """Points below which splitting work between threads costs more than it gains."""
-_NICE = 10
 
 
 class Team:
-    """Threads that share work; those of a patient team leave the cores to whoever else wants them.
+    """Threads that share work with the caller."""
 
-    Where the system does not know priorities of single threads, a patient team is like any other.
-    """
-
-    def __init__(self, name: str, patient: bool = False) -> None:
-        self._patient = patient
+    def __init__(self, name: str, patience: int = 0) -> None:
         self._pool = ThreadPoolExecutor(
             THREADS,
             thread_name_prefix=name,
-            initializer=_be_patient if patient else None,
+            initializer=be_patient,
+            initargs=(patience,),
         )
 
     def each(self, work: Callable[[int], None]) -> None:
@@ -42,11 +39,8 @@ class Team:
         return self._pool.submit(work)
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
-        # The caller has other things to do at once: a patient team does all work itself.
-        mine = 0 if self._patient else 1
-        others = [self._pool.submit(work, part) for part in range(mine, parts)]
-        if mine:
-            work(0)
+        others = [self._pool.submit(work, part) for part in range(1, parts)]
+        work(0)
         for other in others:
             other.result()
 
@@ -56,14 +50,21 @@ def share(count: int, part: int, parts: int = THREADS) -> tuple[int, int]:
     return -(-count * part // parts), -(-count * (part + 1) // parts)
 
 
-def _be_patient() -> None:
-    if hasattr(os, "setpriority"):
+def be_patient(patience: int) -> None:
+    """Have the calling thread leave the cores to threads of less patience, 0 being the least.
+
+    Where the system does not know priorities of single threads, nothing happens.
+    """
+    if patience and sys.platform == "linux":
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), patience)
 
-
-TRAINING = Team("triquad-training", patient=True)
-"""For what can wait: training."""
 
 ANSWERS = Team("triquad-answers")
-"""For what someone waits for: queries, and taking in scans."""
+"""For queries: someone waits."""
+
+PATIENCE = 5
+"""Of everything but queries."""
+
+MAPPING = Team("triquad-mapping", PATIENCE)
+"""For taking in scans and training; the mapper's own thread is as patient."""

@@ -53,11 +53,12 @@ def measure_growth(seed: int) -> list[Figure]:
         queries.append(statistics.median(seconds(query) for _ in range(9)))
         resident.append(resident_bytes())
     each = np.diff(resident) / 1e6  # 100 m of street each
-    halves = each[: len(each) // 2].mean(), each[len(each) // 2 :].mean()
+    # Medians: the replay pool fills up once.
+    halves = np.median(each[: len(each) // 2]), np.median(each[len(each) // 2 :])
     return [
         Figure("training step, 16 regions against 1", steps[-1] / steps[0], "", at_most=1.3),
         Figure("query, 16 regions against 1", queries[-1] / queries[0], "", at_most=1.3),
-        Figure("resident memory per 100 m of street", float(each.mean()), "MB"),
+        Figure("resident memory per 100 m of street", float(np.median(each)), "MB"),
         Figure(
             "the same, second 800 m against the first",
             float(halves[1] / halves[0]),

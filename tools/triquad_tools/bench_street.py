@@ -40,4 +40,6 @@ def bench_street(seed: int) -> BenchStreet:
         report(SCANS, "where it is scored")
         probes = street_probes(through, np.random.default_rng(0))
         visible = through.true_hits(_VISIBLE_VOXEL_M)
+        low, high = scene.bounds  # to which meshes are cut
+        visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
     return BenchStreet(through, scans, probes, visible)
