@@ -5,7 +5,7 @@ import pytest
 import torch
 from triquad_format.field_settings import FieldSettings
 from triquad_server.adam import Betas
-from triquad_server.engine import CompiledEngine, TorchEngine, make_engine
+from triquad_server.engine import CompiledEngine, GradientSums, TorchEngine, make_engine
 from triquad_server.field import Field
 from triquad_server.sampling import Batch
 
@@ -60,7 +60,7 @@ def test_values_and_gradients_are_equal(settings: FieldSettings) -> None:
 def test_a_training_step_is_equal(settings: FieldSettings) -> None:
     slow, fast = trained(settings), trained(settings)
     batch = samples(settings, 4096, seed=2)
-    engine = CompiledEngine(fast)
+    engine = CompiledEngine(fast, GradientSums())
     for step in range(3):
         loss = TorchEngine(slow).train(batch, 0.01, Betas(0.9, 0.99))
         assert engine.train(batch, 0.01, Betas(0.9, 0.99)) == pytest.approx(loss, rel=1e-4), step
@@ -76,7 +76,7 @@ def test_a_training_step_is_equal(settings: FieldSettings) -> None:
 def test_training_goes_on_after_growth() -> None:
     settings = FieldSettings(depth=8, frequencies=4)
     field = trained(settings)
-    engine = make_engine(field)
+    engine = make_engine(field, GradientSums())
     batch = samples(settings, 2048, seed=5)
     before = len(field.features)
     field.grow(leaves(settings, batch))

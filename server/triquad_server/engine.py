@@ -64,7 +64,10 @@ class GradientSums:
 
 
 def make_engine(field: Field, sums: GradientSums | None = None) -> Engine:
-    """The engine for a field: compiled code on the CPU, tensors elsewhere."""
+    """The engine for a field: compiled code on the CPU, tensors elsewhere.
+
+    Without ``sums`` it is for a field that never changes.
+    """
     return CompiledEngine(field, sums) if field.device.type == "cpu" else TorchEngine(field)
 
 
@@ -103,12 +106,14 @@ class CompiledEngine:
     """Compiled kernels over the field's own memory, on all cores."""
 
     def __init__(self, field: Field, sums: GradientSums | None = None) -> None:
+        """``sums`` is for training; a field that is given without it must never change."""
         self._field = field
-        self._sums = sums or GradientSums()
+        self._sums = sums
+        self._frozen = self._compiled() if sums is None else None
 
     def evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
         """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
-        field = self._compiled()
+        field = self._frozen or self._compiled()
         logits = np.empty(len(points), np.float32)
         gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
         compiled_field.evaluate(points, field, logits, gradients)
@@ -121,6 +126,7 @@ class CompiledEngine:
         targets = torch.sigmoid(batch.labels / self._field.settings.logit_scale_m).numpy()
         field = self._compiled()
         sums = self._sums
+        assert sums is not None, "this engine is not for training"
         sums.begin(*field.features.shape)
         mlp_sums = [Mlp(*map(np.zeros_like, field.mlp)) for _ in range(THREADS)]
         counts = [0] * THREADS

@@ -39,6 +39,9 @@ from triquad_server.store import Store
 from triquad_server.tally import Tally
 
 
+_TILE_WORKERS = 2  # one computes while another packs
+
+
 @dataclass(frozen=True)
 class ServedMap:
     """A map that is handed over to a service; nothing else may use it from then on."""
@@ -181,6 +184,7 @@ class Service:
                 keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
                 keys.TILE: answering(TileRequest, tiles.tile),
             },
+            _TILE_WORKERS,
         )
         self._open_desk(
             {
