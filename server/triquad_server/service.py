@@ -38,7 +38,6 @@ from triquad_server.sources import SourceLedger
 from triquad_server.store import Store
 from triquad_server.tally import Tally
 
-
 _TILE_WORKERS = 2  # one computes while another packs
 
 
