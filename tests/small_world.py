@@ -43,9 +43,9 @@ def settings(**training: object) -> Settings:
     )
 
 
-def settled_mapper(chosen: Settings, drive_through: World) -> Mapper:
+def settled_mapper(chosen: Settings, drive_through: World, device: str = "cpu") -> Mapper:
     """A mapper that learnt all it can of a world."""
-    mapper = Mapper("test", chosen, "cpu")
+    mapper = Mapper("test", chosen, device)
     for scan in drive_through.scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
     settle(mapper)

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import small_world
 import torch
 from triquad_format.field_settings import FieldSettings
-from triquad_server.adam import Betas
+from triquad_server.adam import Betas, Parameter
 from triquad_server.engine import CompiledEngine, GradientSums, TorchEngine, make_engine
 from triquad_server.field import Field
 from triquad_server.sampling import Batch
@@ -62,7 +63,7 @@ def test_a_training_step_is_equal(settings: FieldSettings) -> None:
     batch = samples(settings, 4096, seed=2)
     engine = CompiledEngine(fast, GradientSums())
     for step in range(3):
-        loss = TorchEngine(slow).train(batch, 0.01, Betas(0.9, 0.99))
+        loss = float(TorchEngine(slow).train(batch, 0.01, Betas(0.9, 0.99)))
         assert engine.train(batch, 0.01, Betas(0.9, 0.99)) == pytest.approx(loss, rel=1e-4), step
     assert torch.equal(slow.features.steps, fast.features.steps)
     # The gradient's moments are what the step is made of.
@@ -102,3 +103,26 @@ def test_no_points_give_no_values() -> None:
     field = trained(CASES[0])
     none = np.zeros((0, 3), np.float32)
     assert CompiledEngine(field).evaluate(none, gradient=True).gradient.shape == (0, 3)
+
+
+def test_a_step_over_all_rows_is_that_of_the_chosen() -> None:
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn((50, 8), generator=generator)
+    chosen, masked = Parameter(values), Parameter(values)
+    for _ in range(5):
+        mask = torch.rand(50, generator=generator) < 0.4
+        gradient = torch.randn((50, 8), generator=generator)
+        rows = mask.nonzero()[:, 0]
+        chosen.step(rows, gradient[rows], 0.01, Betas(0.9, 0.99))
+        masked.step_where(mask, gradient, 0.01, Betas(0.9, 0.99))
+    assert torch.equal(chosen.steps, masked.steps)
+    for name in ("values", "means", "variances"):
+        torch.testing.assert_close(getattr(masked, name), getattr(chosen, name))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_a_mapper_learns_on_the_gpu() -> None:
+    world = small_world.world(3)
+    mapper = small_world.settled_mapper(small_world.settings(), world, "cuda")
+    assert small_world.surface_error(mapper.publish(), world) < 0.02

@@ -90,9 +90,9 @@ def test_a_lower_limit_takes_effect_at_once() -> None:
     assert np.isfinite(pool.draw(100, 50).points.numpy()).all()
 
 
-def test_neighbours_in_a_batch_are_neighbours_in_space() -> None:
+def test_neighbours_in_a_batch_are_neighbours_on_the_ground() -> None:
     pool = new_pool(100_000)
     pool.add(labelled((RNG.random((50_000, 3)) * 100).astype(np.float32)))
-    points = pool.draw(8192, 0).points
+    points = pool.draw(8192, 0).points[:, :2]
     apart = (points[1:] - points[:-1]).norm(dim=1).median()
-    assert apart < 15, "drawn at random they are some 65 m apart"
+    assert apart < 5, "in any order they are some 50 m apart"

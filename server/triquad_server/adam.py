@@ -80,6 +80,21 @@ class Parameter:
         self.variances.copy_(variances)
         self.steps.copy_(steps)
 
+    def step_where(self, mask: Tensor, gradient: Tensor, rate: float, betas: Betas) -> None:
+        """As :meth:`step` for the rows where ``mask`` [rows] is set; ``gradient`` [rows, ...].
+
+        It goes over all rows, but need not know how many are set, for which a GPU would have to be
+        waited for.
+        """
+        self.steps.add_(mask)
+        mask = mask.reshape(-1, *[1] * (gradient.dim() - 1))
+        age = self.steps.to(gradient.dtype).reshape(mask.shape).clamp(min=1)
+        self.means.lerp_(gradient, (1 - betas.mean) * mask)
+        self.variances.lerp_(gradient.square(), (1 - betas.variance) * mask)
+        mean = self.means / (1 - betas.mean**age)
+        deviation = (self.variances / (1 - betas.variance**age)).sqrt_()
+        self.values.sub_(rate * mask * mean / (deviation + EPSILON))
+
     def step(self, rows: Tensor, gradient: Tensor, rate: float, betas: Betas) -> None:
         """One step of ``rows`` [T] along ``gradient`` [T, ...] at a learning ``rate``."""
         self._steps[rows] += 1

@@ -31,6 +31,8 @@ class CornerIndex:
         self._rows = torch.as_tensor(tree.vertices.rows, device=device)
         self._probes = longest_probe(blocks)
         self._starts = tree.shape.starts.tolist()
+        sides = [(1 << h) + 1 for h in range(settings.feature_levels)]
+        self._offsets = torch.tensor([[0, side, 1, side + 1] for side in sides], device=device)
 
     def around(self, points: Tensor) -> Corners:
         """Vertices around ``points`` [N, 3] (metres from the centre) and their weights."""
@@ -38,8 +40,10 @@ class CornerIndex:
         leaf = points / self._settings.leaf_m + (1 << (self._settings.depth - 1))
         rows = []
         weights = []
-        for plane, axes in enumerate(AXES):
-            uv = leaf[:, list(axes)] / (1 << (levels - 1))  # in blocks
+        for plane, (first, second) in enumerate(AXES):
+            uv = torch.stack([leaf[:, first], leaf[:, second]], 1) / (
+                1 << (levels - 1)
+            )  # in blocks
             block = uv.detach().floor()
             number = self._find(plane, block.to(torch.int64))
             plane_rows = self._rows[number]
@@ -50,8 +54,7 @@ class CornerIndex:
                 t = scaled - cell
                 side = (1 << h) + 1
                 corner = self._starts[h] + (cell[:, 0] * side + cell[:, 1]).to(torch.int64)
-                offsets = corner[:, None] + corner.new_tensor([0, side, 1, side + 1])
-                rows.append(plane_rows.gather(1, offsets))
+                rows.append(plane_rows.gather(1, corner[:, None] + self._offsets[h]))
                 weights.append(_bilinear(t))
         return Corners(self._by_level(rows), self._by_level(weights))
 

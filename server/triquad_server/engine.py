@@ -21,6 +21,10 @@ _LAST_STEP = 2**31 - 1
 _CHUNK = 131_072  # points that tensors are made for at a time
 
 
+Loss = float | torch.Tensor
+"""A number, or a tensor that holds it on a device: to look at it there, one has to wait."""
+
+
 @dataclass(frozen=True)
 class FieldValues:
     """Signed distances [N] and, where asked for, their gradients [N, 3] (else [0, 3])."""
@@ -35,7 +39,7 @@ class Engine(Protocol):
     def evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
         """The field at points [N, 3], metres from the region's centre."""
 
-    def train(self, batch: Batch, rate: float, betas: Betas) -> float:
+    def train(self, batch: Batch, rate: float, betas: Betas) -> Loss:
         """One optimiser step; returns the loss before it."""
 
 
@@ -97,9 +101,9 @@ class TorchEngine:
             value = self._field.sdf(tensor)
         return FieldValues(value.cpu().numpy(), np.zeros((0, 3), np.float32))
 
-    def train(self, batch: Batch, rate: float, betas: Betas) -> float:
+    def train(self, batch: Batch, rate: float, betas: Betas) -> Loss:
         """One optimiser step; returns the loss before it."""
-        return float(self._field.train(batch.points, batch.labels, rate, betas))
+        return self._field.train(batch.points, batch.labels, rate, betas)
 
 
 class CompiledEngine:

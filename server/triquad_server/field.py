@@ -170,8 +170,11 @@ class Field:
         touched = torch.zeros(len(total), dtype=torch.bool, device=self.device)
         touched[rows] = True
         touched[0] = False  # absent vertices stay zero
-        chosen = touched.nonzero()[:, 0]
-        self.features.step(chosen, total[chosen], rate, betas)
+        if self.device.type == "cpu":
+            chosen = touched.nonzero()[:, 0]
+            self.features.step(chosen, total[chosen], rate, betas)
+        else:
+            self.features.step_where(touched, total, rate, betas)
 
     def _normal(self, *size: int) -> Tensor:
         return torch.randn(size, generator=self._generator, device=self.device)

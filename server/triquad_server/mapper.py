@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from triquad_format.region import MapRecord, RegionIndex
 
-from triquad_server.engine import GradientSums
+from triquad_server.engine import GradientSums, Loss
 from triquad_server.epoch import Epoch, FrozenRegion, frozen_region
 from triquad_server.normals import SurfaceNormals
 from triquad_server.region_map import RegionMap, RegionSetup
@@ -51,7 +51,7 @@ class Mapper:
         self._epoch: Epoch | None = None
         self._structure_changed = True
         self.samples_trained = 0
-        self.loss = 0.0
+        self._loss: Loss | None = None
         for region in record.regions if record else ():
             self._regions[region.index] = RegionMap.restore(region, self._setup)
         self._share_pool()
@@ -60,6 +60,11 @@ class Mapper:
     def settled(self) -> bool:
         """Whether nothing is left to learn from the scans so far."""
         return not any(region.owed for region in self._regions.values())
+
+    @property
+    def loss(self) -> float:
+        """The loss of the last steps; on a GPU, to read it waits for all of them."""
+        return 0.0 if self._loss is None else float(self._loss)
 
     @property
     def regions(self) -> list[RegionMap]:
@@ -104,7 +109,8 @@ class Mapper:
         if region is None or region.owed == 0:
             return
         loss = region.train()
-        self.loss = _LOSS_MEMORY * self.loss + (1 - _LOSS_MEMORY) * loss if self.loss else loss
+        before = loss if self._loss is None else self._loss
+        self._loss = _LOSS_MEMORY * before + (1 - _LOSS_MEMORY) * loss
         self.samples_trained += self._settings.training.batch
 
     def publish(self) -> Epoch:

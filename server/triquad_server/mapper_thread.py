@@ -75,6 +75,7 @@ class MapperThread:
         self._next_publish = 0.0
         self._unpublished = False
         self._scans_taken = 0
+        self._loss = 0.0  # as of the newest epoch
         self.epochs = EpochShelf(mapper.publish(), epochs_kept)
         self.progress = Progress()
         self._note_progress()
@@ -199,6 +200,7 @@ class MapperThread:
         epoch = self._mapper.publish()
         if epoch is not self.epochs.newest:
             self.epochs.add(epoch)
+        self._loss = self._mapper.loss
         self._unpublished = False
         now = time.monotonic()
         self._next_publish = now + max(self._period_s, _MIN_PUBLISH_SHARE * (now - started))
@@ -214,7 +216,7 @@ class MapperThread:
             self._scans_taken,
             self._mapper.samples_trained,
             self._mapper.segments_kept,
-            self._mapper.loss,
+            self._loss,
         )
 
 

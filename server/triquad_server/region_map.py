@@ -15,7 +15,7 @@ from triquad_format.region import (
 )
 
 from triquad_server.adam import Betas
-from triquad_server.engine import GradientSums, make_engine
+from triquad_server.engine import GradientSums, Loss, make_engine
 from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 from triquad_server.field_record import field_from_record, region_record, training_moments
@@ -96,7 +96,7 @@ class RegionMap:
         self.owed = min(self.owed + visits, self._training.max_backlog)
         self._fresh_owed = int(visits * self._training.fresh_share)
 
-    def train(self) -> float:
+    def train(self) -> Loss:
         """One optimiser step; returns the loss."""
         settings = self._training
         fresh = min(self._fresh_owed, int(settings.batch * settings.fresh_share))

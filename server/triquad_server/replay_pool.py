@@ -74,7 +74,9 @@ class ReplayPool:
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator(device).manual_seed(seed)
         self._segments = np.zeros((0, COLUMNS), np.float32)
-        self._twin: Tensor | None = None  # of the segments, on a device of its own
+        # Of the segments, and of the newest places, where training is not done here.
+        self._twin: Tensor | None = None
+        self._fresh_twin = torch.zeros(0, dtype=torch.int64, device=device)
         self._bins = np.zeros(0, np.int32)
         self._crowd = np.zeros(_BINS, np.int32)
         self._fresh = np.zeros(0, np.int64)
@@ -96,16 +98,18 @@ class ReplayPool:
         self._extend(used + room)
         _put(segments, places, used, self._segments, self._bins, self._crowd)
         if self._twin is not None:
-            new = torch.from_numpy(segments).to(self._device)
-            self._twin[torch.from_numpy(places).to(self._device)] = new
+            self._fresh_twin = torch.from_numpy(places).to(self._device)
+            self._twin[self._fresh_twin] = torch.from_numpy(segments).to(self._device)
         self._fresh = places
 
     def draw(self, count: int, fresh: int) -> Batch:
         """``count`` samples on segments at random, ``fresh`` of them on the newest."""
+        if self._twin is not None:
+            return draw_samples(self._choose(count, fresh), self._placement, self._generator)
         places = self._rng.integers(self._size, size=count)
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
-        return self._draw(places)
+        return draw_ordered_samples(self._segments, places, self._placement, self._rng)
 
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
@@ -121,13 +125,19 @@ class ReplayPool:
 
     def sample(self, count: int) -> Batch:
         """Samples on at most ``count`` segments, one on each: what a checkpoint keeps."""
-        return self._draw(self._rng.permutation(self._size)[:count])
+        places = self._rng.permutation(self._size)[:count]
+        return draw_ordered_samples(self._segments, places, self._placement, self._rng)
 
-    def _draw(self, places: Places) -> Batch:
-        if self._twin is None:
-            return draw_ordered_samples(self._segments, places, self._placement, self._rng)
-        chosen = self._twin[torch.from_numpy(places).to(self._device)]
-        return draw_samples(chosen, self._placement, self._generator)
+    def _choose(self, count: int, fresh: int) -> Tensor:
+        """Segments [count, COLUMNS] at random, on the device, without a word from here."""
+        assert self._twin is not None
+        places = self._random(self._size, count)
+        if fresh and len(self._fresh):
+            places[:fresh] = self._fresh_twin[self._random(len(self._fresh), fresh)]
+        return self._twin[places]
+
+    def _random(self, below: int, count: int) -> Tensor:
+        return torch.randint(below, (count,), generator=self._generator, device=self._device)
 
     def _keep(self, places: Places) -> None:
         self._segments = self._segments[places]
