@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from functools import partial
 
 import numpy as np
 import torch
@@ -90,9 +89,7 @@ class Mapper:
         around = self._regions_around(rays.ends)
         self._check_regions(around)
         regions = [self._region(index) for index in around]
-        for region in regions:
-            region.see(rays)
-        carving = [MAPPING.beside(partial(region.carve, rays)) for region in regions]
+        carving = [MAPPING.beside(region.see(rays)) for region in regions]
         try:
             normals = self._normals.add(rays.ends, rays.origin)
             for region in regions:

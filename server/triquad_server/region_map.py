@@ -1,5 +1,6 @@
 """One region of the live map: its field, its evidence and what it still has to learn."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,21 +67,21 @@ class RegionMap:
         self._fresh_owed = 0  # those of them meant for the newest scans
         self.changed = True  # since it was last published
 
-    def see(self, rays: Rays) -> None:
-        """Note where the rays ended, and grow the field there; outside the cube nothing is."""
-        new = self.evidence.mark_surface(self.voxels(rays.ends))
+    def see(self, rays: Rays) -> Callable[[], None]:
+        """Note where the rays ended, and grow the field there; outside the cube nothing is.
+
+        Returns:
+            What notes the free space that the rays crossed, wherever they come from and end. It
+            may run beside :meth:`learn`.
+        """
+        ends = self.voxels(rays.ends)
+        new = self.evidence.mark_surface(ends)
         # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
         self.field.grow(new)
         self.changed = True
-
-    def carve(self, rays: Rays) -> None:
-        """Note the free space that the rays crossed, wherever they come from and end."""
-        ends = self.voxels(rays.ends)
-        self.evidence.carve(
-            self.voxels(rays.origin[None])[0],
-            ends[thin(ends, 1.0)],
-            _CARVE_SHORT_M / self._settings.leaf_m,
-        )
+        origin = self.voxels(rays.origin[None])[0]
+        short = _CARVE_SHORT_M / self._settings.leaf_m
+        return lambda: self.evidence.carve(origin, ends[thin(ends, 1.0)], short)
 
     def learn(self, rays: Rays, normals: NDArray[np.float64]) -> None:
         """Keep what the rays teach, to be trained on.

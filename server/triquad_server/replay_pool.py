@@ -12,11 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from triquad_server.feature_rows import prefetch_row
 from triquad_server.sampling import Batch, Placement, draw_ordered_samples, draw_samples
 from triquad_server.segments import COLUMNS, END
 
 _BIN_M = 0.8
 _BINS = 1 << 18
+_AHEAD = 16  # places that are brought into the cache before their turn
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -52,6 +54,7 @@ def _crowded(
 def _put(new: Floats, places: Places, used: int, segments: Floats, bins: Ints, crowd: Ints) -> None:
     """Put new segments into places; those below ``used`` hold one that is pushed out."""
     for i in range(len(places)):
+        prefetch_row(segments, places[min(i + _AHEAD, len(places) - 1)])
         place = places[i]
         if place < used:
             crowd[bins[place]] -= 1

@@ -59,6 +59,7 @@ def measure_core(made: BenchStreet) -> list[Figure]:
     typical = statistics.median(ingest_s[_SETTLE_SCANS:])
     points_mean = float(np.mean([len(scan.points) for scan in made.scans]))
     return [
+        Figure("mesh of the whole street", _mesh_s(epoch, made), "s", at_most=3),
         Figure("parameters of the map", epoch.parameters / 1e6, "M"),
         Figure(f"take in a scan of {points_mean:,.0f} points", 1e3 * typical, "ms", at_most=30),
         *figures,
@@ -120,6 +121,16 @@ def _queries(epoch: Epoch, region: RegionMap, points: NDArray[np.float64]) -> li
         Figure("SDF and gradient, share of the SDF rate", steep / plain, "", at_least=0.5),
         Figure("SDF and gradient alone, times eager torch", ratio(True), ""),
     ]
+
+
+def _mesh_s(epoch: Epoch, made: BenchStreet) -> float:
+    tiles = epoch.tiles(*made.drive.scene.bounds).indices.tolist()
+
+    def mesh_all() -> None:
+        for x, y, z in tiles:
+            epoch.mesh((x, y, z))
+
+    return statistics.median(seconds(mesh_all) for _ in range(3))
 
 
 def _publishing(mapper: Mapper) -> Figure:
