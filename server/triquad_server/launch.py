@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,9 @@ _log = logging.getLogger("triquad_server")
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits: a query is to be answered in a
 few milliseconds, which is Python's default for a single turn."""
+
+_QUICK_S = 2.0
+"""Compiled code that is found on disk is ready by then."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
             _log.warning("the checkpoint is of a map named '%s'", record.name)
         if record is not None and record.settings != options.settings.field:
             _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
-        _log.info("preparing compiled code: up to a minute at the very first start")
-        warm_up(options.settings, device)
+        _prepare(options.settings, device)
         mapper = Mapper(options.map_name, options.settings, device, record)
         session = stack.enter_context(closing(open_session(options.network)))
         info = restored.info if restored else None
@@ -86,6 +89,19 @@ def choose_device(wanted: str) -> str:
     if wanted == "auto":
         return "cuda" if available else "cpu"
     return wanted
+
+
+def _prepare(settings: Settings, device: str) -> None:
+    """Have all kernels compiled; whoever waits for it is told how it goes."""
+    _log.info("preparing compiled code: about a minute at the very first start")
+    started = time.monotonic()
+
+    def report(stage: str) -> None:
+        seconds = time.monotonic() - started
+        if seconds > _QUICK_S:
+            _log.info("preparing compiled code: %s next, %.0f s so far", stage, seconds)
+
+    warm_up(settings, device, report)
 
 
 def _log_ready(options: LaunchOptions, epoch: int, device: str) -> None:

@@ -53,7 +53,7 @@ class TrainingSettings:
     fresh_share: float = 0.5  # of a batch, drawn from the newest scans while they stream in
     visits: float = 48.0  # training samples that each new segment pays for
     max_backlog: int = 24_000_000  # samples owed at most, per region
-    cooldown: float = 1.0  # the rate falls once less than this many samples a kept segment are owed
+    cooldown: float = 8.0  # the rate falls once less than this many samples a kept segment are owed
     max_regions: int = 256  # of the map; a scan that would need more is refused
     seed: int = 42
 
