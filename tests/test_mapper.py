@@ -119,6 +119,29 @@ def test_an_epoch_does_not_change_while_training_goes_on() -> None:
     assert later.vertices > epoch.vertices
 
 
+def test_epochs_share_what_did_not_change_between_them() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    first, second = world().scans[:2]
+    mapper.ingest(first.points, first.world_from_sensor)
+    mapper.train()
+    before = mapper.publish()
+    mapper.train()
+    after = mapper.publish()
+    changed = [
+        (old, new)
+        for old, new in zip(before.frozen_regions, after.frozen_regions, strict=True)
+        if old is not new
+    ]
+    assert len(changed) == 1, "only the region that was trained"
+    old, new = changed[0]
+    assert new.evidence is old.evidence
+    assert new.field.tree is old.field.tree
+    mapper.ingest(second.points, second.world_from_sensor)
+    assert all(region.evidence is not new.evidence for region in mapper.publish().frozen_regions), (
+        "a scan was taken in since"
+    )
+
+
 def test_the_number_of_regions_is_bounded() -> None:
     mapper = Mapper("test", settings(max_regions=2), "cpu")
     scan = world().scans[0]

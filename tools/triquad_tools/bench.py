@@ -26,6 +26,9 @@ PARTS = ("core", "server", "growth")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, whatever the figures; 1 a part failed; 2 wrong usage."""
     options = _parser().parse_args(argv)
+    for path in (options.json, options.record):
+        if path is not None and not os.access(path.parent, os.W_OK):
+            return _complain(f"{path}: cannot be written: choose another folder", BAD_INPUT)
     from triquad_client import TriquadError
 
     try:
