@@ -6,9 +6,11 @@ import small_world
 import torch
 from triquad_format.field_settings import FieldSettings
 from triquad_server.adam import Betas, Parameter
+from triquad_server.compiled_encoding import locate
 from triquad_server.engine import CompiledEngine, GradientSums, TorchEngine, make_engine
 from triquad_server.field import Field
 from triquad_server.sampling import Batch
+from triquad_server.tile import load, new_tile
 
 CPU = torch.device("cpu")
 CASES = [
@@ -97,6 +99,25 @@ def test_points_outside_the_cube_get_values_without_features() -> None:
         slow.sdf,
         atol=2e-6,
     )
+
+
+@pytest.mark.parametrize("levels", [1, 3, 4])
+def test_the_faces_of_the_cube_are_no_trap(levels: int) -> None:
+    """Where rounding takes a point just outside, no vertex is looked for beyond its block."""
+    for leaf_m in np.linspace(0.1, 0.5, 201):
+        settings = FieldSettings(leaf_m=float(leaf_m), depth=6, feature_levels=levels, hidden=4)
+        field = Field(settings, CPU, 3)
+        compiled = CompiledEngine(field)._compiled()
+        face = np.float32(-settings.region_side_m / 2)
+        points = np.array([[face, face, face], [0, face, face], [face, 0, 0]], np.float32)
+        near = np.concatenate([points, np.nextafter(points, np.float32(-1e9)), -points])
+        tile = new_tile(levels, settings.feature_size, settings.input_size, settings.hidden)
+        load(tile, near, 0)
+        locate(tile, compiled.geometry, compiled.vertices, compiled.features)
+        sides = np.array([(1 << (at % levels)) + 1 for at in range(3 * levels)])
+        ends = np.cumsum([(1 << h) ** 2 + 2 * (1 << h) + 1 for h in range(levels)])
+        last = ends[np.arange(3 * levels) % levels]
+        assert (tile.corners.max(axis=1) + sides + 1 < last).all()
 
 
 def test_no_points_give_no_values() -> None:

@@ -185,8 +185,8 @@ def test_absent_vertices_stay_zero() -> None:
 def test_a_copy_does_not_change() -> None:
     field = grown(small())
     points = (torch.rand((500, 3)) * 2 - 1) * 7
+    before = field.sdf(points)
     twin = field.copy()
-    before = twin.sdf(points)
     field.train(points, points[:, 2], 0.01, BETAS)
     field.grow(leaves(field.settings, points))
     assert torch.equal(twin.sdf(points), before)

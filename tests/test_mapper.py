@@ -92,6 +92,23 @@ def test_regions_meet_without_hole_or_step() -> None:
         assert (answer.status == Status.SURFACE).all(), "no hole"
 
 
+def test_free_space_is_seen_in_all_regions_that_rays_pass() -> None:
+    """A wall beyond the border of two regions, seen from this side of it."""
+    chosen = parse_settings({"field": {"depth": 8}})
+    half = chosen.field.region_side_m / 2
+    mapper = Mapper("test", chosen, "cpu")
+    across = np.mgrid[-2:2:0.1, -2:2:0.1].reshape(2, -1).T
+    wall = np.column_stack([np.full(len(across), 12.0), across]).astype(np.float32)
+    pose = np.eye(4)
+    pose[0, 3] = half - 8.0
+    mapper.ingest(wall, pose)
+    along = np.linspace(half - 7.5, half + 3.5, 200)
+    points = np.column_stack([along, np.full(200, 0.05), np.full(200, 0.05)])
+    answer = mapper.publish().query(points)
+    assert (answer.status == Status.FREE).all()
+    assert np.isfinite(answer.sdf).all()
+
+
 def test_it_settles_and_then_changes_no_more(mapped: Mapper) -> None:
     assert mapped.settled
     first, trained = mapped.publish(), mapped.samples_trained

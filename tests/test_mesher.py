@@ -53,7 +53,7 @@ def test_neighbouring_tiles_meet_without_seams(
         twins.append(gaps.min(axis=1) < 1e-4)
     # A vertex without a twin ends the mesh there: no surface was seen beyond.
     assert np.concatenate(twins).sum() > 200
-    assert np.concatenate(twins).mean() > 0.9
+    assert np.concatenate(twins).mean() > 0.8
 
 
 def test_nothing_is_meshed_where_nothing_was_seen(epoch: Epoch) -> None:

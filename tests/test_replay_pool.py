@@ -48,6 +48,16 @@ def test_a_place_left_long_ago_keeps_its_share() -> None:
     assert old > 3000, "a hundred scans elsewhere must not push it out"
 
 
+def test_of_a_scan_that_is_too_large_any_part_is_kept() -> None:
+    pool = new_pool(3000)
+    for _ in range(5):
+        points = place(0, 6000)
+        pool.add(sample_segments(points, np.arange(6000, dtype=np.float32)))
+    labels = pool.sample(3000).labels.numpy()
+    shares = np.histogram(labels, bins=6, range=(0, 6000))[0] / len(labels)
+    assert shares.min() > 0.1
+
+
 def test_the_newest_can_be_drawn_apart() -> None:
     pool = new_pool(100_000)
     pool.add(labelled(place(0, 50_000)))

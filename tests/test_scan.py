@@ -64,3 +64,10 @@ def test_refusals_name_their_reason(reason: str, scan: np.ndarray, at: np.ndarra
 def test_poses_with_six_digits_are_rigid_enough() -> None:
     turn = np.round(pose(m00=0.651617, m01=-0.758549, m10=0.758549, m11=0.651617), 5)
     assert usable_rays(points((5, 0, 0)), turn, SETTINGS).report.points_used == 1
+
+
+def test_returns_at_the_sensor_itself_are_dropped() -> None:
+    points = np.array([[0.0, 0, 0], [5, 0, 0], [0, 0, 0]], np.float32)
+    rays = usable_rays(points, np.eye(4), ScanSettings(range_min_m=0.0))
+    np.testing.assert_array_equal(rays.ends, [[5, 0, 0]])
+    assert rays.report.points_dropped == {"too_near": 2}

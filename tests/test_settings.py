@@ -9,11 +9,10 @@ from triquad_server.settings import Settings, load_settings, parse_settings
 ROOT = Path(__file__).parent.parent
 
 
-def test_the_defaults_are_the_published_ones() -> None:
-    field, scan = Settings().field, Settings().scan
+def test_the_defaults_of_the_field_are_the_published_ones() -> None:
+    field = Settings().field
     assert (field.leaf_m, field.depth, field.feature_levels, field.feature_size) == (0.2, 12, 3, 8)
     assert (field.frequencies, field.frequency_variance, field.hidden) == (16, 50.0, 32)
-    assert (scan.surface_share, scan.truncation_m) == (0.5, 0.3)
     assert field.region_side_m == pytest.approx(819.2)
     assert field.input_size == 120
 
@@ -101,3 +100,8 @@ def test_the_document_lists_every_setting_with_its_default() -> None:
         for entry in dataclasses.fields(type(record)):
             value = repr(getattr(record, entry.name)).replace("'", '"')
             assert f"| `{entry.name}` | `{value}` |" in section, f"{part.name}.{entry.name}"
+
+
+def test_an_optimiser_that_would_diverge_is_refused() -> None:
+    with pytest.raises(SettingsError, match="beta2 = 0.1 is too small for beta1 = 0.9"):
+        parse_settings({"training": {"beta2": 0.1}})

@@ -1,5 +1,6 @@
 """Adam in compiled code: the step of :mod:`triquad_server.adam`, on the rows that were touched."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numba
@@ -37,20 +38,23 @@ class Rates(NamedTuple):
 
 
 def rates(rate: float, betas: Betas) -> Rates:
-    """The numbers of a step; the corrections are tabulated until they no longer matter."""
+    """The numbers of a step."""
+    return Rates(rate, betas.mean, betas.variance, *_corrections(betas))
+
+
+@lru_cache(maxsize=4)
+def _corrections(betas: Betas) -> tuple[Floats, Floats]:
+    """Scales of mean and variance by age, tabulated until they no longer matter."""
     slowest = max(betas.mean, betas.variance)
     count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
     ages = np.arange(1, count + 1)
-    return Rates(
-        rate,
-        betas.mean,
-        betas.variance,
+    return (
         (1 / (1 - betas.mean**ages)).astype(np.float32),
         (1 / (1 - betas.variance**ages)).astype(np.float32),
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
 def step_row(row: int, gradients: Floats, moments: Moments, rates: Rates) -> None:
     """One step of a row along its gradient, which is cleared."""
     moments.steps[row] += 1
@@ -67,7 +71,7 @@ def step_row(row: int, gradients: Floats, moments: Moments, rates: Rates) -> Non
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def step_touched(
     part: int,
     count: int,

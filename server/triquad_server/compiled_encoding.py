@@ -20,6 +20,7 @@ Floats = NDArray[np.float32]
 
 _AXES = np.array(AXES)
 _TURN = np.float32(2 * np.pi)
+_BELOW_1 = np.nextafter(np.float32(1), np.float32(0))
 
 
 class Geometry(NamedTuple):
@@ -62,8 +63,9 @@ def _find_blocks(tile: Tile, plane: int, geometry: Geometry, vertices: Vertices)
         block_u, block_v = np.int64(floor_u), np.int64(floor_v)
         inside = (block_u >= 0) & (block_v >= 0) & (block_u < limit) & (block_v < limit)
         tile.keys[t] = block_key(plane, block_u, block_v) if inside else EMPTY
-        tile.local[0, t] = u - floor_u
-        tile.local[1, t] = v - floor_v
+        # Just below 0, rounding may take the difference to 1.
+        tile.local[0, t] = min(u - floor_u, _BELOW_1) if inside else np.float32(0)
+        tile.local[1, t] = min(v - floor_v, _BELOW_1) if inside else np.float32(0)
     for t in range(TILE):
         number = max(0, find_row(vertices.blocks, tile.keys[t]))
         tile.blocks[plane, t] = number

@@ -44,7 +44,8 @@ class Engine(Protocol):
 
 
 class GradientSums:
-    """Room for the gradients of the feature rows, for each thread; all zero between steps.
+    """Room for the gradients of the feature rows, for each thread; all but row 0 are zero between
+    steps.
 
     Engines that are not trained at the same time share it.
     """

@@ -70,6 +70,15 @@ def _crossing(origin: float, direction: float) -> tuple[int, float, float]:
     return -1, -1 / direction, -fraction / direction
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _inside(origin: float, direction: float, side: int) -> tuple[float, float]:
+    """How far along a ray it enters and leaves the region on an axis."""
+    if direction == 0:
+        return (-np.inf, np.inf) if 0 <= origin <= side else (np.inf, -np.inf)
+    a, b = -origin / direction, (side - origin) / direction
+    return min(a, b), max(a, b)
+
+
 @numba.njit(cache=True, nogil=True)
 def _carve(
     origin: NDArray[np.float64],
@@ -90,14 +99,26 @@ def _carve(
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if length <= stop_short:
             continue
-        reach = length - stop_short
-        x, y, z = int(np.floor(origin[0])), int(np.floor(origin[1])), int(np.floor(origin[2]))
-        step_x, apart_x, next_x = _crossing(origin[0], dx / length)
-        step_y, apart_y, next_y = _crossing(origin[1], dy / length)
-        step_z, apart_z, next_z = _crossing(origin[2], dz / length)
+        dx, dy, dz = dx / length, dy / length, dz / length
+        # Only the part of the ray that lies in the region.
+        enters_x, leaves_x = _inside(origin[0], dx, side)
+        enters_y, leaves_y = _inside(origin[1], dy, side)
+        enters_z, leaves_z = _inside(origin[2], dz, side)
+        first = max(0.0, enters_x, enters_y, enters_z)
+        reach = min(length - stop_short, leaves_x, leaves_y, leaves_z)
+        start_x, start_y, start_z = (
+            origin[0] + first * dx,
+            origin[1] + first * dy,
+            origin[2] + first * dz,
+        )
+        x, y, z = int(np.floor(start_x)), int(np.floor(start_y)), int(np.floor(start_z))
+        step_x, apart_x, next_x = _crossing(start_x, dx)
+        step_y, apart_y, next_y = _crossing(start_y, dy)
+        step_z, apart_z, next_z = _crossing(start_z, dz)
+        next_x, next_y, next_z = next_x + first, next_y + first, next_z + first
         row = -1
         entered = True  # another block
-        travelled = 0.0
+        travelled = first
         while travelled <= reach:
             if entered:
                 row = -1

@@ -206,7 +206,7 @@ def add_to_row(
             table[row, k] += weight * values[point, start + k]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
 def move_row(
     gradients: Floats,
     values: Floats,

@@ -116,7 +116,7 @@ class Field:
         twin.settings, twin.device = self.settings, self.device
         twin._generator = self._generator
         twin.tree = self.tree.copy()
-        twin._corners = self._corners
+        twin._corners = None
         twin.features = self.features.snapshot()
         twin.frequencies = self.frequencies
         twin.mlp = [part.snapshot() for part in self.mlp]

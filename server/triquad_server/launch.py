@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import threading
 import time
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits: a query is to be answered in a
 few milliseconds, which is Python's default for a single turn."""
 
-_QUICK_S = 2.0
+_QUICK_S = 3.0
 """Compiled code that is found on disk is ready by then."""
 
 
@@ -93,15 +94,23 @@ def choose_device(wanted: str) -> str:
 
 def _prepare(settings: Settings, device: str) -> None:
     """Have all kernels compiled; whoever waits for it is told how it goes."""
-    _log.info("preparing compiled code: about a minute at the very first start")
+    _log.info("preparing compiled code")
     started = time.monotonic()
+    first_time = threading.Timer(
+        _QUICK_S, _log.info, ["compiling, about a minute: this is done once for each release"]
+    )
+    first_time.daemon = True
+    first_time.start()
 
     def report(stage: str) -> None:
         seconds = time.monotonic() - started
         if seconds > _QUICK_S:
-            _log.info("preparing compiled code: %s next, %.0f s so far", stage, seconds)
+            _log.info("%.0f s so far; next: %s", seconds, stage)
 
-    warm_up(settings, device, report)
+    try:
+        warm_up(settings, device, report)
+    finally:
+        first_time.cancel()
 
 
 def _log_ready(options: LaunchOptions, epoch: int, device: str) -> None:

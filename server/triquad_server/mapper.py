@@ -12,7 +12,7 @@ from triquad_server.engine import GradientSums, Loss
 from triquad_server.epoch import Epoch, FrozenRegion, frozen_region
 from triquad_server.normals import SurfaceNormals
 from triquad_server.region_map import RegionMap, RegionSetup
-from triquad_server.scan import IngestReport, ScanRefusedError, usable_rays
+from triquad_server.scan import IngestReport, Rays, ScanRefusedError, usable_rays
 from triquad_server.settings import Settings
 from triquad_server.threads import MAPPING
 
@@ -86,18 +86,16 @@ class Mapper:
             ScanRefusedError: the scan cannot be used; the map is unchanged.
         """
         rays = usable_rays(points, world_from_sensor, self._settings.scan)
-        around = self._regions_around(rays.ends)
+        around = self._regions_around(rays)
         self._check_regions(around)
         regions = [self._region(index) for index in around]
-        carving = [MAPPING.beside(region.see(rays)) for region in regions]
-        try:
+        with MAPPING.beside() as beside:
+            for region in regions:
+                beside(region.see(rays))
             normals = self._normals.add(rays.ends, rays.origin)
             for region in regions:
                 region.learn(rays, normals)
             self._share_pool()
-        finally:
-            for work in carving:
-                work.result()
         return rays.report
 
     def train(self) -> None:
@@ -166,23 +164,25 @@ class Mapper:
             self._number,
         )
 
-    def _regions_around(self, points: NDArray[np.float64]) -> list[RegionIndex]:
-        """Regions whose cubes hold any of the points."""
+    def _regions_around(self, rays: Rays) -> list[RegionIndex]:
+        """Regions whose cubes hold an end point or the sensor, and those of the map in between."""
         pitch = self._field_settings.region_pitch_m
         half = self._field_settings.region_side_m / 2
-        least = np.array([points[:, axis].min() for axis in range(3)])
-        greatest = np.array([points[:, axis].max() for axis in range(3)])
-        low = np.floor((least - half) / pitch).astype(int) + 1
-        high = np.ceil((greatest + half) / pitch).astype(int) - 1
+        columns = [np.append(rays.ends[:, axis], rays.origin[axis]) for axis in range(3)]
+        low = [math.floor((column.min() - half) / pitch) + 1 for column in columns]
+        high = [math.ceil((column.max() + half) / pitch) - 1 for column in columns]
         x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
         around = list(itertools.product(x, y, z))
         if len(around) == 1:
             return around
-        return [
-            index
-            for index in around
-            if (np.abs(points - np.multiply(index, pitch)) < half).all(axis=1).any()
-        ]
+
+        def holds_any(index: RegionIndex) -> bool:
+            near = [
+                np.abs(column - i * pitch) < half for column, i in zip(columns, index, strict=True)
+            ]
+            return bool((near[0] & near[1] & near[2]).any())
+
+        return [index for index in around if index in self._regions or holds_any(index)]
 
     def _check_regions(self, wanted: list[RegionIndex]) -> None:
         limit = self._settings.training.max_regions

@@ -203,7 +203,7 @@ def _crossed(
         for corner in range(8):
             x, y, z = cell[0] + (corner >> 2), cell[1] + (corner >> 1 & 1), cell[2] + (corner & 1)
             least, greatest = min(least, volume[x, y, z]), max(greatest, volume[x, y, z])
-        if least <= 0 <= greatest:
+        if least <= 0 < greatest:
             mask[cell[0] + 1, cell[1] + 1, cell[2] + 1] = True
             for axis in range(3):
                 low[axis] = min(low[axis], cell[axis])

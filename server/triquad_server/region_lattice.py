@@ -31,7 +31,8 @@ def _find_owners(
         owners[i] = _NOBODY
         shared[i] = False
         x, y, z = points[i, 0] / pitch_m, points[i, 1] / pitch_m, points[i, 2] / pitch_m
-        if not max(abs(x), abs(y), abs(z)) < CELL_LIMIT - 1:  # NaN is nobody's either
+        limit = CELL_LIMIT - 1
+        if not (abs(x) < limit and abs(y) < limit and abs(z) < limit):  # NaN is nobody's either
             continue
         a, b, c = np.floor(x + 0.5), np.floor(y + 0.5), np.floor(z + 0.5)
         owners[i] = find_row(index, pack(int(a), int(b), int(c)))

@@ -90,14 +90,14 @@ class ReplayPool:
     def add(self, segments: Floats) -> None:
         """Take in ``segments`` [S, COLUMNS]; they become the newest."""
         self.offered += len(segments)
-        if len(segments) > self._capacity:
-            segments = segments[self._rng.integers(len(segments), size=self._capacity)]
         used = self._size
         room = min(len(segments), self._capacity - used)
         places = np.arange(used, used + room)
         if room < len(segments):
             places = np.concatenate([places, self._crowded(len(segments) - room)])
-            segments = segments[: len(places)]
+        if len(places) < len(segments):
+            # Any of them: the last rays of a scan are as good as the first.
+            segments = segments[self._rng.permutation(len(segments))[: len(places)]]
         self._extend(used + room)
         _put(segments, places, used, self._segments, self._bins, self._crowd)
         if self._twin is not None:

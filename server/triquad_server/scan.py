@@ -82,7 +82,7 @@ def _select(
         distance = np.sqrt(x * x + y * y + z * z)
         if not np.isfinite(distance):
             not_finite += 1
-        elif distance < range_min_m:
+        elif distance < range_min_m or distance == 0:  # which is "no return" to many sensors
             too_near += 1
         elif distance > range_max_m:
             too_far += 1

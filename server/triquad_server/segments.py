@@ -45,6 +45,8 @@ def _fill(
             direction[axis] = ends[i, axis] - origin[axis]
             reach += direction[axis] * direction[axis]
         reach = np.sqrt(reach)
+        if reach == 0:
+            continue
         cosine = 0.0
         first, last = (free_from - 1) * reach, behind_m
         for axis in range(3):

@@ -62,6 +62,11 @@ class TrainingSettings:
         check_range("learning_rate", self.learning_rate, 0.0, 1.0)
         check_range("beta1", self.beta1, 0.001, 0.9999)
         check_range("beta2", self.beta2, 0.001, 0.99999)
+        if self.beta2 < self.beta1**2:  # steps would grow without a bound (Kingma and Ba, sec. 4)
+            raise SettingsError(
+                f"beta2 = {self.beta2} is too small for beta1 = {self.beta1}: "
+                f"use at least {self.beta1**2:.6g}"
+            )
         check_range("pool_segments", self.pool_segments, 100, 1_000_000_000)
         check_range("fresh_share", self.fresh_share, 0.0, 1.0)
         check_range("visits", self.visits, 0.0, 1000.0)
@@ -77,7 +82,7 @@ class MeshSettings:
 
     cell_m: float = 0.1
     tile_cells: int = 64  # along the side of a tile
-    reach_m: float = 0.02  # faces lie at most this far from voxels with seen surface
+    reach_m: float = 0.02  # centres of faces lie at most this far from voxels with seen surface
 
     def __post_init__(self) -> None:
         check_range("cell_m", self.cell_m, 0.01, 10.0)

@@ -4,8 +4,8 @@ import contextlib
 import os
 import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
 """Threads that share the work: one per core that this process may use."""
@@ -34,13 +34,23 @@ class Team:
         parts = min(THREADS, max(1, count // _MIN_SHARE))
         self._run(lambda part: work(*share(count, part, parts)), parts)
 
-    def beside(self, work: Callable[[], None]) -> "Future[None]":
-        """Run ``work()`` beside the caller, who waits for the result later."""
-        return self._pool.submit(work)
+    @contextlib.contextmanager
+    def beside(self) -> Iterator[Callable[[Callable[[], None]], None]]:
+        """Run work beside the caller: each that is handed over has ended when the context does."""
+        handed_over: list[Future[None]] = []
+        try:
+            yield lambda work: handed_over.append(self._pool.submit(work))
+        finally:
+            wait(handed_over)
+        for work in handed_over:
+            work.result()
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
         others = [self._pool.submit(work, part) for part in range(1, parts)]
-        work(0)
+        try:
+            work(0)
+        finally:
+            wait(others)  # whatever happens, nobody goes on with what the caller has left
         for other in others:
             other.result()
 
@@ -57,7 +67,9 @@ def be_patient(patience: int) -> None:
     """
     if patience and sys.platform == "linux":
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), patience)
+            thread = threading.get_native_id()
+            nice = os.getpriority(os.PRIO_PROCESS, thread) + patience
+            os.setpriority(os.PRIO_PROCESS, thread, nice)
 
 
 ANSWERS = Team("triquad-answers")

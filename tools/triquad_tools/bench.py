@@ -5,6 +5,7 @@ import datetime
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -31,13 +32,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _complain(f"{path}: cannot be written: choose another folder", BAD_INPUT)
     from triquad_client import TriquadError
 
+    before = signal.signal(signal.SIGTERM, _interrupt)  # so that the server is stopped then, too
     try:
         figures = measure(options.parts or list(PARTS), options.seed)
+        _present(figures, options)
     except (ToolError, TriquadError, OSError) as error:
         return _complain(str(error), FAILED)
     except KeyboardInterrupt:
         return _complain("interrupted", FAILED)
-    _present(figures, options)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     return OK
 
 
@@ -111,6 +115,16 @@ def _complain(message: str, code: int) -> int:
     return code
 
 
+def _part(name: str) -> str:
+    if name not in PARTS:
+        raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(PARTS)}")
+    return name
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="triquad-bench",
@@ -120,7 +134,9 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument
-    add("parts", nargs="*", choices=[*PARTS, []], metavar="PART", help=f"of {', '.join(PARTS)}")
+    add(
+        "parts", nargs="*", type=_part, metavar="PART", help=f"of {', '.join(PARTS)} (default: all)"
+    )
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
     add("--json", type=Path, metavar="FILE", help="write the figures there, too")
     add("--record", type=Path, metavar="FILE.md", help="add a table to this page")

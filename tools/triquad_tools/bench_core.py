@@ -36,7 +36,7 @@ def measure_core(made: BenchStreet) -> list[Figure]:
     settings = Settings()
     warm_up(settings, "cpu")
     mapper = Mapper("bench", settings, "cpu")
-    with progress("core", 5) as report:
+    with progress("core", 4) as report:
         report(0, "taking in scans")
         ingest_s = [
             seconds(partial(mapper.ingest, scan.points, scan.world_from_sensor))
@@ -56,6 +56,7 @@ def measure_core(made: BenchStreet) -> list[Figure]:
         torch.set_num_threads(1)
         report(3, "publishing")
         figures.append(_publishing(mapper))
+        report(4, "done")
     typical = statistics.median(ingest_s[_SETTLE_SCANS:])
     points_mean = float(np.mean([len(scan.points) for scan in made.scans]))
     return [

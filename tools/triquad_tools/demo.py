@@ -59,7 +59,7 @@ def run_demo(out: Path, scans: int, street_seed: int) -> "DemoResults":
     _prepare(out)
     street = steps.simulate(scans, street_seed)
     laps.end("simulate")
-    _say("starting triquad-server (the first run of all compiles kernels: half a minute more) ...")
+    _say("starting triquad-server (the first run of all compiles kernels: a minute more) ...")
     with DemoServer(server_options) as server:
         laps.end("start")
         learnt = steps.learn(server.endpoint, street, out)
