@@ -257,7 +257,7 @@ class SurfaceNormals:
         self,
         fine_m: float = 0.15,
         coarse_m: float = 0.5,
-        max_cells: int = 200_000,  # of each grid, at some 100 bytes
+        max_cells: int = 150_000,  # of each grid, at some 100 bytes
     ) -> None:
         self._grids = (MomentGrid(fine_m), MomentGrid(coarse_m))
         self._max_cells = max_cells
