@@ -88,24 +88,27 @@ class Parameter:
         """
         self.steps.add_(mask)
         mask = mask.reshape(-1, *[1] * (gradient.dim() - 1))
-        age = self.steps.to(gradient.dtype).reshape(mask.shape).clamp(min=1)
         self.means.lerp_(gradient, (1 - betas.mean) * mask)
         self.variances.lerp_(gradient.square(), (1 - betas.variance) * mask)
-        mean = self.means / (1 - betas.mean**age)
-        deviation = (self.variances / (1 - betas.variance**age)).sqrt_()
-        self.values.sub_(rate * mask * mean / (deviation + EPSILON))
+        move = _move(self.means, self.variances, self.steps.clamp(min=1), betas)
+        self.values.sub_(rate * mask * move)
 
     def step(self, rows: Tensor, gradient: Tensor, rate: float, betas: Betas) -> None:
         """One step of ``rows`` [T] along ``gradient`` [T, ...] at a learning ``rate``."""
         self._steps[rows] += 1
-        age = self._steps[rows].to(gradient.dtype).reshape(-1, *[1] * (gradient.dim() - 1))
         means = self._means[rows].lerp_(gradient, 1 - betas.mean)
         variances = self._variances[rows].lerp_(gradient.square(), 1 - betas.variance)
         self._means[rows] = means
         self._variances[rows] = variances
-        mean = means / (1 - betas.mean**age)
-        deviation = (variances / (1 - betas.variance**age)).sqrt_()
-        self._values[rows] -= rate * mean / (deviation + EPSILON)
+        self._values[rows] -= rate * _move(means, variances, self._steps[rows], betas)
+
+
+def _move(means: Tensor, variances: Tensor, steps: Tensor, betas: Betas) -> Tensor:
+    """How far rows [R, ...] of an age of ``steps`` [R] go, at a learning rate of 1."""
+    age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
+    mean = means / (1 - betas.mean**age)
+    deviation = (variances / (1 - betas.variance**age)).sqrt_()
+    return mean / (deviation + EPSILON)
 
 
 def _grown(tensor: Tensor, capacity: int) -> Tensor:

@@ -1,6 +1,6 @@
 """The field's encoding of a tile in compiled code: interpolated features and Fourier features.
 
-The same as :mod:`triquad_server.quadtree` and :mod:`triquad_server.field` compute with tensors.
+The same as :mod:`triquad_server.corners` and :mod:`triquad_server.field` compute with tensors.
 Fourier phases are counted in turns, not radians, which makes their reduction exact.
 """
 

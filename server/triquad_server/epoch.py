@@ -1,5 +1,6 @@
 """A published, immutable state of the map, and the questions it answers."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 from triquad_server.field_record import region_record
 from triquad_server.mesher import TileMesh, mesh_tile
-from triquad_server.region_lattice import Owners, RegionLattice
+from triquad_server.region_lattice import Owned, RegionLattice
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import ANSWERS
 
@@ -98,11 +99,12 @@ class Epoch:
         def work(first: int, last: int) -> None:
             part = slice(first, last)
             owners = self._lattice.owners(points[part])
-            values = self._values(points[part], owners, gradient)
+            groups = list(owners.groups())
+            values = self._values(points[part], groups, owners.shared, gradient)
             answer.sdf[part] = values.sdf
             if answer.gradient is not None:
                 answer.gradient[part] = values.gradient
-            answer.status[part] = self._status(points[part], owners)
+            answer.status[part] = self._status(points[part], groups)
 
         ANSWERS.split(count, work)
         return answer
@@ -114,7 +116,8 @@ class Epoch:
         def work(first: int, last: int) -> None:
             part = slice(first, last)
             owners = self._lattice.owners(points[part])
-            distances[part] = self._values(points[part], owners, gradient=False).sdf
+            values = self._values(points[part], owners.groups(), owners.shared, gradient=False)
+            distances[part] = values.sdf
 
         ANSWERS.split(len(points), work)
         return distances
@@ -134,7 +137,8 @@ class Epoch:
 
         def work(first: int, last: int) -> None:
             part = slice(first, last)
-            status[part] = self._status(points[part], self._lattice.owners(points[part]), reach)
+            groups = self._lattice.owners(points[part]).groups()
+            status[part] = self._status(points[part], groups, reach)
 
         ANSWERS.split(len(points), work)
         return status
@@ -176,26 +180,32 @@ class Epoch:
         )
         return MapRecord(self._name, self.number, self._settings, regions)
 
-    def _values(self, points: NDArray[np.float64], owners: Owners, gradient: bool) -> FieldValues:
+    def _values(
+        self,
+        points: NDArray[np.float64],
+        groups: Iterable[Owned],
+        shared: NDArray[np.bool_],
+        gradient: bool,
+    ) -> FieldValues:
         count = len(points)
         values = FieldValues(
             np.full(count, np.nan, np.float32),
             np.full((count if gradient else 0, 3), np.nan, np.float32),
         )
-        for owned in owners.groups():
+        for owned in groups:
             region = self.frozen_regions[owned.region]
             local = (points[owned.points] - region.centre).astype(np.float32)
             _put(values, owned.points, region.engine.evaluate(local, gradient))
-        shared = np.flatnonzero(owners.shared)
-        if len(shared):
-            _put(values, shared, self._blend(points[shared], gradient))
+        several = np.flatnonzero(shared)
+        if len(several):
+            _put(values, several, self._blend(points[several], gradient))
         return values
 
     def _status(
-        self, points: NDArray[np.float64], owners: Owners, reach: float = 0.5
+        self, points: NDArray[np.float64], groups: Iterable[Owned], reach: float = 0.5
     ) -> NDArray[np.uint8]:
         status = np.full(len(points), Status.UNKNOWN, np.uint8)
-        for owned in owners.groups():
+        for owned in groups:
             region = self.frozen_regions[owned.region]
             voxels = voxel_coordinates(self._settings, region.centre, points[owned.points])
             status[owned.points] = region.evidence.status(voxels, reach)

@@ -14,6 +14,7 @@ from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_format.region import Evidence as EvidenceRecord
 from triquad_format.status import Status
 
+from triquad_server.rows import with_room
 from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 Masks = NDArray[np.uint8]
@@ -323,14 +324,11 @@ class Evidence:
         """Evidence from its record."""
         evidence = cls(side)
         evidence._blocks = VoxelIndex.of_cells(morton.decode(record.codes, 3))
-        shape = (evidence._blocks.capacity, BLOCK_BYTES)
-        evidence._surface, evidence._free = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-        evidence._surface[: evidence.blocks] = record.surface
-        evidence._free[: evidence.blocks] = record.free
+        evidence._surface = with_room(record.surface, evidence._blocks.capacity)
+        evidence._free = with_room(record.free, evidence._blocks.capacity)
         return evidence
 
     def _grow(self) -> None:
         self._blocks.grow()
-        more = np.zeros((self._blocks.capacity - len(self._surface), BLOCK_BYTES), np.uint8)
-        self._surface = np.concatenate([self._surface, more])
-        self._free = np.concatenate([self._free, more])
+        self._surface = with_room(self._surface, self._blocks.capacity)
+        self._free = with_room(self._free, self._blocks.capacity)

@@ -83,12 +83,12 @@ def _seen_cells(
     """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
     reach_m = settings.cell_m / 2 + settings.reach_m
     groups = _grid(-(-settings.tile_cells // _GROUP)) * _GROUP
-    centres = ((first + groups + _GROUP / 2) * settings.cell_m).astype(np.float64)
+    centres = _positions(groups, _GROUP / 2, first, settings.cell_m)
     # A group is looked into where any of its cells may be such.
     wide = settings.cell_m * (_GROUP - 1) / 2 + reach_m
     groups = groups[source.status(centres, wide) == Status.SURFACE]
     cells = _cells_of(groups, settings.tile_cells)
-    seen = source.status(_centres(cells, first, settings.cell_m), reach_m)
+    seen = source.status(_positions(cells, 0.5, first, settings.cell_m), reach_m)
     return np.asarray(cells[seen == Status.SURFACE])
 
 
@@ -107,15 +107,21 @@ def _cells_of(groups: NDArray[np.int64], side: int) -> NDArray[np.int64]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _centres(
-    cells: NDArray[np.int64], first: NDArray[np.int64], cell_m: float
+def _positions(
+    cells: NDArray[np.int64], offset: float, first: NDArray[np.int64], cell_m: float
 ) -> NDArray[np.float64]:
-    """Centres [C, 3] of cells in the map frame."""
-    centres = np.empty(cells.shape)
+    """Where cells [C, 3] of the tile are in the map frame, ``offset`` cells from their corners."""
+    positions = np.empty(cells.shape)
     for i in range(len(cells)):
         for axis in range(3):
-            centres[i, axis] = (first[axis] + cells[i, axis] + 0.5) * cell_m
-    return centres
+            positions[i, axis] = (first[axis] + cells[i, axis] + offset) * cell_m
+    return positions
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _corner(cell: NDArray[np.int64], number: int) -> tuple[int, int, int]:
+    """Lattice point at one of the 8 corners of a cell."""
+    return cell[0] + (number >> 2), cell[1] + (number >> 1 & 1), cell[2] + (number & 1)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -165,7 +171,7 @@ def _corners(seen: NDArray[np.int64], side: int) -> NDArray[np.int64]:
     count = 0
     for cell in seen:
         for corner in range(8):
-            x, y, z = cell[0] + (corner >> 2), cell[1] + (corner >> 1 & 1), cell[2] + (corner & 1)
+            x, y, z = _corner(cell, corner)
             if not needed[x, y, z]:
                 needed[x, y, z] = True
                 points[count, 0], points[count, 1], points[count, 2] = x, y, z
@@ -183,7 +189,7 @@ def _lattice_values(
     side = settings.tile_cells + 1
     points = _corners(seen, side)
     volume = np.ones((side, side, side), np.float32)
-    lattice = ((first + points) * settings.cell_m).astype(np.float64)
+    lattice = _positions(points, 0.0, first, settings.cell_m)
     volume[tuple(points.T)] = source.distances(lattice)
     return volume
 
@@ -201,7 +207,7 @@ def _crossed(
     for cell in seen:
         least, greatest = np.inf, -np.inf
         for corner in range(8):
-            x, y, z = cell[0] + (corner >> 2), cell[1] + (corner >> 1 & 1), cell[2] + (corner & 1)
+            x, y, z = _corner(cell, corner)
             least, greatest = min(least, volume[x, y, z]), max(greatest, volume[x, y, z])
         if least <= 0 < greatest:
             mask[cell[0] + 1, cell[1] + 1, cell[2] + 1] = True

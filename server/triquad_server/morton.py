@@ -1,5 +1,8 @@
-"""Morton codes of tensors; the same codes as :mod:`triquad_format.morton`."""
+"""2-D Morton codes of tensors, and in kernels; the codes of :mod:`triquad_format.morton`."""
 
+from typing import TypeVar
+
+from numba.extending import register_jitable
 from torch import Tensor
 
 _SPREAD = (
@@ -10,13 +13,17 @@ _SPREAD = (
     (1, 0x5555555555555555),
 )
 
+CoordinateT = TypeVar("CoordinateT", int, Tensor)
 
-def encode(first: Tensor, second: Tensor) -> Tensor:
-    """2-D Morton codes of non-negative int64 coordinates below 2**31."""
+
+@register_jitable
+def encode(first: CoordinateT, second: CoordinateT) -> CoordinateT:
+    """Morton codes of non-negative int64 coordinates below 2**31: numbers or tensors."""
     return _spread(first) | (_spread(second) << 1)
 
 
-def _spread(bits: Tensor) -> Tensor:
+@register_jitable
+def _spread(bits: CoordinateT) -> CoordinateT:
     for shift, mask in _SPREAD:
         bits = (bits | (bits << shift)) & mask
     return bits

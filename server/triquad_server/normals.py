@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_server.rows import with_room
 from triquad_server.threads import MAPPING
 from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
@@ -179,9 +180,8 @@ class MomentGrid:
         self._cells = VoxelIndex(1024)
         self._moments = np.zeros((1024, 10), np.float32)
         self._normals = np.zeros((1024, 3), np.float32)
-        self._basis = np.zeros(
-            1024, np.float32
-        )  # points in each cell when its normal was estimated
+        # Points in each cell when its normal was estimated.
+        self._basis = np.zeros(1024, np.float32)
 
     def add(self, points: NDArray[np.float64]) -> Rows:
         """Add points [N, 3], metres, map frame; returns the row of each one's cell."""
@@ -239,15 +239,9 @@ class MomentGrid:
     def _refit(self, rows: NDArray[np.int64] | slice) -> None:
         """Keep some rows, with as much room as the cells have."""
         capacity = self._cells.capacity
-        self._moments = _refitted(self._moments[rows], capacity)
-        self._normals = _refitted(self._normals[rows], capacity)
-        self._basis = _refitted(self._basis[rows], capacity)
-
-
-def _refitted(array: NDArray[np.float32], capacity: int) -> NDArray[np.float32]:
-    fitted = np.zeros((capacity, *array.shape[1:]), np.float32)
-    fitted[: len(array)] = array
-    return fitted
+        self._moments = with_room(self._moments[rows], capacity)
+        self._normals = with_room(self._normals[rows], capacity)
+        self._basis = with_room(self._basis[rows], capacity)
 
 
 class SurfaceNormals:

@@ -7,7 +7,7 @@ border (4 + 9 + 25 for H = 3), and one probe per plane finds them all. A vertex 
 all blocks that it touches.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -16,6 +16,8 @@ from triquad_format import morton
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import AXES
 
+from triquad_server.morton import encode
+from triquad_server.rows import with_room
 from triquad_server.voxel_index import Index, VoxelIndex, make_row
 
 _AXES = np.array(AXES)
@@ -49,23 +51,10 @@ class Shape(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def spread(bits: int) -> int:
-    """The lower 32 bits of a number, each followed by a zero: half of a 2-D Morton code."""
-    for shift, mask in (
-        (16, 0x0000FFFF0000FFFF),
-        (8, 0x00FF00FF00FF00FF),
-        (4, 0x0F0F0F0F0F0F0F0F),
-        (2, 0x3333333333333333),
-        (1, 0x5555555555555555),
-    ):
-        bits = (bits | (bits << shift)) & mask
-    return bits
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
 def block_key(plane: int, u: int, v: int) -> int:
     """Key of the block ``(u, v)`` on a plane."""
-    return spread(u) | (spread(v) << 1) | (plane << PLANE_BITS)
+    key: int = encode(u, v) | (plane << PLANE_BITS)
+    return key
 
 
 @numba.njit(cache=True, nogil=True)
@@ -89,7 +78,7 @@ def _enter(
             count = max(count, block + 1)
             local = (u - (block_u << h)) * side + v - (block_v << h)
             vertices.rows[block, shape.starts[h] + local] = row
-    vertices.codes[row] = spread(u) | (spread(v) << 1)
+    vertices.codes[row] = encode(u, v)
     vertices.owners[row] = 1 + plane * shape.levels + h
     return count
 
@@ -231,15 +220,12 @@ class TriQuadtree:
         if self._blocks.count + _NEW_BLOCKS > self._blocks.capacity:
             self._blocks.grow()
             self.vertices = self.vertices._replace(
-                blocks=self._blocks.arrays, rows=_doubled(self.vertices.rows)
+                blocks=self._blocks.arrays,
+                rows=with_room(self.vertices.rows, self._blocks.capacity),
             )
         if self._rows + _NEW_ROWS > len(self.vertices.codes):
+            capacity = 2 * len(self.vertices.codes)
             self.vertices = self.vertices._replace(
-                codes=_doubled(self.vertices.codes), owners=_doubled(self.vertices.owners)
+                codes=with_room(self.vertices.codes, capacity),
+                owners=with_room(self.vertices.owners, capacity),
             )
-
-
-def _doubled(array: NDArray[Any]) -> NDArray[Any]:
-    grown = np.zeros((2 * len(array), *array.shape[1:]), array.dtype)
-    grown[: len(array)] = array
-    return grown

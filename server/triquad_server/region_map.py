@@ -51,7 +51,6 @@ class RegionMap:
         self._setup = setup
         self._settings = setup.field
         self._training = setup.training
-        self._device = setup.device
         seed = setup.training.seed + hash(index) % 1_000_003
         self.field = Field(setup.field, setup.device, seed)
         self._engine = make_engine(self.field, setup.sums)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from triquad_server.feature_rows import prefetch_row
+from triquad_server.rows import with_room
 from triquad_server.sampling import Batch, Placement, draw_ordered_samples, draw_samples
 from triquad_server.segments import COLUMNS, END
 
@@ -153,11 +154,8 @@ class ReplayPool:
     def _extend(self, size: int) -> None:
         if size > len(self._segments):
             room = min(self._capacity, max(size, 2 * len(self._segments)))
-            segments = np.zeros((room, COLUMNS), np.float32)
-            segments[: self._size] = self._segments[: self._size]
-            bins = np.zeros(room, np.int32)
-            bins[: self._size] = self._bins[: self._size]
-            self._segments, self._bins = segments, bins
+            self._segments = with_room(self._segments[: self._size], room)
+            self._bins = with_room(self._bins[: self._size], room)
             self._copy_to_device()
         self._size = size
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from triquad_server.feature_rows import prefetch_row
-from triquad_server.quadtree import spread
+from triquad_server.morton import encode
 from triquad_server.segments import DIRECTION, END, FREE_FROM, FREE_TO, LABEL, SLOPE
 from triquad_server.threads import MAPPING
 
@@ -87,7 +87,7 @@ def _draw(
         samples[i, 3] = row[LABEL] - offset * row[SLOPE]
         u = min(max(int(samples[i, 0] * per_m + _CELLS), 0), 2 * _CELLS - 1)
         v = min(max(int(samples[i, 1] * per_m + _CELLS), 0), 2 * _CELLS - 1)
-        cells[i] = spread(u) | (spread(v) << 1)
+        cells[i] = encode(u, v)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -5,7 +5,6 @@ import datetime
 import json
 import os
 import platform
-import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from triquad_tools.arguments import seed
 from triquad_tools.errors import ToolError
+from triquad_tools.interruption import sigterm_interrupts
 
 if TYPE_CHECKING:
     from triquad_tools.bench_figures import Figure
@@ -32,16 +32,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _complain(f"{path}: cannot be written: choose another folder", BAD_INPUT)
     from triquad_client import TriquadError
 
-    before = signal.signal(signal.SIGTERM, _interrupt)  # so that the server is stopped then, too
     try:
-        figures = measure(options.parts or list(PARTS), options.seed)
+        with sigterm_interrupts():
+            figures = measure(options.parts or list(PARTS), options.seed)
         _present(figures, options)
     except (ToolError, TriquadError, OSError) as error:
         return _complain(str(error), FAILED)
     except KeyboardInterrupt:
         return _complain("interrupted", FAILED)
-    finally:
-        signal.signal(signal.SIGTERM, before)
     return OK
 
 
@@ -91,10 +89,7 @@ def _present(figures: "list[Figure]", options: argparse.Namespace) -> None:
     from triquad_tools.report import Row, json_text, print_table
 
     title = f"{datetime.date.today().isoformat()}, {machine()}, street {options.seed}"
-    rows = [
-        Row(figure.name, f"{figure.value:.3g} {figure.unit}".rstrip(), _note(figure))
-        for figure in figures
-    ]
+    rows = [Row(figure.name, figure.shown, _note(figure)) for figure in figures]
     print_table(title, rows)
     if options.json is not None:
         result = {"title": title, "figures": [asdict(figure) for figure in figures]}
@@ -119,10 +114,6 @@ def _part(name: str) -> str:
     if name not in PARTS:
         raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(PARTS)}")
     return name
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -17,6 +17,11 @@ class Figure:
     at_most: float | None = None
 
     @property
+    def shown(self) -> str:
+        """The value with its unit."""
+        return f"{self.value:.3g} {self.unit}".rstrip()
+
+    @property
     def kept(self) -> bool:
         """Whether it is within its bounds; NaN never is."""
         low_enough = self.at_most is None or self.value <= self.at_most
@@ -66,6 +71,5 @@ def markdown(title: str, figures: list[Figure]) -> str:
     lines = [f"## {title}", "", "| figure | measured | wanted | |", "|---|---|---|---|"]
     for figure in figures:
         kept = "" if not figure.wanted else "yes" if figure.kept else "**no**"
-        value = f"{figure.value:.3g} {figure.unit}".rstrip()
-        lines.append(f"| {figure.name} | {value} | {figure.wanted} | {kept} |")
+        lines.append(f"| {figure.name} | {figure.shown} | {figure.wanted} | {kept} |")
     return "\n".join(lines) + "\n"

@@ -16,8 +16,7 @@ from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
 
 from triquad_tools.bench_figures import Figure, seconds
-from triquad_tools.lidar import Lidar, SimulatedDrive, drive
-from triquad_tools.street import street
+from triquad_tools.street_drive import street_drive
 
 _REGIONS = 16
 _SCANS = 25
@@ -30,8 +29,7 @@ def measure_growth(seed: int) -> list[Figure]:
     """How training steps, queries and memory change with the number of regions."""
     settings = Settings()
     warm_up(settings, "cpu")
-    scene = street(seed)
-    scans = list(SimulatedDrive(scene, Lidar(), drive(scene, _SCANS, _STEP_M), seed))
+    scans = list(street_drive(seed, _SCANS, _STEP_M))
     hits = np.concatenate([scan.true_hits[::20] for scan in scans])
     rng = np.random.default_rng(seed)
     mapper = Mapper("bench", settings, "cpu")

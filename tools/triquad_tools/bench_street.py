@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_tools.lidar import Lidar, SimulatedDrive, SimulatedScan, drive
-from triquad_tools.map_scores import StreetProbes, street_probes
-from triquad_tools.progress import progress
+from triquad_tools.driven_street import DrivenStreet, driven_street
+from triquad_tools.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.street import street
 
 SCANS = 100
@@ -18,12 +17,9 @@ _VISIBLE_VOXEL_M = 0.05
 
 
 @dataclass(frozen=True)
-class BenchStreet:
+class BenchStreet(DrivenStreet):
     """A drive of 10 s, and the truth about it."""
 
-    drive: SimulatedDrive
-    scans: list[SimulatedScan]
-    probes: StreetProbes
     visible: NDArray[np.float64]  # [M, 3] exact surface points that the lidar hit
 
 
@@ -31,15 +27,8 @@ def bench_street(seed: int) -> BenchStreet:
     """100 scans along the exact street ``seed``."""
     scene = street(seed, _LENGTH_M)
     poses = drive(scene, SCANS, _LENGTH_M / SCANS)
-    through = SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed)
-    scans: list[SimulatedScan] = []
-    with progress("simulating the drive", SCANS) as report:
-        for scan in through:
-            scans.append(scan)
-            report(len(scans), f"{len(scans)} of {SCANS} scans")
-        report(SCANS, "where it is scored")
-        probes = street_probes(through, np.random.default_rng(0))
-        visible = through.true_hits(_VISIBLE_VOXEL_M)
-        low, high = scene.bounds  # to which meshes are cut
-        visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
-    return BenchStreet(through, scans, probes, visible)
+    driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed))
+    visible = driven.drive.true_hits(_VISIBLE_VOXEL_M)
+    low, high = scene.bounds  # to which meshes are cut
+    visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
+    return BenchStreet(driven.drive, driven.scans, driven.probes, visible)

@@ -4,7 +4,6 @@ import argparse
 import importlib.util
 import os
 import shutil
-import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from triquad_tools.arguments import count, seed
 from triquad_tools.errors import ToolError
+from triquad_tools.interruption import sigterm_interrupts
 
 if TYPE_CHECKING:
     from triquad_tools.demo_results import DemoResults
@@ -31,15 +31,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     from triquad_client import TriquadError
     from triquad_format.errors import FormatError
 
-    before = signal.signal(signal.SIGTERM, _interrupt)  # so that the server is stopped then, too
     try:
-        results = run_demo(options.out, options.scans, options.seed)
+        with sigterm_interrupts():
+            results = run_demo(options.out, options.scans, options.seed)
     except KeyboardInterrupt:
         return _complain("interrupted; the server is stopped", FAILED)
     except (ToolError, TriquadError, FormatError, OSError) as error:
         return _complain(str(error), FAILED)
-    finally:
-        signal.signal(signal.SIGTERM, before)
     return _present(options.out, results)
 
 
@@ -123,10 +121,6 @@ def _present(out: Path, results: "DemoResults") -> int:
     for line in broken:
         _complain(line, FAILED)
     return FAILED if broken else OK
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def _say(message: str) -> None:

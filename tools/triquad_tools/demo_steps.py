@@ -15,8 +15,8 @@ from triquad_tools import meshfile
 from triquad_tools.camera import Camera
 from triquad_tools.demo_probe import Probe, ProbeReport
 from triquad_tools.demo_results import Intake, MapSize, Restart
-from triquad_tools.lidar import SimulatedDrive, SimulatedScan
-from triquad_tools.map_scores import StreetProbes, StreetScores, score_street, street_probes
+from triquad_tools.driven_street import DrivenStreet, driven_street
+from triquad_tools.map_scores import StreetScores, score_street
 from triquad_tools.metrics import MeshScores, ScoreSettings, score_against_scene
 from triquad_tools.progress import progress
 from triquad_tools.render import height_colours, render_mesh, write_png
@@ -36,15 +36,6 @@ _VISIBLE_VOXEL_M = 0.05
 _EYE_M = (-14.0, 0.8, 12.0)
 _TARGET_M = (17.0, -0.3, 0.3)
 _VIEW_DEG = 46.0
-
-
-@dataclass(frozen=True)
-class Street:
-    """A simulated drive, its scans and where its map will be asked."""
-
-    drive: SimulatedDrive
-    scans: list[SimulatedScan]
-    probes: StreetProbes
 
 
 @dataclass(frozen=True)
@@ -68,18 +59,12 @@ class Scored:
     answers: SdfResult
 
 
-def simulate(scans: int, seed: int) -> Street:
+def simulate(scans: int, seed: int) -> DrivenStreet:
     """Drive along a street with a simulated lidar."""
-    drive = street_drive(seed, scans)
-    made: list[SimulatedScan] = []
-    with progress("simulating the drive", scans) as report:
-        for scan in drive:
-            made.append(scan)
-            report(len(made), f"{len(made)} of {scans} scans")
-    return Street(drive, made, street_probes(drive, np.random.default_rng(_SEED)))
+    return driven_street(street_drive(seed, scans))
 
 
-def learn(endpoint: str, street: Street, out: Path) -> Learnt:
+def learn(endpoint: str, street: DrivenStreet, out: Path) -> Learnt:
     """Stream the scans and wait until they are learnt, while another process asks."""
     rng = np.random.default_rng(_SEED)
     asked = out / "query_points.npy"
@@ -92,7 +77,7 @@ def learn(endpoint: str, street: Street, out: Path) -> Learnt:
         asked.unlink()
 
 
-def _stream(client: Client, street: Street) -> Intake:
+def _stream(client: Client, street: DrivenStreet) -> Intake:
     started = time.monotonic()
     start_s = time.time()
     with progress("streaming scans", len(street.scans)) as report:
@@ -117,7 +102,7 @@ def _stream(client: Client, street: Street) -> Intake:
     )
 
 
-def score(endpoint: str, street: Street) -> Scored:
+def score(endpoint: str, street: DrivenStreet) -> Scored:
     """Compare the map with the exact street, and have the server write it to its store."""
     rng = np.random.default_rng(_SEED)
     points = rng.permutation(street.probes.near)[:_RESTART_POINTS]
