@@ -129,6 +129,22 @@ def _training(
     )
 
 
+def with_integers(record: MapRecord, limit: int = 100, seed: int = 0) -> MapRecord:
+    """The record with integer features up to ``limit`` in place of its own."""
+    rng = np.random.RandomState(seed)
+    regions = tuple(
+        dataclasses.replace(region, tables=tuple(_integers(rng, t, limit) for t in region.tables))
+        for region in record.regions
+    )
+    return dataclasses.replace(record, regions=regions)
+
+
+def _integers(rng: np.random.RandomState, table: VertexTable, limit: int) -> VertexTable:
+    features = rng.randint(-limit, limit + 1, table.features.shape, np.int64).astype(np.int16)
+    features[:1] = limit
+    return dataclasses.replace(table, features=features, scale=2.0 ** -rng.randint(1, 9))
+
+
 def assert_same(have: object, want: object, where: str = "record") -> None:
     """Fail, naming the field, unless two records are equal in every value and dtype."""
     if dataclasses.is_dataclass(want):

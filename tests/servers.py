@@ -21,6 +21,7 @@ from triquad_format.messages import ErrorReply, FlushReply, FlushRequest, Scan
 from triquad_format.wire import Message
 from triquad_server.mapper import Mapper
 from triquad_server.network import NetworkOptions, open_session
+from triquad_server.retention import Retention
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store import Restored, Store
@@ -58,7 +59,7 @@ def running_service(
     """A service in this process; yields its endpoint."""
     endpoint = free_endpoint()
     network = NetworkOptions((endpoint,), connect, multicast_scouting=False)
-    opened = Store(store, map_name, settings.store.keep) if store else None
+    opened = Store(store, map_name, Retention.chosen(settings.store)) if store else None
     restored: Restored | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
     info = restored.info if restored else None

@@ -333,8 +333,9 @@ def test_a_download_with_wrong_bytes_leaves_nothing(tmp_path):
 
     def chunk(query: zenoh.Query, key: str) -> None:
         with query:
-            offset = wire.decode(MapChunkRequest, query.payload.to_bytes()).offset
-            query.reply(key, wire.encode(MapChunk(offset, data[offset : offset + 60])))
+            asked = wire.decode(MapChunkRequest, query.payload.to_bytes())
+            part = data[asked.offset : asked.offset + asked.length]
+            query.reply(key, wire.encode(MapChunk(asked.offset, part)))
 
     path = tmp_path / "map.triquad"
     path.write_text("older")

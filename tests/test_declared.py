@@ -13,7 +13,13 @@ else:
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-DISTRIBUTIONS = {"zenoh": "eclipse-zenoh", "skimage": "scikit-image", "PIL": "pillow"}
+DISTRIBUTIONS = {
+    "zenoh": "eclipse-zenoh",
+    "skimage": "scikit-image",
+    "PIL": "pillow",
+    "google": "protobuf",
+    "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
+}
 
 
 def declared(*extras: str) -> set[str]:

@@ -179,7 +179,7 @@ def test_a_refused_scan_changes_nothing() -> None:
 
 def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
     epoch = mapped.publish()
-    twin = Mapper("test", settings(), "cpu", mapped.record(training=True))
+    twin = Mapper("test", settings(), "cpu", mapped.changes_since(None).record)
     restored = twin.publish()
     assert restored.number == epoch.number
     points = world().hits[::40] + [0, 0, 0.02]
@@ -205,7 +205,7 @@ def test_a_record_without_samples_owes_nothing() -> None:
     mapper = Mapper("test", settings(), "cpu")
     scan = world().scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
-    record = mapper.record(training=True)
+    record = mapper.changes_since(None).record
     emptied = []
     for region in record.regions:
         state = region.training
@@ -227,7 +227,7 @@ def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
     mapper = Mapper("test", settings(), "cpu")
     for scan in world(2).scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
-    record = mapper.record(training=True)
+    record = mapper.changes_since(None).record
     assert len(record.regions) > 1
     bounded = settings(pool_segments=4000)
     twin = Mapper("test", bounded, "cpu", record)
@@ -242,7 +242,7 @@ def test_what_is_owed_survives_a_restart() -> None:
     mapper = Mapper("test", settings(), "cpu")
     scan = world().scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
-    twin = Mapper("test", settings(), "cpu", mapper.record(training=True))
+    twin = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
     assert not twin.settled
 
 

@@ -1,17 +1,24 @@
 import dataclasses
+import io
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoints
 from map_records import SMALL, assert_same, random_record
+from mapfile_surgery import with_metadata
+from mcap.reader import make_reader
 from triquad_format.crop import crop_record, without_training
 from triquad_format.errors import FormatError
 from triquad_format.evaluator import MapEvaluator
 from triquad_format.field_settings import FieldSettings
-from triquad_format.mapfile import read_map, write_map
+from triquad_format.mapfile import read_map, read_map_file, write_map
+from triquad_format.stored_map import StoredMap
 from triquad_tools.pack import main
 
+VERSION_1 = Path(__file__).parent / "golden" / "map_v1.triquad"
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 
 
@@ -164,6 +171,79 @@ def test_tool_refuses(map_file, tmp_path, capsys):
     assert map_file.read_bytes() == before
     with pytest.raises(SystemExit, match="2"):
         main([str(map_file)])
+
+
+def test_tool_reads_only_what_the_box_needs(tmp_path, capsys):
+    wide = dataclasses.replace(SMALL, depth=10)
+    source, out = tmp_path / "in.triquad", tmp_path / "out.triquad"
+    record = random_record(2, settings=wide, points=2000, training=False)
+    write_map(record, source, preview=False)
+    box = ["--crop", "-60", "-60", "-60", "-40", "-40", "-40"]
+    assert main([str(source), str(out), *box]) == 0
+    assert_same(read_map(out), crop_record(record, [-60] * 3, [-40] * 3))
+    summary = make_reader(io.BytesIO(source.read_bytes())).get_summary()
+    far = summary.chunk_indexes[-2]  # of the last evidence, in the opposite corner
+    data = bytearray(source.read_bytes())
+    data[far.chunk_start_offset + far.chunk_length // 2] ^= 1
+    source.write_bytes(data)
+    assert main([str(source), str(out), *box, "--force"]) == 0
+    assert main([str(source), str(out), "--force"]) == 1
+    assert "damaged" in capsys.readouterr().err
+
+
+def test_tool_takes_an_epoch_of_a_store(tmp_path, capsys):
+    store, out = tmp_path / "store", tmp_path / "out.triquad"
+    (store / "street").mkdir(parents=True)
+    write_checkpoints(store / "street", (3, 5, 9))
+
+    def epoch(*options):
+        assert main([str(store), str(out), "--force", *options]) == 0
+        printed = capsys.readouterr().out.splitlines()[0]
+        record = read_map(out)
+        assert_same(record, map_at(record.epoch))
+        assert printed.startswith(f"epoch {record.epoch}, from {store / 'street'}")
+        return record.epoch
+
+    assert epoch() == 9
+    assert epoch("--at", "5") == 5
+    assert epoch("--at", "8") == 5
+    assert epoch("--at", "2026-01-31T13:30:00Z") == 5
+    assert read_map_file(out).manifest.stamp_ns == START_NS + HOUR_NS
+    assert main([str(store / "street"), str(out), "--at", "2"]) == 2
+    assert "no checkpoint of 2 or before" in capsys.readouterr().err
+    assert main([str(out), str(tmp_path / "o.triquad"), "--at", "2"]) == 2
+    assert "--at asks for a folder" in capsys.readouterr().err
+    newest = store / "street" / "epoch-000000009.delta.triquad"
+    assert main([str(store), str(newest), "--force"]) == 2
+    assert "is the input" in capsys.readouterr().err
+    (store / "street" / "epoch-000000003.triquad").unlink()
+    assert main([str(store), str(out), "--force"]) == 2
+    assert "epoch-000000003.triquad" in capsys.readouterr().err
+    assert main([str(store), str(out), "--force", "--recover"]) == 1
+    assert_same(read_map(out).regions, map_at(9).regions[1:])
+
+
+def test_tool_rewrites_version_1_in_the_newest(tmp_path):
+    out = tmp_path / "out.triquad"
+    assert main([str(VERSION_1), str(out)]) == 0
+    file = read_map_file(out)
+    assert file.metadata["format_version"] == "2"
+    assert_same(file.record, read_map(VERSION_1))
+    with StoredMap.open(out) as stored:
+        assert_same(stored.record(), file.record)
+    box = ["--crop", "-1", "-1", "-1", "1", "1", "1", "--no-training", "--force"]
+    assert main([str(VERSION_1), str(out), *box]) == 0
+    expected = crop_record(without_training(file.record), [-1] * 3, [1] * 3)
+    assert_same(read_map(out), expected)
+
+
+def test_tool_refuses_newer_files(map_file, tmp_path, capsys):
+    out = tmp_path / "out.triquad"
+    needs = with_metadata(map_file.read_bytes(), {"required_features": "holograms"})
+    map_file.write_bytes(needs)
+    assert main([str(map_file), str(out)]) == 2
+    assert "holograms" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_records_are_left_alone():

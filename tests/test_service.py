@@ -232,12 +232,14 @@ def test_chunks_of_other_files_or_beyond_the_end_are_refused(client, endpoint, t
     info = client.download_map(tmp_path / "map.triquad")
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
-        assert peer.refusal(keys.MAP_CHUNK, MapChunkRequest("00" * 32, 0)) == "chunk_gone"
-        for offset in (-1, info.bytes, 2**62):
-            request = MapChunkRequest(info.sha256, offset)
+        assert peer.refusal(keys.MAP_CHUNK, MapChunkRequest("00" * 32, 0, 10)) == "chunk_gone"
+        for offset, length in ((-1, 10), (info.bytes, 10), (2**62, 10), (0, 0), (0, -1)):
+            request = MapChunkRequest(info.sha256, offset, length)
             assert peer.refusal(keys.MAP_CHUNK, request) == "bad_request"
-        answer = peer.ask(keys.MAP_CHUNK, wire.encode(MapChunkRequest(info.sha256, 3)))
-        assert wire.decode(MapChunk, answer).data == (tmp_path / "map.triquad").read_bytes()[3:]
+        data = (tmp_path / "map.triquad").read_bytes()
+        for length, end in ((5, 8), (2**62, None)):
+            answer = peer.ask(keys.MAP_CHUNK, wire.encode(MapChunkRequest(info.sha256, 3, length)))
+            assert wire.decode(MapChunk, answer).data == data[3:end]
 
 
 def test_without_a_store_checkpoints_are_refused_and_the_status_says_so(client):

@@ -9,16 +9,20 @@ from triquad_format.mapfile import read_map
 from triquad_format.region import MapRecord
 from triquad_server import store as store_module
 from triquad_server.errors import StoreError
+from triquad_server.mapper import MapChanges, Mapper
+from triquad_server.retention import Retention
 from triquad_server.store import Store
 
+EMPTY = Mapper("lab", servers.SMALL, "cpu").publish()
 
-def record(epoch: int) -> MapRecord:
-    return MapRecord("lab", epoch, servers.SMALL.field, ())
+
+def record(epoch: int) -> MapChanges:
+    return MapChanges(MapRecord("lab", epoch, servers.SMALL.field, ()), (), EMPTY)
 
 
 @pytest.fixture
 def store(tmp_path):
-    store = Store(tmp_path, "lab", keep=2)
+    store = Store(tmp_path, "lab", Retention(2))
     yield store
     store.close()
 
@@ -83,7 +87,7 @@ def test_a_sound_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkey
     def fail(path):
         raise error
 
-    monkeypatch.setattr(store_module, "read_map", fail)
+    monkeypatch.setattr(store_module, "read_map_file", fail)
     with pytest.raises(StoreError, match="000000002.triquad cannot be read"):
         store.newest()
     assert names(store) == before
@@ -104,7 +108,7 @@ def test_what_keeps_a_checkpoint_from_being_written_is_an_error_of_the_store(
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(store_module, "write_map", fail)
+    monkeypatch.setattr(store_module, "write_parts", fail)
     with pytest.raises(StoreError, match="cannot be written"):
         store.write(record(1))
 
@@ -138,21 +142,21 @@ def test_other_files_are_left_alone(store):
 
 def test_two_servers_do_not_share_a_folder(store, tmp_path):
     with pytest.raises(StoreError, match="in use"):
-        Store(tmp_path, "lab", keep=2)
-    Store(tmp_path, "other", keep=2).close()
+        Store(tmp_path, "lab", Retention(2))
+    Store(tmp_path, "other", Retention(2)).close()
 
 
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):
-        Store(tmp_path / "file", "lab", keep=2)
+        Store(tmp_path / "file", "lab", Retention(2))
 
 
 def test_what_a_killed_server_left_unfinished_goes(store, tmp_path):
     store.write(record(1))
     store.close()
     (store.folder / ".epoch-000000002.triquad.0a1b2c3d.tmp").write_bytes(b"half")
-    with closing(Store(tmp_path, "lab", keep=2)) as again:
+    with closing(Store(tmp_path, "lab", Retention(2))) as again:
         assert names(again) == ["epoch-000000001.triquad"]
         assert again.newest().record.epoch == 1
 

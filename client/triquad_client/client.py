@@ -6,6 +6,7 @@ from types import TracebackType
 
 from numpy.typing import ArrayLike
 from triquad_format import keys
+from triquad_format.mapfile import MapFileInfo
 from triquad_format.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -171,8 +172,24 @@ class Client:
 
         Raises:
             DownloadError: what arrived is not what the server announced.
+            OSError: the file cannot be written.
         """
         return self._download.fetch(Path(path), training)
+
+    def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
+        """Write to a file what the newest map needs to answer within ``bounds``.
+
+        Only the file's index and the parts that the box needs are sent.
+
+        Args:
+            path: the file; an older one is replaced.
+            bounds: corners of a box, metres, map frame.
+
+        Raises:
+            DownloadError: nothing of the map lies in the box, or what arrived is not sound.
+            OSError: the file cannot be written.
+        """
+        return self._download.fetch_box(Path(path), *checks.box(bounds))
 
     def maps(self) -> list[str]:
         """Names of all maps that can be reached, also those of other servers."""

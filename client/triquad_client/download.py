@@ -1,19 +1,27 @@
 """Fetching the map as a file."""
 
 import hashlib
-import os
-import tempfile
 from pathlib import Path
-from typing import IO
+from typing import BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
 from triquad_format import keys
-from triquad_format.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
+from triquad_format.crop import crop_record
+from triquad_format.errors import FormatError
+from triquad_format.mapfile import MapFileInfo, write_map
+from triquad_format.mapfile_writer import replacing
+from triquad_format.messages import MapInfo, MapInfoRequest
+from triquad_format.stored_map import StoredMap
 
-from triquad_client.connection import Connection, Pending, in_flight, retried
+from triquad_client.connection import Connection, retried
 from triquad_client.errors import DownloadError
+from triquad_client.remote_bytes import RemoteBytes
 
 _PREPARE_TIMEOUT_S = 120.0
 """The server writes the file before it answers."""
+
+_BLOCK_BYTES = 2**23
 
 
 class MapDownload:
@@ -31,38 +39,52 @@ class MapDownload:
         # Newer map files may push this one out of the server: then the newest is taken.
         return retried("chunk_gone", lambda: self._fetch(path, training))
 
+    def fetch_box(
+        self, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
+    ) -> MapFileInfo:
+        """Write what answers in the box between two corners [3]; only its parts travel.
+
+        Raises:
+            DownloadError: nothing of the map lies in the box, or its parts are not sound.
+        """
+        return retried("chunk_gone", lambda: self._fetch_box(path, minimum, maximum))
+
     def _fetch(self, path: Path, training: bool) -> MapInfo:
-        info = self._connection.ask(
+        info = self._info(training)
+        remote = RemoteBytes(self._connection, info)
+        with replacing(path) as file:
+            _copy(remote, file, info.sha256)
+        return info
+
+    def _fetch_box(
+        self, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
+    ) -> MapFileInfo:
+        try:
+            stored = StoredMap(RemoteBytes(self._connection, self._info(training=False)))
+            record = crop_record(stored.box(minimum, maximum), minimum, maximum)
+            if not record.regions:
+                raise DownloadError(
+                    f"nothing of the map lies between {minimum.tolist()} and {maximum.tolist()}"
+                )
+            return write_map(record, path)
+        except FormatError as error:
+            raise DownloadError(str(error)) from error
+
+    def _info(self, training: bool) -> MapInfo:
+        return self._connection.ask(
             keys.MAP_INFO,
             MapInfoRequest(training),
             MapInfo,
             background=True,
             timeout_s=max(self._connection.timeout_s, _PREPARE_TIMEOUT_S),
         )
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                self._write(info, file)
-                file.flush()
-                os.fsync(file.fileno())
-            Path(name).chmod(0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-        return info
 
-    def _write(self, info: MapInfo, file: IO[bytes]) -> None:
-        digest = hashlib.sha256()
-        offsets = range(0, info.bytes, max(1, info.chunk_bytes))
-        for chunk in in_flight(lambda offset: self._send(info.sha256, offset), offsets):
-            if chunk.offset != file.tell():
-                raise DownloadError(f"chunk at {chunk.offset} came in place of {file.tell()}")
-            digest.update(chunk.data)
-            file.write(chunk.data)
-        if digest.hexdigest() != info.sha256:
-            raise DownloadError(f"the file's SHA-256 is {digest.hexdigest()}, not {info.sha256}")
 
-    def _send(self, sha256: str, offset: int) -> Pending[MapChunk]:
-        request = MapChunkRequest(sha256, offset)
-        return self._connection.send(keys.MAP_CHUNK, request, MapChunk, background=True)
+def _copy(remote: RemoteBytes, file: BinaryIO, sha256: str) -> None:
+    digest = hashlib.sha256()
+    for offset in range(0, remote.size, _BLOCK_BYTES):
+        data = remote.read(offset, min(_BLOCK_BYTES, remote.size - offset))
+        digest.update(data)
+        file.write(data)
+    if digest.hexdigest() != sha256:
+        raise DownloadError(f"the file's SHA-256 is {digest.hexdigest()}, not {sha256}")

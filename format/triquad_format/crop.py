@@ -15,12 +15,13 @@ from triquad_format.region import (
     Evidence,
     MapRecord,
     Region,
+    RegionIndex,
     TrainingState,
     VertexTable,
     region_centre,
 )
 
-_SLACK_LEAVES = 1 / 16
+SLACK_LEAVES = 1 / 16
 """Kept around the box: points are rounded to float32, at depth 15 by up to 1/128 of a leaf."""
 
 _STATUS_VOXELS = 0.5
@@ -28,11 +29,15 @@ _STATUS_VOXELS = 0.5
 
 
 @dataclass(frozen=True)
-class _LeafBox:
+class LeafBox:
     """The box in the leaf coordinates of one region."""
 
     low: NDArray[np.float64]  # [3]
     high: NDArray[np.float64]  # [3]
+
+    def meets_region(self, settings: FieldSettings) -> bool:
+        """Whether any of the region's cube lies in the box."""
+        return bool((self.low <= 1 << settings.depth).all() and (self.high >= 0).all())
 
 
 def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
@@ -49,15 +54,23 @@ def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> Ma
     Raises:
         FormatError: the corners are not finite or not in order.
     """
+    low, high = check_box(minimum, maximum)
+    regions = []
+    for region in record.regions:
+        box = leaf_box(record.settings, region.index, low, high)
+        if box.meets_region(record.settings):
+            regions.append(_crop_region(record.settings, region, box))
+    return dataclasses.replace(record, regions=tuple(regions))
+
+
+def check_box(
+    minimum: ArrayLike, maximum: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The corners [3] of a box; a :class:`FormatError` where they are not finite or in order."""
     low, high = np.asarray(minimum, np.float64), np.asarray(maximum, np.float64)
     if not (np.isfinite([low, high]).all() and (low < high).all()):
         raise FormatError(f"a box from {low.tolist()} to {high.tolist()} holds nothing")
-    regions = []
-    for region in record.regions:
-        box = _leaf_box(record.settings, region, low, high)
-        if (box.low <= 1 << record.settings.depth).all() and (box.high >= 0).all():
-            regions.append(_crop_region(record.settings, region, box))
-    return dataclasses.replace(record, regions=tuple(regions))
+    return low, high
 
 
 def without_training(record: MapRecord) -> MapRecord:
@@ -66,18 +79,22 @@ def without_training(record: MapRecord) -> MapRecord:
     return dataclasses.replace(record, regions=regions)
 
 
-def _leaf_box(
-    settings: FieldSettings, region: Region, low: NDArray[np.float64], high: NDArray[np.float64]
-) -> _LeafBox:
-    centre = region_centre(settings, region.index)
+def leaf_box(
+    settings: FieldSettings,
+    index: RegionIndex,
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+) -> LeafBox:
+    """The box between two corners [3] of the map frame, grown by what rounding may need."""
+    centre = region_centre(settings, index)
     half = 1 << (settings.depth - 1)
-    return _LeafBox(
-        (low - centre) / settings.leaf_m + half - _SLACK_LEAVES,
-        (high - centre) / settings.leaf_m + half + _SLACK_LEAVES,
+    return LeafBox(
+        (low - centre) / settings.leaf_m + half - SLACK_LEAVES,
+        (high - centre) / settings.leaf_m + half + SLACK_LEAVES,
     )
 
 
-def _crop_region(settings: FieldSettings, region: Region, box: _LeafBox) -> Region:
+def _crop_region(settings: FieldSettings, region: Region, box: LeafBox) -> Region:
     kept = [_reaching(settings, table, box) for table in region.tables]
     tables = tuple(
         dataclasses.replace(table, codes=table.codes[rows], features=table.features[rows])
@@ -90,7 +107,7 @@ def _crop_region(settings: FieldSettings, region: Region, box: _LeafBox) -> Regi
     return dataclasses.replace(region, tables=tables, evidence=evidence, training=training)
 
 
-def _reaching(settings: FieldSettings, table: VertexTable, box: _LeafBox) -> NDArray[np.intp]:
+def _reaching(settings: FieldSettings, table: VertexTable, box: LeafBox) -> NDArray[np.intp]:
     """Rows of the vertices that have a hat function that is not zero all over the box."""
     axes = list(AXES[table.plane])
     cells = morton.decode(table.codes, 2)
@@ -100,26 +117,43 @@ def _reaching(settings: FieldSettings, table: VertexTable, box: _LeafBox) -> NDA
     return np.flatnonzero((below & above).all(axis=1))
 
 
-def _crop_evidence(evidence: Evidence, box: _LeafBox) -> Evidence:
-    """Evidence without the voxels that no point of the box asks for."""
-    first = morton.decode(evidence.codes, 3) * BLOCK_VOXELS
+def voxel_mask(
+    codes: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """Bits [B, BLOCK_BYTES] of the voxels of blocks that meet a box.
+
+    Args:
+        codes: ``[B]`` of the blocks.
+        low: ``[3]`` corner of the box, leaf coordinates of the region.
+        high: ``[3]`` opposite corner.
+    """
+    first = morton.decode(codes, 3) * BLOCK_VOXELS
     voxels = first[:, :, None] + np.arange(BLOCK_VOXELS)  # [B, 3, 8]
-    low = (box.low - _STATUS_VOXELS)[:, None]
-    high = (box.high + _STATUS_VOXELS)[:, None]
-    inside = (voxels + 1 >= low) & (voxels <= high)
+    inside = (voxels + 1 >= low[:, None]) & (voxels <= high[:, None])
     columns = inside[:, 0, :, None] & inside[:, 1, None, :]  # [B, x, y]
     heights = np.packbits(inside[:, 2], axis=1, bitorder="little")  # [B, 1]
-    mask = np.where(columns.reshape(len(columns), BLOCK_VOXELS**2), heights, 0).astype(np.uint8)
+    mask = np.where(columns.reshape(len(columns), BLOCK_VOXELS**2), heights, 0)
+    return mask.astype(np.uint8)
+
+
+def masked(evidence: Evidence, mask: NDArray[np.uint8]) -> Evidence:
+    """The evidence of the voxels whose bit is set in ``mask`` [B, BLOCK_BYTES]."""
     surface, free = evidence.surface & mask, evidence.free & mask
     rows = np.flatnonzero((surface | free).any(axis=1))
     return Evidence(evidence.codes[rows], surface[rows], free[rows])
+
+
+def _crop_evidence(evidence: Evidence, box: LeafBox) -> Evidence:
+    """Evidence without the voxels that no point of the box asks for."""
+    low, high = box.low - _STATUS_VOXELS, box.high + _STATUS_VOXELS
+    return masked(evidence, voxel_mask(evidence.codes, low, high))
 
 
 def _crop_training(
     settings: FieldSettings,
     training: TrainingState,
     kept: list[NDArray[np.intp]],
-    box: _LeafBox,
+    box: LeafBox,
 ) -> TrainingState:
     leaves = training.sample_points / settings.leaf_m + (1 << (settings.depth - 1))
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))

@@ -21,6 +21,10 @@ class DamagedMapFileError(MapFileError):
     """A map file whose bytes are incomplete or fail a check."""
 
 
+class NoIndexError(MapFileError):
+    """A map file that can only be read as a whole: of version 1, or rewritten by another tool."""
+
+
 class UnsupportedMapFileError(MapFileError):
     """A sound map file that needs a newer reader; the text names what is missing."""
 

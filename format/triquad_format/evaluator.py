@@ -59,7 +59,7 @@ class MapEvaluator:
             FormatError: ``points`` has another shape, or a coordinate is not finite.
         """
         positions: Doubles = np.asarray(points, np.float64)
-        _check_points(positions)
+        check_points(positions)
         sdf = np.empty(len(positions), np.float32)
         status = np.empty(len(positions), np.uint8)
         slope = np.empty((len(positions), 3), np.float32) if gradient else None
@@ -107,7 +107,8 @@ class MapEvaluator:
         return status
 
 
-def _check_points(points: Doubles) -> None:
+def check_points(points: Doubles) -> None:
+    """Raise :class:`FormatError` unless ``points`` are finite and of shape [N, 3]."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise FormatError(f"expected points [N, 3], got {list(points.shape)}")
     finite = np.isfinite(points).all(axis=1)
@@ -135,7 +136,7 @@ class _VertexLookup:
         self._codes = table.codes
         self._absent = len(table.codes)
         zeros = np.zeros((1, table.features.shape[1]), np.float32)
-        self._features = np.concatenate([table.features.astype(np.float32), zeros])
+        self._features = np.concatenate([table.vectors(), zeros])
 
     def __call__(self, cells: NDArray[np.int64]) -> Floats:
         """Features [N, d] of the vertices at integer coordinates [N, 2]."""

@@ -1,38 +1,50 @@
-"""Reading map files: nothing is believed before it is checked."""
+"""Reading map files whole: nothing is believed before it is checked."""
 
 import contextlib
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from triquad_format import version_1
 from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,
     MapFileError,
+    NoIndexError,
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.map_parts import FRAME_ID, MANIFEST, PREFIX, TOPICS, UNITS, Part
+from triquad_format.manifest import DIGEST_BYTES, Entry, FileRef, Manifest, unpack_manifest
+from triquad_format.map_facts import MapFacts
+from triquad_format.map_index import (
+    OtherFiles,
+    check_agreement,
+    check_part,
+    one_metadata,
+    reader_version,
+)
 from triquad_format.mapfile_writer import (
-    FORMAT_VERSION,
     MAX_MAP_BYTES,
     MAX_PART_BYTES,
     MESSAGE_ENCODING,
     METADATA_NAME,
 )
 from triquad_format.mcap_records import McapFile, Message
-from triquad_format.part_reader import PartCursor, unpack_manifest, unpack_record
+from triquad_format.part import MANIFEST, PREFIX, PREVIEW, TOPICS
+from triquad_format.part_reader import assemble
+from triquad_format.random_access import FileBytes, RandomAccess
 from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord
 
-KNOWN_FEATURES: frozenset[str] = frozenset()
-"""The ``required_features`` that this reader understands."""
-
 _BLOCK_BYTES = 1 << 20
 
-REMEDY = "an older checkpoint beside it may be intact"
+_FREE_TOTAL_BYTES = 32 * 2**20
+_MAX_TOTAL_RATIO = 32
+"""All chunks together, decompressed, have at most so many times the file's size, and that more."""
+
+REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be sound"
 
 
 @dataclass(frozen=True)
@@ -40,9 +52,8 @@ class StoredPart:
     """A part as it lies in the file."""
 
     topic: str
-    size: int  # bytes of its msgpack map
+    size: int  # bytes of its payload
     stored_size: int  # bytes that it takes in the file, compressed
-    sha256: bytes
 
 
 @dataclass(frozen=True)
@@ -51,8 +62,10 @@ class MapFile:
 
     record: MapRecord
     metadata: dict[str, str]  # of the record "triquad"
-    parts: tuple[StoredPart, ...]  # without the manifest
+    parts: tuple[StoredPart, ...]  # of this file, without the manifest
     size: int  # bytes
+    manifest: Manifest | None  # None: a file of version 1, which has another
+    manifest_sha256: bytes  # of the manifest's payload; empty for a file of version 1
 
 
 def read_map(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYTES) -> MapRecord:
@@ -64,7 +77,8 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
     """Read a map file and check all of it. Arrays may be read-only.
 
     Args:
-        source: a path, or a binary stream, which is read to its end.
+        source: a path, or a binary stream, which is read to its end. Parts in other files are
+            looked for in the folder of the path.
         max_bytes: limit on the file's size and, decompressed, on its parts together.
 
     Raises:
@@ -76,27 +90,32 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
     """
     if isinstance(source, (str, Path)):
         with Path(source).open("rb") as stream:
-            return _read(str(source), stream, max_bytes)
-    return _read(str(getattr(source, "name", "map file")), source, max_bytes)
+            return _read(str(source), stream, max_bytes, Path(source).parent)
+    return _read(str(getattr(source, "name", "map file")), source, max_bytes, None)
 
 
-def _read(name: str, stream: BinaryIO, max_bytes: int) -> MapFile:
-    with _named(name):
+def _read(name: str, stream: BinaryIO, max_bytes: int, folder: Path | None) -> MapFile:
+    with named(name):
         # Block by block: one read of the limit's size would reserve all of it.
         data = bytearray()
         while block := stream.read(_BLOCK_BYTES):
             data += block
             if len(data) > max_bytes:
                 raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
-        return _parse(memoryview(data), max_bytes)
+        return _parse(memoryview(data), decompressed_limit(len(data), max_bytes), folder)
+
+
+def decompressed_limit(size: int, max_bytes: int) -> int:
+    """How large the chunks of a file of ``size`` bytes may be together, decompressed."""
+    return min(max_bytes, _FREE_TOTAL_BYTES + _MAX_TOTAL_RATIO * size)
 
 
 @contextlib.contextmanager
-def _named(name: str) -> Iterator[None]:
+def named(name: str) -> Iterator[None]:
     """Put the file's name and, for damage, the remedy into what is raised."""
     try:
         yield
-    except (UnsupportedMapFileError, TooLargeMapFileError) as error:
+    except (NoIndexError, UnsupportedMapFileError, TooLargeMapFileError) as error:
         raise type(error)(f"{name}: {error}") from error
     except DamagedMapFileError as error:
         raise DamagedMapFileError(f"{name} is damaged: {error}; {REMEDY}") from error
@@ -108,89 +127,82 @@ def _named(name: str) -> Iterator[None]:
         raise TooLargeMapFileError(f"{name}: the map does not fit into memory") from error
 
 
-def _parse(data: memoryview, max_bytes: int) -> MapFile:
+def files_in(folder: Path) -> Callable[[FileRef], RandomAccess]:
+    """Opens the other files that hold parts of a map, in the folder of the map file."""
+    return lambda file: FileBytes(folder / file.name)
+
+
+def _parse(data: memoryview, max_bytes: int, folder: Path | None) -> MapFile:
     mcap = McapFile(data)
-    metadata = _find_metadata(mcap.metadata)
-    _check_versions(metadata)
-    passed: list[StoredPart] = []
-    cursor = PartCursor(_known_parts(mcap.messages(max_bytes), passed))
-    record = unpack_record(cursor)
-    before = len(passed)
-    listed = unpack_manifest(cursor, before)
-    cursor.finish()
-    _check_manifest(listed, passed)
-    _check_agreement(metadata, record)
+    metadata = one_metadata([entries for name, entries in mcap.metadata if name == METADATA_NAME])
+    version = reader_version(metadata)
+    messages = _parts(mcap.messages(max_bytes), version, len(data) // DIGEST_BYTES)
+    if version < 2:
+        parts: list[StoredPart] = []
+        record = version_1.read_record(_noted(messages, parts))
+        manifest, digest = None, b""
+    else:
+        found = list(messages)
+        parts = [_stored(message) for message in found]
+        digest = hashlib.sha256(found[-1].data).digest() if found else b""
+        record, manifest = _assemble(found, len(data), folder)
+    check_agreement(metadata, MapFacts(record.name, record.epoch, record.settings))
     check_record(record)
-    return MapFile(record, metadata, tuple(passed[:-1]), len(data))
+    return MapFile(record, metadata, tuple(parts[:-1]), len(data), manifest, digest)
 
 
-def _find_metadata(records: list[tuple[str, dict[str, str]]]) -> dict[str, str]:
-    found = [entries for name, entries in records if name == METADATA_NAME]
-    if not found:
-        raise MapFileError("this is an MCAP file, but not a map: it has no metadata 'triquad'")
-    if len(found) > 1:
-        raise DamagedMapFileError("the metadata 'triquad' is there more than once")
-    return found[0]
-
-
-def _check_versions(metadata: dict[str, str]) -> None:
-    needed = metadata.get("min_reader_version", "")
-    # int() alone would also take '+1', ' 1' and digits of other scripts, of any length.
-    if not (needed.isascii() and needed.isdigit() and len(needed) < 10):
-        raise DamagedMapFileError(f"min_reader_version = {needed!r:.40} is not a number")
-    if int(needed) > FORMAT_VERSION:
-        raise UnsupportedMapFileError(
-            f"it needs a reader of map file version {needed}; this one reads {FORMAT_VERSION}: "
-            f"install a newer triquad (written by {metadata.get('producer', 'unknown')!r:.80})",
-        )
-    if "required_features" not in metadata:
-        raise DamagedMapFileError("the metadata 'triquad' does not name its required_features")
-    required = {name.strip() for name in metadata["required_features"].split(",")} - {""}
-    if required - KNOWN_FEATURES:
-        unknown = ", ".join(sorted(required - KNOWN_FEATURES))
-        raise UnsupportedMapFileError(
-            f"it requires {unknown:.200}, which this reader does not know: install a newer triquad"
-        )
-
-
-def _known_parts(messages: Iterator[Message], passed: list[StoredPart]) -> Iterator[Part]:
-    """The parts that this version reads; every part, known or not, is noted in ``passed``."""
+def _parts(messages: Iterator[Message], version: int, most: int) -> Iterator[Message]:
+    """The messages that are parts, known or not; a file with more than ``most`` is refused."""
+    after = False
+    count = 0
     for message in messages:
-        if not message.topic.startswith(PREFIX):
+        preview = version >= 2 and message.topic == PREVIEW
+        if not (preview or message.topic.startswith(PREFIX)):
             continue
-        if len(message.data) > MAX_PART_BYTES:
-            raise DamagedMapFileError(f"a part {message.topic:.80} exceeds {MAX_PART_BYTES} bytes")
-        digest = hashlib.sha256(message.data).digest()
-        passed.append(StoredPart(message.topic, len(message.data), message.stored_bytes, digest))
-        if passed[:-1] and passed[-2].topic == MANIFEST:
+        count += 1
+        if count > most:
+            raise DamagedMapFileError("it has more parts than its manifest has room to list")
+        if after:
             raise DamagedMapFileError(f"the part {message.topic:.80} follows the manifest")
-        if message.topic not in TOPICS:
-            continue
-        if message.encoding != MESSAGE_ENCODING:
+        after = message.topic == MANIFEST
+        limit = MAX_PART_BYTES if version >= 2 else version_1.MAX_PART_BYTES
+        if len(message.data) > limit:
+            raise DamagedMapFileError(f"a part {message.topic:.80} exceeds {limit} bytes")
+        if message.topic in TOPICS and message.encoding != MESSAGE_ENCODING:
             raise DamagedMapFileError(f"{message.topic} is encoded in {message.encoding!r:.40}")
-        yield Part(message.topic, message.data)
+        yield message
 
 
-def _check_manifest(listed: list[tuple[str, int, bytes]], passed: list[StoredPart]) -> None:
-    found = [(part.topic, part.size, part.sha256) for part in passed[:-1]]
-    for number, (have, want) in enumerate(zip(found, listed, strict=False)):
-        if have != want:
-            raise DamagedMapFileError(
-                f"part {number}, {have[0]:.80}, is not the one that the manifest lists there",
-            )
-    if len(found) != len(listed):
-        raise DamagedMapFileError(f"{len(found)} parts, but its manifest lists {len(listed)}")
+def _stored(message: Message) -> StoredPart:
+    return StoredPart(message.topic, len(message.data), message.stored_bytes)
 
 
-def _check_agreement(metadata: dict[str, str], record: MapRecord) -> None:
-    wanted = {
-        "map": record.name,
-        "epoch": str(record.epoch),
-        "frame_id": FRAME_ID,
-        "units": UNITS,
-    }
-    for key, value in wanted.items():
-        if metadata.get(key) != value:
-            raise DamagedMapFileError(
-                f"its metadata says {key} = {metadata.get(key)!r:.80}, its parts say {value!r}",
-            )
+def _noted(messages: Iterator[Message], parts: list[StoredPart]) -> Iterator[Message]:
+    for message in messages:
+        parts.append(_stored(message))
+        yield message
+
+
+def _assemble(
+    messages: list[Message], file_bytes: int, folder: Path | None
+) -> tuple[MapRecord, Manifest]:
+    """The record of all parts, those in other files included, and their list."""
+    if not messages or messages[-1].topic != MANIFEST:
+        raise DamagedMapFileError(f"the part {MANIFEST} is missing at the end")
+    manifest = unpack_manifest(messages[-1].data, file_bytes)
+    own = manifest.own
+    if len(own) != len(messages) - 1:
+        raise DamagedMapFileError(f"{len(messages) - 1} parts, but its manifest lists {len(own)}")
+    payloads: dict[Entry, bytes] = {}
+    for number, (entry, message) in enumerate(zip(own, messages[:-1], strict=True)):
+        check_part(number, entry, message.topic, message.data)
+        payloads[entry] = message.data
+    messages.clear()
+    others = OtherFiles(None if folder is None else files_in(folder))
+    try:
+        record = assemble(
+            manifest, lambda e: payloads.pop(e) if e.file is None else others.payload(e)
+        )
+    finally:
+        others.close()
+    return record, manifest

@@ -4,39 +4,61 @@ import contextlib
 import hashlib
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.writer import CompressionType, Writer
-
 from triquad_format import __version__
 from triquad_format.errors import FormatError
-from triquad_format.map_parts import (
-    FEATURE_DTYPES,
-    FRAME_ID,
-    UNITS,
+from triquad_format.evaluator import MapEvaluator
+from triquad_format.manifest import Entry, Manifest, pack_manifest
+from triquad_format.map_facts import FRAME_ID, UNITS, MapFacts
+from triquad_format.map_parts import FEATURE_DTYPES, pack_map, pack_region
+from triquad_format.mcap_writer import ChannelSpec, McapWriter, SchemaSpec
+from triquad_format.part import (
+    EVIDENCE,
+    MANIFEST,
+    MAP,
+    MOMENTS,
+    PREVIEW,
+    REGION,
+    SAMPLES,
+    TRAINING,
+    VERTICES,
     Part,
-    pack_manifest,
-    pack_record,
+    PartKey,
 )
-from triquad_format.mcap_records import MAX_CHUNK_BYTES
+from triquad_format.preview import SCHEMA_NAME, Distances, pack_preview, schema_data
 from triquad_format.record_check import check_record
-from triquad_format.region import MapRecord
+from triquad_format.region import MapRecord, Region
 
-FORMAT_VERSION = 1
-MIN_READER_VERSION = 1
+FORMAT_VERSION = 2
+MIN_READER_VERSION = 2
 METADATA_NAME = "triquad"
 MESSAGE_ENCODING = "msgpack"
-MAX_PART_BYTES = MAX_CHUNK_BYTES - 65_536
+BASE_FILES = "base-files"
+"""The required feature of a file whose parts lie in other files, too."""
+
+MAX_PART_BYTES = 32 * 2**20 - 65_536
 
 MAX_MAP_BYTES = 4 * 2**30
 """Limit on the size of a map file, and on its chunks' decompressed size together."""
 
-_MCAP_BYTES = 256
-"""What MCAP adds to a part within its chunk takes less."""
+# Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
+# good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
+CHANNELS = (
+    ChannelSpec(MAP, MESSAGE_ENCODING, 3),
+    ChannelSpec(REGION, MESSAGE_ENCODING, 3),
+    ChannelSpec(VERTICES, MESSAGE_ENCODING, 1),
+    ChannelSpec(EVIDENCE, MESSAGE_ENCODING, 12),
+    ChannelSpec(TRAINING, MESSAGE_ENCODING, 1),
+    ChannelSpec(MOMENTS, MESSAGE_ENCODING, 1),
+    ChannelSpec(SAMPLES, MESSAGE_ENCODING, 1),
+    ChannelSpec(PREVIEW, "protobuf", 19, SCHEMA_NAME),
+    ChannelSpec(MANIFEST, MESSAGE_ENCODING, 3),
+)
 
 
 @dataclass(frozen=True)
@@ -48,14 +70,25 @@ class MapFileInfo:
     epoch: int
 
 
+@dataclass(frozen=True)
+class WrittenMap:
+    """A file that was written, and what its manifest lists."""
+
+    info: MapFileInfo
+    manifest: Manifest
+    manifest_sha256: bytes
+
+
 def write_map(
     record: MapRecord,
     file: BinaryIO | Path | str,
     *,
     feature_dtype: str = "<f2",
     stamp_ns: int | None = None,
+    distances: Distances | None = None,
+    preview: bool = True,
 ) -> MapFileInfo:
-    """Write a map file.
+    """Write a map file that needs no other.
 
     A path is written under a temporary name (``.<name>.<random>.tmp``) in the same folder, synced
     and renamed, so that the final name never holds half a file.
@@ -63,76 +96,155 @@ def write_map(
     Args:
         record: the map; it is checked first.
         file: a path, or a binary stream at the place where the file begins.
-        feature_dtype: ``"<f2"`` or ``"<f4"``, the precision of the vertex features.
+        feature_dtype: ``"<f2"`` or ``"<f4"``, the precision of features that are not int8.
         stamp_ns: time of creation, nanoseconds since 1970; left out, the file holds no time.
+        distances: a faster way to the map's signed distances than numpy, for the preview.
+        preview: whether the file holds a coarse mesh for MCAP viewers.
 
     Raises:
         FormatError: the record is not sound, or exceeds a limit of the format.
         OSError: the file cannot be written.
     """
-    if feature_dtype not in FEATURE_DTYPES:
-        raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FEATURE_DTYPES}")
+    check_dtype(feature_dtype)
     if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
         raise FormatError(f"stamp_ns = {stamp_ns} is out of range")
     check_record(record)
+    facts = MapFacts(record.name, record.epoch, record.settings)
+    shown = distances or (lambda points: MapEvaluator(record).query(points).sdf)
+    parts = record_parts(record, feature_dtype, shown if preview else None, stamp_ns or 0)
+    return write_parts(file, facts, stamp_ns, parts, {}).info
+
+
+def check_dtype(feature_dtype: str) -> None:
+    """Raise :class:`FormatError` unless features may have this dtype."""
+    if feature_dtype not in FEATURE_DTYPES:
+        raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FEATURE_DTYPES}")
+
+
+def record_parts(
+    record: MapRecord, feature_dtype: str, distances: Distances | None, stamp_ns: int
+) -> Iterator[Part]:
+    """The parts of all regions of a checked record, with previews where there are distances."""
+    for region in record.regions:
+        yield from _region_parts(region, record, feature_dtype)
+        if distances is not None:
+            yield pack_preview(region, record.settings, distances, stamp_ns)
+
+
+def _region_parts(region: Region, record: MapRecord, feature_dtype: str) -> Iterator[Part]:
+    try:
+        yield from pack_region(region, record.settings, feature_dtype)
+    except FormatError as error:
+        raise FormatError(f"region {region.index}: {error}") from error
+
+
+def write_parts(
+    file: BinaryIO | Path | str,
+    facts: MapFacts,
+    stamp_ns: int | None,
+    parts: Iterable[Part | Entry],
+    known: Mapping[PartKey, Entry],
+) -> WrittenMap:
+    """Write a map file from parts.
+
+    Args:
+        file: as in :func:`write_map`.
+        facts: what the file says of the whole map.
+        stamp_ns: time of its epoch.
+        parts: what the map consists of. An entry stands for a part that lies in another file,
+            and is one of ``known``.
+        known: parts of earlier epochs: an equal one keeps its epoch and time, and is not stored
+            again where the entry names a file.
+
+    Raises:
+        FormatError: a limit of the format is exceeded.
+        OSError: the file cannot be written.
+    """
     if isinstance(file, (str, Path)):
-        with _replacing(Path(file)) as stream:
-            return _write(record, stream, feature_dtype, stamp_ns)
-    return _write(record, file, feature_dtype, stamp_ns)
+        with replacing(Path(file)) as stream:
+            return _PartsWriter(stream, facts, stamp_ns, known).write(parts)
+    return _PartsWriter(file, facts, stamp_ns, known).write(parts)
 
 
-class _MeasuredStream:
-    """Passes bytes on, counting and digesting them; all that the MCAP writer needs of a file."""
+class _PartsWriter:
+    """Writes one file, noting what its manifest is to list."""
 
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-        self._count = 0
-        self._digest = hashlib.sha256()
+    def __init__(
+        self,
+        stream: BinaryIO,
+        facts: MapFacts,
+        stamp_ns: int | None,
+        known: Mapping[PartKey, Entry],
+    ) -> None:
+        self._facts = facts
+        self._stamp_ns = stamp_ns
+        self._known = known
+        self._entries: list[Entry] = []
+        self._total = 0
+        schema = SchemaSpec(SCHEMA_NAME, "protobuf", schema_data())
+        self._mcap = McapWriter(stream, f"triquad {__version__}", [schema], CHANNELS)
 
-    def write(self, data: bytes) -> int:
-        self._stream.write(data)
-        self._count += len(data)
-        self._digest.update(data)
-        return len(data)
+    def write(self, parts: Iterable[Part | Entry]) -> WrittenMap:
+        # Where parts of other files are known, some of them are needed as good as always.
+        needs_others = any(entry.file is not None for entry in self._known.values())
+        self._mcap.add_metadata(METADATA_NAME, self._metadata(needs_others))
+        self._store(pack_map(self._facts))
+        for part in parts:
+            if isinstance(part, Entry):
+                self._entries.append(part)
+            else:
+                self._add(part)
+        manifest = Manifest(self._facts, self._stamp_ns or 0, tuple(self._entries))
+        packed = pack_manifest(manifest)
+        self._put(packed, self._stamp_ns or 0)
+        self._mcap.finish()
+        _check_total(self._mcap.size)
+        info = MapFileInfo(self._mcap.size, self._mcap.sha256, self._facts.epoch)
+        return WrittenMap(info, manifest, hashlib.sha256(packed.payload).digest())
 
-    def tell(self) -> int:
-        return self._count
+    def _add(self, part: Part) -> None:
+        """List a part; store it unless another file has it."""
+        known = self._known.get(part.key)
+        digest = hashlib.sha256(part.payload).digest()
+        if known is None or known.sha256 != digest:
+            self._store(part)
+        elif known.file is not None:
+            self._entries.append(known)
+        else:
+            self._store(part, known)
 
-    def info(self, epoch: int) -> MapFileInfo:
-        return MapFileInfo(self._count, self._digest.hexdigest(), epoch)
+    def _store(self, part: Part, known: Entry | None = None) -> None:
+        epoch = known.epoch if known else self._facts.epoch
+        stamp_ns = known.stamp_ns if known else self._stamp_ns or 0
+        digest = hashlib.sha256(part.payload).digest()
+        self._put(part, stamp_ns)
+        self._entries.append(Entry(part.key, len(part.payload), digest, epoch, stamp_ns))
 
-
-def _write(
-    record: MapRecord, stream: BinaryIO, feature_dtype: str, stamp_ns: int | None
-) -> MapFileInfo:
-    measured = _MeasuredStream(stream)
-    # A chunk closes as soon as it exceeds this size: every part gets a chunk of its own.
-    writer = Writer(
-        measured,  # type: ignore[arg-type]
-        chunk_size=1,
-        compression=CompressionType.ZSTD,
-        enable_crcs=True,
-        enable_data_crcs=True,
-    )
-    writer.start(profile="", library=f"triquad {__version__}")
-    writer.add_metadata(METADATA_NAME, _metadata(record, stamp_ns))
-    channels: dict[str, int] = {}
-    total = 0
-    for sequence, part in enumerate(_parts(record, feature_dtype)):
+    def _put(self, part: Part, stamp_ns: int) -> None:
         if len(part.payload) > MAX_PART_BYTES:
             raise FormatError(
-                f"the part {part.topic} has {len(part.payload)} bytes; "
+                f"the part {part.key.topic} has {len(part.payload)} bytes; "
                 f"a map file holds parts of at most {MAX_PART_BYTES}",
             )
-        total += len(part.payload) + _MCAP_BYTES
-        _check_total(total)
-        if part.topic not in channels:
-            channels[part.topic] = writer.register_channel(part.topic, MESSAGE_ENCODING, 0)
-        time = stamp_ns or 0
-        writer.add_message(channels[part.topic], time, part.payload, time, sequence)
-    writer.finish()  # type: ignore[no-untyped-call]
-    _check_total(measured.tell())
-    return measured.info(record.epoch)
+        self._total += len(part.payload)
+        _check_total(self._total)
+        self._mcap.add_message(part.key.topic, part.payload, stamp_ns, part.seams)
+
+    def _metadata(self, needs_others: bool) -> dict[str, str]:
+        entries = {
+            "format_version": str(FORMAT_VERSION),
+            "min_reader_version": str(MIN_READER_VERSION),
+            "required_features": BASE_FILES if needs_others else "",
+            "producer": f"triquad {__version__}",
+            "map": self._facts.name,
+            "epoch": str(self._facts.epoch),
+            "frame_id": FRAME_ID,
+            "units": UNITS,
+        }
+        if self._stamp_ns is not None:
+            created = datetime.fromtimestamp(self._stamp_ns // 10**9, timezone.utc)
+            entries["created"] = created.strftime("%Y-%m-%dT%H:%M:%SZ")
+        return entries
 
 
 def _check_total(size: int) -> None:
@@ -142,34 +254,8 @@ def _check_total(size: int) -> None:
         )
 
 
-def _parts(record: MapRecord, feature_dtype: str) -> Iterator[Part]:
-    """All parts of the file, the manifest last."""
-    entries: list[tuple[str, int, bytes]] = []
-    for part in pack_record(record, feature_dtype):
-        entries.append((part.topic, len(part.payload), hashlib.sha256(part.payload).digest()))
-        yield part
-    yield pack_manifest(entries)
-
-
-def _metadata(record: MapRecord, stamp_ns: int | None) -> dict[str, str]:
-    entries = {
-        "format_version": str(FORMAT_VERSION),
-        "min_reader_version": str(MIN_READER_VERSION),
-        "required_features": "",
-        "producer": f"triquad {__version__}",
-        "map": record.name,
-        "epoch": str(record.epoch),
-        "frame_id": FRAME_ID,
-        "units": UNITS,
-    }
-    if stamp_ns is not None:
-        created = datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc)
-        entries["created"] = created.strftime("%Y-%m-%dT%H:%M:%SZ")
-    return entries
-
-
 @contextlib.contextmanager
-def _replacing(path: Path) -> Iterator[BinaryIO]:
+def replacing(path: Path) -> Iterator[BinaryIO]:
     """A stream whose bytes replace the file at ``path``, durably, where nothing is raised."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
@@ -181,11 +267,11 @@ def _replacing(path: Path) -> Iterator[BinaryIO]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make a rename durable, where the system lets folders be synced."""
+def sync_folder(folder: Path) -> None:
+    """Make renames in a folder durable, where the system lets folders be synced."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

@@ -205,10 +205,11 @@ class MapInfo(Message):
 
 @dataclass(frozen=True)
 class MapChunkRequest(Message):
-    """Bytes ``[offset, offset + chunk_bytes)`` of the map file with this digest."""
+    """Bytes ``[offset, offset + length)`` of the map file with this digest."""
 
     sha256: str
     offset: int
+    length: int  # at most chunk_bytes are sent
 
 
 @dataclass(frozen=True)

@@ -1,34 +1,30 @@
 """The parts of a map file back into a map record; every field is checked as it is read."""
 
-import dataclasses
-import reprlib
-import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.array import ArraySpec, unpack_array
-from triquad_format.errors import DamagedMapFileError, UnsupportedMapFileError
+from triquad_format.errors import DamagedMapFileError
 from triquad_format.field_settings import FieldSettings
-from triquad_format.map_parts import (
+from triquad_format.manifest import Entry, Manifest
+from triquad_format.map_facts import check_map_part
+from triquad_format.map_parts import SAMPLES_PER_PART, cube_shift, square_shift
+from triquad_format.part import (
     EVIDENCE,
-    FRAME_ID,
-    MANIFEST,
+    FIELD_TOPICS,
     MAP,
-    MAX_CODE_BYTES,
     MOMENTS,
     REGION,
     SAMPLES,
     TRAINING,
-    UNITS,
+    TRAINING_TOPICS,
     VERTICES,
-    Part,
-    unshuffle,
-    unshuffle_codes,
+    PartKey,
 )
+from triquad_format.part_body import PartBody
 from triquad_format.region import (
     AXES,
     BLOCK_BYTES,
@@ -40,302 +36,262 @@ from triquad_format.region import (
     TrainingState,
     VertexTable,
 )
+from triquad_format.shuffle import unshuffle
 
-MAX_REGION_INDEX = 2**31 - 1
-_LAYERS = 3
-_MAX_ITEMS = 64
-_MAX_PART_STRING_BYTES = 4096
+LAYERS = 3
 
-_Columns = tuple[NDArray[Any], ...]
-"""What one part, or all parts of a table together, hold of it: columns of equal length."""
+Columns = tuple[NDArray[Any], ...]
+"""Columns of equal length: some rows of a table."""
 
 
-class PartBody:
-    """The decoded msgpack map of a part: typed access to its fields."""
+@dataclass(frozen=True)
+class _Head:
+    """What a region has one of."""
 
-    def __init__(self, part: Part, max_items: int = _MAX_ITEMS) -> None:
-        self._topic = part.topic
-        try:
-            body = msgpack.unpackb(
-                part.payload,
-                max_str_len=_MAX_PART_STRING_BYTES,
-                max_array_len=max_items,
-                max_map_len=_MAX_ITEMS,
-                max_ext_len=0,
-            )
-        except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
-            raise DamagedMapFileError(f"{part.topic}: not a msgpack map: {error}") from error
-        if not isinstance(body, dict):
-            raise DamagedMapFileError(f"{part.topic}: not a map but a {type(body).__name__}")
-        self._body = body
+    frequencies: NDArray[np.float32]
+    mlp: Mlp
+    scales: list[float]  # of each table, or none at all
 
-    def value(self, key: str, kind: type) -> Any:
-        """The field ``key``, which must be exactly of the type ``kind``."""
-        value = self._body.get(key)
-        if type(value) is not kind:
-            raise DamagedMapFileError(
-                f"{self._topic}: {key} = {reprlib.repr(value)} is not {kind.__name__}",
-            )
-        return value
 
-    def expect(self, key: str, wanted: object) -> None:
-        """Refuse a part whose field ``key`` is not ``wanted``."""
-        value = self.value(key, type(wanted))
-        if value != wanted:
-            raise DamagedMapFileError(f"{self._topic}: {key} = {value!r}, expected {wanted!r}")
+@dataclass(frozen=True)
+class _TrainingHead:
+    """What a region's training state has one of."""
 
-    def count(self, key: str) -> int:
-        """A number in ``[0, 2**63)``."""
-        value: int = self.value(key, int)
-        if not 0 <= value < 2**63:
-            raise DamagedMapFileError(f"{self._topic}: {key} = {value} is not a count")
-        return value
+    mlp_means: tuple[NDArray[np.float32], ...]
+    mlp_variances: tuple[NDArray[np.float32], ...]
+    mlp_steps: int
+    visits_owed: int
+    samples: int
 
-    def counts(self, key: str, length: int) -> list[int]:
-        """A list of ``length`` numbers in ``[0, 2**63)``."""
-        values: list[Any] = self.value(key, list)
-        if len(values) != length or not all(
-            type(value) is int and 0 <= value < 2**63 for value in values
-        ):
-            raise DamagedMapFileError(
-                f"{self._topic}: {key} = {reprlib.repr(values)} is not a list of {length} counts",
-            )
-        return values
 
-    def index(self) -> RegionIndex:
-        """The index of the region to which the part belongs."""
-        value = self.value("region", list)
-        if len(value) != 3 or not all(
-            type(number) is int and abs(number) <= MAX_REGION_INDEX for number in value
-        ):
-            raise DamagedMapFileError(
-                f"{self._topic}: region = {reprlib.repr(value)} is not an index"
-            )
-        return (value[0], value[1], value[2])
+class RegionParts:
+    """The parts of one region, gathered in any order."""
 
-    def array(self, key: str, dtype: str, *shape: int | None) -> NDArray[Any]:
-        """An array of this dtype and shape (``None``: any size)."""
-        return self._array(f"{self._topic}: {key}", self._body.get(key), ArraySpec(dtype, shape))
+    def __init__(self, index: RegionIndex, settings: FieldSettings) -> None:
+        self._index = index
+        self._settings = settings
+        self._head: _Head | None = None
+        self._training: _TrainingHead | None = None
+        self._columns: dict[PartKey, tuple[Columns, ...]] = {}
 
-    def arrays(self, key: str, count: int) -> tuple[NDArray[Any], ...]:
-        """``count`` arrays of ``<f4``, each of any shape of one or two axes."""
-        items = self.value(key, list)
-        if len(items) != count:
-            raise DamagedMapFileError(
-                f"{self._topic}: {key} holds {len(items)} arrays, not {count}"
-            )
-        return tuple(
-            self._array(f"{self._topic}: {key}[{i}]", item, None) for i, item in enumerate(items)
+    def add(self, key: PartKey, payload: bytes) -> None:
+        """Read a part.
+
+        Raises:
+            FormatError: it is malformed, or not the part that ``key`` says.
+        """
+        body = PartBody(key.topic, payload)
+        if body.index() != key.region:
+            raise DamagedMapFileError(f"{key.topic}: of region {body.index()}, not {key.region}")
+        if key.topic == REGION:
+            self._head = _read_head(body)
+        elif key.topic == TRAINING:
+            self._training = _read_training_head(body)
+        elif key.topic in _READERS:
+            body.expect("plane", key.plane)
+            body.expect("cell", key.cell)
+            self._columns[key] = _READERS[key.topic](body, key, self._settings)
+
+    def region(self) -> Region:
+        """The region; the caller has checked by the manifest that all parts are there.
+
+        Raises:
+            FormatError: parts do not fit together.
+        """
+        if self._head is None:
+            raise DamagedMapFileError(f"the part {REGION} of region {self._index} is missing")
+        tables = [columns for plane in range(len(AXES)) for columns in self._tables(plane)]
+        places = [(plane, level) for plane in range(len(AXES)) for level in self._settings.levels]
+        scales: list[Any] = self._head.scales or [None] * len(places)
+        if len(scales) != len(places):
+            raise DamagedMapFileError(f"{REGION}: {len(scales)} scales for {len(places)} tables")
+        vertices = tuple(
+            _vertex_table(place, columns, scale)
+            for place, columns, scale in zip(places, tables, scales, strict=True)
+        )
+        return Region(
+            index=self._index,
+            frequencies=self._head.frequencies,
+            mlp=self._head.mlp,
+            tables=vertices,
+            evidence=self._evidence(),
+            training=self._training_state(),
         )
 
-    def codes(self, key: str) -> NDArray[np.int64]:
-        """Morton codes [V]."""
-        planes = self.array(key, "|u1", None, None)
-        if not 1 <= len(planes) <= MAX_CODE_BYTES:
-            raise DamagedMapFileError(f"{self._topic}: {key} has {len(planes)} bytes per code")
-        return unshuffle_codes(planes)
+    def _of(self, topic: str, plane: int = 0) -> list[tuple[Columns, ...]]:
+        """Parts of a topic in the order of their cells."""
+        keys = sorted(k for k in self._columns if k.topic == topic and k.plane == plane)
+        return [self._columns[key] for key in keys]
 
-    def floats(self, key: str, *shape: int | None) -> NDArray[Any]:
-        """A shuffled array of ``<f2`` or ``<f4``."""
-        planes = self.array(key, "|u1", None, *shape)
-        if len(planes) not in (2, 4):
-            raise DamagedMapFileError(f"{self._topic}: {key} has {len(planes)} bytes per value")
-        return unshuffle(planes, f"<f{len(planes)}")
+    def _tables(self, plane: int) -> list[Columns]:
+        """Codes and features of a plane, level by level."""
+        size = self._settings.feature_size
+        empty = (np.zeros(0, np.int64), np.zeros((0, size), np.float16))
+        return self._levels(VERTICES, plane, empty)
 
-    @staticmethod
-    def _array(name: str, packed: object, spec: ArraySpec | None) -> NDArray[Any]:
-        array = unpack_array(name, packed)
-        (spec or ArraySpec("<f4", (None,) * array.ndim)).check(name, array)
-        return array
+    def _levels(self, topic: str, plane: int, empty: Columns) -> list[Columns]:
+        squares = self._of(topic, plane)
+        return [
+            _joined(topic, [square[h] for square in squares], empty)
+            for h in range(self._settings.feature_levels)
+        ]
 
-    def mapping(self, key: str) -> Mapping[str, object]:
-        """A nested map."""
-        value: Mapping[str, object] = self.value(key, dict)
-        return value
+    def _evidence(self) -> Evidence:
+        masks = np.zeros((0, BLOCK_BYTES), np.uint8)
+        empty = (np.zeros(0, np.int64), masks, masks)
+        return Evidence(*_joined(EVIDENCE, [part[0] for part in self._of(EVIDENCE)], empty))
+
+    def _training_state(self) -> TrainingState | None:
+        head = self._training
+        if head is None:
+            return None
+        size = self._settings.feature_size
+        rows = np.zeros((0, size), np.float32)
+        moments = [
+            columns
+            for plane in range(len(AXES))
+            for columns in self._levels(MOMENTS, plane, (rows, rows, np.zeros(0, np.int32)))
+        ]
+        empty = (np.zeros((0, 3), np.float32), np.zeros(0, np.float16))
+        points, labels = _joined(SAMPLES, [part[0] for part in self._of(SAMPLES)], empty)
+        if len(points) != head.samples:
+            raise DamagedMapFileError(f"{SAMPLES}: {len(points)} samples, not {head.samples}")
+        return TrainingState(
+            table_means=tuple(columns[0] for columns in moments),
+            table_variances=tuple(columns[1] for columns in moments),
+            table_steps=tuple(columns[2] for columns in moments),
+            mlp_means=head.mlp_means,
+            mlp_variances=head.mlp_variances,
+            mlp_steps=head.mlp_steps,
+            sample_points=points,
+            sample_labels=labels,
+            visits_owed=head.visits_owed,
+        )
 
 
-class PartCursor:
-    """Takes parts one after the other, in the order that the format demands."""
+def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRecord:
+    """The record of the parts that a manifest lists.
 
-    def __init__(self, parts: Iterator[Part]) -> None:
-        self._parts = parts
-
-    def take(self, topic: str, max_items: int = _MAX_ITEMS) -> PartBody:
-        """The body of the next part, which must be of this topic."""
-        part = next(self._parts, None)
-        if part is None:
-            raise DamagedMapFileError(f"the part {topic} is missing at the end")
-        if part.topic != topic:
-            raise DamagedMapFileError(f"expected the part {topic}, found {part.topic}")
-        return PartBody(part, max_items)
-
-    def finish(self) -> None:
-        """Refuse any further part."""
-        part = next(self._parts, None)
-        if part is not None:
-            raise DamagedMapFileError(f"the part {part.topic} follows the manifest")
-
-
-def unpack_record(cursor: PartCursor) -> MapRecord:
-    """The record in the parts up to the manifest; shapes against settings are not yet checked.
+    Args:
+        manifest: the list; regions come in the order of their parts ``/triquad/region``.
+        payload_of: gives the checked payload of a part; it is asked once for each.
 
     Raises:
-        FormatError: a part is missing, misplaced or malformed.
+        FormatError: a part is missing, malformed or does not fit the others.
     """
-    body = cursor.take(MAP)
-    for key, wanted in (("frame_id", FRAME_ID), ("units", UNITS)):
-        if body.value(key, str) != wanted:
-            raise UnsupportedMapFileError(f"{key} = {body.value(key, str)!r}, not {wanted!r}")
-    settings = _unpack_settings(body.mapping("settings"))
-    regions = tuple(_unpack_region(cursor, settings) for _ in range(body.count("regions")))
-    return MapRecord(body.value("name", str), body.count("epoch"), settings, regions)
+    settings = manifest.facts.settings
+    by_region: dict[RegionIndex, list[Entry]] = {}
+    for entry in manifest.entries:
+        if entry.key.topic == REGION:
+            by_region[entry.key.region] = []
+    for entry in manifest.entries:
+        if entry.key.topic == MAP:
+            check_map_part(payload_of(entry), manifest.facts)
+        elif entry.key.topic in (*FIELD_TOPICS, *TRAINING_TOPICS):
+            by_region[entry.key.region].append(entry)
+    regions = []
+    for index, entries in by_region.items():
+        parts = RegionParts(index, settings)
+        for entry in entries:
+            parts.add(entry.key, payload_of(entry))
+        regions.append(parts.region())
+    return MapRecord(manifest.facts.name, manifest.facts.epoch, settings, tuple(regions))
 
 
-def unpack_manifest(cursor: PartCursor, max_parts: int) -> list[tuple[str, int, bytes]]:
-    """Topic, length and SHA-256 of every part before the manifest."""
-    entries = cursor.take(MANIFEST, max(max_parts, _MAX_ITEMS)).value("parts", list)
-    try:
-        return [(entry["topic"], entry["bytes"], entry["sha256"]) for entry in entries]
-    except (TypeError, KeyError) as error:
-        raise DamagedMapFileError(f"{MANIFEST}: an entry is malformed: {error}") from error
+def _vertex_table(place: tuple[int, int], columns: Columns, scale: float | None) -> VertexTable:
+    codes, features = columns
+    if scale is not None and not len(codes):
+        features = features.astype(np.int16)  # no part tells of what dtype no rows are
+    return VertexTable(*place, codes, features, scale)
 
 
-def _unpack_settings(body: Mapping[str, object]) -> FieldSettings:
-    hints = typing.get_type_hints(FieldSettings)
-    values: dict[str, Any] = {}
-    for field in dataclasses.fields(FieldSettings):
-        value = body.get(field.name)
-        if hints[field.name] is float and type(value) is int and abs(value) < 2**53:
-            value = float(value)
-        if type(value) is not hints[field.name]:
-            raise DamagedMapFileError(f"{MAP}: setting {field.name} = {reprlib.repr(value)}")
-        values[field.name] = value
-    return FieldSettings(**values)
+def _joined(topic: str, portions: Iterable[Columns], empty: Columns) -> Columns:
+    """The rows of all portions, column by column."""
+    kept = list(portions)
+    # The portion without rows gives dtypes where there is no other.
+    kept = [portion for portion in kept if len(portion[0])] or kept[:1] or [empty]
+    kinds = [(column.dtype, column.shape[1:]) for column in kept[0]]
+    for portion in kept[1:]:
+        if [(column.dtype, column.shape[1:]) for column in portion] != kinds:
+            raise DamagedMapFileError(f"{topic}: parts of a table differ in dtype or shape")
+    if len(kept) == 1:
+        return kept[0]
+    return tuple(np.concatenate(column) for column in zip(*kept, strict=True))
 
 
-def _unpack_region(cursor: PartCursor, settings: FieldSettings) -> Region:
-    body = cursor.take(REGION)
-    index = body.index()
-    places = [(plane, level) for plane in range(len(AXES)) for level in settings.levels]
-    counts = body.counts("vertices", len(places))
-    tables = tuple(
-        _unpack_table(cursor, index, place, count)
-        for place, count in zip(places, counts, strict=True)
-    )
-    evidence = _unpack_evidence(cursor, index, body.count("blocks"))
-    training = None
-    if body.value("training", bool):
-        training = _unpack_training(cursor, index, places, counts)
-    return Region(
-        index=index,
-        frequencies=body.array("frequencies", "<f4", None),
-        mlp=Mlp(body.arrays("weights", _LAYERS), body.arrays("biases", _LAYERS)),
-        tables=tables,
-        evidence=evidence,
-        training=training,
-    )
+def _read_head(body: PartBody) -> _Head:
+    mlp = Mlp(body.arrays("weights", LAYERS), body.arrays("biases", LAYERS))
+    scales = body.array("scales", "<f4", None).tolist()
+    return _Head(body.array("frequencies", "<f4", None), mlp, scales)
 
 
-def _take_of_region(cursor: PartCursor, topic: str, index: RegionIndex) -> PartBody:
-    body = cursor.take(topic)
-    if body.index() != index:
-        raise DamagedMapFileError(f"{topic}: of region {body.index()}, expected {index}")
-    return body
-
-
-def _take_rows(
-    cursor: PartCursor,
-    topic: str,
-    index: RegionIndex,
-    count: int,
-    read: Callable[[PartBody], _Columns],
-) -> _Columns:
-    """The columns of a table of ``count`` rows, from as many parts as it was split into."""
-    portions: list[_Columns] = []
-    found = 0
-    while not portions or found < count:
-        columns = read(_take_of_region(cursor, topic, index))
-        rows = len(columns[0])
-        if any(len(column) != rows for column in columns):
-            raise DamagedMapFileError(f"{topic}: columns of region {index} differ in length")
-        if portions and (rows == 0 or _kinds(columns) != _kinds(portions[0])):
-            raise DamagedMapFileError(f"{topic}: a part of region {index} does not fit the first")
-        portions.append(columns)
-        found += rows
-    if found != count:
-        raise DamagedMapFileError(f"{topic}: region {index} has {found} rows, not {count}")
-    if len(portions) == 1:
-        return portions[0]
-    return tuple(np.concatenate(column) for column in zip(*portions, strict=True))
-
-
-def _kinds(columns: _Columns) -> list[tuple[np.dtype[Any], tuple[int, ...]]]:
-    return [(column.dtype, column.shape[1:]) for column in columns]
-
-
-def _unpack_table(
-    cursor: PartCursor, index: RegionIndex, place: tuple[int, int], count: int
-) -> VertexTable:
-    def read(body: PartBody) -> _Columns:
-        _expect_place(body, place)
-        return body.codes("codes"), body.floats("features", None, None)
-
-    return VertexTable(*place, *_take_rows(cursor, VERTICES, index, count, read))
-
-
-def _unpack_evidence(cursor: PartCursor, index: RegionIndex, count: int) -> Evidence:
-    def read(body: PartBody) -> _Columns:
-        masks = [body.array(key, "|u1", None, BLOCK_BYTES) for key in ("surface", "free")]
-        return body.codes("codes"), *masks
-
-    return Evidence(*_take_rows(cursor, EVIDENCE, index, count, read))
-
-
-def _unpack_training(
-    cursor: PartCursor,
-    index: RegionIndex,
-    places: list[tuple[int, int]],
-    counts: list[int],
-) -> TrainingState:
-    body = _take_of_region(cursor, TRAINING, index)
-    moments = [
-        _unpack_moments(cursor, index, place, count)
-        for place, count in zip(places, counts, strict=True)
-    ]
-    points, labels = _unpack_samples(cursor, index, body.count("samples"))
-    return TrainingState(
-        table_means=tuple(columns[0] for columns in moments),
-        table_variances=tuple(columns[1] for columns in moments),
-        table_steps=tuple(columns[2] for columns in moments),
-        mlp_means=body.arrays("mlp_means", 2 * _LAYERS),
-        mlp_variances=body.arrays("mlp_variances", 2 * _LAYERS),
-        mlp_steps=body.count("mlp_steps"),
-        sample_points=points,
-        sample_labels=labels,
-        visits_owed=body.count("visits_owed"),
+def _read_training_head(body: PartBody) -> _TrainingHead:
+    return _TrainingHead(
+        body.arrays("mlp_means", 2 * LAYERS),
+        body.arrays("mlp_variances", 2 * LAYERS),
+        body.count("mlp_steps"),
+        body.count("visits_owed"),
+        body.count("samples"),
     )
 
 
-def _unpack_moments(
-    cursor: PartCursor, index: RegionIndex, place: tuple[int, int], count: int
-) -> _Columns:
-    def read(body: PartBody) -> _Columns:
-        _expect_place(body, place)
-        means, variances = (body.floats(key, None, None) for key in ("means", "variances"))
-        return means, variances, unshuffle(body.array("steps", "|u1", 4, None), "<i4")
-
-    return _take_rows(cursor, MOMENTS, index, count, read)
+# Sizes are checked before anything is decoded, which takes more memory than a part has bytes.
 
 
-def _expect_place(body: PartBody, place: tuple[int, int]) -> None:
-    """Refuse a part of another plane or level."""
-    body.expect("plane", place[0])
-    body.expect("level", place[1])
+def _read_vertices(body: PartBody, key: PartKey, settings: FieldSettings) -> tuple[Columns, ...]:
+    size = settings.feature_size
+    levels: list[Columns] = []
+    for level, rows in zip(
+        settings.levels, body.maps("levels", settings.feature_levels), strict=True
+    ):
+        shift = square_shift(settings, level)
+        codes = _global(rows.codes("codes", 1 << shift), key, shift)
+        if rows.has("integers"):
+            levels.append((codes, rows.integers("integers", len(codes), size)))
+        else:
+            levels.append((codes, rows.floats("features", len(codes), size)))
+    return tuple(levels)
 
 
-def _unpack_samples(cursor: PartCursor, index: RegionIndex, count: int) -> _Columns:
-    def read(body: PartBody) -> _Columns:
-        points = unshuffle(body.array("points", "|u1", 4, None, 3), "<f4")
-        return points, body.floats("labels", None)
+def _read_evidence(body: PartBody, key: PartKey, _settings: FieldSettings) -> tuple[Columns, ...]:
+    codes = _global(body.codes("codes", 1 << cube_shift()), key, cube_shift())
+    masks = [body.array(name, "|u1", len(codes), BLOCK_BYTES) for name in ("surface", "free")]
+    return ((codes, *masks),)
 
-    return _take_rows(cursor, SAMPLES, index, count, read)
+
+def _read_moments(body: PartBody, _key: PartKey, settings: FieldSettings) -> tuple[Columns, ...]:
+    size = settings.feature_size
+    levels: list[Columns] = []
+    for level, rows in zip(
+        settings.levels, body.maps("levels", settings.feature_levels), strict=True
+    ):
+        steps = rows.array("steps", "|u1", 4, None)
+        count = steps.shape[1]
+        rows.limit("steps", count, 1 << square_shift(settings, level))
+        means, variances = (rows.floats(name, count, size) for name in ("means", "variances"))
+        levels.append((means, variances, unshuffle(steps, "<i4")))
+    return tuple(levels)
+
+
+def _read_samples(body: PartBody, _key: PartKey, _settings: FieldSettings) -> tuple[Columns, ...]:
+    points = body.array("points", "|u1", 4, None, 3)
+    count = points.shape[1]
+    body.limit("points", count, SAMPLES_PER_PART)
+    return ((unshuffle(points, "<f4"), body.floats("labels", count)),)
+
+
+_READERS: Mapping[str, Callable[[PartBody, PartKey, FieldSettings], tuple[Columns, ...]]] = {
+    VERTICES: _read_vertices,
+    EVIDENCE: _read_evidence,
+    MOMENTS: _read_moments,
+    SAMPLES: _read_samples,
+}
+
+
+def _global(local: NDArray[np.int64], key: PartKey, shift: int) -> NDArray[np.int64]:
+    """Codes [V] from those within a square or cube."""
+    if len(local) and not 0 <= local.max() < 1 << shift:
+        raise DamagedMapFileError(f"{key.topic}: a code lies outside of cell {key.cell}")
+    if key.cell >= 1 << 60 - shift:
+        raise DamagedMapFileError(f"{key.topic}: cell {key.cell} is out of range")
+    return local + (key.cell << shift)

@@ -1,5 +1,6 @@
 """What a map record must hold to be sound: checked before it is written and after it is read."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,6 +15,7 @@ from triquad_format.region import (
     AXES,
     BLOCK_BYTES,
     BLOCK_VOXELS,
+    MAX_INTEGER,
     Evidence,
     MapRecord,
     Mlp,
@@ -47,6 +49,8 @@ def _check_region(settings: FieldSettings, region: Region) -> None:
     places = [(plane, level) for plane in range(len(AXES)) for level in settings.levels]
     if [(table.plane, table.level) for table in region.tables] != places:
         raise FormatError("the vertex tables are not those of the settings")
+    if len({table.scale is None for table in region.tables}) > 1:
+        raise FormatError("some tables have integer features, others have not")
     for table in region.tables:
         _check_table(settings, table)
     _check_evidence(settings, region.evidence)
@@ -73,7 +77,21 @@ def _check_table(settings: FieldSettings, table: VertexTable) -> None:
     if len(table.codes) and morton.decode(table.codes, 2).max() > 1 << table.level:
         raise FormatError(f"{name} codes: a vertex lies outside the level")
     shape = (len(table.codes), settings.feature_size)
-    _check_floats(f"{name} features", table.features, _FLOATS, shape)
+    if table.scale is None:
+        _check_floats(f"{name} features", table.features, _FLOATS, shape)
+        return
+    ArraySpec("<i2", shape).check(f"{name} features", table.features)
+    if not (math.isfinite(table.scale) and table.scale > 0 and _is_single(table.scale)):
+        raise FormatError(
+            f"{name}: a scale of {table.scale} is not a positive number of single precision"
+        )
+    if np.abs(table.features.astype(np.int32)).max(initial=0) > MAX_INTEGER:
+        raise FormatError(f"{name}: an integer exceeds {MAX_INTEGER}")
+
+
+def _is_single(value: float) -> bool:
+    with np.errstate(over="ignore"):
+        return float(np.float32(value)) == value
 
 
 def _check_evidence(settings: FieldSettings, evidence: Evidence) -> None:
@@ -133,7 +151,7 @@ def _check_arrays(
 
 def _check_floats(
     name: str,
-    array: NDArray[np.floating],
+    array: NDArray[np.floating | np.int16],
     dtypes: tuple[str, ...],
     shape: tuple[int, ...],
     low: float = -np.inf,

@@ -26,6 +26,9 @@ BLOCK_VOXELS = 8
 BLOCK_BYTES = BLOCK_VOXELS**3 // 8
 """Bytes of one bit mask of a block: voxel (x, y, z) is bit ``z`` of byte ``x * 8 + y``."""
 
+MAX_INTEGER = 32_639
+"""Largest integer feature: its two bytes, both signed, reach no further."""
+
 RegionIndex = tuple[int, int, int]
 
 
@@ -36,7 +39,13 @@ class VertexTable:
     plane: int
     level: int
     codes: NDArray[np.int64]  # [V] Morton codes of (a, b), strictly increasing
-    features: NDArray[np.floating]  # [V, feature_size]
+    features: NDArray[np.floating | np.int16]  # [V, feature_size]
+    scale: float | None = None  # of integer features: one step, in single precision
+
+    def vectors(self) -> NDArray[np.float32]:
+        """The feature vectors [V, feature_size] themselves: integers count steps of ``scale``."""
+        vectors = self.features.astype(np.float32)
+        return vectors if self.scale is None else vectors * np.float32(self.scale)
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,12 @@ class Region:
     tables: tuple[VertexTable, ...]  # plane-major: (plane 0, coarsest level), ...
     evidence: Evidence
     training: TrainingState | None
+
+    @property
+    def parameters(self) -> int:
+        """Learnable numbers: features, weights and biases."""
+        features = sum(table.features.size for table in self.tables)
+        return features + sum(array.size for array in (*self.mlp.weights, *self.mlp.biases))
 
 
 @dataclass(frozen=True)

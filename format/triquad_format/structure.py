@@ -5,6 +5,8 @@ would hold up everything else for seconds and take a hundred times its size. Rea
 alone tells: https://github.com/msgpack/msgpack/blob/master/spec.md
 """
 
+from collections.abc import Iterator
+
 from triquad_format.errors import WireError
 
 MAX_OBJECTS = 20_000
@@ -23,11 +25,12 @@ _NUMBER_BYTES = {
     0xD3: 8,
 }
 _LENGTH_BYTES = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}  # binaries and strings
+_BINARIES = (0xC4, 0xC5, 0xC6)
 _COUNT_BYTES = {0xDC: 2, 0xDD: 4, 0xDE: 2, 0xDF: 4}  # arrays and maps
 _SINGLE = (0xC0, 0xC2, 0xC3)  # nil, false, true
 
 
-def check_structure(payload: bytes) -> None:
+def check_structure(payload: bytes, max_objects: int = MAX_OBJECTS) -> None:
     """Refuse a msgpack object that is incomplete, too deep, or made of too many objects.
 
     Raises:
@@ -45,14 +48,25 @@ def check_structure(payload: bytes) -> None:
         if at >= len(payload):
             raise WireError("not a triquad message: it is incomplete")
         at, children = _header(payload, at)
-        if objects + children > MAX_OBJECTS:
-            raise WireError(f"not a triquad message: more than {MAX_OBJECTS} objects")
+        if objects + children > max_objects:
+            raise WireError(f"not a triquad message: more than {max_objects} objects")
         if children:
             open_items.append(children)
         if len(open_items) > MAX_DEPTH:
             raise WireError(f"not a triquad message: nested more than {MAX_DEPTH} deep")
     if at != len(payload):
         raise WireError("not a triquad message: it is incomplete, or something follows it")
+
+
+def binary_offsets(payload: bytes) -> Iterator[range]:
+    """Where the bytes of each binary lie in a sound msgpack object, in their order."""
+    at, objects = 0, 1
+    while objects:
+        code = payload[at]
+        end, children = _header(payload, at)
+        if code in _BINARIES:
+            yield range(at + 1 + _LENGTH_BYTES[code], end)
+        at, objects = end, objects - 1 + children
 
 
 def _header(payload: bytes, at: int) -> tuple[int, int]:

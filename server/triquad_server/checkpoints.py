@@ -2,12 +2,15 @@
 
 import logging
 import threading
+import time
+from pathlib import Path
 
 from triquad_format.messages import CheckpointInfo, CheckpointRequest
 
 from triquad_server.errors import RequestError, StoreError
 from triquad_server.mapper_thread import MapperThread
 from triquad_server.store import Store
+from triquad_server.threads import PATIENCE, be_patient
 
 _log = logging.getLogger(__name__)
 
@@ -30,18 +33,20 @@ class Checkpoints:
         self._period_s = period_s
         self._writing = threading.Lock()
         self._stopping = threading.Event()
+        self._wake = threading.Event()
         self.last = last
         self.error = None if store else _NO_STORE
         self._thread = threading.Thread(target=self._run, name="checkpoints")
 
     def start(self) -> None:
         """Begin to write checkpoints while the map changes."""
-        if self._store is not None and self._period_s > 0:
+        if self._store is not None:
             self._thread.start()
 
     def close(self) -> None:
         """Write a last checkpoint, if the map changed since the one before."""
         self._stopping.set()
+        self._wake.set()
         if self._thread.ident is not None:
             self._thread.join()
         if self._store is not None:
@@ -55,8 +60,35 @@ class Checkpoints:
             raise RequestError("store", str(error)) from error
 
     def _run(self) -> None:
-        while not self._stopping.wait(self._period_s):
-            self._write_if_changed()
+        be_patient(PATIENCE)
+        due = time.monotonic() + self._period_s
+        while not self._stopping.is_set():
+            self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)
+            self._wake.clear()
+            if self._stopping.is_set():
+                return
+            if self._period_s > 0 and time.monotonic() >= due:
+                self._write_if_changed()
+                due = time.monotonic() + self._period_s
+            self._fold()
+
+    def _fold(self) -> None:
+        """Put old checkpoints together, where there are many."""
+        assert self._store is not None
+        try:
+            info = self._store.fold(self._stopping.is_set)
+        except StoreError as error:
+            _log.error("%s", error)
+            return
+        except Exception:
+            _log.exception("folding checkpoints met a defect")
+            return
+        if info is None:
+            return
+        _log.info("folded %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
+        with self._writing:
+            if self.last is not None and self.last.epoch == info.epoch:
+                self.last = info
 
     def _write_if_changed(self) -> None:
         try:
@@ -72,14 +104,16 @@ class Checkpoints:
             raise StoreError(_NO_STORE)
         with self._writing:
             epoch = self._mapper.call(lambda mapper: mapper.publish().number)
-            if self.last is not None and self.last.epoch == epoch:
+            if self.last is not None and self.last.epoch == epoch and Path(self.last.path).exists():
                 return self.last
+            base = self._store.base_epoch
             try:
-                info = self._store.write(self._mapper.call(lambda mapper: mapper.record(True)))
+                info = self._store.write(self._mapper.call(lambda m: m.changes_since(base)))
             except StoreError as error:
                 self.error = str(error)
                 _log.error("%s", error)
                 raise
             self.last, self.error = info, None
+            self._wake.set()  # to see whether to fold
             _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
             return info

@@ -40,12 +40,12 @@ class MapDownloads:
                 if file.info.epoch == newest.number and file.training == request.training:
                     self._files.move_to_end(file.info.sha256)
                     return file.info
+        record = newest.record()
         if request.training:
-            record = self._mapper.call(lambda mapper: mapper.record(True))
-        else:
-            record = newest.record()
+            changes = self._mapper.call(lambda mapper: mapper.changes_since(None))
+            record, newest = changes.record, changes.epoch
         buffer = io.BytesIO()
-        written = write_map(record, buffer)
+        written = write_map(record, buffer, distances=newest.distances)
         info = MapInfo(written.epoch, written.bytes, written.sha256, CHUNK_BYTES)
         with self._lock:
             self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())
@@ -59,10 +59,11 @@ class MapDownloads:
             file = self._files.get(request.sha256)
         if file is None:
             raise RequestError("chunk_gone", "this map file is not kept; ask for its info again")
-        if not 0 <= request.offset < len(file.data):
+        if not 0 <= request.offset < len(file.data) or request.length < 1:
             raise RequestError(
                 "bad_request",
-                f"offset {request.offset} is outside the file of {len(file.data)} bytes",
+                f"{request.length} bytes from {request.offset} on are not in the file of "
+                f"{len(file.data)} bytes",
             )
-        end = request.offset + CHUNK_BYTES
+        end = request.offset + min(request.length, CHUNK_BYTES)
         return MapChunk(request.offset, file.data[request.offset : end])

@@ -95,7 +95,7 @@ def field_from_record(
     field.frequencies = _tensor(record.frequencies, device)
     for table in record.tables:
         h = table.level - settings.levels[0]
-        features = _tensor(table.features.astype(np.float32), device)
+        features = _tensor(table.vectors(), device)
         field.restore(table.plane, h, table.codes.astype(np.int64), features)
     parts = zip(record.mlp.weights, record.mlp.biases, strict=True)
     field.mlp = [Parameter(_tensor(array, device)[None]) for pair in parts for array in pair]

@@ -14,6 +14,7 @@ from triquad_server.errors import ServerError
 from triquad_server.mapper import Mapper
 from triquad_server.memory import give_back_early
 from triquad_server.network import NetworkOptions, listen_endpoints, open_session
+from triquad_server.retention import Retention
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.stop import Stop, Stops, wait_for_stop
@@ -54,7 +55,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         store = None
         restored = None
         if options.store is not None:
-            store = Store(options.store, options.map_name, options.settings.store.keep)
+            store = Store(options.store, options.map_name, Retention.chosen(options.settings.store))
             stack.enter_context(closing(store))
             restored = store.newest()
         if restored is not None:

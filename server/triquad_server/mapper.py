@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,6 +19,15 @@ from triquad_server.threads import MAPPING
 
 _LOSS_MEMORY = 0.95
 _POOL_STEP = 1.1
+
+
+@dataclass(frozen=True)
+class MapChanges:
+    """What a checkpoint needs that follows another."""
+
+    record: MapRecord  # of the regions that changed, with training state
+    regions: tuple[RegionIndex, ...]  # all that there are
+    epoch: Epoch  # the same state, for questions
 
 
 class Mapper:
@@ -142,10 +152,25 @@ class Mapper:
         self._share_pool()
         self._structure_changed = True
 
-    def record(self, training: bool) -> MapRecord:
-        """The live map as plain arrays, sharing nothing with it."""
-        regions = tuple(region.record(training) for region in self._regions.values())
-        return MapRecord(self._name, self.publish().number, self._field_settings, regions)
+    def changes_since(self, epoch: int | None) -> MapChanges:
+        """The newest epoch, with training state, of the regions that changed after ``epoch``.
+
+        ``None``: of all regions.
+        """
+        newest = self.publish()
+        changed = {
+            frozen.index
+            for frozen in newest.frozen_regions
+            if epoch is None or frozen.changed > epoch
+        }
+        regions = tuple(
+            region.record(True) for index, region in self._regions.items() if index in changed
+        )
+        return MapChanges(
+            MapRecord(self._name, newest.number, self._field_settings, regions),
+            tuple(self._regions),
+            newest,
+        )
 
     def _freeze(
         self,

@@ -97,14 +97,18 @@ class MeshSettings:
 
 @dataclass(frozen=True)
 class StoreSettings:
-    """When checkpoints are written and how many are kept."""
+    """When checkpoints are written and how far back they are kept."""
 
     period_s: float = 60.0  # between checkpoints while the map changes; 0: only on request
-    keep: int = 5  # newest checkpoints that stay on disk
+    keep: int = 20  # newest checkpoints that stay on disk; two always do
+    keep_age_s: float = 0.0  # older ones go; 0: of any age
+    keep_bytes: int = 4_000_000_000  # as long as all take more, the oldest go; 0: no limit
 
     def __post_init__(self) -> None:
         check_range("period_s", self.period_s, 0.0, 1e7)
         check_range("keep", self.keep, 2, 1_000_000)
+        check_range("keep_age_s", self.keep_age_s, 0.0, 1e10)
+        check_range("keep_bytes", self.keep_bytes, 0, 2**60)
 
 
 @dataclass(frozen=True)

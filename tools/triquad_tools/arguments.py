@@ -2,6 +2,10 @@
 
 import argparse
 import math
+import re
+
+_PER_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
+_LEAST_ERROR_M, _LARGEST_ERROR_M = 1e-5, 0.1
 
 
 def positive(text: str) -> float:
@@ -21,6 +25,19 @@ def not_negative(text: str) -> float:
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
     return value
+
+
+def error_limit(text: str) -> float:
+    """A length with its unit, such as ``2mm``, in metres: 0.01 mm to 10 cm."""
+    match = re.fullmatch(r"([0-9]*\.?[0-9]+)(mm|cm|m)", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a length with its unit: use 2mm, 0.2cm or 0.002m"
+        )
+    metres = float(match[1]) / _PER_METRE[match[2]]
+    if not _LEAST_ERROR_M <= metres <= _LARGEST_ERROR_M:
+        raise argparse.ArgumentTypeError(f"{text} is out of range: use 0.01mm to 10cm")
+    return metres
 
 
 def count(text: str) -> int:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
-PARTS = ("core", "server", "growth")
+PARTS = ("core", "server", "growth", "file", "store")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,16 +46,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
     """The figures of some parts on one street."""
     from triquad_tools.bench_core import measure_core
+    from triquad_tools.bench_file import measure_file
     from triquad_tools.bench_server import measure_server
+    from triquad_tools.bench_store import measure_store
     from triquad_tools.bench_street import bench_street
 
     figures: list[Figure] = []
-    if "core" in parts or "server" in parts:
+    if {"core", "server", "file", "store"} & set(parts):
         made = bench_street(street_seed)
         if "server" in parts:
             figures += measure_server(made)
         if "core" in parts:
             figures += measure_core(made)
+        if "file" in parts:
+            figures += measure_file(made)
+        if "store" in parts:
+            figures += measure_store(made)
     if "growth" in parts:
         figures += _growth(street_seed)
     return figures
@@ -120,8 +126,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="triquad-bench",
         description="Measure triquad on this machine, on a simulated street: a server under a "
-        "10 Hz lidar, its core against eager torch, and a map that grows to 16 regions. Takes "
-        "some minutes; nothing else should run meanwhile.",
+        "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
+        "file, and checkpoints. Takes some minutes; nothing else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument

@@ -1,0 +1,78 @@
+"""Bytes that can be read from any place: of a file, of memory, or of a file elsewhere."""
+
+import os
+from pathlib import Path
+from typing import Protocol
+
+from triquad_format.errors import DamagedMapFileError
+
+
+class RandomAccess(Protocol):
+    """Where a map file's bytes come from."""
+
+    name: str
+    size: int  # bytes
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Exactly ``length`` bytes from ``offset`` on.
+
+        Raises:
+            DamagedMapFileError: there are not so many.
+            OSError: they cannot be read.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the source."""
+        ...
+
+
+class FileBytes:
+    """The bytes of a file; they stay readable while it is open, even where it is deleted."""
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self._stream = path.open("rb", buffering=0)
+        self.size = os.fstat(self._stream.fileno()).st_size
+        self.bytes_read = 0
+
+    def read(self, offset: int, length: int) -> bytes:
+        """As :meth:`RandomAccess.read`; threads may read at the same time."""
+        check_range(offset, length, self.size)
+        data = os.pread(self._stream.fileno(), length, offset)
+        while len(data) < length:
+            more = os.pread(self._stream.fileno(), length - len(data), offset + len(data))
+            if not more:
+                raise DamagedMapFileError(f"it was cut to {offset + len(data)} bytes meanwhile")
+            data += more
+        self.bytes_read += length
+        return data
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+
+class MemoryBytes:
+    """Bytes in memory."""
+
+    def __init__(self, data: bytes | bytearray | memoryview, name: str = "map file") -> None:
+        self.name = name
+        self.size = len(data)
+        self._data = memoryview(data)
+
+    def read(self, offset: int, length: int) -> bytes:
+        """As :meth:`RandomAccess.read`."""
+        check_range(offset, length, self.size)
+        return bytes(self._data[offset : offset + length])
+
+    def close(self) -> None:
+        """Nothing is held but memory."""
+
+
+def check_range(offset: int, length: int, size: int) -> None:
+    """Raise :class:`DamagedMapFileError` unless the bytes lie within ``size``."""
+    if offset < 0 or length < 0 or offset + length > size:
+        raise DamagedMapFileError(
+            f"bytes {offset} to {offset + length} are needed, but it has {size}: it is incomplete"
+        )

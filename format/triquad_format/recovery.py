@@ -1,0 +1,63 @@
+"""What could be saved of a damaged map file, and what it has lost, and where."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format import morton
+from triquad_format.field_settings import FieldSettings
+from triquad_format.part import CELL_LEAVES_LOG2, EVIDENCE, VERTICES, PartKey
+from triquad_format.region import AXES, MapRecord, region_centre
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A part that is lost, and the box in which the map has lost something by it.
+
+    Without a part ``/triquad/region`` all of the region is lost; without vertices the distances
+    in a square column; without evidence the status in a cube. One part ``/triquad/training``
+    stands for all of a region's training state.
+    """
+
+    key: PartKey
+    minimum: NDArray[np.float64]  # [3] metres, map frame
+    maximum: NDArray[np.float64]  # [3]
+
+    def meets(self, centre: NDArray[np.float64], side_m: float) -> bool:
+        """Whether the box meets a cube at ``centre`` [3]."""
+        low, high = centre - side_m / 2, centre + side_m / 2
+        return bool(((self.minimum <= high) & (self.maximum >= low)).all())
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What was saved of a map, and what was not."""
+
+    record: MapRecord
+    losses: tuple[Loss, ...]  # those that are known
+    intact: int  # parts of regions that could be read
+    parts: int | None  # how many there were; None: not known, for the manifest is lost
+    stamp_ns: int = 0  # when the epoch was written, nanoseconds since 1970; 0 if not known
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing was lost."""
+        return not self.losses and self.intact == self.parts
+
+
+def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
+    """The loss of a part."""
+    low = np.zeros(3)
+    high = np.full(3, float(1 << settings.depth))
+    axes = {VERTICES: list(AXES[key.plane]), EVIDENCE: [0, 1, 2]}.get(key.topic, [])
+    if axes:
+        cell = morton.decode(np.array([key.cell]), len(axes))[0]
+        low[axes] = cell << CELL_LEAVES_LOG2
+        high[axes] = np.minimum((cell + 1) << CELL_LEAVES_LOG2, 1 << settings.depth)
+    if key.topic == VERTICES:
+        # A vertex is felt as far as the side of its level's nodes; those at the upper border of a
+        # square belong to the next.
+        low[axes] -= 1 << (settings.feature_levels - 1)
+    corner = region_centre(settings, key.region) - settings.region_side_m / 2
+    return Loss(key, corner + low * settings.leaf_m, corner + high * settings.leaf_m)

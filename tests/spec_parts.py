@@ -1,0 +1,294 @@
+"""Parts of a version 2 map and their answers, from docs/map-file.md and nothing of the project."""
+
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+PLANES = ((0, 1), (0, 2), (1, 2))
+UNKNOWN, FREE, SURFACE = 0, 1, 2
+
+Index = tuple[int, int, int]
+Key = tuple[str, Index, int, int]
+"""Topic, region, plane, cell."""
+Array = NDArray[Any]
+
+
+class RefusedError(Exception):
+    """The page says that a reader must refuse this file."""
+
+
+def check(condition: object, what: str) -> None:
+    if not condition:
+        raise RefusedError(what)
+
+
+# Sections 4 and 5
+
+
+def plain(stored: dict[str, Any]) -> Array:
+    """Section 4.1."""
+    dtype = np.dtype(stored["dtype"])
+    check(len(stored["data"]) == np.prod(stored["shape"], dtype=object) * dtype.itemsize, "array")
+    return np.frombuffer(stored["data"], dtype).reshape(stored["shape"])
+
+
+class Settings:
+    """Settings of the map and what derives from them."""
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        self.leaf, self.depth = float(values["leaf_m"]), int(values["depth"])
+        self.sizes, self.feature_size = int(values["feature_levels"]), int(values["feature_size"])
+        self.encoding, self.logit = str(values["encoding"]), float(values["logit_scale_m"])
+        self.levels = range(self.depth - self.sizes + 1, self.depth + 1)
+        self.side = self.leaf * 2**self.depth
+        self.overlap = self.leaf * 16
+        self.pitch = self.leaf * (2**self.depth - 16)
+
+    def leaf_coordinates(self, points: Array, index: Index) -> Array:
+        return (points - np.array(index) * self.pitch) / self.leaf + 2.0 ** (self.depth - 1)
+
+    def inside(self, points: Array, index: Index) -> NDArray[np.bool_]:
+        return (np.abs(points - np.array(index) * self.pitch) < self.side / 2).all(1)
+
+    def needs(self, key: Key, points: Array) -> bool:
+        """Whether an answer at one of the points depends on a part."""
+        topic, index, plane, cell = key
+        u = self.leaf_coordinates(points[self.inside(points, index)], index)
+        if topic == "/triquad/vertices":
+            return near(u[:, PLANES[plane]], cell, 2 ** (self.sizes - 1) + 1 / 16)
+        if topic == "/triquad/evidence":
+            return near(u, cell, 1)
+        return topic == "/triquad/region" and len(u) > 0
+
+
+def near(u: Array, cell: int, distance: int) -> bool:
+    """Whether a square or cube is within a distance of some leaf coordinates."""
+    start = demorton(np.array([cell]), u.shape[1]) * 256
+    return bool(((u >= start - distance) & (u <= start + 256 + distance)).all(1).any())
+
+
+def demorton(codes: Array, axes: int) -> NDArray[np.int64]:
+    result = np.zeros((len(codes), axes), np.int64)
+    for bit in range(63):
+        result[:, bit % axes] |= (codes >> bit & 1) << bit // axes
+    return result
+
+
+def unshuffled(stored: dict[str, Any], dtypes: dict[int, str]) -> Array:
+    """Section 4.2."""
+    data = plain(stored)
+    check(data.dtype == np.uint8, "dtype of a shuffled array")
+    return np.ascontiguousarray(np.moveaxis(data, 0, -1)).view(dtypes[len(data)])[..., 0]
+
+
+def codes_of(stored: dict[str, Any], cell: int, bits: int) -> NDArray[np.int64]:
+    """Section 4.3: the codes within the region."""
+    data = plain(stored).astype(np.int64)
+    differences = sum(row << 8 * k for k, row in enumerate(data))
+    check((differences[1:] > 0).all(), "codes increase strictly")
+    codes = np.cumsum(differences)
+    check((codes < 1 << bits).all(), "a code lies outside its cell")
+    return (cell << bits) + codes
+
+
+def integers_of(stored: dict[str, Any]) -> NDArray[np.float32]:
+    data = plain(stored).astype(np.int64)
+    return sum(row << 8 * k for k, row in enumerate(data)).T.astype(np.float32)
+
+
+def place(coordinates: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each row, in which neighbours outside the region have their own."""
+    return coordinates @ (1 << 20 * np.arange(coordinates.shape[1]))
+
+
+class Table:
+    """Rows of values at places; zeros elsewhere."""
+
+    def __init__(self, chunks: list[tuple[Array, Array]], width: int, dtype: str) -> None:
+        none = (np.zeros(0, np.int64), np.zeros((0, width), dtype))
+        places, values = (np.concatenate(column) for column in zip(none, *chunks, strict=True))
+        order = np.argsort(places)
+        self.places = np.append(places[order], np.iinfo(np.int64).max)
+        self.values = np.concatenate([values[order], np.zeros((1, width), dtype)])
+
+    def __call__(self, coordinates: NDArray[np.int64]) -> Array:
+        wanted = place(coordinates)
+        rows = np.searchsorted(self.places, wanted)
+        return self.values[np.where(self.places[rows] == wanted, rows, -1)]
+
+
+class Region:
+    """Section 5.2 to 5.4 for one region."""
+
+    def __init__(self, settings: Settings, parts: dict[Key, bytes], index: Index) -> None:
+        own = {key: msgpack.unpackb(parts[key]) for key in parts if is_of(key, index)}
+        check(all(agrees(key, part) for key, part in own.items()), "a part with another key")
+        (head,) = (part for key, part in own.items() if key[0] == "/triquad/region")
+        self.settings, self.index = settings, index
+        self.centre = np.array(index) * settings.pitch
+        self.frequencies = plain(head["frequencies"])
+        self.weights = [plain(array) for array in head["weights"]]
+        self.biases = [plain(array) for array in head["biases"]]
+        scales = plain(head["scales"])
+        self.tables = {
+            (plane, level): self._table(own, plane, i, scales[plane * settings.sizes + i :][:1])
+            for plane in range(3)
+            for i, level in enumerate(settings.levels)
+        }
+        self.surface, self.free = self._evidence(own, "surface"), self._evidence(own, "free")
+
+    def _table(self, own: dict[Key, Any], plane: int, i: int, scale: Array) -> Table:
+        bits = 2 * (8 - (self.settings.sizes - 1 - i))
+        chunks = []
+        for key, part in own.items():
+            if key[0] == "/triquad/vertices" and key[2] == plane:
+                level = part["levels"][i]
+                codes = codes_of(level["codes"], key[3], bits)
+                features = features_of(level, scale)
+                chunks.append((place(demorton(codes, 2)), features))
+        return Table(chunks, self.settings.feature_size, "<f4")
+
+    def _evidence(self, own: dict[Key, Any], name: str) -> Table:
+        chunks = []
+        for key, part in own.items():
+            if key[0] == "/triquad/evidence":
+                codes = codes_of(part["codes"], key[3], 15)
+                chunks.append((place(demorton(codes, 3)), plain(part[name])))
+        return Table(chunks, 64, "|u1")
+
+
+def is_of(key: Key, index: Index) -> bool:
+    return key[1] == index and key[0] in (
+        "/triquad/region",
+        "/triquad/vertices",
+        "/triquad/evidence",
+    )
+
+
+def agrees(key: Key, part: dict[str, Any]) -> bool:
+    """Whether a part names its own key."""
+    place_in_region = (part.get("plane", 0), part.get("cell", 0))
+    return tuple(part["region"]) == key[1] and place_in_region == key[2:]
+
+
+def features_of(level: dict[str, Any], scale: Array) -> Array:
+    if len(scale):
+        return integers_of(level["integers"]) * scale
+    return unshuffled(level["features"], {2: "<f2", 4: "<f4"}).astype(np.float32)
+
+
+# Section 8
+
+
+def interpolated(table: Table, v: Array) -> tuple[Array, Array, Array]:
+    """g and its derivatives by the two coordinates of v."""
+    base = np.floor(v)
+    t, w = (v - base)[:, :1], (v - base)[:, 1:]
+    f00, f10, f01, f11 = (
+        table(base.astype(np.int64) + corner) for corner in ((0, 0), (1, 0), (0, 1), (1, 1))
+    )
+    value = (1 - t) * (1 - w) * f00 + t * (1 - w) * f10 + (1 - t) * w * f01 + t * w * f11
+    by_t = (1 - w) * (f10 - f00) + w * (f11 - f01)
+    return value, by_t, (1 - t) * (f01 - f00) + t * (f11 - f10)
+
+
+def features_at(region: Region, x: Array) -> tuple[Array, Array]:
+    """Features [N, L S] and their Jacobian [N, L S, 3]."""
+    settings = region.settings
+    u = x / np.float32(settings.leaf) + np.float32(2.0 ** (settings.depth - 1))
+    width = settings.feature_size
+    values = np.zeros((len(x), settings.sizes * width), np.float32)
+    jacobian = np.zeros((*values.shape, 3), np.float32)
+    for k, level in enumerate(settings.levels):
+        node, column = 2.0 ** (settings.depth - level), slice(k * width, (k + 1) * width)
+        for plane, (i, j) in enumerate(PLANES):
+            table = region.tables[plane, level]
+            g, by_i, by_j = interpolated(table, u[:, (i, j)] / np.float32(node))
+            values[:, column] += g
+            jacobian[:, column, i] += by_i / np.float32(node * settings.leaf)
+            jacobian[:, column, j] += by_j / np.float32(node * settings.leaf)
+    return values, jacobian
+
+
+def fourier_at(region: Region, x: Array) -> tuple[Array, Array]:
+    """Fourier features [N, 6 m] and their Jacobian [N, 6 m, 3]."""
+    half = np.float32(region.settings.side / 2)
+    turns = np.float32(2 * np.pi) * region.frequencies
+    angle = (x / half)[:, :, None] * turns
+    flat = (len(x), angle[0].size) if len(x) else (0, 3 * len(turns))
+    sin, cos = np.sin(angle).reshape(flat), np.cos(angle).reshape(flat)
+    slope = np.repeat(np.eye(3, dtype=np.float32), len(turns), 0) * np.tile(turns, 3)[:, None]
+    outer = np.concatenate([cos, -sin], 1)[:, :, None] * np.tile(slope / half, (2, 1))
+    return np.concatenate([sin, cos], 1), outer
+
+
+def field_at(region: Region, x: Array) -> tuple[Array, Array]:
+    """f and its gradient in one region; x in single precision from its centre."""
+    kinds = {"features": [features_at], "fourier": [fourier_at], "both": [features_at, fourier_at]}
+    inputs = [kind(region, x) for kind in kinds[region.settings.encoding]]
+    values, jacobian = (np.concatenate(column, 1) for column in zip(*inputs, strict=True))
+    w1, w2, w3 = region.weights
+    b1, b2, b3 = region.biases
+    y1 = values @ w1 + b1
+    y2 = np.maximum(y1, 0) @ w2 + b2
+    logit = np.maximum(y2, 0) @ w3 + b3
+    back = (((y2 > 0) * w3[:, 0]) @ w2.T * (y1 > 0)) @ w1.T
+    scale = np.float32(region.settings.logit)
+    return logit[:, 0] * scale, np.einsum("nk,nka->na", back, jacobian) * scale
+
+
+class Map:
+    """Answers from the parts of a map, or from those near the points."""
+
+    def __init__(self, facts: dict[str, Any], parts: dict[Key, bytes]) -> None:
+        self.settings = Settings(facts["settings"])
+        heads = [key[1] for key in parts if key[0] == "/triquad/region"]
+        self.regions = {index: Region(self.settings, parts, index) for index in heads}
+
+    def distance(self, points: Array) -> tuple[Array, Array]:
+        """Section 8.2: distance and gradient."""
+        total, value = np.zeros((2, len(points)))
+        slope, total_slope = np.zeros((2, len(points), 3))
+        for region in self.regions.values():
+            used = self.settings.inside(points, region.index)
+            d = points[used] - region.centre
+            f, gradient = field_at(region, d.astype(np.float32))
+            w, by_p = weight(self.settings, d)
+            total[used] += w
+            value[used] += w * f
+            slope[used] += w[:, None] * gradient + f[:, None] * by_p
+            total_slope[used] += by_p
+        total[total == 0] = np.nan
+        sdf = value / total
+        return sdf, (slope - sdf[:, None] * total_slope) / total[:, None]
+
+    def status(self, points: Array) -> NDArray[np.uint8]:
+        """Section 8.3."""
+        result = np.full(len(points), UNKNOWN, np.uint8)
+        owners = np.floor(points / self.settings.pitch + 0.5).astype(np.int64)
+        for region in self.regions.values():
+            owned = (owners == region.index).all(1)
+            u = self.settings.leaf_coordinates(points[owned], region.index)
+            halves = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), -1).reshape(-1, 3)
+            surface = np.any([bits(region.surface, np.floor(u + half)) for half in halves], 0)
+            free = bits(region.free, np.floor(u))
+            result[owned] = np.where(surface, SURFACE, np.where(free, FREE, UNKNOWN))
+        return result
+
+
+def weight(settings: Settings, d: Array) -> tuple[Array, Array]:
+    """The weight of a region and its derivative."""
+    ramp = (settings.side / 2 - np.abs(d)) / settings.overlap
+    factors = np.clip(ramp, 0, 1)
+    slope = np.where(ramp < 1, -np.sign(d) / settings.overlap, 0)
+    x, y, z = factors.T
+    return x * y * z, slope * np.stack([y * z, x * z, x * y], 1)
+
+
+def bits(table: Table, voxels: Array) -> NDArray[np.bool_]:
+    voxels = voxels.astype(np.int64)
+    x, y, z = (voxels % 8).T
+    rows = table(voxels // 8)
+    return (rows[np.arange(len(rows)), 8 * x + y] >> z & 1).astype(bool)
