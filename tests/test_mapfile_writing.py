@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from map_records import SMALL, assert_same, random_record, with_integers
 from mapfile_surgery import write_pair, write_record
+from triquad_format import morton
 from triquad_format.errors import FormatError
+from triquad_format.field_settings import FieldSettings
 from triquad_format.mapfile import read_map, write_map
 from triquad_format.region import MAX_INTEGER
 
@@ -138,3 +140,15 @@ def test_an_unchanged_part_keeps_its_epoch_and_time(tmp_path):
             entry.key.topic == "/triquad/vertices" and entry.key.region == (1, 0, 0)
         )
         assert (entry.epoch, entry.stamp_ns) == ((5, 2 * 10**9) if is_new else (3, 10**9))
+
+
+def test_what_shrinks_more_than_readers_believe_is_stored_as_it_is(tmp_path):
+    wide = FieldSettings(depth=8, feature_levels=1, feature_size=64)
+    record = random_record(0, settings=wide, training=False, feature_dtype="<f4")
+    cells = np.stack(np.meshgrid(np.arange(256), np.arange(256)), axis=-1).reshape(-1, 2)
+    codes = np.sort(morton.encode(cells))
+    zeros = np.zeros((len(codes), 64), np.float32)
+    record = with_table(record, codes=codes, features=zeros)
+    path = tmp_path / "map.triquad"
+    write_map(record, path, feature_dtype="<f4", preview=False)
+    assert_same(read_map(path), record)

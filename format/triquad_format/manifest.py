@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 from triquad_format.array import pack_array
 from triquad_format.errors import DamagedMapFileError, FormatError
 from triquad_format.map_facts import MapFacts, pack_facts, unpack_facts
-from triquad_format.part import FIELD_TOPICS, MANIFEST, REGION, TRAINING_TOPICS, Part, PartKey
+from triquad_format.part import (
+    FIELD_TOPICS,
+    MANIFEST,
+    MAP,
+    REGION,
+    TRAINING,
+    TRAINING_TOPICS,
+    Part,
+    PartKey,
+)
 from triquad_format.part_body import PartBody, pack_part
 
 MAX_ENTRIES = 1 << 20
@@ -133,7 +142,7 @@ def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
     entries = tuple(_entries(columns, topics, files))
     if len({entry.key for entry in entries}) != count:
         raise DamagedMapFileError(f"{MANIFEST}: it lists a part twice")
-    _check_regions([entry.key for entry in entries])
+    _check_keys([entry.key for entry in entries])
     return Manifest(facts, body.count("created_ns"), entries)
 
 
@@ -163,8 +172,13 @@ def _check_columns(columns: Mapping[str, NDArray[Any]], topics: int, files: int)
             raise DamagedMapFileError(f"{MANIFEST}: a number in {name!r} is negative")
 
 
-def _check_regions(keys: list[PartKey]) -> None:
-    """Refuse parts of a region whose head is not listed."""
+def _check_keys(keys: list[PartKey]) -> None:
+    """Refuse parts of a region whose head is not listed, and cells of what has none."""
+    if PartKey(MAP) not in keys:
+        raise DamagedMapFileError(f"{MANIFEST}: it does not list the part {MAP}")
+    for key in keys:
+        if key.topic in (MAP, REGION, TRAINING) and (key.plane or key.cell):
+            raise DamagedMapFileError(f"{MANIFEST}: {key.topic} has plane or cell: {key}")
     regions = {key.region for key in keys if key.topic == REGION}
     for key in keys:
         if key.topic in (*FIELD_TOPICS, *TRAINING_TOPICS) and key.region not in regions:

@@ -10,7 +10,7 @@ from triquad_format.errors import (
     NoIndexError,
     UnsupportedMapFileError,
 )
-from triquad_format.manifest import Entry, FileRef, unpack_manifest
+from triquad_format.manifest import Entry, FileRef, Manifest, unpack_manifest
 from triquad_format.map_facts import FRAME_ID, UNITS, MapFacts, check_map_part
 from triquad_format.mapfile_writer import BASE_FILES, FORMAT_VERSION, METADATA_NAME
 from triquad_format.mcap_index import McapIndex
@@ -98,6 +98,7 @@ class MapIndex:
         if len(own) != last:
             raise DamagedMapFileError(f"{last} parts, but its manifest lists {len(own)}")
         check_agreement(self.metadata, self.manifest.facts)
+        check_features(self.metadata, self.manifest)
         self._numbers = {entry.key: number for number, entry in enumerate(own)}
         self._own = {entry.key: entry for entry in own}
         if (stated := self._own.get(PartKey(MAP))) is not None:
@@ -163,13 +164,17 @@ def reader_version(metadata: dict[str, str]) -> int:
         )
     if "required_features" not in metadata:
         raise DamagedMapFileError("the metadata 'triquad' does not name its required_features")
-    required = {name.strip() for name in metadata["required_features"].split(",")} - {""}
-    if required - KNOWN_FEATURES:
-        unknown = ", ".join(sorted(required - KNOWN_FEATURES))
+    missing = _required(metadata) - KNOWN_FEATURES
+    if missing:
+        unknown = ", ".join(sorted(missing))
         raise UnsupportedMapFileError(
             f"it requires {unknown:.200}, which this reader does not know: install a newer triquad"
         )
     return int(needed)
+
+
+def _required(metadata: dict[str, str]) -> set[str]:
+    return {name.strip() for name in metadata["required_features"].split(",")} - {""}
 
 
 def check_part(number: int, entry: Entry, topic: str, data: bytes) -> None:
@@ -179,6 +184,12 @@ def check_part(number: int, entry: Entry, topic: str, data: bytes) -> None:
         raise DamagedMapFileError(
             f"part {number}, {topic:.80}, is not the one that the manifest lists there",
         )
+
+
+def check_features(metadata: dict[str, str], manifest: Manifest) -> None:
+    """Raise :class:`DamagedMapFileError` where a feature is used that is not required."""
+    if manifest.files and BASE_FILES not in _required(metadata):
+        raise DamagedMapFileError(f"parts lie in other files, but {BASE_FILES} is not required")
 
 
 def check_agreement(metadata: dict[str, str], facts: MapFacts) -> None:

@@ -21,6 +21,7 @@ from triquad_format.map_facts import MapFacts
 from triquad_format.map_index import (
     OtherFiles,
     check_agreement,
+    check_features,
     check_part,
     one_metadata,
     reader_version,
@@ -31,7 +32,7 @@ from triquad_format.mapfile_writer import (
     MESSAGE_ENCODING,
     METADATA_NAME,
 )
-from triquad_format.mcap_records import McapFile, Message
+from triquad_format.mcap_records import McapFile, Message, total_limit
 from triquad_format.part import MANIFEST, PREFIX, PREVIEW, TOPICS
 from triquad_format.part_reader import assemble
 from triquad_format.random_access import FileBytes, RandomAccess
@@ -39,10 +40,6 @@ from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord
 
 _BLOCK_BYTES = 1 << 20
-
-_FREE_TOTAL_BYTES = 32 * 2**20
-_MAX_TOTAL_RATIO = 32
-"""All chunks together, decompressed, have at most so many times the file's size, and that more."""
 
 REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be sound"
 
@@ -102,12 +99,7 @@ def _read(name: str, stream: BinaryIO, max_bytes: int, folder: Path | None) -> M
             data += block
             if len(data) > max_bytes:
                 raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
-        return _parse(memoryview(data), decompressed_limit(len(data), max_bytes), folder)
-
-
-def decompressed_limit(size: int, max_bytes: int) -> int:
-    """How large the chunks of a file of ``size`` bytes may be together, decompressed."""
-    return min(max_bytes, _FREE_TOTAL_BYTES + _MAX_TOTAL_RATIO * size)
+        return _parse(memoryview(data), min(max_bytes, total_limit(len(data))), folder)
 
 
 @contextlib.contextmanager
@@ -146,6 +138,7 @@ def _parse(data: memoryview, max_bytes: int, folder: Path | None) -> MapFile:
         parts = [_stored(message) for message in found]
         digest = hashlib.sha256(found[-1].data).digest() if found else b""
         record, manifest = _assemble(found, len(data), folder)
+        check_features(metadata, manifest)
     check_agreement(metadata, MapFacts(record.name, record.epoch, record.settings))
     check_record(record)
     return MapFile(record, metadata, tuple(parts[:-1]), len(data), manifest, digest)

@@ -16,6 +16,7 @@ from triquad_format.evaluator import MapEvaluator
 from triquad_format.manifest import Entry, Manifest, pack_manifest
 from triquad_format.map_facts import FRAME_ID, UNITS, MapFacts
 from triquad_format.map_parts import FEATURE_DTYPES, pack_map, pack_region
+from triquad_format.mcap_records import total_limit
 from triquad_format.mcap_writer import ChannelSpec, McapWriter, SchemaSpec
 from triquad_format.part import (
     EVIDENCE,
@@ -199,6 +200,11 @@ class _PartsWriter:
         self._put(packed, self._stamp_ns or 0)
         self._mcap.finish()
         _check_total(self._mcap.size)
+        if self._total > total_limit(self._mcap.size):
+            raise FormatError(
+                f"the map's parts shrink from {self._total} to {self._mcap.size} bytes: "
+                "readers take that for an attack"
+            )
         info = MapFileInfo(self._mcap.size, self._mcap.sha256, self._facts.epoch)
         return WrittenMap(info, manifest, hashlib.sha256(packed.payload).digest())
 

@@ -27,6 +27,10 @@ FREE_CHUNK_BYTES = 12 * 2**20
 MAX_CHUNK_RATIO = 16
 """A chunk above ``FREE_CHUNK_BYTES`` has at most so many times its compressed size."""
 
+_FREE_TOTAL_BYTES = 32 * 2**20
+_MAX_TOTAL_RATIO = 32
+"""All chunks together, decompressed, have at most so many times the file's size, and that more."""
+
 MAX_WINDOW_BYTES = 8 * 2**20
 """Memory that zstd may ask for beside its output; RFC 8878 has every decoder support it."""
 
@@ -222,6 +226,16 @@ def metadata_entries(record: Record) -> tuple[str, dict[str, str]]:
     return name, entries
 
 
+def chunk_limit(stored_size: int) -> int:
+    """Bytes to which a chunk of ``stored_size`` bytes may decompress."""
+    return max(FREE_CHUNK_BYTES, MAX_CHUNK_RATIO * stored_size)
+
+
+def total_limit(file_size: int) -> int:
+    """Bytes to which all chunks of a file may decompress together."""
+    return _FREE_TOTAL_BYTES + _MAX_TOTAL_RATIO * file_size
+
+
 def declared_size(record: Record) -> int:
     """Bytes of a chunk's records, as it says."""
     fields = Fields(record)
@@ -258,7 +272,7 @@ def _decompress(record: Record) -> memoryview:
         raise DamagedMapFileError(f"{where} does not fill its record")
     if size > MAX_CHUNK_BYTES:
         raise DamagedMapFileError(f"{where} declares {size} bytes; the limit is {MAX_CHUNK_BYTES}")
-    if size > max(FREE_CHUNK_BYTES, MAX_CHUNK_RATIO * len(stored)):
+    if size > chunk_limit(len(stored)):
         raise DamagedMapFileError(f"{where} declares {size} bytes, but stores {len(stored)}")
     if compression == "":
         chunk = stored

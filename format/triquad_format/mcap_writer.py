@@ -30,7 +30,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from triquad_format.mcap_records import MAGIC
+from triquad_format.mcap_records import MAGIC, chunk_limit
 
 _FOOTER_FIELDS = 20
 
@@ -132,12 +132,14 @@ class McapWriter:
         )
         shift = len(message) - len(payload)
         stored = _compress(message, [shift + seam for seam in seams], spec.level)
-        compression = "zstd" if len(stored) < len(message) else ""
+        # What shrinks by more than readers believe is not compressed.
+        shrinks = len(stored) < len(message) <= chunk_limit(len(stored))
+        compression = "zstd" if shrinks else ""
         start = self.size
         self._record(
             Chunk(
                 compression=compression,
-                data=stored if compression else message,
+                data=stored if shrinks else message,
                 message_end_time=time_ns,
                 message_start_time=time_ns,
                 uncompressed_crc=zlib.crc32(message),
@@ -151,7 +153,7 @@ class McapWriter:
                 chunk_length=index_start - start,
                 chunk_start_offset=start,
                 compression=compression,
-                compressed_size=min(len(stored), len(message)),
+                compressed_size=len(stored if shrinks else message),
                 message_end_time=time_ns,
                 message_index_length=self.size - index_start,
                 message_index_offsets={number: index_start},

@@ -15,8 +15,7 @@ from triquad_format.errors import (
 from triquad_format.manifest import Manifest, unpack_manifest
 from triquad_format.map_facts import MapFacts, unpack_facts
 from triquad_format.map_index import reader_version
-from triquad_format.mapfile_reader import decompressed_limit
-from triquad_format.mcap_records import Message
+from triquad_format.mcap_records import Message, total_limit
 from triquad_format.part import (
     FIELD_TOPICS,
     MANIFEST,
@@ -69,7 +68,7 @@ def read_messages(path: Path, max_bytes: int) -> Iterator[Message]:
         raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
     data = path.read_bytes()
     _refuse_newer(found_metadata(data))
-    return intact_messages(data, decompressed_limit(size, max_bytes))
+    return intact_messages(data, min(max_bytes, total_limit(size)))
 
 
 def salvage(messages: list[Message], path: Path, max_bytes: int) -> Salvage:
