@@ -111,7 +111,7 @@ def _is_by(file: CheckpointFile, when: str) -> bool:
     if when.isascii() and when.isdigit():
         return file.epoch <= int(when)
     try:
-        limit_ns = int(datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp() * 1e9)
+        limit_s = datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp()
     except ValueError as error:
         raise MapFileError(
             f"{when!r} is neither the number of an epoch nor a time such as 2026-01-31T12:00:00Z"
@@ -120,4 +120,5 @@ def _is_by(file: CheckpointFile, when: str) -> bool:
         manifest = open_manifest(file)
     except MapFileError:
         return False
-    return manifest is not None and 0 < manifest.stamp_ns <= limit_ns
+    # Times are shown in whole seconds: what is shown must find its checkpoint.
+    return manifest is not None and 0 < manifest.stamp_ns // 10**9 <= limit_s

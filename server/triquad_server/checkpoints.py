@@ -1,8 +1,10 @@
 """When checkpoints are written: now and then, on request, and at the end."""
 
 import logging
+import queue
 import threading
 import time
+from concurrent.futures import Future
 from pathlib import Path
 
 from triquad_format.messages import CheckpointInfo, CheckpointRequest
@@ -18,7 +20,10 @@ _NO_STORE = "the server was started without --store: the map is not kept"
 
 
 class Checkpoints:
-    """Writes the map to its store. A store that fails never stops the mapping."""
+    """Writes the map to its store, on a thread of its own that gives way to those that answer.
+
+    A store that fails never stops the mapping.
+    """
 
     def __init__(
         self,
@@ -31,7 +36,7 @@ class Checkpoints:
         self._mapper = mapper
         self._store = store
         self._period_s = period_s
-        self._writing = threading.Lock()
+        self._asked: queue.SimpleQueue[Future[CheckpointInfo]] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._wake = threading.Event()
         self.last = last
@@ -39,7 +44,7 @@ class Checkpoints:
         self._thread = threading.Thread(target=self._run, name="checkpoints")
 
     def start(self) -> None:
-        """Begin to write checkpoints while the map changes."""
+        """Begin to write checkpoints, while the map changes and on request."""
         if self._store is not None:
             self._thread.start()
 
@@ -54,8 +59,13 @@ class Checkpoints:
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
         """A checkpoint of the map as it is now; the last one where nothing changed."""
+        if self._store is None:
+            raise RequestError("store", _NO_STORE)
+        asked: Future[CheckpointInfo] = Future()
+        self._asked.put(asked)
+        self._wake.set()
         try:
-            return self._write()
+            return asked.result()
         except StoreError as error:
             raise RequestError("store", str(error)) from error
 
@@ -65,30 +75,19 @@ class Checkpoints:
         while not self._stopping.is_set():
             self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)
             self._wake.clear()
-            if self._stopping.is_set():
-                return
+            self._write_as_asked()
             if self._period_s > 0 and time.monotonic() >= due:
                 self._write_if_changed()
                 due = time.monotonic() + self._period_s
             self._fold()
 
-    def _fold(self) -> None:
-        """Put old checkpoints together, where there are many."""
-        assert self._store is not None
-        try:
-            info = self._store.fold(self._stopping.is_set)
-        except StoreError as error:
-            _log.error("%s", error)
-            return
-        except Exception:
-            _log.exception("folding checkpoints met a defect")
-            return
-        if info is None:
-            return
-        _log.info("folded %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
-        with self._writing:
-            if self.last is not None and self.last.epoch == info.epoch:
-                self.last = info
+    def _write_as_asked(self) -> None:
+        while not self._asked.empty():
+            asked = self._asked.get()
+            try:
+                asked.set_result(self._write())
+            except Exception as error:
+                asked.set_exception(error)
 
     def _write_if_changed(self) -> None:
         try:
@@ -100,20 +99,39 @@ class Checkpoints:
             _log.exception("a checkpoint met a defect")
 
     def _write(self) -> CheckpointInfo:
-        if self._store is None:
-            raise StoreError(_NO_STORE)
-        with self._writing:
-            epoch = self._mapper.call(lambda mapper: mapper.publish().number)
-            if self.last is not None and self.last.epoch == epoch and Path(self.last.path).exists():
-                return self.last
-            base = self._store.base_epoch
-            try:
-                info = self._store.write(self._mapper.call(lambda m: m.changes_since(base)))
-            except StoreError as error:
-                self.error = str(error)
-                _log.error("%s", error)
-                raise
-            self.last, self.error = info, None
-            self._wake.set()  # to see whether to fold
-            _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
-            return info
+        assert self._store is not None
+        epoch = self._mapper.call(lambda mapper: mapper.publish().number)
+        last = self.last
+        if last is not None and last.epoch == epoch and Path(last.path).exists():
+            return last
+        base = self._store.base_epoch
+        try:
+            info = self._store.write(self._mapper.call(lambda m: m.changes_since(base)))
+        except StoreError as error:
+            self.error = str(error)
+            _log.error("%s", error)
+            raise
+        self.last, self.error = info, None
+        _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
+        return info
+
+    def _fold(self) -> None:
+        """Put old checkpoints together, where there are many."""
+        assert self._store is not None
+        try:
+            info = self._store.fold(self._interrupted)
+        except StoreError as error:
+            _log.error("%s", error)
+            return
+        except Exception:
+            _log.exception("folding checkpoints met a defect")
+            return
+        if info is None:
+            return
+        _log.info("folded %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
+        if self.last is not None and self.last.epoch == info.epoch:
+            self.last = info
+
+    def _interrupted(self) -> bool:
+        """Whether something is more urgent than folding, which can be begun again."""
+        return self._stopping.is_set() or not self._asked.empty()

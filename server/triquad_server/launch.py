@@ -12,7 +12,7 @@ import torch
 
 from triquad_server.errors import ServerError
 from triquad_server.mapper import Mapper
-from triquad_server.memory import give_back_early
+from triquad_server.memory import give_back_early, spare_from_collection
 from triquad_server.network import NetworkOptions, listen_endpoints, open_session
 from triquad_server.retention import Retention
 from triquad_server.service import ServedMap, Service
@@ -72,6 +72,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         served = ServedMap(options.map_name, mapper, device, store, info)
         service = Service(session, served, options.settings, lambda: stops.put(Stop.DEFECT))
         stack.enter_context(closing(service))
+        spare_from_collection()
         _log_ready(options, service.epoch, device)
         why = wait_for_stop(stops)
         _log.info("stopping, %s", why.value)

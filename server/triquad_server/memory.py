@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import gc
 import os
 import resource
 import sys
@@ -37,3 +38,13 @@ def give_back_early() -> None:
         options(_M_ARENA_MAX, _ARENAS)
         options(_M_MMAP_THRESHOLD, _LARGE_BYTES)
         options(_M_TRIM_THRESHOLD, 2 * _LARGE_BYTES)
+
+
+def spare_from_collection() -> None:
+    """Leave all objects that are there now out of every later garbage collection.
+
+    torch and numba make a quarter of a million, which stay: to look through them would stop all
+    threads for a tenth of a second.
+    """
+    gc.collect()
+    gc.freeze()

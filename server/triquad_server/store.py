@@ -66,7 +66,7 @@ class Restored:
 
 
 class _FoldStoppedError(Exception):
-    """The server ends: folding is left for the next time."""
+    """Something is more urgent: folding is left for the next time."""
 
 
 class Store:
