@@ -1,6 +1,5 @@
 import dataclasses
 import os
-import threading
 from contextlib import closing
 from pathlib import Path
 
@@ -174,30 +173,6 @@ def test_folding_puts_all_into_one_file(store):
     assert [file.name for file in manifest.files] == [Path(info.path).name]
     for epoch, record in records.items():
         assert_same(read_map(checkpoint_at(store.folder, str(epoch)).path), record)
-
-
-def test_a_checkpoint_written_while_folding_stays_sound(store):
-    records = drive(store, 9)
-    newest = max(records)
-    begun, go_on = threading.Event(), threading.Event()
-
-    def stopping() -> bool:
-        begun.set()
-        go_on.wait(60)
-        return False
-
-    folding = threading.Thread(target=store.fold, args=(stopping,))
-    folding.start()
-    assert begun.wait(60)
-    during = grown(88, newest + 1, records[newest], ROW[:1])
-    store.write(changes(during, ROW[:1]))
-    go_on.set()
-    folding.join(60)
-    after = grown(99, newest + 2, during, ROW[1:2])
-    store.write(changes(after, ROW[1:2]))
-    found = paths(store)
-    for epoch, record in {**records, newest + 1: during, newest + 2: after}.items():
-        assert_same(read_map(found[epoch]), record)
 
 
 def test_folding_ends_when_the_server_does(store):

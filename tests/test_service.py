@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import servers
 import triquad_client
-from triquad_client import RefusedError, Status
+from triquad_client import DownloadError, RefusedError, Status
 from triquad_format import keys, wire
+from triquad_format.evaluator import MapEvaluator
 from triquad_format.mapfile import read_map
 from triquad_format.messages import (
     ErrorReply,
@@ -333,3 +334,21 @@ def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
             assert wire.decode(ErrorReply, reply.err.payload.to_bytes()).code == "busy"
         go_on.set()
         assert [reply.ok is not None for replies in answered for reply in replies] == [True, True]
+
+
+def test_a_box_of_the_map_is_downloaded_without_the_rest(client, tmp_path):
+    learn(client)
+    client.settle(servers.WAIT_S)
+    whole = client.download_map(tmp_path / "whole.triquad")
+    low, high = (1.0, -4.5, -4.5), (4.5, 4.5, 4.5)
+    box = client.download_box(tmp_path / "box.triquad", (low, high))
+    assert box.epoch == whole.epoch
+    assert box.bytes < whole.bytes
+    points = np.random.default_rng(0).uniform(low, high, (500, 3))
+    here = MapEvaluator(read_map(tmp_path / "box.triquad")).query(points, gradient=True)
+    there = MapEvaluator(read_map(tmp_path / "whole.triquad")).query(points, gradient=True)
+    assert np.array_equal(here.sdf, there.sdf)
+    assert np.array_equal(here.status, there.status)
+    with pytest.raises(DownloadError, match="nothing of the map lies between"):
+        client.download_box(tmp_path / "none.triquad", ((500, 0, 0), (501, 1, 1)))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["box.triquad", "whole.triquad"]

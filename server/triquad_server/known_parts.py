@@ -67,22 +67,6 @@ def known_parts(
     return KnownParts(manifest.facts, manifest.stamp_ns, entries, held)
 
 
-def folded(known: KnownParts, manifest: Manifest, file: FileRef) -> KnownParts:
-    """``known`` with what the complete ``file`` holds taken from there."""
-    there = {entry.key: entry for entry in manifest.entries}
-
-    def moved(entry: Entry) -> Entry:
-        same = there.get(entry.key)
-        fits = same is not None and same.sha256 == entry.sha256
-        return dataclasses.replace(entry, file=file) if fits else entry
-
-    entries = {key: moved(entry) for key, entry in known.entries.items()}
-    used = {entry.file for entry in entries.values()}
-    held = {other: size for other, size in known.held.items() if other in used}
-    held[file] = own_bytes(manifest)
-    return dataclasses.replace(known, entries=entries, held=held)
-
-
 def own_bytes(manifest: Manifest) -> int:
     """Bytes of the parts in the manifest's own file."""
     return sum(entry.size for entry in manifest.own)

@@ -8,9 +8,8 @@ import fcntl
 import hashlib
 import logging
 import os
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +44,7 @@ from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord
 
 from triquad_server.errors import StoreError
-from triquad_server.known_parts import KnownParts, folded, known_parts, own_bytes
+from triquad_server.known_parts import KnownParts, known_parts, own_bytes
 from triquad_server.mapper import MapChanges
 from triquad_server.retention import KeptCheckpoint, Retention
 
@@ -70,10 +69,7 @@ class _FoldStoppedError(Exception):
 
 
 class Store:
-    """The checkpoints of one map. One server at a time holds the folder.
-
-    One thread writes; another may fold meanwhile.
-    """
+    """The checkpoints of one map, for one thread. One server at a time holds the folder."""
 
     def __init__(self, root: Path, map_name: str, retention: Retention) -> None:
         """Take possession of ``root/map_name``, which is made if need be.
@@ -84,7 +80,6 @@ class Store:
         self.folder = root / map_name
         self._retention = retention
         self._known: KnownParts | None = None
-        self._changing = threading.Lock()  # of what is known, and of which files there are
         self._files: dict[Path, frozenset[str]] = {}  # that a checkpoint needs
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -168,12 +163,7 @@ class Store:
             raise StoreError(f"checkpoint {path} cannot be written: {error}") from error
         except MemoryError as error:
             raise StoreError(f"checkpoint {path} cannot be written: out of memory") from error
-        with self._changing:
-            held = {} if self._known is None else self._known.held
-            file = FileRef(path.name, written.manifest_sha256)
-            self._known = known_parts(written.manifest, file, held)
-            self._files[path] = self._known.files
-            self._tidy(record.epoch)
+        self._newest_is(path, written, {} if known is None else known.held)
         return info
 
     def fold(self, stopping: Callable[[], bool]) -> CheckpointInfo | None:
@@ -198,14 +188,15 @@ class Store:
             return None
         except (FormatError, OSError) as error:
             raise StoreError(f"{path} cannot be folded: {error}") from error
-        with self._changing:
-            assert self._known is not None
-            self._known = folded(
-                self._known, written.manifest, FileRef(path.name, written.manifest_sha256)
-            )
-            self._files[path] = frozenset({path.name})
-            self._tidy(self._known.facts.epoch)
+        self._newest_is(path, written, {})
         return info
+
+    def _newest_is(self, path: Path, written: WrittenMap, held: Mapping[FileRef, int]) -> None:
+        """Note what was written; let go of the oldest."""
+        file = FileRef(path.name, written.manifest_sha256)
+        self._known = known_parts(written.manifest, file, held)
+        self._files[path] = self._known.files
+        self._tidy(self._known.facts.epoch)
 
     def _remember(self, checkpoint: CheckpointFile, file: MapFile) -> None:
         """Note what a checkpoint that was read consists of."""
