@@ -32,10 +32,6 @@ def write_checkpoints(folder: Path, epochs: tuple[int, ...]) -> list[Path]:
         facts = MapFacts(record.name, epoch, record.settings)
         parts = record_parts(record, "<f2", None, stamp_ns)
         written = write_parts(path, facts, stamp_ns, parts, known)
-        here = FileRef(path.name, written.manifest_sha256)
-        known = {
-            entry.key: dataclasses.replace(entry, file=entry.file or here)
-            for entry in written.manifest.entries
-        }
+        known = written.manifest.elsewhere(FileRef(path.name, written.manifest_sha256))
         paths.append(path)
     return paths

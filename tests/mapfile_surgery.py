@@ -141,13 +141,23 @@ def in_level(number, edit):
     return lambda body: edit(body["levels"][number])
 
 
+def altered(parts, count, rng):
+    """``count`` times the parts, with some bits of one flipped."""
+    for _ in range(count):
+        at = int(rng.integers(len(parts)))
+        payload = bytearray(parts[at].payload)
+        # Most flips hit the heads, where lengths, shapes and keys are.
+        for _ in range(int(rng.integers(1, 4))):
+            payload[int(len(payload) * rng.random() ** 3)] ^= 1 << int(rng.integers(8))
+        yield [*parts[:at], RawPart(parts[at].topic, bytes(payload)), *parts[at + 1 :]]
+
+
 def write_pair(
     folder, base, record, *, names=("base.triquad", "next.triquad"), stamps=(None, None)
 ):
     """A complete file of ``base``, and one of what ``record`` changes of it."""
     first = write_record(folder / names[0], base, stamps[0], {})
-    file = FileRef(names[0], first.manifest_sha256)
-    known = {e.key: dataclasses.replace(e, file=file) for e in first.manifest.entries}
+    known = first.manifest.elsewhere(FileRef(names[0], first.manifest_sha256))
     return first, write_record(folder / names[1], record, stamps[1], known)
 
 

@@ -14,6 +14,19 @@ def test_client_comes_without_the_server_and_its_libraries():
     assert done.returncode == 0, done.stderr
 
 
+PREVIEW_CODE = """
+import sys
+import triquad_client, triquad_format.stored_map
+loaded = [name for name in sys.modules if name.startswith(("google.", "foxglove"))]
+sys.exit(f"reading a map brought in {loaded}" if loaded else 0)
+"""
+
+
+def test_reading_a_map_comes_without_what_previews_are_written_with():
+    done = subprocess.run([sys.executable, "-c", PREVIEW_CODE], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_all_public_names_exist():
     import triquad_client
 

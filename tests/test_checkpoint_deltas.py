@@ -8,8 +8,9 @@ from map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.history import checkpoint_at, checkpoint_files
 from triquad_format.mapfile import read_map, read_map_file
+from triquad_format.recover import recover
 from triquad_format.region import MapRecord, RegionIndex
-from triquad_server.errors import StoreError
+from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapper import MapChanges, Mapper
 from triquad_server.retention import Retention
 from triquad_server.settings import Settings
@@ -126,16 +127,88 @@ def test_a_base_that_vanished_makes_the_next_checkpoint_complete(store):
     assert_same(read_map(paths(store)[3]), third)
 
 
-def test_a_damaged_base_is_not_copied_from(store):
-    """Copying reads old parts: what is damaged must not be written again as if it were sound."""
+def spoil(path, keep_time=False):
+    """Overwrite the middle of a file."""
+    before = path.stat()
+    data = path.read_bytes()
+    path.write_bytes(data[:2000] + bytes(5000) + data[7000:])
+    if keep_time:
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def test_after_its_base_was_spoilt_a_checkpoint_is_complete(store):
     first = grown(1, 1)
     store.write(changes(first))
-    base = paths(store)[1]
-    base.write_bytes(base.read_bytes()[:2000] + b"\0" * 5000 + base.read_bytes()[7000:])
+    spoil(paths(store)[1])
+    assert store.base_epoch is None
+    second = grown(2, 2)
+    store.write(changes(second))
+    assert_same(read_map(paths(store)[2]), second)
+
+
+def test_a_damaged_base_is_not_copied_from(store):
+    """What is damaged must not be written again as if it were sound; then all is asked for."""
+    first = grown(1, 1)
+    store.write(changes(first))
+    spoil(paths(store)[1], keep_time=True)
+    assert store.base_epoch == 1
     second = grown(2, 2, first, ROW[:7])
-    with pytest.raises(StoreError, match="epoch-000000001.triquad"):
+    with pytest.raises(StoreBaseError, match="epoch-000000001.triquad"):
         store.write(changes(second, ROW[:7]))
     assert list(paths(store)) == [1]
+    assert store.base_epoch is None
+    third = grown(3, 3)
+    store.write(changes(third))
+    assert_same(read_map(paths(store)[3]), third)
+
+
+def test_a_damaged_base_is_found_when_folding(store):
+    drive(store, 9)
+    spoil(paths(store)[1], keep_time=True)
+    spoil(paths(store)[5], keep_time=True)
+    with pytest.raises(StoreBaseError, match="cannot be folded"):
+        store.fold(lambda: False)
+    assert store.base_epoch is None
+
+
+def test_a_sound_delta_serves_where_the_complete_file_of_its_epoch_is_damaged(store):
+    records = drive(store, 2)
+    (store.folder / "epoch-000000003.triquad").write_bytes(b"half a fi")
+    restored = store.newest()
+    assert restored is not None
+    assert_same(restored.record, records[3])
+
+
+def test_whoever_deletes_the_lock_lets_nobody_else_in(store, tmp_path):
+    store.write(changes(grown(1, 1)))
+    (store.folder / "lock").unlink()
+    store.write(changes(grown(2, 2)))
+    with pytest.raises(StoreError, match="in use by another server"):
+        Store(tmp_path, "lab", Retention(2))
+    (store.folder / "lock").unlink()
+    with (
+        closing(Store(tmp_path, "lab", Retention(2))),
+        pytest.raises(StoreError, match="in use by another server"),
+    ):
+        store.write(changes(grown(3, 3)))
+    store.write(changes(grown(3, 3)))
+
+
+@pytest.mark.parametrize("clock_ns", [-(10**18), 2**63])
+def test_no_clock_keeps_a_checkpoint_from_being_written(store, monkeypatch, clock_ns):
+    monkeypatch.setattr("time.time_ns", lambda: clock_ns)
+    store.write(changes(grown(1, 1)))
+    assert read_map(paths(store)[1]).epoch == 1
+
+
+def test_what_is_no_file_does_not_stop_the_retention(tmp_path):
+    with closing(Store(tmp_path, "lab", Retention(2))) as store:
+        (store.folder / "epoch-000000000.triquad").mkdir()
+        os.mkfifo(store.folder / "epoch-000000000.delta.triquad")
+        (store.folder / "epoch-000000001.triquad").symlink_to("nowhere")
+        for epoch in range(2, 6):
+            store.write(changes(grown(epoch, epoch)))
+        assert sorted(paths(store)) == [4, 5]
 
 
 def test_without_its_base_a_delta_is_damaged_by_name(store):
@@ -219,3 +292,24 @@ def test_retention_by_age(tmp_path):
         last = grown(9, 9, records[4], ROW[:1])
         store.write(changes(last, ROW[:1]))
         assert sorted(paths(store)) == [1, 4, 9]
+
+
+def test_what_was_set_aside_can_still_be_recovered_with_its_base(store):
+    records = drive(store, 3)
+    base = paths(store)[1]
+    base.write_bytes(base.read_bytes()[:-2000])
+    with pytest.raises(StoreError, match="all 4 checkpoints"):
+        store.newest()
+    whole = grown(5, 5)
+    store.write(changes(whole))
+    restored = store.newest()
+    assert restored is not None
+    assert_same(restored.record, whole)
+    for path in paths(store).values():
+        if path != paths(store)[5]:
+            path.rename(path.with_name(path.name + ".damaged"))
+    newest = store.folder / "epoch-000000004.delta.triquad.damaged"
+    saved = recover(newest).record
+    changed = {region.index: region for region in saved.regions}
+    for index in ROW[2:5]:
+        assert_same(changed[index], next(r for r in records[4].regions if r.index == index))

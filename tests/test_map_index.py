@@ -1,6 +1,7 @@
 """Parts by random access, in one file and in the files that a delta names."""
 
 import dataclasses
+import io
 import os
 import shutil
 
@@ -15,12 +16,13 @@ from mapfile_surgery import (
     write_pair,
     write_record,
 )
-from mcap.writer import CompressionType, IndexType
+from mcap.writer import CompressionType, IndexType, Writer
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
 from triquad_format.manifest import FileRef
 from triquad_format.map_index import MapIndex
 from triquad_format.mapfile import read_map
 from triquad_format.random_access import FileBytes, MemoryBytes
+from triquad_format.recover import recover
 from triquad_format.stored_map import StoredMap
 
 BASE = random_record(30, indices=((0, 0, 0), (1, 0, 0)), epoch=3)
@@ -83,7 +85,7 @@ def test_a_delta_needs_its_folder(pair, tmp_path_factory):
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     shutil.copy(pair / "next.triquad", elsewhere)
     for read in both_readers(elsewhere / "next.triquad"):
-        with pytest.raises(DamagedMapFileError, match=r"base.triquad.*No such file"):
+        with pytest.raises(DamagedMapFileError, match=r"base.triquad, .*, is missing"):
             read()
 
 
@@ -124,7 +126,7 @@ def test_a_base_that_is_a_folder_is_refused(pair):
     (pair / "base.triquad").unlink()
     (pair / "base.triquad").mkdir()
     for read in both_readers(pair / "next.triquad"):
-        with pytest.raises(DamagedMapFileError, match=r"base.triquad.*directory"):
+        with pytest.raises(DamagedMapFileError, match=r"base.triquad is not a regular file"):
             read()
 
 
@@ -163,3 +165,22 @@ def test_files_rewritten_part_by_part_keep_their_index(tmp_path):
     path.write_bytes(rebuild(parts_of(data), metadata_of(data), compression=CompressionType.NONE))
     for read in both_readers(path):
         assert_same(read(), BASE)
+
+
+def test_a_pipe_keeps_no_reader_waiting(tmp_path):
+    pipe = tmp_path / "map.triquad"
+    os.mkfifo(pipe)
+    for read in (read_map, StoredMap.open, recover):
+        with pytest.raises(MapFileError, match="is not a regular file"):
+            read(pipe)
+
+
+def test_metadata_that_is_indexed_twice_is_refused():
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    for _ in range(2):
+        writer.add_metadata("triquad", metadata_of(file_bytes(BASE))["triquad"])
+    writer.finish()
+    with pytest.raises(DamagedMapFileError, match="more than once"):
+        StoredMap(MemoryBytes(stream.getvalue()))

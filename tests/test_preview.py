@@ -12,7 +12,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from triquad_format import morton
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.field_settings import FieldSettings
-from triquad_format.preview import CELL_LEAVES, CLUSTER_CELLS
+from triquad_format.preview import CLUSTER_CELLS, NET_LEAVES
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS, Evidence
 
 SETTINGS = FieldSettings()
@@ -72,7 +72,7 @@ def ground_file():
 
 
 def test_viewers_see_the_surface(ground_file):
-    cell = SETTINGS.leaf_m * CELL_LEAVES * CLUSTER_CELLS
+    cell = SETTINGS.leaf_m * NET_LEAVES * CLUSTER_CELLS
     found = scenes(ground_file)
     assert len(found) == 2
     for (name, scene), x in zip(found, (0.0, SETTINGS.region_pitch_m), strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import servers
 import triquad_client
-from triquad_client import DownloadError, RefusedError, Status
+from triquad_client import DownloadError, InvalidInputError, RefusedError, Status
 from triquad_format import keys, wire
 from triquad_format.evaluator import MapEvaluator
 from triquad_format.mapfile import read_map
@@ -349,6 +349,15 @@ def test_a_box_of_the_map_is_downloaded_without_the_rest(client, tmp_path):
     there = MapEvaluator(read_map(tmp_path / "whole.triquad")).query(points, gradient=True)
     assert np.array_equal(here.sdf, there.sdf)
     assert np.array_equal(here.status, there.status)
+    everything = client.download_box(tmp_path / "all.triquad", ((-math.inf,) * 3, (math.inf,) * 3))
+    assert read_map(tmp_path / "all.triquad").regions[0].parameters > 0
+    assert everything.epoch == whole.epoch
+    with pytest.raises(InvalidInputError, match="hold nothing"):
+        client.download_box(tmp_path / "none.triquad", (low, low))
     with pytest.raises(DownloadError, match="nothing of the map lies between"):
         client.download_box(tmp_path / "none.triquad", ((500, 0, 0), (501, 1, 1)))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["box.triquad", "whole.triquad"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "all.triquad",
+        "box.triquad",
+        "whole.triquad",
+    ]

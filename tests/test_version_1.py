@@ -11,6 +11,7 @@ from map_records import assert_same, random_record
 from mapfile_surgery import (
     RawPart,
     all_of,
+    altered,
     metadata_of,
     parts_of,
     read_bytes,
@@ -126,14 +127,7 @@ def test_bit_flips():
 
 
 def test_altered_parts_with_right_digests():
-    parts = parts_of(DATA)[:-1]
-    rng = np.random.default_rng(3)
-    for _ in range(250):
-        at = int(rng.integers(len(parts)))
-        payload = bytearray(parts[at].payload)
-        for _ in range(int(rng.integers(1, 4))):
-            payload[int(len(payload) * rng.random() ** 3)] ^= 1 << int(rng.integers(8))
-        mutant = [*parts[:at], RawPart(parts[at].topic, bytes(payload)), *parts[at + 1 :]]
+    for mutant in altered(parts_of(DATA)[:-1], 250, np.random.default_rng(3)):
         with contextlib.suppress(MapFileError):
             check_record(read_bytes(file_of(mutant)))
 

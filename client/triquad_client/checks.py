@@ -110,6 +110,18 @@ def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return minimum, maximum
 
 
+def filled_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As :func:`box`, with infinite sides at ``FARTHEST_M``.
+
+    Raises:
+        InvalidInputError: the box holds nothing.
+    """
+    minimum, maximum = (np.clip(corner, -FARTHEST_M, FARTHEST_M) for corner in box(bounds))
+    if not (minimum < maximum).all():
+        raise InvalidInputError(f"bounds = {bounds!r} hold nothing")
+    return minimum, maximum
+
+
 def _points(points: ArrayLike, dtype: Any, error: type[InvalidInputError]) -> NDArray[Any]:
     try:
         array = np.asarray(points)

@@ -6,7 +6,6 @@ from types import TracebackType
 
 from numpy.typing import ArrayLike
 from triquad_format import keys
-from triquad_format.mapfile import MapFileInfo
 from triquad_format.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -17,6 +16,7 @@ from triquad_format.messages import (
     StatusRequest,
     TileList,
 )
+from triquad_format.written_map import MapFileInfo
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
@@ -186,10 +186,11 @@ class Client:
             bounds: corners of a box, metres, map frame.
 
         Raises:
+            InvalidInputError: the bounds are not a box, or hold nothing.
             DownloadError: nothing of the map lies in the box, or what arrived is not sound.
             OSError: the file cannot be written.
         """
-        return self._download.fetch_box(Path(path), *checks.box(bounds))
+        return self._download.fetch_box(Path(path), *checks.filled_box(bounds))
 
     def maps(self) -> list[str]:
         """Names of all maps that can be reached, also those of other servers."""

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format import keys
 from triquad_format.crop import crop_record
+from triquad_format.durable_file import replacing
 from triquad_format.errors import FormatError
-from triquad_format.mapfile import MapFileInfo, write_map
-from triquad_format.mapfile_writer import replacing
 from triquad_format.messages import MapInfo, MapInfoRequest
 from triquad_format.stored_map import StoredMap
+from triquad_format.written_map import MapFileInfo
 
 from triquad_client.connection import Connection, retried
 from triquad_client.errors import DownloadError
@@ -59,14 +59,17 @@ class MapDownload:
     def _fetch_box(
         self, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
     ) -> MapFileInfo:
+        # Most clients fetch no box: they need none of what previews take.
+        from triquad_format.mapfile_writer import write_map
+
         try:
             stored = StoredMap(RemoteBytes(self._connection, self._info(training=False)))
             record = crop_record(stored.box(minimum, maximum), minimum, maximum)
-            if not record.regions:
+            if not any(len(region.evidence.codes) for region in record.regions):
                 raise DownloadError(
                     f"nothing of the map lies between {minimum.tolist()} and {maximum.tolist()}"
                 )
-            return write_map(record, path)
+            return write_map(record, path, stamp_ns=stored.manifest.stamp_ns or None)
         except FormatError as error:
             raise DownloadError(str(error)) from error
 

@@ -7,7 +7,7 @@ from triquad_format.messages import Tile, TileList, TileListRequest, TileRequest
 
 from triquad_client.connection import Connection, Pending, in_flight, retried
 from triquad_client.mesh import Mesh
-from triquad_client.welding import compacted, welded
+from triquad_client.welding import joined
 
 
 class Meshes:
@@ -33,25 +33,10 @@ class Meshes:
     def _mesh(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Mesh:
         listed = self.tiles(minimum, maximum)
         indices = [(int(x), int(y), int(z)) for x, y, z in listed.tiles]
-        tiles = list(in_flight(lambda index: self._send(index, listed.epoch), indices))
-        vertices, faces = _joined(tiles)
-        vertices, faces = welded(vertices, faces, listed.tile_side_m)
-        centroids = vertices[faces].mean(axis=1)
-        inside = ((centroids >= minimum) & (centroids <= maximum)).all(axis=1)
-        vertices, faces = compacted(vertices, faces[inside])
-        return Mesh(vertices, faces, listed.epoch)
+        tiles = in_flight(lambda index: self._send(index, listed.epoch), indices)
+        triangles = [(tile.origin + tile.vertices, tile.faces) for tile in tiles]
+        return Mesh(*joined(triangles, listed.tile_side_m, minimum, maximum), listed.epoch)
 
     def _send(self, index: tuple[int, int, int], epoch: int) -> Pending[Tile]:
         request = TileRequest(*index, epoch)
         return self._connection.send(keys.TILE, request, Tile, background=True)
-
-
-def _joined(tiles: list[Tile]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices [V, 3] in the map frame and faces [F, 3] of all tiles."""
-    starts = np.cumsum([0, *(len(tile.vertices) for tile in tiles)])
-    vertices = [np.zeros((0, 3)), *(tile.origin + tile.vertices for tile in tiles)]
-    faces = [
-        np.zeros((0, 3), np.int32),
-        *(tile.faces + int(start) for start, tile in zip(starts, tiles, strict=False)),
-    ]
-    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)

@@ -1,5 +1,7 @@
 """Joining the meshes of tiles: vertices on common faces become one."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,11 +13,34 @@ _SHIFTS = np.array([(0.5, 0.5, 0.5), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0)
 along it only: a second round, shifted along that axis, brings them together."""
 
 
+Triangles = tuple[NDArray[np.float64], NDArray[np.int32]]
+"""Vertices [V, 3] in the map frame, metres, and faces [F, 3]."""
+
+
+def joined(
+    tiles: Sequence[Triangles],
+    tile_side_m: float,
+    minimum: NDArray[np.float64],
+    maximum: NDArray[np.float64],
+) -> Triangles:
+    """One mesh of the tiles' faces whose centroids lie in the box between two corners [3]."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in tiles)])
+    shifted = [faces + int(start) for (_, faces), start in zip(tiles, starts, strict=False)]
+    vertices, faces = welded(
+        np.concatenate([np.zeros((0, 3)), *(vertices for vertices, _ in tiles)]),
+        np.concatenate([np.zeros((0, 3), np.int32), *shifted]).astype(np.int32),
+        tile_side_m,
+    )
+    centroids = vertices[faces].mean(axis=1)
+    inside = ((centroids >= minimum) & (centroids <= maximum)).all(axis=1)
+    return compacted(vertices, faces[inside])
+
+
 def welded(
     vertices: NDArray[np.float64],
     faces: NDArray[np.int32],
     tile_side_m: float,
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+) -> Triangles:
     """The mesh with one vertex where tiles had several.
 
     Args:
@@ -39,7 +64,7 @@ def welded(
 def compacted(
     vertices: NDArray[np.float64],
     faces: NDArray[np.integer],
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+) -> Triangles:
     """The mesh without vertices that no face uses."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True

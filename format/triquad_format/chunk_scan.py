@@ -8,8 +8,8 @@ import contextlib
 import re
 from collections.abc import Iterator
 
+from triquad_format.container import ENCODINGS, METADATA_NAME
 from triquad_format.errors import FormatError, TooLargeMapFileError
-from triquad_format.mapfile_writer import CHANNELS, METADATA_NAME
 from triquad_format.mcap_records import (
     Message,
     Record,
@@ -17,9 +17,11 @@ from triquad_format.mcap_records import (
     declared_size,
     metadata_entries,
 )
-from triquad_format.part import PREVIEW, TOPICS
 
 _HEAD_BYTES = 9  # of a record: opcode and length
+
+_LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
+"""Bytes of all supposed chunks that are looked at, and so many times the file's size."""
 
 # A record below 4 GiB; in a chunk then times, size and checksum, and the name of its compression.
 _CHUNK = re.compile(rb"\x06.{4}\x00{4}.{28}(?:\x04\x00{3}zstd|\x00{4})", re.DOTALL)
@@ -38,12 +40,14 @@ def intact_messages(data: bytes, max_bytes: int) -> Iterator[Message]:
         TooLargeMapFileError: there is more.
     """
     channels = _channels(data)
+    budget = _LEAST_BUDGET + _BUDGET_RATIO * len(data)
     at = 0
     while match := _CHUNK.search(data, at):
         at = match.start() + 1
         record = _record(data, match.start())
-        if record is None:
+        if record is None or len(record.content) > budget:
             continue
+        budget -= len(record.content)
         try:
             messages = list(chunk_messages(record, dict(channels)))
         except FormatError:
@@ -79,10 +83,9 @@ def _channels(data: bytes) -> dict[int, tuple[str, str]]:
 
     The records stand twice in a file, and have no checksum of their own.
     """
-    channels = {i + 1: (spec.topic, spec.encoding) for i, spec in enumerate(CHANNELS)}
-    known = {(topic, "msgpack") for topic in TOPICS} | {(PREVIEW, "protobuf")}
+    channels = dict(enumerate(ENCODINGS.items(), start=1))
     for match in _CHANNEL.finditer(data):
         channel = (match[2].decode(), match[3].decode())
-        if channel in known:
+        if channel in ENCODINGS.items():
             channels[int.from_bytes(match[1], "little")] = channel
     return channels

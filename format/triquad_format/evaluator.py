@@ -20,6 +20,7 @@ from triquad_format.region import (
     MapRecord,
     Region,
     VertexTable,
+    leaf_coordinates,
     region_centre,
 )
 from triquad_format.status import Status
@@ -242,7 +243,7 @@ class _RegionField:
 
         Owned points lie half an overlap inside the cube: no voxel here is out of range.
         """
-        u = offset / self._settings.leaf_m + (1 << (self._settings.depth - 1))
+        u = leaf_coordinates(self._settings, offset)
         free = self._evidence.seen(np.floor(u).astype(np.int64), self._evidence.free)
         status = np.where(free, Status.FREE, Status.UNKNOWN).astype(np.uint8)
         sides = np.floor(np.stack([u - 0.5, u + 0.5])).astype(np.int64)  # [2, N, 3]

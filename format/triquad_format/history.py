@@ -10,9 +10,9 @@ from datetime import datetime
 from pathlib import Path
 
 from triquad_format.errors import MapFileError, NoIndexError
+from triquad_format.file_errors import named
 from triquad_format.manifest import Manifest
-from triquad_format.map_index import MapIndex
-from triquad_format.mapfile_reader import files_in, named
+from triquad_format.map_index import MapIndex, files_in
 from triquad_format.random_access import FileBytes
 
 _NAME = re.compile(r"epoch-([0-9]{9,19})(\.delta)?\.triquad")
@@ -35,17 +35,21 @@ def checkpoint_name(epoch: int, complete: bool) -> str:
 def checkpoint_file(path: Path) -> CheckpointFile | None:
     """The checkpoint of that name; ``None`` where it is not the name of one."""
     match = _NAME.fullmatch(path.name)
-    return CheckpointFile(int(match[1]), not match[2], path) if match else None
+    if match is None or int(match[1]) >= 2**63:
+        return None
+    return CheckpointFile(int(match[1]), not match[2], path)
 
 
 def checkpoint_files(folder: Path) -> list[CheckpointFile]:
-    """The checkpoints in a folder, newest first; a complete one before a partial one.
+    """The checkpoints in a folder, newest first; a complete one before a delta.
+
+    What is no file, or a link to none, is left out.
 
     Raises:
         OSError: the folder cannot be read.
     """
-    found = [file for path in folder.iterdir() if (file := checkpoint_file(path)) is not None]
-    return sorted(found, reverse=True)
+    found = [checkpoint_file(path) for path in folder.iterdir() if path.is_file()]
+    return sorted((file for file in found if file is not None), reverse=True)
 
 
 def newest_of_each(files: Iterable[CheckpointFile]) -> list[CheckpointFile]:
@@ -101,14 +105,22 @@ def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
     """
     files = newest_of_each(checkpoint_files(folder))
     found = [file for file in files if _is_by(file, when)]
+    epochs = f"epochs {files[-1].epoch} to {files[0].epoch}" if files else "nothing"
     if not found:
-        epochs = f"{files[-1].epoch} to {files[0].epoch}" if files else "none"
-        raise MapFileError(f"{folder} holds no checkpoint of {when} or before; epochs: {epochs}")
+        raise MapFileError(f"{folder} holds no checkpoint of {when} or before, but {epochs}")
+    if _is_epoch(when) and int(when) > files[0].epoch:
+        raise MapFileError(
+            f"{folder} holds {epochs}, not {when}; a time is written as 2026-01-31T12:00:00Z"
+        )
     return max(found)
 
 
+def _is_epoch(when: str) -> bool:
+    return when.isascii() and when.isdigit() and len(when) < 20
+
+
 def _is_by(file: CheckpointFile, when: str) -> bool:
-    if when.isascii() and when.isdigit():
+    if _is_epoch(when):
         return file.epoch <= int(when)
     try:
         limit_s = datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp()

@@ -1,5 +1,7 @@
 """The manifest: the list of all parts of a map, and the files that hold them."""
 
+import dataclasses
+import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,12 +13,11 @@ from triquad_format.array import pack_array
 from triquad_format.errors import DamagedMapFileError, FormatError
 from triquad_format.map_facts import MapFacts, pack_facts, unpack_facts
 from triquad_format.part import (
-    FIELD_TOPICS,
     MANIFEST,
     MAP,
     REGION,
+    REGION_TOPICS,
     TRAINING,
-    TRAINING_TOPICS,
     Part,
     PartKey,
 )
@@ -58,6 +59,14 @@ class Entry:
     stamp_ns: int  # time of that epoch, nanoseconds since 1970; 0 if not known
     file: FileRef | None = None  # None: the file that holds the manifest
 
+    def check(self, number: int, topic: str, data: bytes) -> None:
+        """Raise :class:`DamagedMapFileError` unless part ``number`` of its file is this one."""
+        fits = topic == self.key.topic and len(data) == self.size
+        if not fits or hashlib.sha256(data).digest() != self.sha256:
+            raise DamagedMapFileError(
+                f"part {number}, {topic:.80}, is not the one that the manifest lists there",
+            )
+
 
 @dataclass(frozen=True)
 class Manifest:
@@ -76,6 +85,10 @@ class Manifest:
     def own(self) -> tuple[Entry, ...]:
         """The parts in the manifest's own file, in their order."""
         return tuple(entry for entry in self.entries if entry.file is None)
+
+    def elsewhere(self, own: FileRef) -> dict[PartKey, Entry]:
+        """The parts as another file lists them; ``own`` is the manifest's own file."""
+        return {e.key: dataclasses.replace(e, file=e.file or own) for e in self.entries}
 
 
 def pack_manifest(manifest: Manifest) -> Part:
@@ -157,7 +170,7 @@ def _files(listed: list[Any]) -> list[FileRef]:
         if len(digest) != DIGEST_BYTES:
             raise DamagedMapFileError(f"{MANIFEST}: the digest of {name!r:.80} is not a digest")
         files.append(FileRef(name, digest))
-    if len(set(files)) != len(files):
+    if len({file.name for file in files}) != len(files):
         raise DamagedMapFileError(f"{MANIFEST}: it names a file twice")
     return files
 
@@ -181,7 +194,7 @@ def _check_keys(keys: list[PartKey]) -> None:
             raise DamagedMapFileError(f"{MANIFEST}: {key.topic} has plane or cell: {key}")
     regions = {key.region for key in keys if key.topic == REGION}
     for key in keys:
-        if key.topic in (*FIELD_TOPICS, *TRAINING_TOPICS) and key.region not in regions:
+        if key.topic in REGION_TOPICS and key.region not in regions:
             raise DamagedMapFileError(f"the part {REGION} of {key.region} is missing")
 
 

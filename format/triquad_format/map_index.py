@@ -2,26 +2,47 @@
 
 import hashlib
 from collections.abc import Callable
+from pathlib import Path
 
+from triquad_format.container import METADATA_NAME
 from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,
     MapFileError,
     NoIndexError,
-    UnsupportedMapFileError,
 )
-from triquad_format.manifest import Entry, FileRef, Manifest, unpack_manifest
-from triquad_format.map_facts import FRAME_ID, UNITS, MapFacts, check_map_part
-from triquad_format.mapfile_writer import BASE_FILES, FORMAT_VERSION, METADATA_NAME
+from triquad_format.file_metadata import (
+    check_agreement,
+    check_features,
+    one_metadata,
+    reader_version,
+)
+from triquad_format.manifest import Entry, FileRef, unpack_manifest
+from triquad_format.map_facts import check_map_part
 from triquad_format.mcap_index import McapIndex
 from triquad_format.part import MANIFEST, MAP, PartKey
-from triquad_format.random_access import RandomAccess
+from triquad_format.random_access import FileBytes, RandomAccess
 
-KNOWN_FEATURES: frozenset[str] = frozenset({BASE_FILES})
-"""The ``required_features`` that this reader understands."""
+DAMAGED_SUFFIX = ".damaged"
+"""Added to the names of files that are set aside."""
 
 OpenFile = Callable[[FileRef], RandomAccess]
 """Opens another file of the same folder."""
+
+
+def files_in(folder: Path) -> OpenFile:
+    """Opens the other files that hold parts of a map, in the folder of the map file.
+
+    One that was set aside as damaged still serves with those of its parts that are sound.
+    """
+
+    return lambda file: FileBytes(file_in(folder, file.name))
+
+
+def file_in(folder: Path, name: str) -> Path:
+    """The file of this name; where it was set aside as damaged, under its new name."""
+    aside = folder / (name + DAMAGED_SUFFIX)
+    return aside if aside.exists() and not (folder / name).exists() else folder / name
 
 
 class OtherFiles:
@@ -36,6 +57,7 @@ class OtherFiles:
 
         Raises:
             MapFileError: that file is missing, damaged or another.
+            OSError: the system refuses to read it.
         """
         assert entry.file is not None
         if entry.file not in self._indices:
@@ -43,7 +65,7 @@ class OtherFiles:
         index = self._indices[entry.file]
         try:
             return index.payload(index.find(entry))
-        except (MapFileError, OSError) as error:
+        except MapFileError as error:
             raise DamagedMapFileError(f"{entry.file.name}, which holds parts: {error}") from error
 
     def close(self) -> None:
@@ -61,7 +83,11 @@ class OtherFiles:
             except BaseException:
                 source.close()
                 raise
-        except (FormatError, OSError) as error:
+        except FileNotFoundError as error:
+            raise DamagedMapFileError(
+                f"{file.name}, which holds parts, is missing; put it beside this file"
+            ) from error
+        except FormatError as error:
             raise DamagedMapFileError(f"{file.name}, which holds parts: {error}") from error
 
 
@@ -119,7 +145,7 @@ class MapIndex:
             return self._others.payload(entry)
         number = self._numbers[entry.key]
         message = self._mcap.message(number)
-        check_part(number, entry, message.topic, message.data)
+        entry.check(number, message.topic, message.data)
         return message.data
 
     def find(self, entry: Entry) -> Entry:
@@ -135,73 +161,3 @@ def _index_of(file: FileRef, source: RandomAccess) -> MapIndex:
     if index.manifest_sha256 != file.manifest_sha256:
         raise DamagedMapFileError("it is not the file that the map was made with")
     return index
-
-
-def one_metadata(found: list[dict[str, str]]) -> dict[str, str]:
-    """The metadata record ``triquad``, of which there must be one."""
-    if not found:
-        raise MapFileError("this is an MCAP file, but not a map: it has no metadata 'triquad'")
-    if len(found) > 1:
-        raise DamagedMapFileError("the metadata 'triquad' is there more than once")
-    return found[0]
-
-
-def reader_version(metadata: dict[str, str]) -> int:
-    """The version that is needed to read the file.
-
-    Raises:
-        UnsupportedMapFileError: it is newer than this reader; the text names what is missing.
-        DamagedMapFileError: the metadata does not tell.
-    """
-    needed = metadata.get("min_reader_version", "")
-    # int() alone would also take '+1', ' 1' and digits of other scripts, of any length.
-    if not (needed.isascii() and needed.isdigit() and len(needed) < 10):
-        raise DamagedMapFileError(f"min_reader_version = {needed!r:.40} is not a number")
-    if int(needed) > FORMAT_VERSION:
-        raise UnsupportedMapFileError(
-            f"it needs a reader of map file version {needed}; this one reads {FORMAT_VERSION}: "
-            f"install a newer triquad (written by {metadata.get('producer', 'unknown')!r:.80})",
-        )
-    if "required_features" not in metadata:
-        raise DamagedMapFileError("the metadata 'triquad' does not name its required_features")
-    missing = _required(metadata) - KNOWN_FEATURES
-    if missing:
-        unknown = ", ".join(sorted(missing))
-        raise UnsupportedMapFileError(
-            f"it requires {unknown:.200}, which this reader does not know: install a newer triquad"
-        )
-    return int(needed)
-
-
-def _required(metadata: dict[str, str]) -> set[str]:
-    return {name.strip() for name in metadata["required_features"].split(",")} - {""}
-
-
-def check_part(number: int, entry: Entry, topic: str, data: bytes) -> None:
-    """Raise :class:`DamagedMapFileError` unless a part is the one that is listed."""
-    fits = topic == entry.key.topic and len(data) == entry.size
-    if not fits or hashlib.sha256(data).digest() != entry.sha256:
-        raise DamagedMapFileError(
-            f"part {number}, {topic:.80}, is not the one that the manifest lists there",
-        )
-
-
-def check_features(metadata: dict[str, str], manifest: Manifest) -> None:
-    """Raise :class:`DamagedMapFileError` where a feature is used that is not required."""
-    if manifest.files and BASE_FILES not in _required(metadata):
-        raise DamagedMapFileError(f"parts lie in other files, but {BASE_FILES} is not required")
-
-
-def check_agreement(metadata: dict[str, str], facts: MapFacts) -> None:
-    """Raise :class:`DamagedMapFileError` unless metadata and parts tell the same."""
-    wanted = {
-        "map": facts.name,
-        "epoch": str(facts.epoch),
-        "frame_id": FRAME_ID,
-        "units": UNITS,
-    }
-    for key, value in wanted.items():
-        if metadata.get(key) != value:
-            raise DamagedMapFileError(
-                f"its metadata says {key} = {metadata.get(key)!r:.80}, its parts say {value!r}",
-            )

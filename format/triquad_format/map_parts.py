@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.array import pack_array
+from triquad_format.cell import cube_shift, square_shift
 from triquad_format.errors import FormatError
 from triquad_format.field_settings import FieldSettings
 from triquad_format.map_facts import MapFacts, pack_facts
 from triquad_format.part import (
-    CELL_LEAVES_LOG2,
     EVIDENCE,
     MAP,
     MOMENTS,
@@ -27,7 +27,6 @@ from triquad_format.part import (
 from triquad_format.part_body import pack_part
 from triquad_format.region import (
     AXES,
-    BLOCK_VOXELS,
     Evidence,
     Region,
     TrainingState,
@@ -68,16 +67,6 @@ def pack_region(
     yield from _pack_evidence(region)
     if region.training is not None:
         yield from _pack_training(region, region.training, settings)
-
-
-def square_shift(settings: FieldSettings, level: int) -> int:
-    """Bits by which a vertex' code exceeds that of its square."""
-    return 2 * (CELL_LEAVES_LOG2 - (settings.depth - level))
-
-
-def cube_shift() -> int:
-    """Bits by which a block's code exceeds that of its cube."""
-    return 3 * (CELL_LEAVES_LOG2 - (BLOCK_VOXELS.bit_length() - 1))
 
 
 def _place(region: Region, plane: int, cell: int) -> dict[str, object]:

@@ -1,8 +1,10 @@
 """The map file: how a map is kept and handed on. ``docs/map-file.md`` is the specification."""
 
-from triquad_format.map_index import KNOWN_FEATURES
+from triquad_format.container import FORMAT_VERSION, MAX_MAP_BYTES
+from triquad_format.file_metadata import KNOWN_FEATURES
 from triquad_format.mapfile_reader import MapFile, StoredPart, read_map, read_map_file
-from triquad_format.mapfile_writer import FORMAT_VERSION, MAX_MAP_BYTES, MapFileInfo, write_map
+from triquad_format.mapfile_writer import write_map
+from triquad_format.written_map import MapFileInfo
 
 SUFFIX = ".triquad"
 

@@ -1,47 +1,37 @@
 """Reading map files whole: nothing is believed before it is checked."""
 
-import contextlib
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 from triquad_format import version_1
-from triquad_format.errors import (
-    DamagedMapFileError,
-    FormatError,
-    MapFileError,
-    NoIndexError,
-    TooLargeMapFileError,
-    UnsupportedMapFileError,
-)
-from triquad_format.manifest import DIGEST_BYTES, Entry, FileRef, Manifest, unpack_manifest
-from triquad_format.map_facts import MapFacts
-from triquad_format.map_index import (
-    OtherFiles,
-    check_agreement,
-    check_features,
-    check_part,
-    one_metadata,
-    reader_version,
-)
-from triquad_format.mapfile_writer import (
+from triquad_format.container import (
     MAX_MAP_BYTES,
     MAX_PART_BYTES,
     MESSAGE_ENCODING,
     METADATA_NAME,
 )
+from triquad_format.errors import DamagedMapFileError, TooLargeMapFileError
+from triquad_format.file_errors import named
+from triquad_format.file_metadata import (
+    check_agreement,
+    check_features,
+    one_metadata,
+    reader_version,
+)
+from triquad_format.manifest import DIGEST_BYTES, Entry, Manifest, unpack_manifest
+from triquad_format.map_facts import MapFacts
+from triquad_format.map_index import OtherFiles, files_in
 from triquad_format.mcap_records import McapFile, Message, total_limit
 from triquad_format.part import MANIFEST, PREFIX, PREVIEW, TOPICS
 from triquad_format.part_reader import assemble
-from triquad_format.random_access import FileBytes, RandomAccess
+from triquad_format.random_access import open_regular
 from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord
 
 _BLOCK_BYTES = 1 << 20
-
-REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be sound"
 
 
 @dataclass(frozen=True)
@@ -86,7 +76,7 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
         OSError: the file cannot be read.
     """
     if isinstance(source, (str, Path)):
-        with Path(source).open("rb") as stream:
+        with open_regular(Path(source)) as stream:
             return _read(str(source), stream, max_bytes, Path(source).parent)
     return _read(str(getattr(source, "name", "map file")), source, max_bytes, None)
 
@@ -100,28 +90,6 @@ def _read(name: str, stream: BinaryIO, max_bytes: int, folder: Path | None) -> M
             if len(data) > max_bytes:
                 raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
         return _parse(memoryview(data), min(max_bytes, total_limit(len(data))), folder)
-
-
-@contextlib.contextmanager
-def named(name: str) -> Iterator[None]:
-    """Put the file's name and, for damage, the remedy into what is raised."""
-    try:
-        yield
-    except (NoIndexError, UnsupportedMapFileError, TooLargeMapFileError) as error:
-        raise type(error)(f"{name}: {error}") from error
-    except DamagedMapFileError as error:
-        raise DamagedMapFileError(f"{name} is damaged: {error}; {REMEDY}") from error
-    except MapFileError as error:
-        raise MapFileError(f"{name}: {error}") from error
-    except FormatError as error:
-        raise DamagedMapFileError(f"{name} is damaged: {error}; {REMEDY}") from error
-    except MemoryError as error:
-        raise TooLargeMapFileError(f"{name}: the map does not fit into memory") from error
-
-
-def files_in(folder: Path) -> Callable[[FileRef], RandomAccess]:
-    """Opens the other files that hold parts of a map, in the folder of the map file."""
-    return lambda file: FileBytes(folder / file.name)
 
 
 def _parse(data: memoryview, max_bytes: int, folder: Path | None) -> MapFile:
@@ -188,7 +156,7 @@ def _assemble(
         raise DamagedMapFileError(f"{len(messages) - 1} parts, but its manifest lists {len(own)}")
     payloads: dict[Entry, bytes] = {}
     for number, (entry, message) in enumerate(zip(own, messages[:-1], strict=True)):
-        check_part(number, entry, message.topic, message.data)
+        entry.check(number, message.topic, message.data)
         payloads[entry] = message.data
     messages.clear()
     others = OtherFiles(None if folder is None else files_in(folder))

@@ -1,16 +1,23 @@
 """Writing map files: the same record gives the same bytes, and a path gets all of them or none."""
 
-import contextlib
 import hashlib
-import os
-import secrets
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import BinaryIO
 
 from triquad_format import __version__
+from triquad_format.container import (
+    BASE_FILES,
+    ENCODINGS,
+    FORMAT_VERSION,
+    MAX_MAP_BYTES,
+    MAX_PART_BYTES,
+    METADATA_NAME,
+    MIN_READER_VERSION,
+    PREVIEW_ENCODING,
+)
+from triquad_format.durable_file import replacing
 from triquad_format.errors import FormatError
 from triquad_format.evaluator import MapEvaluator
 from triquad_format.manifest import Entry, Manifest, pack_manifest
@@ -34,50 +41,25 @@ from triquad_format.part import (
 from triquad_format.preview import SCHEMA_NAME, Distances, pack_preview, schema_data
 from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord, Region
-
-FORMAT_VERSION = 2
-MIN_READER_VERSION = 2
-METADATA_NAME = "triquad"
-MESSAGE_ENCODING = "msgpack"
-BASE_FILES = "base-files"
-"""The required feature of a file whose parts lie in other files, too."""
-
-MAX_PART_BYTES = 32 * 2**20 - 65_536
-
-MAX_MAP_BYTES = 4 * 2**30
-"""Limit on the size of a map file, and on its chunks' decompressed size together."""
+from triquad_format.written_map import MapFileInfo, WrittenMap
 
 # Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
 # good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
-CHANNELS = (
-    ChannelSpec(MAP, MESSAGE_ENCODING, 3),
-    ChannelSpec(REGION, MESSAGE_ENCODING, 3),
-    ChannelSpec(VERTICES, MESSAGE_ENCODING, 1),
-    ChannelSpec(EVIDENCE, MESSAGE_ENCODING, 12),
-    ChannelSpec(TRAINING, MESSAGE_ENCODING, 1),
-    ChannelSpec(MOMENTS, MESSAGE_ENCODING, 1),
-    ChannelSpec(SAMPLES, MESSAGE_ENCODING, 1),
-    ChannelSpec(PREVIEW, "protobuf", 19, SCHEMA_NAME),
-    ChannelSpec(MANIFEST, MESSAGE_ENCODING, 3),
+_LEVELS = {
+    MAP: 3,
+    REGION: 3,
+    VERTICES: 1,
+    EVIDENCE: 12,
+    TRAINING: 1,
+    MOMENTS: 1,
+    SAMPLES: 1,
+    PREVIEW: 19,
+    MANIFEST: 3,
+}
+_CHANNELS = tuple(
+    ChannelSpec(topic, encoding, _LEVELS[topic], SCHEMA_NAME if topic == PREVIEW else "")
+    for topic, encoding in ENCODINGS.items()
 )
-
-
-@dataclass(frozen=True)
-class MapFileInfo:
-    """What was written."""
-
-    bytes: int
-    sha256: str  # of the whole file, hexadecimal
-    epoch: int
-
-
-@dataclass(frozen=True)
-class WrittenMap:
-    """A file that was written, and what its manifest lists."""
-
-    info: MapFileInfo
-    manifest: Manifest
-    manifest_sha256: bytes
 
 
 def write_map(
@@ -106,7 +88,7 @@ def write_map(
         FormatError: the record is not sound, or exceeds a limit of the format.
         OSError: the file cannot be written.
     """
-    check_dtype(feature_dtype)
+    _check_dtype(feature_dtype)
     if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
         raise FormatError(f"stamp_ns = {stamp_ns} is out of range")
     check_record(record)
@@ -116,8 +98,7 @@ def write_map(
     return write_parts(file, facts, stamp_ns, parts, {}).info
 
 
-def check_dtype(feature_dtype: str) -> None:
-    """Raise :class:`FormatError` unless features may have this dtype."""
+def _check_dtype(feature_dtype: str) -> None:
     if feature_dtype not in FEATURE_DTYPES:
         raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FEATURE_DTYPES}")
 
@@ -182,14 +163,16 @@ class _PartsWriter:
         self._known = known
         self._entries: list[Entry] = []
         self._total = 0
-        schema = SchemaSpec(SCHEMA_NAME, "protobuf", schema_data())
-        self._mcap = McapWriter(stream, f"triquad {__version__}", [schema], CHANNELS)
+        schema = SchemaSpec(SCHEMA_NAME, PREVIEW_ENCODING, schema_data())
+        self._mcap = McapWriter(stream, f"triquad {__version__}", [schema], _CHANNELS)
 
     def write(self, parts: Iterable[Part | Entry]) -> WrittenMap:
         # Where parts of other files are known, some of them are needed as good as always.
         needs_others = any(entry.file is not None for entry in self._known.values())
         self._mcap.add_metadata(METADATA_NAME, self._metadata(needs_others))
-        self._store(pack_map(self._facts))
+        whole = pack_map(self._facts)
+        self._put(whole, self._stamp_ns or 0)
+        self._entries.append(self._changed(whole))
         for part in parts:
             if isinstance(part, Entry):
                 self._entries.append(part)
@@ -210,21 +193,19 @@ class _PartsWriter:
 
     def _add(self, part: Part) -> None:
         """List a part; store it unless another file has it."""
+        entry = self._changed(part)
         known = self._known.get(part.key)
-        digest = hashlib.sha256(part.payload).digest()
-        if known is None or known.sha256 != digest:
-            self._store(part)
-        elif known.file is not None:
-            self._entries.append(known)
-        else:
-            self._store(part, known)
+        if known is not None and known.sha256 == entry.sha256:
+            entry = known
+        if entry.file is None:
+            self._put(part, entry.stamp_ns)
+        self._entries.append(entry)
 
-    def _store(self, part: Part, known: Entry | None = None) -> None:
-        epoch = known.epoch if known else self._facts.epoch
-        stamp_ns = known.stamp_ns if known else self._stamp_ns or 0
+    def _changed(self, part: Part) -> Entry:
+        """The entry of a part that this epoch changed."""
         digest = hashlib.sha256(part.payload).digest()
-        self._put(part, stamp_ns)
-        self._entries.append(Entry(part.key, len(part.payload), digest, epoch, stamp_ns))
+        stamp_ns = self._stamp_ns or 0
+        return Entry(part.key, len(part.payload), digest, self._facts.epoch, stamp_ns)
 
     def _put(self, part: Part, stamp_ns: int) -> None:
         if len(part.payload) > MAX_PART_BYTES:
@@ -258,30 +239,3 @@ def _check_total(size: int) -> None:
         raise FormatError(
             f"the map takes {size} bytes or more; a map file holds at most {MAX_MAP_BYTES}",
         )
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A stream whose bytes replace the file at ``path``, durably, where nothing is raised."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with temporary.open("xb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames in a folder durable, where the system lets folders be synced."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

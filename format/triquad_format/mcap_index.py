@@ -91,12 +91,14 @@ class McapIndex:
 
     def metadata(self, name: str) -> list[dict[str, str]]:
         """The metadata records of a name."""
+        places = [place for indexed, place in self._metadata if indexed == name]
+        if len(places) > 1:
+            raise DamagedMapFileError(f"the metadata {name!r} is there more than once")
         found = []
-        for indexed, place in self._metadata:
-            if indexed == name:
-                if place.length > MAX_METADATA_BYTES:
-                    raise DamagedMapFileError(f"the metadata at byte {place.start} is too long")
-                found.append(metadata_entries(self._record(place, METADATA))[1])
+        for place in places:
+            if place.length > MAX_METADATA_BYTES:
+                raise DamagedMapFileError(f"the metadata at byte {place.start} is too long")
+            found.append(metadata_entries(self._record(place, METADATA))[1])
         return found
 
     def _summary(self) -> memoryview:
@@ -116,7 +118,7 @@ class McapIndex:
         if not 0 <= length <= MAX_SUMMARY_BYTES:
             raise DamagedMapFileError(f"its footer names byte {start} as the summary's start")
         summary = self._source.read(start, length)
-        check_crc("summary", summary + end[: FOOTER_BYTES - 4], crc)
+        check_crc("the summary", summary + end[: FOOTER_BYTES - 4], crc)
         return memoryview(summary)
 
     def _note(self, record: Record) -> None:

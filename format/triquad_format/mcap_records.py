@@ -177,7 +177,7 @@ def _data_section(data: memoryview) -> list[Record]:
     following = walk(data, len(MAGIC))
     for record in following:
         if record.opcode == DATA_END:
-            check_crc("data section", data[: record.start], Fields(record).number(4))
+            check_crc("the data section", data[: record.start], Fields(record).number(4))
             _check_tail(data, record.end, following)
             return records
         if record.opcode == FOOTER:
@@ -202,13 +202,13 @@ def _check_tail(data: memoryview, summary_start: int, following: Iterator[Record
     declared_start, _, crc = fields.number(8), fields.number(8), fields.number(4)
     if declared_start not in (0, summary_start):
         raise DamagedMapFileError(f"its footer names byte {declared_start} as the summary's start")
-    check_crc("summary", data[summary_start : footer.end - 4], crc)
+    check_crc("the summary", data[summary_start : footer.end - 4], crc)
 
 
 def check_crc(name: str, data: memoryview | bytes, declared: int) -> None:
     """Compare a checksum; writers that compute none declare 0."""
     if declared and zlib.crc32(data) != declared:
-        raise DamagedMapFileError(f"the {name} at {len(data)} bytes fails its checksum")
+        raise DamagedMapFileError(f"{name} fails its checksum")
 
 
 def metadata_entries(record: Record) -> tuple[str, dict[str, str]]:

@@ -32,8 +32,6 @@ from mcap.records import (
 
 from triquad_format.mcap_records import MAGIC, chunk_limit
 
-_FOOTER_FIELDS = 20
-
 
 @dataclass(frozen=True)
 class ChannelSpec:
@@ -78,26 +76,8 @@ class McapWriter:
         self._crc = 0
         self.size = 0
         self._summary = _Summary()
-        numbers = {schema.name: i + 1 for i, schema in enumerate(schemas)}
-        self._schemas = [
-            Schema(
-                id=numbers[schema.name],
-                data=schema.data,
-                encoding=schema.encoding,
-                name=schema.name,
-            )
-            for schema in schemas
-        ]
-        self._channels = [
-            Channel(
-                id=i + 1,
-                topic=spec.topic,
-                message_encoding=spec.encoding,
-                metadata={},
-                schema_id=numbers.get(spec.schema, 0),
-            )
-            for i, spec in enumerate(channels)
-        ]
+        self._schemas = _schema_records(schemas)
+        self._channels = _channel_records(channels, self._schemas)
         self._specs = {spec.topic: (i + 1, spec) for i, spec in enumerate(channels)}
         self._write(MAGIC)
         self._record(Header("", library))
@@ -121,46 +101,12 @@ class McapWriter:
         ``seams`` are offsets in the payload where bytes of another kind begin.
         """
         number, spec = self._specs[topic]
-        message = _packed(
-            Message(
-                channel_id=number,
-                log_time=time_ns,
-                data=payload,
-                publish_time=time_ns,
-                sequence=0,
-            )
-        )
-        shift = len(message) - len(payload)
-        stored = _compress(message, [shift + seam for seam in seams], spec.level)
-        # What shrinks by more than readers believe is not compressed.
-        shrinks = len(stored) < len(message) <= chunk_limit(len(stored))
-        compression = "zstd" if shrinks else ""
+        chunk = _chunk(number, payload, time_ns, seams, spec.level)
         start = self.size
-        self._record(
-            Chunk(
-                compression=compression,
-                data=stored if shrinks else message,
-                message_end_time=time_ns,
-                message_start_time=time_ns,
-                uncompressed_crc=zlib.crc32(message),
-                uncompressed_size=len(message),
-            )
-        )
+        self._record(chunk)
         index_start = self.size
         self._record(MessageIndex(number, [(time_ns, 0)]))
-        self._summary.chunks.append(
-            ChunkIndex(
-                chunk_length=index_start - start,
-                chunk_start_offset=start,
-                compression=compression,
-                compressed_size=len(stored if shrinks else message),
-                message_end_time=time_ns,
-                message_index_length=self.size - index_start,
-                message_index_offsets={number: index_start},
-                message_start_time=time_ns,
-                uncompressed_size=len(message),
-            )
-        )
+        self._summary.chunks.append(_chunk_index(chunk, number, (start, index_start, self.size)))
         self._summary.counts[number] = self._summary.counts.get(number, 0) + 1
 
     def finish(self) -> None:
@@ -215,6 +161,68 @@ class McapWriter:
         self._digest.update(data)
         self._crc = zlib.crc32(data, self._crc)
         self.size += len(data)
+
+
+def _schema_records(specs: Sequence[SchemaSpec]) -> list[Schema]:
+    return [
+        Schema(id=number, data=spec.data, encoding=spec.encoding, name=spec.name)
+        for number, spec in enumerate(specs, start=1)
+    ]
+
+
+def _channel_records(specs: Sequence[ChannelSpec], schemas: Sequence[Schema]) -> list[Channel]:
+    numbers = {schema.name: schema.id for schema in schemas}
+    return [
+        Channel(
+            id=number,
+            topic=spec.topic,
+            message_encoding=spec.encoding,
+            metadata={},
+            schema_id=numbers.get(spec.schema, 0),
+        )
+        for number, spec in enumerate(specs, start=1)
+    ]
+
+
+def _chunk(channel: int, payload: bytes, time_ns: int, seams: Sequence[int], level: int) -> Chunk:
+    """A chunk of one message."""
+    message = _packed(
+        Message(
+            channel_id=channel,
+            log_time=time_ns,
+            data=payload,
+            publish_time=time_ns,
+            sequence=0,
+        )
+    )
+    shift = len(message) - len(payload)
+    stored = _compress(message, [shift + seam for seam in seams], level)
+    # What shrinks by more than readers believe is not compressed.
+    shrinks = len(stored) < len(message) <= chunk_limit(len(stored))
+    return Chunk(
+        compression="zstd" if shrinks else "",
+        data=stored if shrinks else message,
+        message_end_time=time_ns,
+        message_start_time=time_ns,
+        uncompressed_crc=zlib.crc32(message),
+        uncompressed_size=len(message),
+    )
+
+
+def _chunk_index(chunk: Chunk, channel: int, places: tuple[int, int, int]) -> ChunkIndex:
+    """What the summary tells of a chunk; ``places`` are where it, its index and the next begin."""
+    start, index_start, end = places
+    return ChunkIndex(
+        chunk_length=index_start - start,
+        chunk_start_offset=start,
+        compression=chunk.compression,
+        compressed_size=len(chunk.data),
+        message_end_time=chunk.message_end_time,
+        message_index_length=end - index_start,
+        message_index_offsets={channel: index_start},
+        message_start_time=chunk.message_start_time,
+        uncompressed_size=chunk.uncompressed_size,
+    )
 
 
 def _packed(record: McapRecord) -> bytes:

@@ -17,10 +17,8 @@ PREVIEW = "/preview/mesh"
 
 FIELD_TOPICS = (REGION, VERTICES, EVIDENCE)
 TRAINING_TOPICS = (TRAINING, MOMENTS, SAMPLES)
-TOPICS = (MAP, *FIELD_TOPICS, *TRAINING_TOPICS, MANIFEST)
-
-CELL_LEAVES_LOG2 = 8
-"""Vertices and evidence are split into squares and cubes of ``2**8`` leaves (51.2 m) a side."""
+REGION_TOPICS = (*FIELD_TOPICS, *TRAINING_TOPICS)
+TOPICS = (MAP, *REGION_TOPICS, MANIFEST)
 
 NO_REGION: RegionIndex = (0, 0, 0)
 

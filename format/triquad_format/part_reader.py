@@ -7,20 +7,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_format.cell import cube_shift, square_shift
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.field_settings import FieldSettings
 from triquad_format.manifest import Entry, Manifest
 from triquad_format.map_facts import check_map_part
-from triquad_format.map_parts import SAMPLES_PER_PART, cube_shift, square_shift
+from triquad_format.map_parts import SAMPLES_PER_PART
 from triquad_format.part import (
     EVIDENCE,
-    FIELD_TOPICS,
     MAP,
     MOMENTS,
     REGION,
+    REGION_TOPICS,
     SAMPLES,
     TRAINING,
-    TRAINING_TOPICS,
     VERTICES,
     PartKey,
 )
@@ -28,6 +28,7 @@ from triquad_format.part_body import PartBody
 from triquad_format.region import (
     AXES,
     BLOCK_BYTES,
+    MLP_LAYERS,
     Evidence,
     MapRecord,
     Mlp,
@@ -37,8 +38,6 @@ from triquad_format.region import (
     VertexTable,
 )
 from triquad_format.shuffle import unshuffle
-
-LAYERS = 3
 
 Columns = tuple[NDArray[Any], ...]
 """Columns of equal length: some rows of a table."""
@@ -187,7 +186,7 @@ def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRec
     for entry in manifest.entries:
         if entry.key.topic == MAP:
             check_map_part(payload_of(entry), manifest.facts)
-        elif entry.key.topic in (*FIELD_TOPICS, *TRAINING_TOPICS):
+        elif entry.key.topic in REGION_TOPICS:
             by_region[entry.key.region].append(entry)
     regions = []
     for index, entries in by_region.items():
@@ -220,15 +219,15 @@ def _joined(topic: str, portions: Iterable[Columns], empty: Columns) -> Columns:
 
 
 def _read_head(body: PartBody) -> _Head:
-    mlp = Mlp(body.arrays("weights", LAYERS), body.arrays("biases", LAYERS))
+    mlp = Mlp(body.arrays("weights", MLP_LAYERS), body.arrays("biases", MLP_LAYERS))
     scales = body.array("scales", "<f4", None).tolist()
     return _Head(body.array("frequencies", "<f4", None), mlp, scales)
 
 
 def _read_training_head(body: PartBody) -> _TrainingHead:
     return _TrainingHead(
-        body.arrays("mlp_means", 2 * LAYERS),
-        body.arrays("mlp_variances", 2 * LAYERS),
+        body.arrays("mlp_means", 2 * MLP_LAYERS),
+        body.arrays("mlp_variances", 2 * MLP_LAYERS),
         body.count("mlp_steps"),
         body.count("visits_owed"),
         body.count("samples"),

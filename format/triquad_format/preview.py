@@ -13,14 +13,14 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from numpy.typing import NDArray
 
 from triquad_format import morton
+from triquad_format.evidence_voxels import seen_voxels
 from triquad_format.field_settings import FieldSettings
 from triquad_format.map_facts import FRAME_ID
 from triquad_format.part import PREVIEW, Part, PartKey
-from triquad_format.region import Evidence, Region, region_centre
-from triquad_format.seen_voxels import seen_voxels
+from triquad_format.region import Evidence, Region, region_corner
 
 SCHEMA_NAME = "foxglove.SceneUpdate"
-CELL_LEAVES = 2
+NET_LEAVES = 2
 """Side of the cells in which the surface is looked for, in leaves: 0.4 m."""
 
 CLUSTER_CELLS = 3
@@ -87,10 +87,10 @@ def _coarse_mesh(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices [V, 3], map frame, and faces [F, 3]: surface nets (Gibson 1998), clustered."""
     # By codes: numpy holds Python's lock while it sorts rows.
-    seen = morton.encode(seen_voxels(evidence, evidence.surface) // CELL_LEAVES)
+    seen = morton.encode(seen_voxels(evidence, evidence.surface) // NET_LEAVES)
     cells = morton.decode(np.unique(seen), 3)
-    side_m = settings.leaf_m * CELL_LEAVES
-    origin = region_centre(settings, index) - settings.region_side_m / 2
+    side_m = settings.leaf_m * NET_LEAVES
+    origin = region_corner(settings, index)
     corners = morton.encode(cells[:, None] + _CORNERS)  # [C, 8]
     codes, where = np.unique(corners, return_inverse=True)
     values = distances(morton.decode(codes, 3) * side_m + origin)

@@ -1,10 +1,12 @@
 """Bytes that can be read from any place: of a file, of memory, or of a file elsewhere."""
 
+import io
 import os
+import stat
 from pathlib import Path
 from typing import Protocol
 
-from triquad_format.errors import DamagedMapFileError
+from triquad_format.errors import DamagedMapFileError, MapFileError
 
 
 class RandomAccess(Protocol):
@@ -27,12 +29,26 @@ class RandomAccess(Protocol):
         ...
 
 
+def open_regular(path: Path) -> io.FileIO:
+    """A file for reading; a pipe or device, which could keep its reader waiting, is refused.
+
+    Raises:
+        MapFileError: it is no regular file.
+        OSError: it cannot be opened.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise MapFileError(f"{path} is not a regular file")
+    return io.FileIO(descriptor)
+
+
 class FileBytes:
     """The bytes of a file; they stay readable while it is open, even where it is deleted."""
 
     def __init__(self, path: Path) -> None:
         self.name = str(path)
-        self._stream = path.open("rb", buffering=0)
+        self._stream = open_regular(path)
         self.size = os.fstat(self._stream.fileno()).st_size
         self.bytes_read = 0
 

@@ -16,6 +16,7 @@ from triquad_format.region import (
     BLOCK_BYTES,
     BLOCK_VOXELS,
     MAX_INTEGER,
+    MLP_LAYERS,
     Evidence,
     MapRecord,
     Mlp,
@@ -66,8 +67,8 @@ def _mlp_shapes(settings: FieldSettings) -> list[tuple[int, ...]]:
 
 
 def _check_mlp(settings: FieldSettings, mlp: Mlp) -> None:
-    if len(mlp.weights) != 3 or len(mlp.biases) != 3:
-        raise FormatError("the MLP does not have three layers")
+    if len(mlp.weights) != MLP_LAYERS or len(mlp.biases) != MLP_LAYERS:
+        raise FormatError(f"the MLP does not have {MLP_LAYERS} layers")
     _check_arrays("mlp", [*mlp.weights, *mlp.biases], _mlp_shapes(settings))
 
 

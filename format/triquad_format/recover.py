@@ -10,16 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from triquad_format import morton
-from triquad_format.crop import masked, voxel_mask
+from triquad_format.cell import cells_at
+from triquad_format.container import MAX_MAP_BYTES
 from triquad_format.errors import FormatError, MapFileError
+from triquad_format.evidence_voxels import masked, seen_voxels, voxels_felt
 from triquad_format.field_settings import FieldSettings
-from triquad_format.mapfile_reader import named
-from triquad_format.mapfile_writer import MAX_MAP_BYTES
+from triquad_format.file_errors import named
+from triquad_format.leaf_box import LeafBox
 from triquad_format.part import (
-    CELL_LEAVES_LOG2,
     FIELD_TOPICS,
     REGION,
+    REGION_TOPICS,
     TRAINING,
     TRAINING_TOPICS,
     VERTICES,
@@ -34,13 +35,10 @@ from triquad_format.region import (
     MapRecord,
     Region,
     RegionIndex,
+    leaf_coordinates,
     region_centre,
-    voxel_coordinates,
 )
 from triquad_format.salvage import Salvage, read_messages, salvage
-from triquad_format.seen_voxels import seen_voxels
-
-_STATUS_LEAVES = 0.5  # so far beyond its sides a voxel with seen surface is felt
 
 
 def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> Recovery:
@@ -79,7 +77,7 @@ def _recover(found: Salvage) -> Recovery:
         if region is None:
             lost.add(PartKey(REGION, index))
             continue
-        if found.listed is None:
+        if found.parts_listed is None:
             missing |= _missing_squares(settings, region, payloads)
         lost |= {key for key in missing if key.topic in FIELD_TOPICS}
         had_training = any(key.topic in TRAINING_TOPICS for key in (*payloads, *missing))
@@ -89,7 +87,7 @@ def _recover(found: Salvage) -> Recovery:
     losses = tuple(loss_of(key, settings) for key in sorted(lost, key=_place))
     regions = [_silenced(settings, region, losses) for region in regions]
     record = MapRecord(found.facts.name, found.facts.epoch, settings, tuple(regions))
-    return Recovery(record, losses, len(found.payloads), found.listed, found.stamp_ns)
+    return Recovery(record, losses, len(found.payloads), found.parts_listed, found.stamp_ns)
 
 
 def _place(key: PartKey) -> tuple[RegionIndex, PartKey]:
@@ -103,7 +101,7 @@ def _region(
     missing: set[PartKey],
 ) -> Region | None:
     """The region of these parts, with its training state where that is complete."""
-    choices = [(*FIELD_TOPICS, *TRAINING_TOPICS), FIELD_TOPICS]
+    choices = [REGION_TOPICS, FIELD_TOPICS]
     if any(key.topic in (VERTICES, *TRAINING_TOPICS) for key in missing):
         choices = [FIELD_TOPICS]
     for topics in choices:
@@ -132,8 +130,8 @@ def _missing_squares(
         shift = settings.depth - table.level
         nodes = np.unique(voxels[:, list(AXES[table.plane])] >> shift, axis=0)
         for corner in np.ndindex(2, 2):
-            squares = np.unique(morton.encode((nodes + corner) << shift >> CELL_LEAVES_LOG2))
-            needed |= {PartKey(VERTICES, region.index, table.plane, c) for c in squares.tolist()}
+            squares = cells_at((nodes + corner) << shift)
+            needed |= {PartKey(VERTICES, region.index, table.plane, cell) for cell in squares}
     return needed - payloads.keys()
 
 
@@ -144,7 +142,6 @@ def _silenced(settings: FieldSettings, region: Region, losses: Iterable[Loss]) -
     for loss in losses:
         if loss.key.topic == VERTICES and loss.meets(centre, settings.region_side_m):
             corners = np.stack([loss.minimum, loss.maximum])
-            low, high = voxel_coordinates(settings, centre, corners)
-            mask = voxel_mask(evidence.codes, low - _STATUS_LEAVES, high + _STATUS_LEAVES)
-            evidence = masked(evidence, ~mask)
+            box = LeafBox(*leaf_coordinates(settings, corners - centre))
+            evidence = masked(evidence, ~voxels_felt(evidence, box))
     return dataclasses.replace(region, evidence=evidence)

@@ -13,10 +13,10 @@ from triquad_format.map_facts import unpack_facts
 from triquad_format.mcap_records import Message
 from triquad_format.part import (
     EVIDENCE,
-    FIELD_TOPICS,
     MANIFEST,
     MAP,
     REGION,
+    REGION_TOPICS,
     TRAINING,
     TRAINING_TOPICS,
     VERTICES,
@@ -27,8 +27,6 @@ from triquad_format.record_check import check_record
 from triquad_format.recovery import Loss, Recovery, loss_of
 from triquad_format.region import MapRecord, Region, RegionIndex
 from triquad_format.version_1 import PartCursor, unpack_region
-
-_TOPICS = (*FIELD_TOPICS, *TRAINING_TOPICS)
 
 
 def is_version_1(messages: list[Message]) -> bool:
@@ -46,7 +44,7 @@ def recover_version_1(messages: list[Message]) -> Recovery:
     facts = unpack_facts(PartBody(MAP, next(m.data for m in messages if m.topic == MAP)))
     by_region: dict[RegionIndex, list[Message]] = {}
     for message in messages:
-        if message.topic in _TOPICS:
+        if message.topic in REGION_TOPICS:
             index = PartBody(message.topic, message.data).index()
             by_region.setdefault(index, []).append(message)
     regions: list[Region] = []
@@ -99,7 +97,7 @@ def _listed(messages: list[Message]) -> int | None:
         if message.topic == MANIFEST:
             try:
                 parts = PartBody(MANIFEST, message.data, MAX_ENTRIES).value("parts", list)
-                return sum(part["topic"] in _TOPICS for part in parts)
+                return sum(part["topic"] in REGION_TOPICS for part in parts)
             except (MapFileError, TypeError, KeyError):
                 return None
     return None

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format import morton
+from triquad_format.cell import extent, vertex_reach
 from triquad_format.field_settings import FieldSettings
-from triquad_format.part import CELL_LEAVES_LOG2, EVIDENCE, VERTICES, PartKey
-from triquad_format.region import AXES, MapRecord, region_centre
+from triquad_format.part import VERTICES, PartKey
+from triquad_format.region import AXES, MapRecord, region_corner
 
 
 @dataclass(frozen=True)
@@ -36,28 +36,25 @@ class Recovery:
 
     record: MapRecord
     losses: tuple[Loss, ...]  # those that are known
-    intact: int  # parts of regions that could be read
-    parts: int | None  # how many there were; None: not known, for the manifest is lost
+    parts_intact: int  # parts of regions that could be read
+    parts_listed: int | None  # how many there were; None: not known, for the manifest is lost
     stamp_ns: int = 0  # when the epoch was written, nanoseconds since 1970; 0 if not known
 
     @property
     def complete(self) -> bool:
         """Whether nothing was lost."""
-        return not self.losses and self.intact == self.parts
+        return not self.losses and self.parts_intact == self.parts_listed
 
 
 def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
     """The loss of a part."""
-    low = np.zeros(3)
-    high = np.full(3, float(1 << settings.depth))
-    axes = {VERTICES: list(AXES[key.plane]), EVIDENCE: [0, 1, 2]}.get(key.topic, [])
-    if axes:
-        cell = morton.decode(np.array([key.cell]), len(axes))[0]
-        low[axes] = cell << CELL_LEAVES_LOG2
-        high[axes] = np.minimum((cell + 1) << CELL_LEAVES_LOG2, 1 << settings.depth)
+    box = extent(settings, key)
     if key.topic == VERTICES:
         # A vertex is felt as far as the side of its level's nodes; those at the upper border of a
         # square belong to the next.
-        low[axes] -= 1 << (settings.feature_levels - 1)
-    corner = region_centre(settings, key.region) - settings.region_side_m / 2
-    return Loss(key, corner + low * settings.leaf_m, corner + high * settings.leaf_m)
+        box.low[list(AXES[key.plane])] -= vertex_reach(settings)
+    # What is seen of a voxel is felt beside it, too.
+    box.low[:] -= 1
+    box.high[:] += 1
+    corner = region_corner(settings, key.region)
+    return Loss(key, corner + box.low * settings.leaf_m, corner + box.high * settings.leaf_m)

@@ -11,6 +11,7 @@ cube of 8 x 8 x 8 voxels.
 """
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,11 @@ BLOCK_BYTES = BLOCK_VOXELS**3 // 8
 MAX_INTEGER = 32_639
 """Largest integer feature: its two bytes, both signed, reach no further."""
 
+MLP_LAYERS = 3
+
 RegionIndex = tuple[int, int, int]
+
+_Float = TypeVar("_Float", bound=np.floating)
 
 
 @dataclass(frozen=True)
@@ -116,10 +121,11 @@ def region_centre(settings: FieldSettings, index: RegionIndex) -> NDArray[np.flo
     return np.asarray(index, np.float64) * settings.region_pitch_m
 
 
-def voxel_coordinates(
-    settings: FieldSettings,
-    centre: NDArray[np.float64],
-    points: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Points [N, 3] of the map frame in evidence voxels of the region at ``centre`` [3]."""
-    return (points - centre) / settings.leaf_m + (1 << (settings.depth - 1))
+def region_corner(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:
+    """Least corner [3] of a region's cube in the map frame, metres."""
+    return region_centre(settings, index) - settings.region_side_m / 2
+
+
+def leaf_coordinates(settings: FieldSettings, offset: NDArray[_Float]) -> NDArray[_Float]:
+    """Leaf coordinates [N, 3] at ``offset`` [N, 3] from a region's centre, metres."""
+    return np.asarray(offset / settings.leaf_m + (1 << (settings.depth - 1)), offset.dtype)

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,23 +13,15 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
+from triquad_format.file_metadata import reader_version
 from triquad_format.manifest import Manifest, unpack_manifest
 from triquad_format.map_facts import MapFacts, unpack_facts
-from triquad_format.map_index import reader_version
+from triquad_format.map_index import file_in
 from triquad_format.mcap_records import Message, total_limit
-from triquad_format.part import (
-    FIELD_TOPICS,
-    MANIFEST,
-    MAP,
-    REGION,
-    TRAINING,
-    TRAINING_TOPICS,
-    PartKey,
-)
+from triquad_format.part import MANIFEST, MAP, REGION, REGION_TOPICS, TRAINING, PartKey
 from triquad_format.part_body import PartBody
+from triquad_format.random_access import FileBytes
 from triquad_format.region import RegionIndex
-
-_TOPICS = (*FIELD_TOPICS, *TRAINING_TOPICS)
 
 
 @dataclass(frozen=True)
@@ -38,7 +31,7 @@ class Salvage:
     facts: MapFacts
     payloads: Mapping[PartKey, bytes]
     missing: frozenset[PartKey]  # as far as the manifest tells
-    listed: int | None  # parts in the manifest; None: it is lost
+    parts_listed: int | None  # in the manifest; None: it is lost
     stamp_ns: int  # when the epoch was written, nanoseconds since 1970; 0 if not known
 
     @property
@@ -63,10 +56,11 @@ def read_messages(path: Path, max_bytes: int) -> Iterator[Message]:
         TooLargeMapFileError: it exceeds ``max_bytes``.
         OSError: it cannot be read.
     """
-    size = path.stat().st_size
-    if size > max_bytes:
-        raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
-    data = path.read_bytes()
+    with closing(FileBytes(path)) as file:
+        size = file.size
+        if size > max_bytes:
+            raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
+        data = file.read(0, size)
     _refuse_newer(found_metadata(data))
     return intact_messages(data, min(max_bytes, total_limit(size)))
 
@@ -92,7 +86,11 @@ def _refuse_newer(metadata: dict[str, str]) -> None:
     try:
         reader_version(metadata)
     except UnsupportedMapFileError:
-        if metadata.get("format_version", "") >= metadata.get("min_reader_version", ""):
+        follows, needed = (
+            metadata.get(key, "") for key in ("format_version", "min_reader_version")
+        )
+        # Else the metadata is damaged itself.
+        if follows.isdecimal() and needed.isdecimal() and int(follows) >= int(needed):
             raise
     except MapFileError:
         return  # damaged, too: the parts will tell
@@ -122,12 +120,12 @@ def _as_listed(
     manifest: Manifest, messages: list[Message], folder: Path, max_bytes: int
 ) -> Salvage:
     """The parts that a manifest lists, known by their digests."""
-    entries = [entry for entry in manifest.entries if entry.key.topic in _TOPICS]
+    entries = [entry for entry in manifest.entries if entry.key.topic in REGION_TOPICS]
     wanted = {entry.sha256 for entry in entries}
     found = _by_digest(messages, wanted)
     for file in manifest.files:
         try:
-            found |= _by_digest(read_messages(folder / file.name, max_bytes), wanted)
+            found |= _by_digest(read_messages(file_in(folder, file.name), max_bytes), wanted)
         except (FormatError, OSError):
             continue
     payloads = {e.key: found[e.sha256] for e in entries if e.sha256 in found}
@@ -142,7 +140,7 @@ def _by_digest(messages: Iterable[Message], wanted: set[bytes]) -> dict[bytes, b
 
 def _own_key(message: Message) -> PartKey | None:
     """What a part says that it is of."""
-    if message.topic not in _TOPICS:
+    if message.topic not in REGION_TOPICS:
         return None
     try:
         body = PartBody(message.topic, message.data)

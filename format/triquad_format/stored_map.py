@@ -8,25 +8,24 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from triquad_format import morton
-from triquad_format.crop import SLACK_LEAVES, LeafBox, check_box, leaf_box
+from triquad_format.cell import cells_near, extent, vertex_reach
 from triquad_format.evaluator import Answer, MapEvaluator, check_points
+from triquad_format.file_errors import named
+from triquad_format.leaf_box import SLACK_LEAVES, LeafBox, check_box, leaf_box, whole_region
 from triquad_format.manifest import Entry, Manifest
-from triquad_format.map_index import MapIndex, OpenFile
-from triquad_format.mapfile_reader import files_in, named
+from triquad_format.map_index import MapIndex, OpenFile, files_in
 from triquad_format.part import (
-    CELL_LEAVES_LOG2,
     EVIDENCE,
     FIELD_TOPICS,
     REGION,
-    TRAINING_TOPICS,
+    REGION_TOPICS,
     VERTICES,
     PartKey,
 )
 from triquad_format.part_reader import RegionParts, assemble
 from triquad_format.random_access import FileBytes, RandomAccess
 from triquad_format.record_check import check_record
-from triquad_format.region import AXES, MapRecord, RegionIndex, region_centre
+from triquad_format.region import AXES, MapRecord, RegionIndex, leaf_coordinates, region_centre
 
 
 class StoredMap:
@@ -103,7 +102,7 @@ class StoredMap:
         Raises:
             MapFileError: a part is damaged.
         """
-        topics = (*FIELD_TOPICS, *TRAINING_TOPICS) if training else FIELD_TOPICS
+        topics = REGION_TOPICS if training else FIELD_TOPICS
         return self._assembled(
             entry for entry in self.manifest.entries if entry.key.topic in topics
         )
@@ -128,7 +127,7 @@ class StoredMap:
             entry
             for entry in self.manifest.entries
             if entry.key.topic in FIELD_TOPICS
-            and boxes[entry.key.region].meets_region(self._settings)
+            and boxes[entry.key.region].meets(whole_region(self._settings))
             and self._reaches(entry.key, boxes[entry.key.region])
         )
 
@@ -141,37 +140,25 @@ class StoredMap:
 
     def _reaches(self, key: PartKey, box: LeafBox) -> bool:
         """Whether a part holds something that answers in a box."""
-        if key.topic == REGION:
-            return True
-        axes = list(AXES[key.plane]) if key.topic == VERTICES else [0, 1, 2]
-        slack = self._vertex_reach if key.topic == VERTICES else 1
-        cell = morton.decode(np.array([key.cell]), len(axes))[0]
-        first = cell << CELL_LEAVES_LOG2
-        last = (cell + 1) << CELL_LEAVES_LOG2
-        return bool(
-            ((first - slack <= box.high[axes]) & (last + slack >= box.low[axes])).all(),
-        )
-
-    @property
-    def _vertex_reach(self) -> int:
-        """How far a vertex of the coarsest level is felt, leaves."""
-        return 1 << (self._settings.feature_levels - 1)
+        slack = vertex_reach(self._settings) if key.topic == VERTICES else 1
+        return box.meets(extent(self._settings, key), slack)
 
     def _needed_at(self, points: NDArray[np.float64]) -> set[PartKey]:
         """Parts that answers at points [N, 3] hang on."""
         needed: set[PartKey] = set()
         half = self._settings.region_side_m / 2
+        reach = vertex_reach(self._settings) + SLACK_LEAVES
         for index in self._regions:
             offset = points - region_centre(self._settings, index)
             offset = offset[(np.abs(offset) < half).all(axis=1)]
             if not len(offset):
                 continue
             needed.add(PartKey(REGION, index))
-            leaves = offset / self._settings.leaf_m + (1 << (self._settings.depth - 1))
+            leaves = leaf_coordinates(self._settings, offset)
             for plane, axes in enumerate(AXES):
-                cells = _cells(leaves[:, axes], self._vertex_reach + SLACK_LEAVES)
+                cells = cells_near(leaves[:, axes], reach)
                 needed |= {PartKey(VERTICES, index, plane, cell) for cell in cells}
-            needed |= {PartKey(EVIDENCE, index, 0, cell) for cell in _cells(leaves, 1)}
+            needed |= {PartKey(EVIDENCE, index, 0, cell) for cell in cells_near(leaves, 1)}
         return needed & self._by_key.keys()
 
     def _load(self, keys: set[PartKey]) -> None:
@@ -202,14 +189,3 @@ class StoredMap:
         loaded = [self._parts[index] for index in self._regions if index in self._parts]
         regions = tuple(parts.region() for parts in loaded)
         return MapRecord(facts.name, facts.epoch, facts.settings, regions)
-
-
-def _cells(leaves: NDArray[np.float64], reach: float) -> list[int]:
-    """Morton codes of the squares or cubes within ``reach`` leaves of points [N, D]."""
-    dimensions = leaves.shape[1]
-    codes = []
-    for corner in np.ndindex(*(2,) * dimensions):
-        near = np.floor(leaves + (2 * np.array(corner) - 1) * reach).astype(np.int64)
-        codes.append(morton.encode(np.maximum(near, 0) >> CELL_LEAVES_LOG2))
-    cells: list[int] = np.unique(np.concatenate(codes)).tolist()
-    return cells

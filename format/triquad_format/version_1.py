@@ -29,6 +29,7 @@ from triquad_format.part_body import MAX_ITEMS, PartBody
 from triquad_format.region import (
     AXES,
     BLOCK_BYTES,
+    MLP_LAYERS,
     Evidence,
     MapRecord,
     Mlp,
@@ -40,7 +41,6 @@ from triquad_format.region import (
 from triquad_format.shuffle import unshuffle
 
 MAX_PART_BYTES = MAX_CHUNK_BYTES - 65_536
-_LAYERS = 3
 
 _Columns = tuple[NDArray[Any], ...]
 """What one part, or all parts of a table together, hold of it: columns of equal length."""
@@ -145,7 +145,7 @@ def unpack_region(
     return Region(
         index=index,
         frequencies=body.array("frequencies", "<f4", None),
-        mlp=Mlp(body.arrays("weights", _LAYERS), body.arrays("biases", _LAYERS)),
+        mlp=Mlp(body.arrays("weights", MLP_LAYERS), body.arrays("biases", MLP_LAYERS)),
         tables=tables,
         evidence=seen,
         training=state,
@@ -232,8 +232,8 @@ def _unpack_training(
         table_means=tuple(columns[0] for columns in moments),
         table_variances=tuple(columns[1] for columns in moments),
         table_steps=tuple(columns[2] for columns in moments),
-        mlp_means=body.arrays("mlp_means", 2 * _LAYERS),
-        mlp_variances=body.arrays("mlp_variances", 2 * _LAYERS),
+        mlp_means=body.arrays("mlp_means", 2 * MLP_LAYERS),
+        mlp_variances=body.arrays("mlp_variances", 2 * MLP_LAYERS),
         mlp_steps=body.count("mlp_steps"),
         sample_points=points,
         sample_labels=labels,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from triquad_format.messages import CheckpointInfo, CheckpointRequest
 
-from triquad_server.errors import RequestError, StoreError
+from triquad_server.errors import RequestError, StoreBaseError, StoreError
 from triquad_server.mapper_thread import MapperThread
 from triquad_server.store import Store
 from triquad_server.threads import PATIENCE, be_patient
@@ -104,9 +104,8 @@ class Checkpoints:
         last = self.last
         if last is not None and last.epoch == epoch and Path(last.path).exists():
             return last
-        base = self._store.base_epoch
         try:
-            info = self._store.write(self._mapper.call(lambda m: m.changes_since(base)))
+            info = self._write_changes(self._store)
         except StoreError as error:
             self.error = str(error)
             _log.error("%s", error)
@@ -115,12 +114,27 @@ class Checkpoints:
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
 
+    def _write_changes(self, store: Store) -> CheckpointInfo:
+        """What changed since the last checkpoint; all of the map where that was damaged since."""
+        base = store.base_epoch
+        try:
+            return store.write(self._mapper.call(lambda mapper: mapper.changes_since(base)))
+        except StoreBaseError as error:
+            _log.warning("%s; all of the map is written instead", error)
+            return store.write(self._mapper.call(lambda mapper: mapper.changes_since(None)))
+
     def _fold(self) -> None:
         """Put old checkpoints together, where there are many."""
         assert self._store is not None
         try:
             info = self._store.fold(self._interrupted)
+        except StoreBaseError as error:
+            _log.warning("%s; all of the map is written instead", error)
+            self.last = None
+            self._write_if_changed()
+            return
         except StoreError as error:
+            self.error = str(error)
             _log.error("%s", error)
             return
         except Exception:

@@ -2,6 +2,7 @@
 
 import io
 import threading
+import time
 from collections import OrderedDict
 from dataclasses import dataclass
 
@@ -45,7 +46,8 @@ class MapDownloads:
             changes = self._mapper.call(lambda mapper: mapper.changes_since(None))
             record, newest = changes.record, changes.epoch
         buffer = io.BytesIO()
-        written = write_map(record, buffer, distances=newest.distances)
+        stamp_ns = min(max(time.time_ns(), 0), 2**63 - 1)
+        written = write_map(record, buffer, stamp_ns=stamp_ns, distances=newest.distances)
         info = MapInfo(written.epoch, written.bytes, written.sha256, CHUNK_BYTES)
         with self._lock:
             self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())

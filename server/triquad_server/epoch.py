@@ -10,8 +10,8 @@ from triquad_format.region import (
     BLOCK_VOXELS,
     MapRecord,
     RegionIndex,
+    leaf_coordinates,
     region_centre,
-    voxel_coordinates,
 )
 from triquad_format.status import Status
 
@@ -207,7 +207,7 @@ class Epoch:
         status = np.full(len(points), Status.UNKNOWN, np.uint8)
         for owned in groups:
             region = self.frozen_regions[owned.region]
-            voxels = voxel_coordinates(self._settings, region.centre, points[owned.points])
+            voxels = leaf_coordinates(self._settings, points[owned.points] - region.centre)
             status[owned.points] = region.evidence.status(voxels, reach)
         return status
 

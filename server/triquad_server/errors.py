@@ -15,6 +15,10 @@ class StoreError(ServerError):
     """Checkpoints cannot be read or written."""
 
 
+class StoreBaseError(StoreError):
+    """Files that hold parts of the newest checkpoint are damaged: a complete one is due."""
+
+
 class MapperStoppedError(ServerError):
     """The mapper thread has ended and takes no more commands."""
 

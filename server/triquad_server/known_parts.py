@@ -59,12 +59,9 @@ def known_parts(
 
     ``held_before`` gives the bytes of the parts in each of the other files.
     """
-    entries = {
-        entry.key: dataclasses.replace(entry, file=entry.file or file) for entry in manifest.entries
-    }
     held = {other: held_before.get(other, 0) for other in manifest.files}
     held[file] = own_bytes(manifest)
-    return KnownParts(manifest.facts, manifest.stamp_ns, entries, held)
+    return KnownParts(manifest.facts, manifest.stamp_ns, manifest.elsewhere(file), held)
 
 
 def own_bytes(manifest: Manifest) -> int:

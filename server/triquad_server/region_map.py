@@ -11,8 +11,8 @@ from triquad_format.region import (
     Region,
     RegionIndex,
     TrainingState,
+    leaf_coordinates,
     region_centre,
-    voxel_coordinates,
 )
 
 from triquad_server.adam import Betas
@@ -119,7 +119,7 @@ class RegionMap:
 
     def voxels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Voxel coordinates [N, 3] of points."""
-        return voxel_coordinates(self._settings, self.centre, points)
+        return leaf_coordinates(self._settings, points - self.centre)
 
     def record(self, training: bool) -> Region:
         """The region as plain arrays, sharing nothing with this one."""

@@ -4,16 +4,14 @@ A checkpoint holds what changed since the one before and refers to older files f
 and then all is folded into one file. How far back they reach, the retention decides.
 """
 
-import fcntl
 import hashlib
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 from triquad_format.errors import (
     FormatError,
@@ -29,30 +27,32 @@ from triquad_format.history import (
     newest_of_each,
     open_manifest,
 )
-from triquad_format.manifest import Entry, FileRef
+from triquad_format.manifest import FileRef
 from triquad_format.map_facts import MapFacts
-from triquad_format.map_index import OtherFiles
-from triquad_format.map_parts import pack_region
+from triquad_format.map_index import DAMAGED_SUFFIX, OtherFiles, files_in
 from triquad_format.mapfile import MapFile, read_map_file
-from triquad_format.mapfile_reader import files_in
-from triquad_format.mapfile_writer import WrittenMap, write_parts
+from triquad_format.mapfile_writer import write_parts
 from triquad_format.messages import CheckpointInfo
-from triquad_format.part import MAP, Part
-from triquad_format.part_body import repack_part
-from triquad_format.preview import pack_preview
 from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord
+from triquad_format.written_map import WrittenMap
 
-from triquad_server.errors import StoreError
+from triquad_server.checkpoint_parts import (
+    StoppedError,
+    checkpoint_parts,
+    copied_parts,
+    unless,
+)
+from triquad_server.errors import StoreBaseError, StoreError
+from triquad_server.file_identity import FileIdentity, file_identity
+from triquad_server.folder_lock import FolderLock
 from triquad_server.known_parts import KnownParts, known_parts, own_bytes
 from triquad_server.mapper import MapChanges
 from triquad_server.retention import KeptCheckpoint, Retention
 
 _log = logging.getLogger(__name__)
 
-_LOCK_NAME = "lock"
 _UNFINISHED = ".epoch-*.tmp"  # left by a server that was killed while it wrote
-_DAMAGED_SUFFIX = ".damaged"
 _READ_BYTES = 2**20
 
 
@@ -62,10 +62,6 @@ class Restored:
 
     record: MapRecord
     info: CheckpointInfo
-
-
-class _FoldStoppedError(Exception):
-    """Something is more urgent: folding is left for the next time."""
 
 
 class Store:
@@ -81,14 +77,12 @@ class Store:
         self._retention = retention
         self._known: KnownParts | None = None
         self._files: dict[Path, frozenset[str]] = {}  # that a checkpoint needs
+        self._identities: dict[str, FileIdentity | None] = {}  # of files that were sound
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.folder / _LOCK_NAME).open("a+b")
+            self._lock = FolderLock(self.folder)
         except OSError as error:
             raise StoreError(f"store {self.folder} cannot be written to: {error}") from error
-        if not _locked(self._lock):
-            self._lock.close()
-            raise StoreError(f"store {self.folder} is in use by another server")
         _delete(self.folder.glob(_UNFINISHED))
 
     def close(self) -> None:
@@ -99,7 +93,7 @@ class Store:
     def base_epoch(self) -> int | None:
         """The epoch after which changes are enough for a checkpoint; ``None``: all is needed."""
         known = self._known
-        if known is None or not all((self.folder / name).is_file() for name in known.files):
+        if known is None or any(self._is_touched(name) for name in known.files):
             return None
         return known.facts.epoch
 
@@ -115,7 +109,7 @@ class Store:
         """
         damaged: list[Path] = []
         try:
-            checkpoints = newest_of_each(checkpoint_files(self.folder))
+            checkpoints = checkpoint_files(self.folder)
         except OSError as error:
             raise StoreError(f"store {self.folder} cannot be read: {error}") from error
         for checkpoint in checkpoints:
@@ -139,6 +133,7 @@ class Store:
         """Write a checkpoint of what changed since :attr:`base_epoch`; let go of the oldest.
 
         Raises:
+            StoreBaseError: older files cannot be read; all of the map is needed.
             StoreError: it could not be written; the older ones are untouched.
         """
         record = changes.record
@@ -147,18 +142,22 @@ class Store:
         # Where most changed, the rest is copied, too: the checkpoint then needs no other.
         delta = known is not None and known.is_small(changed)
         path = self.folder / checkpoint_name(record.epoch, complete=not delta)
-        stamp_ns = time.time_ns()
+        stamp_ns = min(max(time.time_ns(), 0), 2**63 - 1)  # whatever the clock says
         try:
+            self._lock.renew()
             check_record(record)
             with closing(OtherFiles(files_in(self.folder))) as others:
                 written = write_parts(
                     path,
                     MapFacts(record.name, record.epoch, record.settings),
                     stamp_ns,
-                    _parts(changes, known, None if delta else others, stamp_ns),
+                    checkpoint_parts(changes, known, None if delta else others, stamp_ns),
                     {} if known is None else known.entries if delta else known.stored_here(),
                 )
             info = _written_info(path, written)
+        except MapFileError as error:
+            self._known = None
+            raise StoreBaseError(f"checkpoint {path} cannot be written: {error}") from error
         except (FormatError, OSError) as error:
             raise StoreError(f"checkpoint {path} cannot be written: {error}") from error
         except MemoryError as error:
@@ -172,7 +171,8 @@ class Store:
         It is left undone as soon as ``stopping()`` says so.
 
         Raises:
-            StoreError: the file cannot be written, or one that holds parts cannot be read.
+            StoreBaseError: a file that holds parts cannot be read; all of the map is needed.
+            StoreError: the file cannot be written.
         """
         known = self._known
         if known is None or not known.worth_folding:
@@ -180,12 +180,15 @@ class Store:
         path = self.folder / checkpoint_name(known.facts.epoch, complete=True)
         try:
             with closing(OtherFiles(files_in(self.folder))) as others:
-                parts = _unless(stopping, _copied(known.entries.values(), others))
+                parts = unless(stopping, copied_parts(known.entries.values(), others))
                 here = known.stored_here()
                 written = write_parts(path, known.facts, known.stamp_ns, parts, here)
             info = _written_info(path, written)
-        except _FoldStoppedError:
+        except StoppedError:
             return None
+        except MapFileError as error:
+            self._known = None
+            raise StoreBaseError(f"{path} cannot be folded: {error}") from error
         except (FormatError, OSError) as error:
             raise StoreError(f"{path} cannot be folded: {error}") from error
         self._newest_is(path, written, {})
@@ -196,7 +199,13 @@ class Store:
         file = FileRef(path.name, written.manifest_sha256)
         self._known = known_parts(written.manifest, file, held)
         self._files[path] = self._known.files
+        self._identities[path.name] = file_identity(path)
         self._tidy(self._known.facts.epoch)
+
+    def _is_touched(self, name: str) -> bool:
+        """Whether a file is gone, or not as it was when it was written or read."""
+        identity = file_identity(self.folder / name)
+        return identity is None or identity != self._identities.get(name)
 
     def _remember(self, checkpoint: CheckpointFile, file: MapFile) -> None:
         """Note what a checkpoint that was read consists of."""
@@ -209,6 +218,8 @@ class Store:
             held[other] = 0 if manifest is None else own_bytes(manifest)
         own = FileRef(checkpoint.path.name, file.manifest_sha256)
         self._known = known_parts(file.manifest, own, held)
+        for name in self._known.files:
+            self._identities[name] = file_identity(self.folder / name)
 
     def _tidy(self, newest: int) -> None:
         """Delete the files that no checkpoint needs which is to stay.
@@ -232,6 +243,7 @@ class Store:
         gone = [file.path for file in files if file.path.name not in needed]
         for path in gone:
             self._files.pop(path, None)
+            self._identities.pop(path.name, None)
         _delete(gone)
 
     def _needed_by(self, file: CheckpointFile) -> frozenset[str]:
@@ -246,36 +258,6 @@ class Store:
                 names |= {other.name for other in manifest.files}
             self._files[file.path] = frozenset(names)
         return self._files[file.path]
-
-
-def _parts(
-    changes: MapChanges, known: KnownParts | None, others: OtherFiles | None, stamp_ns: int
-) -> Iterator[Part | Entry]:
-    """The parts of a checkpoint; those that did not change are copied from ``others``, if given."""
-    changed = {region.index: region for region in changes.record.regions}
-    settings = changes.record.settings
-    for index in changes.regions:
-        region = changed.get(index)
-        if region is not None:
-            yield from pack_region(region, settings)
-            yield pack_preview(region, settings, changes.epoch.distances, stamp_ns)
-        elif known is not None:
-            entries = known.of_region(index)
-            yield from entries if others is None else _copied(entries, others)
-
-
-def _copied(entries: Iterable[Entry], others: OtherFiles) -> Iterator[Part]:
-    """Parts that other files hold, read and checked; the map's own part is made anew."""
-    for entry in entries:
-        if entry.key.topic != MAP:
-            yield repack_part(entry.key, others.payload(entry))
-
-
-def _unless(stopping: Callable[[], bool], parts: Iterator[Part]) -> Iterator[Part]:
-    for part in parts:
-        if stopping():
-            raise _FoldStoppedError
-        yield part
 
 
 def _written_info(path: Path, written: WrittenMap) -> CheckpointInfo:
@@ -322,7 +304,7 @@ def _read(checkpoint: CheckpointFile) -> MapFile | None:
 def _set_aside(damaged: list[Path]) -> None:
     try:
         for path in damaged:
-            path.rename(path.with_name(path.name + _DAMAGED_SUFFIX))
+            path.rename(path.with_name(path.name + DAMAGED_SUFFIX))
     except OSError as error:
         raise StoreError(f"the damaged {path} cannot be renamed: {error}") from error
 
@@ -336,12 +318,3 @@ def _info(checkpoint: CheckpointFile) -> CheckpointInfo:
         size = file.tell()
         stamp_ns = os.fstat(file.fileno()).st_mtime_ns
     return CheckpointInfo(str(path), size, checkpoint.epoch, digest.hexdigest(), stamp_ns)
-
-
-def _locked(file: IO[bytes]) -> bool:
-    """Lock a file for this process; the system lets go of it however the process ends."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True

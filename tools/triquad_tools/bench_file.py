@@ -8,9 +8,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from triquad_format.field_change import field_change
 from triquad_format.mapfile import read_map, write_map
-from triquad_format.quantise import quantise
 from triquad_format.region import MapRecord
 from triquad_server.epoch import Epoch
 from triquad_server.mapper import Mapper
@@ -19,9 +17,11 @@ from triquad_server.warm_up import warm_up
 
 from triquad_tools.bench_figures import Figure
 from triquad_tools.bench_street import BenchStreet
+from triquad_tools.field_change import field_change
 from triquad_tools.meshfile import Mesh
 from triquad_tools.metrics import ScoreSettings, score_against_scene
 from triquad_tools.progress import progress
+from triquad_tools.quantise import quantise
 from triquad_tools.surface_mesh import surface_mesh
 
 _LARGE_BYTES = 100_000_000

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format import morton
+from triquad_format.cell import CELL_LEAVES, extent
 from triquad_format.field_settings import FieldSettings
 from triquad_format.manifest import Manifest
-from triquad_format.part import CELL_LEAVES_LOG2, EVIDENCE, VERTICES, PartKey
-from triquad_format.region import region_centre
+from triquad_format.part import EVIDENCE, VERTICES, PartKey
+from triquad_format.region import region_centre, region_corner
 
 from triquad_tools.colour_scale import AGE, WHITE, ColourScale, rgb
 from triquad_tools.plan_grid import PlanGrid, Window
@@ -55,7 +55,7 @@ def ages_panel(grid: PlanGrid, manifest: Manifest | None, seen: Columns, surface
         Swatch(f"#{colour.tobytes().hex()}", str(age))
         for age, colour in zip(ages, colours, strict=True)
     ]
-    side_m = manifest.facts.settings.leaf_m * (1 << CELL_LEAVES_LOG2)
+    side_m = manifest.facts.settings.leaf_m * CELL_LEAVES
     note = f"told apart in squares of {side_m:g} m; darker where there is surface"
     return Panel(heading, picture, swatches=tuple(reversed(swatches)), note=note)
 
@@ -72,15 +72,12 @@ def latest_epochs(grid: PlanGrid, manifest: Manifest) -> NDArray[np.int64]:
 
 def _window(grid: PlanGrid, settings: FieldSettings, key: PartKey) -> Window | None:
     """What a part covers in the plan, as far as answers of its region hang on it."""
-    if key.topic == EVIDENCE:
-        cell = morton.decode(np.array(key.cell), 3)[:2]
-    elif key.topic == VERTICES and key.plane == _PLAN_PLANE:
-        cell = morton.decode(np.array(key.cell), 2)
-    else:
+    if key.topic != EVIDENCE and (key.topic, key.plane) != (VERTICES, _PLAN_PLANE):
         return None
+    box = extent(settings, key)
+    corner = region_corner(settings, key.region)[:2]
+    low, high = (corner + settings.leaf_m * end[:2] for end in (box.low, box.high))
     centre = region_centre(settings, key.region)[:2]
-    low = centre - settings.region_side_m / 2 + settings.leaf_m * (cell << CELL_LEAVES_LOG2)
-    high = low + settings.leaf_m * (1 << CELL_LEAVES_LOG2)
     half = settings.region_pitch_m / 2
     return grid.window(np.maximum(low, centre - half), np.minimum(high, centre + half))
 

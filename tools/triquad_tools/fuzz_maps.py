@@ -32,11 +32,10 @@ from triquad_format.record_check import check_record
 from triquad_format.region import MapRecord
 from triquad_format.stored_map import StoredMap
 
-from triquad_tools.arguments import count, seed
+from triquad_tools.arguments import count, not_negative, seed
 from triquad_tools.map_mutations import MUTATIONS, Mutant
 from triquad_tools.sound_maps import SoundMap, sound_maps
 
-_LIMIT_S = 5.0
 _LIMIT_BYTES = 64 * 2**20
 _TRACED_EACH = 50
 _COLUMN = 17  # width of a column of the table
@@ -62,6 +61,16 @@ class Tally:
     outcomes: Counter[str] = field(default_factory=Counter)
     slowest_s: float = 0.0
     most_bytes: int = 0  # of those that were measured
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A map of which a file is to be spoilt, and how."""
+
+    rng: random.Random
+    sound: SoundMap
+    kind: str  # of MUTATIONS
+    traced: bool  # whether the memory that reading takes is measured
 
 
 @dataclass(frozen=True)
@@ -91,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--count", type=count, default=10_000, help="spoilt files")
     parser.add_argument("--seed", type=seed, default=0, help="each gives other files")
     parser.add_argument("--first", type=seed, default=0, help="number of the first of them")
+    parser.add_argument("--limit", type=not_negative, default=5.0, help="s for a file; 0: any")
     parser.add_argument("files", type=Path, nargs="*", help="more sound map files to spoil")
     return parser
 
@@ -98,37 +108,49 @@ def _parser() -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace, maps: list[SoundMap], readers: list[Reader]) -> int:
     tallies = {name: Tally() for name in MUTATIONS}
     begun = time.monotonic()
-    watch = Watch(max(len(data) for sound in maps for data in sound.files.values()))
+    largest = max(len(data) for sound in maps for data in sound.files.values())
+    watch = Watch(options.limit, largest)
     for number in range(options.first, options.first + options.count):
-        rng = random.Random(f"{options.seed} {number}")
-        kind = rng.choices(list(MUTATIONS), [share for _, share in MUTATIONS.values()])[0]
-        traced = kind == "bombs" or number % _TRACED_EACH == 0
+        trial = _trial(options.seed, number, maps)
         try:
-            _try_one(rng, rng.choice(maps), kind, readers, tallies[kind], watch, traced)
+            _try_one(trial, readers, tallies[trial.kind], watch)
         except (Exception, TooSlowError) as error:
             traceback.print_exc()
             again = f"--seed {options.seed} --first {number} --count 1"
-            print(" ".join([f"{kind}: {error!r}; again:", again, *map(str, options.files)]))
+            print(" ".join([f"{trial.kind}: {error!r}; again:", again, *map(str, options.files)]))
             return 1
     _print_table(tallies, time.monotonic() - begun)
     return 0
 
 
+def _trial(seed: int, number: int, maps: list[SoundMap]) -> Trial:
+    rng = random.Random(f"{seed} {number}")
+    kind = rng.choices(list(MUTATIONS), [share for _, share in MUTATIONS.values()])[0]
+    traced = kind == "bombs" or number % _TRACED_EACH == 0
+    return Trial(rng, rng.choice(maps), kind, traced)
+
+
 class Watch:
     """Sees what a reader takes."""
 
-    def __init__(self, file_bytes: int) -> None:
-        """``file_bytes`` is the size of the largest sound file, all of which were read before."""
+    def __init__(self, limit_s: float, file_bytes: int) -> None:
+        """Begin.
+
+        Args:
+            limit_s: what a reader may take; 0: any time.
+            file_bytes: size of the largest sound file, all of which were read before.
+        """
+        self._limit_s = limit_s
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-        self._limit = pages * resource.getpagesize() + _LIMIT_BYTES + file_bytes
+        self._limit_bytes = pages * resource.getpagesize() + _LIMIT_BYTES + file_bytes
         self._hard_limit = resource.getrlimit(resource.RLIMIT_AS)[1]
-        signal.signal(signal.SIGALRM, _too_slow)
+        signal.signal(signal.SIGALRM, self._too_slow)
 
     def limited(self, tally: Tally, read: Callable[[], str]) -> None:
         """Note what came of it; the address space is limited."""
-        resource.setrlimit(resource.RLIMIT_AS, (self._limit, self._hard_limit))
+        resource.setrlimit(resource.RLIMIT_AS, (self._limit_bytes, self._hard_limit))
         try:
-            _timed(tally, read)
+            self._timed(tally, read)
         finally:
             resource.setrlimit(resource.RLIMIT_AS, (self._hard_limit, self._hard_limit))
 
@@ -136,7 +158,7 @@ class Watch:
         """Note what came of it, and how much memory it took; tracing takes some itself."""
         tracemalloc.start()
         try:
-            _timed(tally, read)
+            self._timed(tally, read)
             most = tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
@@ -144,39 +166,30 @@ class Watch:
         if most > _LIMIT_BYTES + size:
             raise WrongError(f"it took {most} bytes; the file has {size}")
 
+    def _timed(self, tally: Tally, read: Callable[[], str]) -> None:
+        begun = time.perf_counter()
+        signal.setitimer(signal.ITIMER_REAL, self._limit_s)
+        try:
+            tally.outcomes[read()] += 1
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        tally.slowest_s = max(tally.slowest_s, time.perf_counter() - begun)
 
-def _timed(tally: Tally, read: Callable[[], str]) -> None:
-    begun = time.perf_counter()
-    signal.setitimer(signal.ITIMER_REAL, _LIMIT_S)
-    try:
-        tally.outcomes[read()] += 1
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-    tally.slowest_s = max(tally.slowest_s, time.perf_counter() - begun)
-
-
-def _too_slow(_number: int, _frame: FrameType | None) -> None:
-    raise TooSlowError(f"it took more than {_LIMIT_S} s")
+    def _too_slow(self, _number: int, _frame: FrameType | None) -> None:
+        raise TooSlowError(f"it took more than {self._limit_s:g} s")
 
 
-def _try_one(
-    rng: random.Random,
-    sound: SoundMap,
-    kind: str,
-    readers: list[Reader],
-    tally: Tally,
-    watch: Watch,
-    traced: bool,
-) -> None:
+def _try_one(trial: Trial, readers: list[Reader], tally: Tally, watch: Watch) -> None:
     """Spoil one file of a map, and read the map in each way."""
-    name = rng.choice(list(sound.files))
-    mutant = MUTATIONS[kind][0](rng, sound.files[name])
+    sound = trial.sound
+    name = trial.rng.choice(list(sound.files))
+    mutant = MUTATIONS[trial.kind][0](trial.rng, sound.files[name])
     # Of another file a map knows the digest: no forgery of it passes.
     mutant = dataclasses.replace(mutant, forged=mutant.forged and name == sound.name)
     (sound.folder / name).write_bytes(mutant.data)
     for reader in readers:
         read = functools.partial(_outcome, reader, sound, mutant)
-        if traced:
+        if trial.traced:
             watch.traced(tally, len(mutant.data), read)
         else:
             watch.limited(tally, read)

@@ -80,6 +80,9 @@ def _check_usage(options: argparse.Namespace) -> None:
             plot and plot.suffix != _PICTURE_SUFFIX
         ),
         f"--plot {plot}: its folder does not exist": plot and not plot.parent.is_dir(),
+        f"--plot {plot}: that is the map file itself": (
+            plot and plot.exists() and any(p.exists() and plot.samefile(p) for p in options.files)
+        ),
     }
     for problem, there in problems.items():
         if there:

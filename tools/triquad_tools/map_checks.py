@@ -1,5 +1,6 @@
 """Checks of a map file beyond those that every reading makes."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def _mcap_library(path: Path, file: MapFile) -> str:
         with path.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
             topics = [channel.topic for _, channel, _ in reader.iter_messages()]
-    except (McapError, ValueError, OSError) as error:
+    except (McapError, ValueError, KeyError, struct.error, OSError) as error:
         raise FailedCheckError(f"{path}: the mcap library refuses it: {error}") from error
     # A file of version 1 has no preview of ours.
     shown = PREVIEW if file.manifest is not None else None

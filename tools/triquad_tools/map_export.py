@@ -6,7 +6,7 @@ import numpy as np
 from triquad_client.glb import glb_bytes
 from triquad_client.ply import ply_bytes
 from triquad_format.crop import without_training
-from triquad_format.mapfile_writer import replacing
+from triquad_format.durable_file import replacing
 from triquad_format.region import MapRecord
 from triquad_server.epoch import Epoch
 from triquad_server.mapper import Mapper
@@ -17,9 +17,6 @@ from triquad_tools.map_source import Box
 from triquad_tools.progress import progress
 from triquad_tools.sdf_grid import DenseGrid, SparseGrid, dense_grid, evidence_bounds, sparse_grid
 from triquad_tools.surface_mesh import surface_mesh
-
-MESH_SUFFIXES = (".ply", ".glb")
-GRID_SUFFIX = ".npz"
 
 MARGIN_CELLS = 16
 """A map that is exported within a box is needed so far around it."""

@@ -9,7 +9,7 @@ import hashlib
 import math
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,7 +19,7 @@ from triquad_format.mcap_records import CHUNK, MAGIC
 
 from triquad_tools.sealed_mcap import (
     Dissected,
-    Part,
+    LooseMessage,
     Piece,
     chunk,
     chunk_records,
@@ -68,7 +68,7 @@ def lie_in_heads(rng: random.Random, data: bytes) -> Mutant:
     if rng.random() < 0.3:
         return Mutant(sealed(pieces, lambda summary: _with_number(rng, summary, 8)), False)
     at = rng.randrange(len(pieces))
-    opcode, content = pieces[at]
+    opcode, content = pieces[at].opcode, pieces[at].content
     if opcode == CHUNK and rng.random() < 0.8:
         head = bytearray(content[:48])
         offset, size = rng.choice(((16, 8), (24, 4), (28, 4), (32, 8), (36, 8), (40, 8)))
@@ -121,11 +121,11 @@ def _shuffle(rng: random.Random, items: list[Any]) -> None:
 def spoil_parts(rng: random.Random, data: bytes) -> Mutant:
     """Parts are others, missing, doubled or swapped; checksums fit, digests do not."""
     dissected = _dissected(data)
-    *parts, manifest = dissected.parts
+    *parts, manifest = dissected.messages
     if rng.random() < 0.7:
         at = rng.randrange(len(parts))
         payload = _flipped(rng, parts[at].payload, rng.randint(1, 3))
-        parts[at] = parts[at]._replace(payload=payload)
+        parts[at] = replace(parts[at], payload=payload)
     else:
         _shuffle(rng, parts)
     return Mutant(rebuilt(dissected.pieces, [*parts, manifest]), False)
@@ -144,29 +144,29 @@ def forge_values(rng: random.Random, data: bytes) -> Mutant:
 def forge_manifest(rng: random.Random, data: bytes) -> Mutant:
     """The manifest tells something else."""
     dissected = _dissected(data)
-    parts = list(dissected.parts)
+    parts = list(dissected.messages)
     manifest = parts[-1]
     spoil = rng.choice((_spoilt_bytes, _spoilt_values, _spoilt_values))
-    parts[-1] = manifest._replace(payload=spoil(rng, manifest.payload))
+    parts[-1] = replace(manifest, payload=spoil(rng, manifest.payload))
     return Mutant(rebuilt(dissected.pieces, parts), True)
 
 
 def explode(rng: random.Random, data: bytes) -> Mutant:
     """A part, or parts, that take far more memory than their file."""
     dissected = _dissected(data)
-    parts = list(dissected.parts)
+    parts = list(dissected.messages)
     at = rng.randrange(len(parts))
     size = int(_MAX_BOMB_BYTES * rng.random() ** 2)
     step = rng.randrange(5)
     if step == 0:
-        parts[at] = parts[at]._replace(payload=bytes(size))
+        parts[at] = replace(parts[at], payload=bytes(size))
     elif step == 1:
         item = rng.choice((b"\x90", b"\x80", b"\xa2ab", b"\xcb" + bytes(8)))
-        parts[at] = parts[at]._replace(payload=_nested(item, size))
+        parts[at] = replace(parts[at], payload=_nested(item, size))
     elif step == 2:
-        parts[at] = parts[at]._replace(payload=_with_column(rng, parts[at].payload, size))
+        parts[at] = replace(parts[at], payload=_with_column(rng, parts[at].payload, size))
     elif step == 3:
-        parts[at:at] = [Part("/triquad/x", "msgpack", b"")] * (size // 1024)
+        parts[at:at] = [LooseMessage("/triquad/x", "msgpack", b"")] * (size // 1024)
         return Mutant(rebuilt(dissected.pieces, parts), False)
     else:
         pieces = [*dissected.pieces, chunk(bytes(size), True, rng.choice((None, *_NUMBERS)))]
@@ -196,13 +196,13 @@ def _dissected(data: bytes) -> Dissected:
 
 def _forged(rng: random.Random, data: bytes, spoil: Callable[[bytes], bytes]) -> Mutant:
     dissected = _dissected(data)
-    parts = list(dissected.parts)
+    parts = list(dissected.messages)
     at = rng.randrange(len(parts) - 1)
-    parts[at] = parts[at]._replace(payload=spoil(parts[at].payload))
+    parts[at] = replace(parts[at], payload=spoil(parts[at].payload))
     return Mutant(rebuilt(dissected.pieces, _relisted(parts, at), rng.random() < 0.2), True)
 
 
-def _relisted(parts: Sequence[Part], at: int) -> list[Part]:
+def _relisted(parts: Sequence[LooseMessage], at: int) -> list[LooseMessage]:
     """The parts, with what the manifest tells of one that changed, unless it is the manifest."""
     *others, manifest = parts
     if at == len(others):
@@ -218,7 +218,7 @@ def _relisted(parts: Sequence[Part], at: int) -> list[Part]:
         columns["bytes"]["data"] = _patched(columns["bytes"]["data"], 8 * row, size, 8)
         digests = columns["sha256"]["data"]
         columns["sha256"]["data"] = digests[: 32 * row] + digest + digests[32 * (row + 1) :]
-    return [*others, manifest._replace(payload=msgpack.packb(body))]
+    return [*others, replace(manifest, payload=msgpack.packb(body))]
 
 
 def _spoilt_bytes(rng: random.Random, payload: bytes) -> bytes:

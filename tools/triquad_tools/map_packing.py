@@ -4,12 +4,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.field_change import FieldChange
 from triquad_format.mapfile import MapFileInfo, write_map
-from triquad_format.quantise import dequantised, quantise
 from triquad_format.region import MapRecord
 
+from triquad_tools.field_change import FieldChange
 from triquad_tools.map_source import SourceMap
+from triquad_tools.quantise import dequantised, quantise
 
 DTYPES = {"fp16": "<f2", "fp32": "<f4"}
 INTEGERS = "int8"

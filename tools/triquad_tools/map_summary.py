@@ -5,14 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format import morton
 from triquad_format.field_settings import FieldSettings
 from triquad_format.mapfile import MapFile
 from triquad_format.part import TRAINING_TOPICS
-from triquad_format.region import BLOCK_VOXELS, MapRecord, Region, region_centre
+from triquad_format.region import MapRecord, Region, region_centre
 
 from triquad_tools.report import print_columns
-from triquad_tools.seen_space import owned_evidence
+from triquad_tools.seen_space import evidence_box, owned_evidence
 
 
 @dataclass(frozen=True)
@@ -144,11 +143,12 @@ def _precision(region: RegionSummary) -> str:
 def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
     training = region.training
     evidence = owned_evidence(record.settings, region)
+    box = evidence_box(record.settings, region)
     voxel_m3 = record.settings.leaf_m**3
     return RegionSummary(
         index=region.index,
         centre_m=_rounded(region_centre(record.settings, region.index)),
-        parameters=_parameters(region),
+        parameters=region.parameters,
         precision=tuple(sorted({table.features.dtype.name for table in region.tables})),
         scales=tuple(sorted(table.scale for table in region.tables if table.scale is not None)),
         vertices={
@@ -156,7 +156,7 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
             for level in record.settings.levels
         },
         evidence_blocks=len(region.evidence.codes),
-        evidence_box_m=_evidence_box(record, region),
+        evidence_box_m=None if box is None else tuple(map(_rounded, box)),
         surface_m3=_bits(evidence.surface) * voxel_m3,
         free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
         samples=None if training is None else len(training.sample_points),
@@ -164,26 +164,8 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
     )
 
 
-def _parameters(region: Region) -> int:
-    arrays = (*region.mlp.weights, *region.mlp.biases)
-    features = sum(table.features.size for table in region.tables)
-    return features + sum(array.size for array in arrays)
-
-
 def _bits(masks: NDArray[np.uint8]) -> int:
     return int(np.unpackbits(masks).sum(dtype=np.int64))
-
-
-def _evidence_box(record: MapRecord, region: Region) -> tuple[tuple[float, ...], ...] | None:
-    """Corners of the box around the region's evidence, to whole blocks, map frame."""
-    if not len(region.evidence.codes):
-        return None
-    settings = record.settings
-    blocks = morton.decode(region.evidence.codes, 3)
-    corner = region_centre(settings, region.index) - settings.region_side_m / 2
-    side_m = settings.leaf_m * BLOCK_VOXELS
-    ends = (blocks.min(axis=0), blocks.max(axis=0) + 1)
-    return tuple(_rounded(corner + end * side_m) for end in ends)
 
 
 def _rounded(place: NDArray[np.float64]) -> tuple[float, ...]:

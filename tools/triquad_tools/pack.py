@@ -1,8 +1,9 @@
 """``triquad-pack``: rewrite a map file: smaller, from history, saved from damage, or as a mesh."""
 
 import argparse
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ _MAP, _MESHES, _GRID = ".triquad", (".ply", ".glb"), ".npz"
 _SUFFIXES = (_MAP, *_MESHES, _GRID)
 _MESH_CELL_M, _GRID_CELL_M = 0.1, 0.2
 _CELL_RANGE_M = (0.01, 10.0)
+
+_Add = Callable[..., argparse.Action]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,7 +55,13 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
         "nothing lies in the box; 2 wrong usage, or input that cannot be used.",
     )
-    add = parser.add_argument
+    _add_source(parser.add_argument)
+    _add_content(parser.add_argument)
+    _add_target(parser.add_argument)
+    return parser
+
+
+def _add_source(add: _Add) -> None:
     add("input", type=Path, metavar="IN", help="map file, or folder of checkpoints")
     add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(_SUFFIXES))
     add(
@@ -62,6 +71,9 @@ def _parser() -> argparse.ArgumentParser:
         "2026-01-31T12:00:00Z (default: the newest of all)",
     )
     add("--recover", action="store_true", help="save what is intact of a damaged file")
+
+
+def _add_content(add: _Add) -> None:
     add("--precision", choices=("fp16", "fp32", "int8"), help="of features (default: as in IN)")
     add(
         "--max-error",
@@ -79,6 +91,9 @@ def _parser() -> argparse.ArgumentParser:
         "has training state that is kept",
     )
     add("--no-training", action="store_true", help="drop what only further training needs")
+
+
+def _add_target(add: _Add) -> None:
     add(
         "--cell",
         type=positive,
@@ -87,7 +102,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--sparse", action="store_true", help=f"{_GRID}: only blocks around surface, not a box")
     add("--force", action="store_true", help="replace OUT where it exists")
-    return parser
 
 
 def _pack(arguments: argparse.Namespace) -> int:
@@ -127,8 +141,13 @@ def _check_usage(arguments: argparse.Namespace) -> None:
 
 def _check_target(source: Path, target: Path, force: bool) -> None:
     """Refuse a target that must not be written."""
-    if target.exists():
-        if source.exists() and target.samefile(source):
+    from triquad_format.history import checkpoint_file
+
+    folder = source if source.is_dir() else source.parent
+    if checkpoint_file(target) is not None and target.parent.resolve() == folder.resolve():
+        raise ToolError(f"{target} would pass for a checkpoint of {folder}; give another name")
+    if os.path.lexists(target):
+        if source.exists() and target.exists() and target.samefile(source):
             raise ToolError(f"{target} is the input; write to another file")
         if target.is_dir():
             raise ToolError(f"{target} is a folder; give the name of a file")

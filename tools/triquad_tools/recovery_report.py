@@ -10,12 +10,13 @@ def print_recovery(recovery: Recovery) -> None:
     """Print a line for each loss, and how much was saved."""
     for loss in recovery.losses:
         print(f"lost: {_what(loss)}{_where(loss)}")
-    if recovery.parts is None:
-        print(f"saved {recovery.intact} parts; the list of parts is lost: there may have been more")
+    if recovery.parts_listed is None:
+        saved = f"saved {recovery.parts_intact} parts"
+        print(f"{saved}; the list of parts is lost: there may have been more")
     elif recovery.complete:
-        print(f"saved all {recovery.parts} parts: nothing is lost")
+        print(f"saved all {recovery.parts_listed} parts: nothing is lost")
     else:
-        print(f"saved {recovery.intact} of {recovery.parts} parts")
+        print(f"saved {recovery.parts_intact} of {recovery.parts_listed} parts")
     if not any(len(region.evidence.codes) for region in recovery.record.regions):
         print("no evidence is left: the map gives distances, but says UNKNOWN everywhere")
 

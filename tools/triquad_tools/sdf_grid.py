@@ -8,16 +8,16 @@ and the status ``UNKNOWN``.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format import morton
-from triquad_format.region import BLOCK_VOXELS, MapRecord, region_centre
+from triquad_format.region import MapRecord
+from triquad_server.epoch import Answer
 
 from triquad_tools.errors import ToolError
 from triquad_tools.map_source import Box
-from triquad_tools.seen_space import surface_voxels
+from triquad_tools.progress import Report
+from triquad_tools.seen_space import evidence_box, surface_voxels
 
 MAX_CELLS = 200_000_000
 
@@ -29,21 +29,6 @@ BAND_CELLS = 3
 
 _POINTS_AT_ONCE = 1 << 20
 _ROUNDING = 1e-9
-
-Report = Callable[[float, str], None]
-
-
-class Answer(Protocol):
-    """Distances and statuses of points."""
-
-    @property
-    def sdf(self) -> NDArray[np.float32]:
-        """Signed distances [N], metres."""
-
-    @property
-    def status(self) -> NDArray[np.uint8]:
-        """Status values [N]."""
-
 
 Query = Callable[[NDArray[np.float64]], Answer]
 """Answers at points [N, 3] of the map frame."""
@@ -74,15 +59,11 @@ class SparseGrid:
 
 def evidence_bounds(record: MapRecord) -> Box | None:
     """The box around all that rays have shown, to whole blocks; ``None`` where that is nothing."""
-    settings = record.settings
-    corners = []
-    for region in record.regions:
-        if len(region.evidence.codes):
-            blocks = morton.decode(region.evidence.codes, 3)
-            corner = region_centre(settings, region.index) - settings.region_side_m / 2
-            side_m = settings.leaf_m * BLOCK_VOXELS
-            corners += [corner + blocks.min(0) * side_m, corner + (blocks.max(0) + 1) * side_m]
-    return np.array([np.min(corners, axis=0), np.max(corners, axis=0)]) if corners else None
+    found = [evidence_box(record.settings, region) for region in record.regions]
+    boxes = [box for box in found if box is not None]
+    if not boxes:
+        return None
+    return np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))])
 
 
 def dense_grid(query: Query, box: Box, cell_m: float, report: Report) -> DenseGrid:
@@ -93,7 +74,7 @@ def dense_grid(query: Query, box: Box, cell_m: float, report: Report) -> DenseGr
     """
     corners = list(zip(box[0].tolist(), box[1].tolist(), strict=True))
     sides = [(high - low) / cell_m for low, high in corners]
-    if math.prod(sides) > MAX_CELLS:
+    if math.prod(side + 1 for side in sides) > MAX_CELLS:  # so many points at most
         sizes = " x ".join(f"{side:.6g}" for side in sides)
         raise _too_many(sizes, math.prod(sides), "--crop, --sparse")
     low = [math.ceil(low / cell_m - _ROUNDING) for low, _ in corners]

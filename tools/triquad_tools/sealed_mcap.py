@@ -7,7 +7,6 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import zstandard
 from triquad_format.mcap_records import (
@@ -30,15 +29,17 @@ _EVERYTHING = 1 << 40
 Edit = Callable[[bytes], bytes]
 
 
-class Piece(NamedTuple):
+@dataclass(frozen=True)
+class Piece:
     """A record: what it is, and its content."""
 
     opcode: int
     content: bytes
 
 
-class Part(NamedTuple):
-    """A message."""
+@dataclass(frozen=True)
+class LooseMessage:
+    """A message on its own."""
 
     topic: str
     encoding: str
@@ -50,7 +51,7 @@ class Dissected:
     """A map file in pieces."""
 
     pieces: tuple[Piece, ...]  # of its data section
-    parts: tuple[Part, ...]
+    messages: tuple[LooseMessage, ...]
 
 
 def dissect(data: bytes) -> Dissected:
@@ -60,9 +61,9 @@ def dissect(data: bytes) -> Dissected:
         if record.opcode == DATA_END:
             break
         pieces.append(Piece(record.opcode, bytes(record.content)))
-    messages = McapFile(memoryview(data)).messages(_EVERYTHING)
-    parts = tuple(Part(message.topic, message.encoding, message.data) for message in messages)
-    return Dissected(tuple(pieces), parts)
+    found = McapFile(memoryview(data)).messages(_EVERYTHING)
+    messages = tuple(LooseMessage(each.topic, each.encoding, each.data) for each in found)
+    return Dissected(tuple(pieces), messages)
 
 
 def packed(piece: Piece) -> bytes:
@@ -99,15 +100,17 @@ def _index_of(piece: Piece, start: int, length: int) -> Piece | None:
     return None
 
 
-def rebuilt(pieces: Sequence[Piece], parts: Sequence[Part], compressed: bool = False) -> bytes:
-    """A file with header and metadata of ``pieces``, and a chunk for each part."""
+def rebuilt(
+    pieces: Sequence[Piece], messages: Sequence[LooseMessage], compressed: bool = False
+) -> bytes:
+    """A file with header and metadata of ``pieces``, and a chunk for each message."""
     channels: dict[str, Piece] = {}
     chunks = []
-    for part in parts:
-        number = list(channels).index(part.topic) if part.topic in channels else len(channels)
-        content = struct.pack("<HH", number, 0) + _text(part.topic.encode())
-        channels[part.topic] = Piece(CHANNEL, content + _text(part.encoding.encode()) + bytes(4))
-        message = Piece(MESSAGE, struct.pack("<HIQQ", number, 0, 0, 0) + part.payload)
+    for each in messages:
+        number = list(channels).index(each.topic) if each.topic in channels else len(channels)
+        content = struct.pack("<HH", number, 0) + _text(each.topic.encode())
+        channels[each.topic] = Piece(CHANNEL, content + _text(each.encoding.encode()) + bytes(4))
+        message = Piece(MESSAGE, struct.pack("<HIQQ", number, 0, 0, 0) + each.payload)
         chunks.append(chunk(packed(message), compressed))
     kept = [piece for piece in pieces if piece.opcode in (HEADER, METADATA)]
     return sealed([*kept, *channels.values(), *chunks])

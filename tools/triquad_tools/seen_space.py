@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format import morton
+from triquad_format.evidence_voxels import seen_voxels
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import (
     BLOCK_VOXELS,
     Evidence,
     MapRecord,
     Region,
-    region_centre,
+    region_corner,
 )
-from triquad_format.seen_voxels import seen_voxels
 
 _MasksOf = Callable[[Evidence], NDArray[np.uint8]]
 
@@ -35,6 +35,18 @@ def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
     rows = np.flatnonzero(((blocks >= 1) & (blocks < last)).all(axis=1))
     evidence = region.evidence
     return Evidence(evidence.codes[rows], evidence.surface[rows], evidence.free[rows])
+
+
+def evidence_box(settings: FieldSettings, region: Region) -> NDArray[np.float64] | None:
+    """Corners [2, 3] of the box around a region's evidence, to whole blocks, metres, map frame.
+
+    ``None`` where there is no evidence.
+    """
+    if not len(region.evidence.codes):
+        return None
+    blocks = morton.decode(region.evidence.codes, 3)
+    ends = np.stack([blocks.min(axis=0), blocks.max(axis=0) + 1])
+    return region_corner(settings, region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
 
 
 def surface_voxels(record: MapRecord) -> NDArray[np.float64]:
@@ -75,5 +87,5 @@ def _metres(
     settings: FieldSettings, region: Region, voxels: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Middles ``[N, 3]`` of voxels ``[N, 3]`` of a region."""
-    corner = region_centre(settings, region.index) - settings.region_side_m / 2
+    corner = region_corner(settings, region.index)
     return corner + (voxels + 0.5) * settings.leaf_m

@@ -74,8 +74,7 @@ def _delta(folder: Path, base: MapRecord) -> SoundMap:
     first = write_parts(
         folder / "base.triquad", facts, 10**9, record_parts(base, "<f2", None, 0), {}
     )
-    file = FileRef("base.triquad", first.manifest_sha256)
-    known = {e.key: dataclasses.replace(e, file=file) for e in first.manifest.entries}
+    known = first.manifest.elsewhere(FileRef("base.triquad", first.manifest_sha256))
     later = dataclasses.replace(_with_integers(base), epoch=base.epoch + 1)
     facts = dataclasses.replace(facts, epoch=later.epoch)
     parts = record_parts(later, "<f2", None, 0)

@@ -8,7 +8,7 @@ from triquad_format.errors import FormatError, MapFileError, NoIndexError
 from triquad_format.history import CheckpointFile, checkpoint_files, map_folder
 from triquad_format.manifest import Entry, FileRef, Manifest
 from triquad_format.map_index import MapIndex
-from triquad_format.part import FIELD_TOPICS, TRAINING_TOPICS, PartKey
+from triquad_format.part import REGION_TOPICS, PartKey
 from triquad_format.random_access import FileBytes
 from triquad_format.region import RegionIndex
 
@@ -158,4 +158,4 @@ class _Indices:
 
 
 def _is_of_region(entry: Entry) -> bool:
-    return entry.key.topic in (*FIELD_TOPICS, *TRAINING_TOPICS)
+    return entry.key.topic in REGION_TOPICS

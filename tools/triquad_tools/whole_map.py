@@ -4,9 +4,9 @@ from contextlib import closing
 from pathlib import Path
 
 from triquad_format.errors import NoIndexError
-from triquad_format.map_index import MapIndex
+from triquad_format.file_errors import named
+from triquad_format.map_index import MapIndex, file_in
 from triquad_format.mapfile import MapFile, read_map_file
-from triquad_format.mapfile_reader import named
 from triquad_format.random_access import FileBytes
 
 from triquad_tools.errors import ToolError
@@ -27,7 +27,7 @@ def read_whole(path: Path) -> MapFile:
     """
     if path.is_dir():
         raise ToolError(f"{path} is a folder: --log lists the checkpoints in it")
-    missing = [name for name in _needed_files(path) if not (path.parent / name).exists()]
+    missing = [name for name in _needed_files(path) if not file_in(path.parent, name).exists()]
     if missing:
         raise MissingFilesError(
             f"{path} needs {', '.join(missing)}: not in its folder, copy what is missing there"

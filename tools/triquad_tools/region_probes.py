@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-
 from triquad_format import morton
-from triquad_format.field_change import FieldChange, draw_probes
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import AXES, Region, VertexTable
+
+from triquad_tools.field_change import FieldChange, draw_probes
 
 Floats = NDArray[np.float32]
 
@@ -82,8 +82,8 @@ class _TableCorners:
         v = u[:, AXES[table.plane]] / np.float32(1 << (settings.depth - table.level))
         floor = np.floor(v)
         hat = np.stack([1 - (v - floor), v - floor])  # [2, P, 2]
-        cell = np.maximum(floor.astype(np.int64), 0)
-        self._rows = [_rows_of(table.codes, cell + corner) for corner in _CORNERS]
+        least = np.maximum(floor.astype(np.int64), 0)
+        self._rows = [_rows_of(table.codes, least + corner) for corner in _CORNERS]
         self._weights = [hat[a, :, 0] * hat[b, :, 1] for a, b in _CORNERS]
 
     def interpolated(self, vectors: Floats) -> Floats:
@@ -95,11 +95,11 @@ class _TableCorners:
         return total
 
 
-def _rows_of(codes: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Rows [P] of the vertices at ``cells`` [P, 2]; ``len(codes)`` where there is none."""
+def _rows_of(codes: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Rows [P] of ``vertices`` [P, 2]; ``len(codes)`` where there is none."""
     if not len(codes):
-        return np.zeros(len(cells), np.intp)
-    wanted = morton.encode(cells)
+        return np.zeros(len(vertices), np.intp)
+    wanted = morton.encode(vertices)
     rows = np.searchsorted(codes, wanted)
     found = codes[np.minimum(rows, len(codes) - 1)] == wanted
     return np.where(found, rows, len(codes))

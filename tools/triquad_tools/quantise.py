@@ -17,12 +17,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
 from triquad_format.errors import FormatError
-from triquad_format.field_change import FieldChange, field_change
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import MAX_INTEGER, MapRecord, Region, VertexTable
-from triquad_format.region_probes import RegionProbes
+
+from triquad_tools.field_change import FieldChange, field_change
+from triquad_tools.region_probes import RegionProbes
 
 _SEARCH_SEED, _MEASURE_SEED = 0, 1
 _QUANTILE_PER_RMS = 3.2  # of the changes; seen 3.1 to 3.3; only where the search begins

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
 from triquad_format.evaluator import MapEvaluator
+from triquad_format.evidence_voxels import seen_voxels
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import MapRecord, Region, region_centre
-from triquad_format.seen_voxels import seen_voxels
 
 QUANTILE = 0.99
 

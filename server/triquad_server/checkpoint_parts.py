@@ -1,0 +1,52 @@
+"""The parts of a checkpoint: those that changed, and those that older files hold."""
+
+from collections.abc import Callable, Iterable, Iterator
+
+from triquad_format.manifest import Entry
+from triquad_format.map_index import OtherFiles
+from triquad_format.map_parts import pack_region
+from triquad_format.part import MAP, Part
+from triquad_format.part_body import repack_part
+from triquad_format.preview import pack_preview
+
+from triquad_server.known_parts import KnownParts
+from triquad_server.mapper import MapChanges
+
+
+class StoppedError(Exception):
+    """Something is more urgent: what is left of the parts is not asked for."""
+
+
+def checkpoint_parts(
+    changes: MapChanges, known: KnownParts | None, others: OtherFiles | None, stamp_ns: int
+) -> Iterator[Part | Entry]:
+    """The parts of a checkpoint; those that did not change are copied from ``others``, if given."""
+    changed = {region.index: region for region in changes.record.regions}
+    settings = changes.record.settings
+    for index in changes.regions:
+        region = changed.get(index)
+        if region is not None:
+            yield from pack_region(region, settings)
+            yield pack_preview(region, settings, changes.epoch.distances, stamp_ns)
+        elif known is not None:
+            entries = known.of_region(index)
+            yield from entries if others is None else copied_parts(entries, others)
+
+
+def copied_parts(entries: Iterable[Entry], others: OtherFiles) -> Iterator[Part]:
+    """Parts that other files hold, read and checked; the map's own part is made anew."""
+    for entry in entries:
+        if entry.key.topic != MAP:
+            yield repack_part(entry.key, others.payload(entry))
+
+
+def unless(stopping: Callable[[], bool], parts: Iterator[Part]) -> Iterator[Part]:
+    """The parts, until ``stopping()``.
+
+    Raises:
+        StoppedError: it says so.
+    """
+    for part in parts:
+        if stopping():
+            raise StoppedError
+        yield part
