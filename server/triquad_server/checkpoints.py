@@ -70,7 +70,7 @@ class Checkpoints:
             raise RequestError("store", str(error)) from error
 
     def _run(self) -> None:
-        be_patient(PATIENCE)
+        be_patient(2 * PATIENCE)  # mapping comes first, too
         due = time.monotonic() + self._period_s
         while not self._stopping.is_set():
             self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)

@@ -18,6 +18,7 @@ from triquad_server.warm_up import warm_up
 from triquad_tools.bench_figures import Figure
 from triquad_tools.bench_street import BenchStreet
 from triquad_tools.field_change import field_change
+from triquad_tools.map_packing import INTEGER_ERROR_M
 from triquad_tools.meshfile import Mesh
 from triquad_tools.metrics import ScoreSettings, score_against_scene
 from triquad_tools.progress import progress
@@ -67,7 +68,7 @@ def _settled(made: BenchStreet) -> Mapper:
 def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> list[Figure]:
     plain = write_map(record, folder / "fp16.triquad", distances=epoch.distances)
     stored = read_map(folder / "fp16.triquad")
-    eighth, tight = quantise(stored, 0.001), quantise(stored, 0.002)
+    eighth, tight = quantise(stored, INTEGER_ERROR_M), quantise(stored, 0.002)
     small = write_map(eighth.record, folder / "int8.triquad", distances=epoch.distances)
     least = write_map(tight.record, folder / "2mm.triquad", distances=epoch.distances)
     live = field_change(record, stored, _SEED)

@@ -15,7 +15,7 @@ DTYPES = {"fp16": "<f2", "fp32": "<f4"}
 INTEGERS = "int8"
 """Features as integers, most of which take one byte."""
 
-INTEGER_ERROR_M = 0.001
+INTEGER_ERROR_M = 0.0015
 """Limit on the change of distances where none is given."""
 
 
