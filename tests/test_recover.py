@@ -11,6 +11,7 @@ from checkpoint_folder import FIRST, SECOND, map_at, write_checkpoints
 from map_records import SMALL, assert_same, random_record
 from mapfile_surgery import file_bytes, manifest_of, rebuild, with_metadata
 from mcap.reader import make_reader
+from triquad_format import morton
 from triquad_format.crop import without_training
 from triquad_format.errors import MapFileError, UnsupportedMapFileError
 from triquad_format.evaluator import MapEvaluator
@@ -162,8 +163,33 @@ def test_what_a_loss_says_of_its_place(recovered):
             break
     loss = recovered(flipped(DATA, chunk.end - 20)).losses[-1]
     assert loss.key.plane == 0
-    np.testing.assert_allclose(loss.minimum, [-64.75, -64.75, -64.25])
-    np.testing.assert_allclose(loss.maximum, [0.25, 0.25, 64.25])
+    np.testing.assert_allclose(loss.minimum, [-65, -65, -64.5])
+    np.testing.assert_allclose(loss.maximum, [0.5, 0.5, 64.5])
+
+
+def test_outside_of_the_boxes_that_are_told_nothing_changes(recovered):
+    """Also where surface was seen across the border of the box, and right beside it."""
+    rng = np.random.default_rng(0)
+    leaves = np.concatenate([np.full((300, 1), 255.0), rng.uniform(0, 512, (300, 2))], axis=1)
+    seen = random_record(6, settings=SQUARES, points=4000).regions[0].evidence
+    region = dataclasses.replace(RECORD.regions[0], evidence=seen, training=None)
+    record = dataclasses.replace(RECORD, regions=(region,))
+    data = file_bytes(record)
+    chunk = next(chunk for chunk in chunks(data) if chunk.topic == VERTICES)
+    recovery = recovered(flipped(data, chunk.end - 20))
+    (loss,) = recovery.losses
+    blocks = morton.decode(seen.codes, 3)
+    corner = region_corner(SQUARES, region.index)
+    places = np.concatenate([blocks * 8.0, blocks * 8.0 + 7, leaves])
+    points = np.concatenate(
+        [corner + (places + rng.uniform(-1, 2, places.shape)) * SQUARES.leaf_m for _ in range(10)]
+    )
+    outside = ((points < loss.minimum) | (points > loss.maximum)).any(axis=1)
+    assert outside.sum() > 1000
+    before = MapEvaluator(record).query(points[outside])
+    after = MapEvaluator(recovery.record).query(points[outside])
+    assert np.array_equal(before.sdf, after.sdf, equal_nan=True)
+    assert np.array_equal(before.status, after.status)
 
 
 @pytest.mark.parametrize("topic", [TRAINING, MOMENTS, SAMPLES])
@@ -336,7 +362,7 @@ def test_tool(tmp_path, capsys):
     assert lines[0].startswith("lost: training state of region 0 0 0")
     assert lines[1] == (
         "lost: vertices of plane XY of region 0 0 0: now UNKNOWN, "
-        "x -64.8 to 0.2 m, y -64.8 to 0.2 m, z -64.2 to 64.2 m"
+        "x -65.0 to 0.5 m, y -65.0 to 0.5 m, z -64.5 to 64.5 m"
     )
     assert lines[2].startswith("saved ")
     assert_same(read_map(out), recover(broken).record)

@@ -10,6 +10,10 @@ from triquad_format.field_settings import FieldSettings
 from triquad_format.part import VERTICES, PartKey
 from triquad_format.region import AXES, MapRecord, region_corner
 
+STATUS_REACH_LEAVES = 2
+"""How far beyond lost vertices a status may change: voxels felt there go, whole, and were felt
+half a leaf beyond."""
+
 
 @dataclass(frozen=True)
 class Loss:
@@ -53,8 +57,7 @@ def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
         # A vertex is felt as far as the side of its level's nodes; those at the upper border of a
         # square belong to the next.
         box.low[list(AXES[key.plane])] -= vertex_reach(settings)
-    # What is seen of a voxel is felt beside it, too.
-    box.low[:] -= 1
-    box.high[:] += 1
+    box.low[:] -= STATUS_REACH_LEAVES
+    box.high[:] += STATUS_REACH_LEAVES
     corner = region_corner(settings, key.region)
     return Loss(key, corner + box.low * settings.leaf_m, corner + box.high * settings.leaf_m)
