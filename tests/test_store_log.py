@@ -6,6 +6,7 @@ import pytest
 from checkpoint_folder import write_checkpoints
 from triquad_format.mapfile import read_map_file
 from triquad_tools.inspect import main
+from triquad_tools.pack import main as pack
 
 VERSION_1 = Path(__file__).parent / "golden" / "map_v1.triquad"
 EPOCHS = (9, 12, 15)
@@ -111,3 +112,15 @@ def test_what_is_no_folder_of_checkpoints_is_one_line(tmp_path, name, capsys):
     assert captured.out == ""
     assert captured.err.count("\n") == 1
     assert name in captured.err
+
+
+def test_what_was_set_aside_is_named(folder, tmp_path, capsys):
+    newest = folder / "epoch-000000015.delta.triquad"
+    damaged = newest.with_name(newest.name + ".damaged")
+    newest.rename(damaged)
+    assert main([str(folder), "--log"]) == 0
+    assert f"{damaged.name}: set aside as damaged" in capsys.readouterr().out
+    assert pack([str(folder), str(tmp_path / "out.triquad")]) == 0
+    assert f"{damaged} is newer, but damaged" in capsys.readouterr().out
+    assert pack([str(damaged), str(tmp_path / "saved.triquad"), "--recover"]) == 0
+    assert read_map_file(tmp_path / "saved.triquad").record.epoch == 15

@@ -12,7 +12,7 @@ from pathlib import Path
 from triquad_format.errors import MapFileError, NoIndexError
 from triquad_format.file_errors import named
 from triquad_format.manifest import Manifest
-from triquad_format.map_index import MapIndex, files_in
+from triquad_format.map_index import DAMAGED_SUFFIX, MapIndex, files_in
 from triquad_format.random_access import FileBytes
 
 _NAME = re.compile(r"epoch-([0-9]{9,19})(\.delta)?\.triquad")
@@ -50,6 +50,16 @@ def checkpoint_files(folder: Path) -> list[CheckpointFile]:
     """
     found = [checkpoint_file(path) for path in folder.iterdir() if path.is_file()]
     return sorted((file for file in found if file is not None), reverse=True)
+
+
+def set_aside(folder: Path) -> list[Path]:
+    """Checkpoints in a folder that a server found damaged and renamed, in the order of names.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    ended = [path for path in folder.iterdir() if path.name.endswith(DAMAGED_SUFFIX)]
+    return sorted(path for path in ended if checkpoint_file(path.with_suffix("")) is not None)
 
 
 def newest_of_each(files: Iterable[CheckpointFile]) -> list[CheckpointFile]:

@@ -112,9 +112,19 @@ def _pack(arguments: argparse.Namespace) -> int:
     _check_target(path, arguments.output, arguments.force)
     if path != arguments.input:
         print(f"epoch {epoch_of(path)}, from {path}")
+        if arguments.at is None:
+            _tell_set_aside(path)
     if arguments.output.suffix == _MAP:
         return _pack_map(arguments, path)
     return _export(arguments, path)
+
+
+def _tell_set_aside(path: Path) -> None:
+    """Name the newer checkpoints beside the newest sound one, which were damaged."""
+    from triquad_format.history import set_aside
+
+    for newer in (aside for aside in set_aside(path.parent) if aside.name > path.name):
+        print(f"triquad-pack: {newer} is newer, but damaged: --recover saves what is intact of it")
 
 
 def _check_usage(arguments: argparse.Namespace) -> None:

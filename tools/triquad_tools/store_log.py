@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError, MapFileError, NoIndexError
-from triquad_format.history import CheckpointFile, checkpoint_files, map_folder
+from triquad_format.history import CheckpointFile, checkpoint_files, map_folder, set_aside
 from triquad_format.manifest import Entry, FileRef, Manifest
 from triquad_format.map_index import MapIndex
 from triquad_format.part import REGION_TOPICS, PartKey
@@ -45,6 +45,7 @@ class StoreLog:
     folder: str
     bytes: int
     checkpoints: tuple[LoggedCheckpoint, ...]
+    set_aside: tuple[str, ...] = ()  # names of files that a server found damaged
 
     @property
     def damaged(self) -> int:
@@ -64,7 +65,8 @@ def read_log(store: Path) -> StoreLog:
     folder = map_folder(store)
     indices = _Indices(folder)
     checkpoints = tuple(_logged(file, indices) for file in checkpoint_files(folder))
-    return StoreLog(str(folder), sum(found.bytes for found in checkpoints), checkpoints)
+    aside = tuple(path.name for path in set_aside(folder))
+    return StoreLog(str(folder), sum(found.bytes for found in checkpoints), checkpoints, aside)
 
 
 def print_log(log: StoreLog) -> None:
@@ -75,6 +77,8 @@ def print_log(log: StoreLog) -> None:
     for checkpoint in log.checkpoints:
         if checkpoint.problem is not None:
             print(f"  {checkpoint.file}: {checkpoint.problem}")
+    for name in log.set_aside:
+        print(f"  {name}: set aside as damaged; triquad-pack --recover saves what is intact")
 
 
 def _row(checkpoint: LoggedCheckpoint) -> tuple[str, ...]:
