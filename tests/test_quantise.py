@@ -12,6 +12,7 @@ from triquad_format.errors import FormatError
 from triquad_format.evaluator import MapEvaluator
 from triquad_format.mapfile import read_map
 from triquad_tools.field_change import draw_probes, field_change
+from triquad_tools.map_packing import INTEGER_ERROR_M
 from triquad_tools.pack import main
 from triquad_tools.quantise import dequantised, quantise
 from triquad_tools.region_probes import RegionProbes
@@ -28,7 +29,7 @@ def street():
 
 @pytest.fixture(scope="module")
 def fine(street):
-    return quantise(street, 0.001)
+    return quantise(street, INTEGER_ERROR_M)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def test_random_maps_keep_to_the_limit(encoding):
         assert all(table.features.dtype == np.int16 for table in region.tables)
 
 
-@pytest.mark.parametrize(("name", "limit_m"), [("fine", 0.001), ("coarse", 0.005)])
+@pytest.mark.parametrize(("name", "limit_m"), [("fine", INTEGER_ERROR_M), ("coarse", 0.005)])
 def test_a_trained_map_keeps_to_the_limit_and_shrinks(street, name, limit_m, request):
     packed = request.getfixturevalue(name)
     fresh = field_change(street, packed.record, OTHER_SEED)
