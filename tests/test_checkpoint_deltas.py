@@ -11,6 +11,7 @@ from triquad_format.mapfile import read_map, read_map_file
 from triquad_format.recover import recover
 from triquad_format.region import MapRecord, RegionIndex
 from triquad_server.errors import StoreBaseError, StoreError
+from triquad_server.file_identity import file_identity
 from triquad_server.mapper import MapChanges, Mapper
 from triquad_server.retention import Retention
 from triquad_server.settings import Settings
@@ -127,13 +128,18 @@ def test_a_base_that_vanished_makes_the_next_checkpoint_complete(store):
     assert_same(read_map(paths(store)[3]), third)
 
 
-def spoil(path, keep_time=False):
-    """Overwrite the middle of a file."""
+def spoil(path):
+    """Overwrite the middle of a file, and put its time back."""
     before = path.stat()
     data = path.read_bytes()
     path.write_bytes(data[:2000] + bytes(5000) + data[7000:])
-    if keep_time:
-        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def rot(store, path):
+    """Damage a file as a disk does: nothing but its bytes tells."""
+    spoil(path)
+    store._identities[path.name] = file_identity(path)
 
 
 def test_after_its_base_was_spoilt_a_checkpoint_is_complete(store):
@@ -150,7 +156,7 @@ def test_a_damaged_base_is_not_copied_from(store):
     """What is damaged must not be written again as if it were sound; then all is asked for."""
     first = grown(1, 1)
     store.write(changes(first))
-    spoil(paths(store)[1], keep_time=True)
+    rot(store, paths(store)[1])
     assert store.base_epoch == 1
     second = grown(2, 2, first, ROW[:7])
     with pytest.raises(StoreBaseError, match="epoch-000000001.triquad"):
@@ -164,8 +170,8 @@ def test_a_damaged_base_is_not_copied_from(store):
 
 def test_a_damaged_base_is_found_when_folding(store):
     drive(store, 9)
-    spoil(paths(store)[1], keep_time=True)
-    spoil(paths(store)[5], keep_time=True)
+    rot(store, paths(store)[1])
+    rot(store, paths(store)[5])
     with pytest.raises(StoreBaseError, match="cannot be folded"):
         store.fold(lambda: False)
     assert store.base_epoch is None
@@ -313,3 +319,22 @@ def test_what_was_set_aside_can_still_be_recovered_with_its_base(store):
     changed = {region.index: region for region in saved.regions}
     for index in ROW[2:5]:
         assert_same(changed[index], next(r for r in records[4].regions if r.index == index))
+
+
+def test_who_lost_the_folder_does_not_fold_in_it(store, tmp_path):
+    drive(store, 9)
+    (store.folder / "lock").unlink()
+    with closing(Store(tmp_path, "lab", Retention(100))) as other:
+        assert other.newest() is not None
+        with pytest.raises(StoreError, match="in use by another server"):
+            store.fold(lambda: False)
+        assert 10 in paths(other)
+
+
+def test_damaged_files_of_one_name_are_all_set_aside(store):
+    store.write(changes(grown(1, 1)))
+    bad = store.folder / "epoch-000000002.triquad"
+    for _ in range(3):
+        bad.write_bytes(b"half a fi")
+        assert store.newest().record.epoch == 1
+    assert len(list(store.folder.glob("*.damaged"))) == 3

@@ -116,3 +116,23 @@ def test_checkpoints_while_it_learns_are_deltas_only_where_that_pays(tmp_path, a
         after = client.query_sdf(probes)
         assert np.array_equal(after.status, before.status)
         assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)
+
+
+def test_a_checkpoint_that_was_spoilt_is_written_again_when_asked_for(arguments):
+    with (
+        servers.server_process(arguments) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        learn(client)
+        path = Path(client.checkpoint().path)
+        path.write_bytes(path.read_bytes()[:1000])
+        again = client.checkpoint()
+        assert again.epoch == client.status().epoch
+        assert read_map(again.path).epoch == again.epoch
+        server.process.kill()
+        server.wait()
+    with (
+        servers.server_process(arguments) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        assert client.status().regions == 1

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 
+from triquad_format.errors import MapFileError
 from triquad_format.manifest import Entry
 from triquad_format.map_index import OtherFiles
 from triquad_format.map_parts import pack_region
@@ -34,10 +35,19 @@ def checkpoint_parts(
 
 
 def copied_parts(entries: Iterable[Entry], others: OtherFiles) -> Iterator[Part]:
-    """Parts that other files hold, read and checked; the map's own part is made anew."""
+    """Parts that other files hold, read and checked; the map's own part is made anew.
+
+    Raises:
+        MapFileError: one of the files cannot be read, or is damaged.
+    """
     for entry in entries:
-        if entry.key.topic != MAP:
-            yield repack_part(entry.key, others.payload(entry))
+        if entry.key.topic == MAP:
+            continue
+        try:
+            payload = others.payload(entry)
+        except OSError as error:  # of reading: the file that is written is another
+            raise MapFileError(f"a file that holds parts cannot be read: {error}") from error
+        yield repack_part(entry.key, payload)
 
 
 def unless(stopping: Callable[[], bool], parts: Iterator[Part]) -> Iterator[Part]:

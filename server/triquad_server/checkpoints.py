@@ -5,7 +5,6 @@ import queue
 import threading
 import time
 from concurrent.futures import Future
-from pathlib import Path
 
 from triquad_format.messages import CheckpointInfo, CheckpointRequest
 
@@ -102,7 +101,8 @@ class Checkpoints:
         assert self._store is not None
         epoch = self._mapper.call(lambda mapper: mapper.publish().number)
         last = self.last
-        if last is not None and last.epoch == epoch and Path(last.path).exists():
+        # The base is the last checkpoint, as long as its files are as they were written.
+        if last is not None and last.epoch == epoch == self._store.base_epoch:
             return last
         try:
             info = self._write_changes(self._store)

@@ -11,7 +11,8 @@ class FileIdentity:
     device: int
     inode: int
     size: int  # bytes
-    changed_ns: int  # nanoseconds since 1970
+    modified_ns: int  # nanoseconds since 1970
+    changed_ns: int  # the same, of anything about it: nobody can set this back
 
 
 def file_identity(path: Path) -> FileIdentity | None:
@@ -20,4 +21,6 @@ def file_identity(path: Path) -> FileIdentity | None:
         status = path.stat()
     except OSError:
         return None
-    return FileIdentity(status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+    return FileIdentity(
+        status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    )

@@ -5,6 +5,7 @@ and then all is folded into one file. How far back they reach, the retention dec
 """
 
 import hashlib
+import itertools
 import logging
 import os
 import time
@@ -179,6 +180,7 @@ class Store:
             return None
         path = self.folder / checkpoint_name(known.facts.epoch, complete=True)
         try:
+            self._lock.renew()
             with closing(OtherFiles(files_in(self.folder))) as others:
                 parts = unless(stopping, copied_parts(known.entries.values(), others))
                 here = known.stored_here()
@@ -304,7 +306,13 @@ def _read(checkpoint: CheckpointFile) -> MapFile | None:
 def _set_aside(damaged: list[Path]) -> None:
     try:
         for path in damaged:
-            path.rename(path.with_name(path.name + DAMAGED_SUFFIX))
+            aside = path.with_name(path.name + DAMAGED_SUFFIX)
+            for number in itertools.count(2):
+                if not os.path.lexists(aside):
+                    break
+                aside = path.with_name(f"{path.name}.{number}{DAMAGED_SUFFIX}")
+            path.rename(aside)
+            _log.warning("%s is now called %s", path, aside.name)
     except OSError as error:
         raise StoreError(f"the damaged {path} cannot be renamed: {error}") from error
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 OK, DAMAGED, BAD_INPUT = 0, 1, 2
 
 _TILE_M = 6.4
+_LEAST_TILE_M = 0.1
 _ROWS = 20
 _PICTURE_SUFFIX = ".png"
 
@@ -75,6 +76,9 @@ def _check_usage(options: argparse.Namespace) -> None:
         f"only --diff takes more than one file: {given} given": not options.diff and given > 1,
         "--verify is for one map file": options.verify and (options.log or options.diff),
         "--tile and --limit go with --diff": (options.tile or options.limit) and not options.diff,
+        f"--tile {options.tile} m is too small: use {_LEAST_TILE_M} or more": (
+            options.tile and options.tile < _LEAST_TILE_M
+        ),
         "--plot is for map files, not for --log": options.log and plot,
         f"--plot {plot}: its name must end in {_PICTURE_SUFFIX}": (
             plot and plot.suffix != _PICTURE_SUFFIX

@@ -151,10 +151,11 @@ def _check_usage(arguments: argparse.Namespace) -> None:
 
 def _check_target(source: Path, target: Path, force: bool) -> None:
     """Refuse a target that must not be written."""
-    from triquad_format.history import checkpoint_file
+    from triquad_format.history import checkpoint_file, checkpoint_files
 
-    folder = source if source.is_dir() else source.parent
-    if checkpoint_file(target) is not None and target.parent.resolve() == folder.resolve():
+    folder = target.parent
+    named_so = checkpoint_file(target) is not None
+    if named_so and folder.is_dir() and checkpoint_files(folder):
         raise ToolError(f"{target} would pass for a checkpoint of {folder}; give another name")
     if os.path.lexists(target):
         if source.exists() and target.exists() and target.samefile(source):
