@@ -8,7 +8,7 @@ from mapfile_surgery import file_bytes
 from small_world import settings, settled_mapper, world
 from triquad_format.crop import crop_record
 from triquad_format.evaluator import MapEvaluator
-from triquad_format.mapfile import read_map
+from triquad_format.mapfile import read_map, write_map
 from triquad_format.status import Status
 from triquad_tools.meshfile import read_mesh
 from triquad_tools.pack import main
@@ -140,3 +140,11 @@ def test_refusals(map_file, tmp_path, capsys):
     refused("--sparse is of .npz", "mesh.ply", "--sparse")
     refused("of map files", "mesh.ply", "--max-error", "2mm")
     refused("nowhere is not a folder", "nowhere/mesh.ply")
+
+
+def test_regions_too_far_for_a_mesh_are_told(tmp_path, capsys):
+    record = random_record(0, indices=((2**31 - 1, 0, 0),))
+    write_map(record, tmp_path / "far.triquad", preview=False)
+    assert main([str(tmp_path / "far.triquad"), str(tmp_path / "far.ply")]) == 2
+    assert "too far from the origin" in capsys.readouterr().err
+    assert not (tmp_path / "far.ply").exists()

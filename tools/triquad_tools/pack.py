@@ -36,6 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(error, DAMAGED)
     except (FormatError, ToolError, OSError) as error:
         return _complain(error, BAD_INPUT)
+    except OverflowError:
+        return _complain("its regions lie too far from the origin: use --crop", BAD_INPUT)
     except MemoryError:
         return _complain("it does not fit into memory: use --crop", BAD_INPUT)
     except KeyboardInterrupt:
