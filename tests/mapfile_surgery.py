@@ -10,12 +10,14 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from triquad_format.array import pack_array, unpack_array
+from triquad_format.errors import MapFileError
 from triquad_format.manifest import FileRef, pack_manifest, unpack_manifest
 from triquad_format.map_facts import MapFacts
 from triquad_format.mapfile import read_map, write_map
 from triquad_format.mapfile_writer import record_parts, write_parts
 from triquad_format.part import MANIFEST
 from triquad_format.random_access import MemoryBytes
+from triquad_format.record_check import check_record
 from triquad_format.stored_map import StoredMap
 
 
@@ -150,6 +152,16 @@ def altered(parts, count, rng):
         for _ in range(int(rng.integers(1, 4))):
             payload[int(len(payload) * rng.random() ** 3)] ^= 1 << int(rng.integers(8))
         yield [*parts[:at], RawPart(parts[at].topic, bytes(payload)), *parts[at + 1 :]]
+
+
+def sound_or_refused(read, data):
+    """The record of a hostile file, which must be sound; ``None`` where the file is refused."""
+    try:
+        record = read(data)
+    except MapFileError:
+        return None
+    check_record(record)
+    return record
 
 
 def write_pair(

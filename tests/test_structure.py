@@ -1,3 +1,5 @@
+import contextlib
+
 import msgpack
 import pytest
 from hypothesis import given
@@ -21,7 +23,10 @@ VALUES = st.recursive(
 
 @given(VALUES)
 def test_ordinary_values_pass(value):
-    check_structure(msgpack.packb(value))
+    packed = msgpack.packb(value)
+    check_structure(packed)
+    with pytest.raises(WireError):
+        check_structure(packed[:-1])
 
 
 @given(st.binary(max_size=200))
@@ -30,10 +35,10 @@ def test_what_passes_can_be_unpacked_and_what_does_not_is_named(payload):
         check_structure(payload)
     except WireError:
         return
-    try:
+    with contextlib.suppress(ValueError, TypeError):  # text that is not UTF-8, or a map as a key
         msgpack.unpackb(payload, strict_map_key=False)
-    except (ValueError, TypeError):  # text that is not UTF-8, or a map as a key
-        return
+    with pytest.raises(WireError):
+        check_structure(payload + b"\xc0")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Files of version 1, which are no longer written: read as ever, and as strictly."""
 
-import contextlib
 import hashlib
 from pathlib import Path
 
@@ -19,11 +18,11 @@ from mapfile_surgery import (
     set_array,
     set_field,
     shorten,
+    sound_or_refused,
 )
 from triquad_format.array import pack_array, unpack_array
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile import read_map, read_map_file
-from triquad_format.record_check import check_record
 from triquad_format.shuffle import shuffle_codes, unshuffle_codes
 
 GOLDEN = Path(__file__).parent / "golden" / "map_v1.triquad"
@@ -127,9 +126,9 @@ def test_bit_flips():
 
 
 def test_altered_parts_with_right_digests():
-    for mutant in altered(parts_of(DATA)[:-1], 250, np.random.default_rng(3)):
-        with contextlib.suppress(MapFileError):
-            check_record(read_bytes(file_of(mutant)))
+    mutants = altered(parts_of(DATA)[:-1], 250, np.random.default_rng(3))
+    found = [sound_or_refused(read_bytes, file_of(mutant)) for mutant in mutants]
+    assert 0 < sum(record is not None for record in found) < 250
 
 
 def test_parts_missing_reordered_doubled_swapped():

@@ -206,9 +206,10 @@ def test_messages_with_a_changed_byte_are_read_or_refused(message, data):
     payload = bytearray(wire.encode(message))
     payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     try:
-        wire.decode(type(message), bytes(payload))
+        read = wire.decode(type(message), bytes(payload))
     except WireError:
         return
+    assert type(read) is type(message)
 
 
 @pytest.mark.parametrize(
