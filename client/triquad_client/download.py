@@ -65,7 +65,7 @@ class MapDownload:
         try:
             stored = StoredMap(RemoteBytes(self._connection, self._info(training=False)))
             record = crop_record(stored.box(minimum, maximum), minimum, maximum)
-            if not any(len(region.evidence.codes) for region in record.regions):
+            if not record.has_evidence:
                 raise DownloadError(
                     f"nothing of the map lies between {minimum.tolist()} and {maximum.tolist()}"
                 )

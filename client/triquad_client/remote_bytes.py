@@ -14,7 +14,6 @@ class RemoteBytes:
     def __init__(self, connection: Connection, info: MapInfo) -> None:
         self.name = f"the map of epoch {info.epoch}"
         self.size = info.bytes
-        self.bytes_read = 0
         self._connection = connection
         self._info = info
 
@@ -36,7 +35,6 @@ class RemoteBytes:
             data += chunk.data
         if len(data) != length:
             raise DownloadError(f"{len(data)} bytes came from {offset} on, not {length}")
-        self.bytes_read += length
         return bytes(data)
 
     def close(self) -> None:

@@ -134,19 +134,13 @@ class _VertexLookup:
     """Feature vectors of one plane and level by vertex; an absent vertex gives zeros."""
 
     def __init__(self, table: VertexTable) -> None:
-        self._codes = table.codes
-        self._absent = len(table.codes)
+        self._rows_of = table.rows_of
         zeros = np.zeros((1, table.features.shape[1]), np.float32)
         self._features = np.concatenate([table.vectors(), zeros])
 
     def __call__(self, cells: NDArray[np.int64]) -> Floats:
         """Features [N, d] of the vertices at integer coordinates [N, 2]."""
-        if not self._absent:
-            return np.zeros((len(cells), self._features.shape[1]), np.float32)
-        codes = morton.encode(cells)
-        rows = np.searchsorted(self._codes, codes)
-        found = self._codes[np.minimum(rows, self._absent - 1)] == codes
-        features: Floats = self._features[np.where(found, rows, self._absent)]
+        features: Floats = self._features[self._rows_of(cells)]
         return features
 
 
@@ -189,7 +183,7 @@ class _RegionField:
         settings = self._settings
         size = settings.feature_size
         leaf = np.float32(settings.leaf_m)
-        u = local / leaf + np.float32(1 << (settings.depth - 1))
+        u = leaf_coordinates(settings, local)
         features = np.zeros((len(local), settings.feature_levels * size), np.float32)
         for table, lookup in self._lookups:
             axes = AXES[table.plane]

@@ -44,9 +44,7 @@ def pack_map(facts: MapFacts) -> Part:
     return pack_part(PartKey(MAP), pack_facts(facts))
 
 
-def pack_region(
-    region: Region, settings: FieldSettings, feature_dtype: str = "<f2"
-) -> Iterator[Part]:
+def pack_region(region: Region, settings: FieldSettings, feature_dtype: str) -> Iterator[Part]:
     """The parts of a checked region, in the order of the file.
 
     Raises:

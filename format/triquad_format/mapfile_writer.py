@@ -20,6 +20,7 @@ from triquad_format.container import (
 from triquad_format.durable_file import replacing
 from triquad_format.errors import FormatError
 from triquad_format.evaluator import MapEvaluator
+from triquad_format.field_settings import FieldSettings
 from triquad_format.manifest import Entry, Manifest, pack_manifest
 from triquad_format.map_facts import FRAME_ID, UNITS, MapFacts
 from triquad_format.map_parts import FEATURE_DTYPES, pack_map, pack_region
@@ -108,16 +109,27 @@ def record_parts(
 ) -> Iterator[Part]:
     """The parts of all regions of a checked record, with previews where there are distances."""
     for region in record.regions:
-        yield from _region_parts(region, record, feature_dtype)
-        if distances is not None:
-            yield pack_preview(region, record.settings, distances, stamp_ns)
+        yield from region_parts(region, record.settings, feature_dtype, distances, stamp_ns)
 
 
-def _region_parts(region: Region, record: MapRecord, feature_dtype: str) -> Iterator[Part]:
+def region_parts(
+    region: Region,
+    settings: FieldSettings,
+    feature_dtype: str,
+    distances: Distances | None,
+    stamp_ns: int,
+) -> Iterator[Part]:
+    """The parts of a checked region, with its preview where there are distances.
+
+    Raises:
+        FormatError: features do not fit ``feature_dtype``.
+    """
     try:
-        yield from pack_region(region, record.settings, feature_dtype)
+        yield from pack_region(region, settings, feature_dtype)
     except FormatError as error:
         raise FormatError(f"region {region.index}: {error}") from error
+    if distances is not None:
+        yield pack_preview(region, settings, distances, stamp_ns)
 
 
 def write_parts(

@@ -29,7 +29,7 @@ from triquad_format.part import (
 from triquad_format.part_reader import RegionParts
 from triquad_format.record_check import check_record
 from triquad_format.recover_version_1 import is_version_1, recover_version_1
-from triquad_format.recovery import STATUS_REACH_LEAVES, Loss, Recovery, loss_of
+from triquad_format.recovery import Loss, Recovery, felt_box, loss_of
 from triquad_format.region import (
     AXES,
     MapRecord,
@@ -139,10 +139,9 @@ def _silenced(settings: FieldSettings, region: Region, losses: Iterable[Loss]) -
     """The region without evidence where vertices are lost, be they its own or a neighbour's."""
     evidence = region.evidence
     centre = region_centre(settings, region.index)
-    reach_m = STATUS_REACH_LEAVES * settings.leaf_m
     for loss in losses:
         if loss.key.topic == VERTICES and loss.meets(centre, settings.region_side_m):
-            corners = np.stack([loss.minimum + reach_m, loss.maximum - reach_m])
+            corners = felt_box(loss.key, settings)
             box = LeafBox(*leaf_coordinates(settings, corners - centre))
             evidence = masked(evidence, ~voxels_felt(evidence, box))
     return dataclasses.replace(region, evidence=evidence)

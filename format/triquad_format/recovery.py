@@ -52,12 +52,17 @@ class Recovery:
 
 def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
     """The loss of a part."""
+    low, high = felt_box(key, settings)
+    reach_m = STATUS_REACH_LEAVES * settings.leaf_m
+    return Loss(key, low - reach_m, high + reach_m)
+
+
+def felt_box(key: PartKey, settings: FieldSettings) -> NDArray[np.float64]:
+    """Corners [2, 3] of the box in which a part is felt itself, metres, map frame."""
     box = extent(settings, key)
     if key.topic == VERTICES:
         # A vertex is felt as far as the side of its level's nodes; those at the upper border of a
         # square belong to the next.
         box.low[list(AXES[key.plane])] -= vertex_reach(settings)
-    box.low[:] -= STATUS_REACH_LEAVES
-    box.high[:] += STATUS_REACH_LEAVES
     corner = region_corner(settings, key.region)
-    return Loss(key, corner + box.low * settings.leaf_m, corner + box.high * settings.leaf_m)
+    return corner + np.stack([box.low, box.high]) * settings.leaf_m

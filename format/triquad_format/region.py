@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_format import morton
 from triquad_format.field_settings import FieldSettings
 
 AXES = ((0, 1), (0, 2), (1, 2))
@@ -51,6 +52,15 @@ class VertexTable:
         """The feature vectors [V, feature_size] themselves: integers count steps of ``scale``."""
         vectors = self.features.astype(np.float32)
         return vectors if self.scale is None else vectors * np.float32(self.scale)
+
+    def rows_of(self, vertices: NDArray[np.integer]) -> NDArray[np.intp]:
+        """Rows [N] of the vertices at integer coordinates [N, 2]; ``V`` where there is none."""
+        if not len(self.codes):
+            return np.zeros(len(vertices), np.intp)
+        wanted = morton.encode(vertices)
+        rows = np.searchsorted(self.codes, wanted)
+        found = self.codes[np.minimum(rows, len(self.codes) - 1)] == wanted
+        return np.where(found, rows, len(self.codes))
 
 
 @dataclass(frozen=True)
@@ -114,6 +124,11 @@ class MapRecord:
     epoch: int
     settings: FieldSettings
     regions: tuple[Region, ...]
+
+    @property
+    def has_evidence(self) -> bool:
+        """Whether rays have shown anything; without evidence all is ``UNKNOWN``."""
+        return any(len(region.evidence.codes) for region in self.regions)
 
 
 def region_centre(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:

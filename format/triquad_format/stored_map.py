@@ -75,11 +75,6 @@ class StoredMap:
         """All parts of the map."""
         return self._index.manifest
 
-    @property
-    def metadata(self) -> dict[str, str]:
-        """The file's metadata record ``triquad``."""
-        return self._index.metadata
-
     def close(self) -> None:
         """Close all files."""
         self._index.close()

@@ -5,13 +5,14 @@ from collections.abc import Callable, Iterable, Iterator
 from triquad_format.errors import MapFileError
 from triquad_format.manifest import Entry
 from triquad_format.map_index import OtherFiles
-from triquad_format.map_parts import pack_region
+from triquad_format.mapfile_writer import region_parts
 from triquad_format.part import MAP, Part
 from triquad_format.part_body import repack_part
-from triquad_format.preview import pack_preview
 
 from triquad_server.known_parts import KnownParts
 from triquad_server.mapper import MapChanges
+
+_FEATURE_DTYPE = "<f2"
 
 
 class StoppedError(Exception):
@@ -27,8 +28,9 @@ def checkpoint_parts(
     for index in changes.regions:
         region = changed.get(index)
         if region is not None:
-            yield from pack_region(region, settings)
-            yield pack_preview(region, settings, changes.epoch.distances, stamp_ns)
+            yield from region_parts(
+                region, settings, _FEATURE_DTYPE, changes.epoch.distances, stamp_ns
+            )
         elif known is not None:
             entries = known.of_region(index)
             yield from entries if others is None else copied_parts(entries, others)

@@ -2,7 +2,6 @@
 
 import io
 import threading
-import time
 from collections import OrderedDict
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ from triquad_format.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoR
 
 from triquad_server.errors import RequestError
 from triquad_server.mapper_thread import MapperThread
+from triquad_server.stamp import stamp_now_ns
 
 CHUNK_BYTES = 2**20
 FILES_KEPT = 2
@@ -41,13 +41,13 @@ class MapDownloads:
                 if file.info.epoch == newest.number and file.training == request.training:
                     self._files.move_to_end(file.info.sha256)
                     return file.info
-        record = newest.record()
         if request.training:
             changes = self._mapper.call(lambda mapper: mapper.changes_since(None))
             record, newest = changes.record, changes.epoch
+        else:
+            record = newest.record()
         buffer = io.BytesIO()
-        stamp_ns = min(max(time.time_ns(), 0), 2**63 - 1)
-        written = write_map(record, buffer, stamp_ns=stamp_ns, distances=newest.distances)
+        written = write_map(record, buffer, stamp_ns=stamp_now_ns(), distances=newest.distances)
         info = MapInfo(written.epoch, written.bytes, written.sha256, CHUNK_BYTES)
         with self._lock:
             self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())

@@ -50,6 +50,7 @@ from triquad_server.folder_lock import FolderLock
 from triquad_server.known_parts import KnownParts, known_parts, own_bytes
 from triquad_server.mapper import MapChanges
 from triquad_server.retention import KeptCheckpoint, Retention
+from triquad_server.stamp import stamp_now_ns
 
 _log = logging.getLogger(__name__)
 
@@ -143,7 +144,7 @@ class Store:
         # Where most changed, the rest is copied, too: the checkpoint then needs no other.
         delta = known is not None and known.is_small(changed)
         path = self.folder / checkpoint_name(record.epoch, complete=not delta)
-        stamp_ns = min(max(time.time_ns(), 0), 2**63 - 1)  # whatever the clock says
+        stamp_ns = stamp_now_ns()
         try:
             self._lock.renew()
             check_record(record)

@@ -82,13 +82,9 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
 def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
     """The map within a box, with or without training state; errors as :func:`read_source`."""
     record = source.record if box is None else crop_record(source.record, box[0], box[1])
-    if _has_evidence(source.record) and not _has_evidence(record):
+    if source.record.has_evidence and not record.has_evidence:
         raise NothingLeftError("nothing of the map lies in the box")
     return SourceMap(record if training else without_training(record), source.stamp_ns)
-
-
-def _has_evidence(record: MapRecord) -> bool:
-    return any(len(region.evidence.codes) for region in record.regions)
 
 
 def _whole(path: Path) -> SourceMap:

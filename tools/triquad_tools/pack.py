@@ -82,7 +82,7 @@ def _add_content(add: _Add) -> None:
         type=error_limit,
         metavar="LENGTH",
         help="features as coarse integers as move 99 %% of distances by less than this, such as "
-        "2mm; drops training state (default with int8: 1mm)",
+        "2mm; drops training state (default with int8: 1.5mm)",
     )
     add(
         "--crop",

@@ -17,7 +17,7 @@ def print_recovery(recovery: Recovery) -> None:
         print(f"saved all {recovery.parts_listed} parts: nothing is lost")
     else:
         print(f"saved {recovery.parts_intact} of {recovery.parts_listed} parts")
-    if not any(len(region.evidence.codes) for region in recovery.record.regions):
+    if not recovery.record.has_evidence:
         print("no evidence is left: the map gives distances, but says UNKNOWN everywhere")
 
 

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format import morton
 from triquad_format.field_settings import FieldSettings
-from triquad_format.region import AXES, Region, VertexTable
+from triquad_format.region import AXES, Region, VertexTable, leaf_coordinates
 
 from triquad_tools.field_change import FieldChange, draw_probes
 
@@ -78,12 +77,12 @@ class _TableCorners:
     """Where points lie among the vertices of one table."""
 
     def __init__(self, settings: FieldSettings, table: VertexTable, local: Floats) -> None:
-        u = local / np.float32(settings.leaf_m) + np.float32(1 << (settings.depth - 1))
+        u = leaf_coordinates(settings, local)
         v = u[:, AXES[table.plane]] / np.float32(1 << (settings.depth - table.level))
         floor = np.floor(v)
         hat = np.stack([1 - (v - floor), v - floor])  # [2, P, 2]
         least = np.maximum(floor.astype(np.int64), 0)
-        self._rows = [_rows_of(table.codes, least + corner) for corner in _CORNERS]
+        self._rows = [table.rows_of(least + corner) for corner in _CORNERS]
         self._weights = [hat[a, :, 0] * hat[b, :, 1] for a, b in _CORNERS]
 
     def interpolated(self, vectors: Floats) -> Floats:
@@ -93,16 +92,6 @@ class _TableCorners:
         for rows, weights in zip(self._rows, self._weights, strict=True):
             total += weights[:, None] * padded[rows]
         return total
-
-
-def _rows_of(codes: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Rows [P] of ``vertices`` [P, 2]; ``len(codes)`` where there is none."""
-    if not len(codes):
-        return np.zeros(len(vertices), np.intp)
-    wanted = morton.encode(vertices)
-    rows = np.searchsorted(codes, wanted)
-    found = codes[np.minimum(rows, len(codes) - 1)] == wanted
-    return np.where(found, rows, len(codes))
 
 
 def _fixed_input(settings: FieldSettings, region: Region, local: Floats, weight: Floats) -> Floats:
