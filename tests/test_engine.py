@@ -5,12 +5,12 @@ import pytest
 import small_world
 import torch
 from triquad_format.field_settings import FieldSettings
+from triquad_kernels.encoding import locate
+from triquad_kernels.tile import load, new_tile
 from triquad_server.adam import Betas, Parameter
-from triquad_server.compiled_encoding import locate
 from triquad_server.engine import CompiledEngine, GradientSums, TorchEngine, make_engine
 from triquad_server.field import Field
 from triquad_server.sampling import Batch
-from triquad_server.tile import load, new_tile
 
 CPU = torch.device("cpu")
 CASES = [

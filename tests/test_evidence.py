@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.status import Status
-from triquad_server.evidence import Evidence
+from triquad_kernels.evidence import Evidence
 
 SIDE = 64
 RNG = np.random.default_rng(0)

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.field_settings import FieldSettings
-from triquad_server.region_lattice import RegionLattice
+from triquad_kernels.region_lattice import RegionLattice
 
 FIELD = FieldSettings(depth=8)
 REGIONS = [(0, 0, 0), (1, 0, 0), (-1, 2, 0), (3, 3, -1)]

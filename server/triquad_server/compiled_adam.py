@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_kernels.feature_rows import move_row, prefetch_row
+from triquad_kernels.field import Touched
 
 from triquad_server.adam import EPSILON, Betas
-from triquad_server.compiled_field import Touched
-from triquad_server.feature_rows import move_row, prefetch_row
 
 Floats = NDArray[np.float32]
 

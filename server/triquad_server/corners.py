@@ -6,10 +6,9 @@ import torch
 from torch import Tensor
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import AXES
-
-from triquad_server import morton
-from triquad_server.quadtree import PLANE_BITS, TriQuadtree
-from triquad_server.voxel_index import MULTIPLIER, longest_probe
+from triquad_kernels import morton
+from triquad_kernels.quadtree import PLANE_BITS, TriQuadtree
+from triquad_kernels.voxel_index import MULTIPLIER, longest_probe
 
 
 @dataclass(frozen=True)

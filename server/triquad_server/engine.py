@@ -6,13 +6,13 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from triquad_kernels import field as compiled_field
+from triquad_kernels.encoding import Geometry
+from triquad_kernels.field import CompiledField, Touched
+from triquad_kernels.mlp import Mlp
 
-from triquad_server import compiled_field
 from triquad_server.adam import Betas, Parameter
 from triquad_server.compiled_adam import Moments, Rates, rates, step_row, step_touched
-from triquad_server.compiled_encoding import Geometry
-from triquad_server.compiled_field import CompiledField, Touched
-from triquad_server.compiled_mlp import Mlp
 from triquad_server.field import Field
 from triquad_server.sampling import Batch
 from triquad_server.threads import MAPPING, THREADS, share

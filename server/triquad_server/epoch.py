@@ -14,13 +14,13 @@ from triquad_format.region import (
     region_centre,
 )
 from triquad_format.status import Status
+from triquad_kernels.evidence import Evidence
+from triquad_kernels.region_lattice import Owned, RegionLattice
 
 from triquad_server.engine import Engine, FieldValues, make_engine
-from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 from triquad_server.field_record import region_record
 from triquad_server.mesher import TileMesh, mesh_tile
-from triquad_server.region_lattice import Owned, RegionLattice
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import ANSWERS
 

@@ -14,10 +14,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.field_settings import FieldSettings
+from triquad_kernels.quadtree import TriQuadtree
 
 from triquad_server.adam import Betas, Parameter
 from triquad_server.corners import CornerIndex, Corners
-from triquad_server.quadtree import TriQuadtree
 
 
 class Field:

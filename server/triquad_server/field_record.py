@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import AXES, Mlp, Region, RegionIndex, TrainingState, VertexTable
+from triquad_kernels.evidence import Evidence
 
 from triquad_server.adam import Parameter
-from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 
 

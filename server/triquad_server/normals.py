@@ -8,10 +8,10 @@ fine grid serves where it has a plane, the coarse one where it has not.
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_kernels.rows import with_room
+from triquad_kernels.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
-from triquad_server.rows import with_room
 from triquad_server.threads import MAPPING
-from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation

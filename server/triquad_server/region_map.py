@@ -14,10 +14,11 @@ from triquad_format.region import (
     leaf_coordinates,
     region_centre,
 )
+from triquad_kernels.evidence import Evidence
+from triquad_kernels.voxel_index import thin
 
 from triquad_server.adam import Betas
 from triquad_server.engine import GradientSums, Loss, make_engine
-from triquad_server.evidence import Evidence
 from triquad_server.field import Field
 from triquad_server.field_record import field_from_record, region_record, training_moments
 from triquad_server.replay_pool import ReplayPool
@@ -25,7 +26,6 @@ from triquad_server.sampling import Placement
 from triquad_server.scan import Rays
 from triquad_server.segments import ray_segments, sample_segments
 from triquad_server.settings import ScanSettings, TrainingSettings
-from triquad_server.voxel_index import thin
 
 _CARVE_SHORT_M = 0.1
 _CHECKPOINT_SAMPLES = 1_000_000

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from triquad_kernels.feature_rows import prefetch_row
+from triquad_kernels.rows import with_room
 
-from triquad_server.feature_rows import prefetch_row
-from triquad_server.rows import with_room
 from triquad_server.sampling import Batch, Placement, draw_ordered_samples, draw_samples
 from triquad_server.segments import COLUMNS, END
 

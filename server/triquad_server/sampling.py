@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from triquad_kernels.feature_rows import prefetch_row
+from triquad_kernels.morton import encode
 
-from triquad_server.feature_rows import prefetch_row
-from triquad_server.morton import encode
 from triquad_server.segments import DIRECTION, END, FREE_FROM, FREE_TO, LABEL, SLOPE
 from triquad_server.threads import MAPPING
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_kernels.voxel_index import Keys, empty_keys, enter
 
 from triquad_server.settings import ScanSettings
-from triquad_server.voxel_index import Keys, empty_keys, enter
 
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""

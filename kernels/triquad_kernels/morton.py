@@ -1,9 +1,8 @@
 """2-D Morton codes of tensors, and in kernels; the codes of :mod:`triquad_format.morton`."""
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from numba.extending import register_jitable
-from torch import Tensor
 
 _SPREAD = (
     (16, 0x0000FFFF0000FFFF),
@@ -13,17 +12,18 @@ _SPREAD = (
     (1, 0x5555555555555555),
 )
 
-CoordinateT = TypeVar("CoordinateT", int, Tensor)
+CoordinateT = TypeVar("CoordinateT")
 
 
 @register_jitable
 def encode(first: CoordinateT, second: CoordinateT) -> CoordinateT:
     """Morton codes of non-negative int64 coordinates below 2**31: numbers or tensors."""
-    return _spread(first) | (_spread(second) << 1)
+    codes: CoordinateT = _spread(first) | (_spread(second) << 1)
+    return codes
 
 
 @register_jitable
-def _spread(bits: CoordinateT) -> CoordinateT:
+def _spread(bits: Any) -> Any:
     for shift, mask in _SPREAD:
         bits = (bits | (bits << shift)) & mask
     return bits

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_server.tile import TILE, Tile
+from triquad_kernels.tile import TILE, Tile
 
 Floats = NDArray[np.float32]
 

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_server.compiled_encoding import (
+from triquad_kernels.encoding import (
     Geometry,
     add_feature_gradient,
     add_feature_slopes,
@@ -20,9 +20,9 @@ from triquad_server.compiled_encoding import (
     locate,
     wave,
 )
-from triquad_server.compiled_mlp import Mlp, add_weight_gradient, backward, forward, turned
-from triquad_server.quadtree import Vertices
-from triquad_server.tile import TILE, Tile, load, new_tile
+from triquad_kernels.mlp import Mlp, add_weight_gradient, backward, forward, turned
+from triquad_kernels.quadtree import Vertices
+from triquad_kernels.tile import TILE, Tile, load, new_tile
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.region import AXES
 
-from triquad_server.feature_rows import add_rows, add_to_row, prefetch_row
-from triquad_server.quadtree import Shape, Vertices, block_key
-from triquad_server.tile import TILE, Tile
-from triquad_server.voxel_index import EMPTY, find_row
+from triquad_kernels.feature_rows import add_rows, add_to_row, prefetch_row
+from triquad_kernels.quadtree import Shape, Vertices, block_key
+from triquad_kernels.tile import TILE, Tile
+from triquad_kernels.voxel_index import EMPTY, find_row
 
 Floats = NDArray[np.float32]
 

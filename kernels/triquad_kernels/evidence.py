@@ -14,8 +14,8 @@ from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_format.region import Evidence as EvidenceRecord
 from triquad_format.status import Status
 
-from triquad_server.rows import with_room
-from triquad_server.voxel_index import Index, VoxelIndex, find_row, make_row, pack
+from triquad_kernels.rows import with_room
+from triquad_kernels.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 Masks = NDArray[np.uint8]
 

@@ -16,9 +16,9 @@ from triquad_format import morton
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import AXES
 
-from triquad_server.morton import encode
-from triquad_server.rows import with_room
-from triquad_server.voxel_index import Index, VoxelIndex, make_row
+from triquad_kernels.morton import encode
+from triquad_kernels.rows import with_room
+from triquad_kernels.voxel_index import Index, VoxelIndex, make_row
 
 _AXES = np.array(AXES)
 PLANE_BITS = 40

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import RegionIndex
 
-from triquad_server.voxel_index import CELL_LIMIT, Index, VoxelIndex, find_row, pack
+from triquad_kernels.voxel_index import CELL_LIMIT, Index, VoxelIndex, find_row, pack
 
 _NOBODY = -1
 
