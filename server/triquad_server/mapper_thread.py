@@ -175,7 +175,9 @@ class MapperThread:
         if scan is None:
             return False
         try:
-            report = self._mapper.ingest(scan.points, scan.world_from_sensor)
+            report = self._mapper.ingest(
+                scan.points, scan.world_from_sensor, scan.stamp_ns // 1_000_000_000
+            )
         except ScanRefusedError as error:
             self._inputs.scans_dropped.add(error.reason)
             self._inputs.ledger.refuse(scan, str(error))
