@@ -25,7 +25,8 @@ from triquad_client import (
     TriquadError,
     UnknownMapError,
 )
-from triquad_client.connection import open_connection, retried
+from triquad_client.call import Call, retried
+from triquad_client.connection import open_connection
 from triquad_format import keys, wire
 from triquad_format.messages import (
     ErrorReply,
@@ -364,15 +365,18 @@ def test_a_zenoh_configuration_file_is_used(endpoint, tmp_path):
 def test_only_the_expected_refusal_is_asked_again_and_not_for_ever():
     asked = []
 
-    def refuse(code: str, times: int) -> int:
+    def refuse(code: str, times: int) -> Call[int]:
+        yield from ()
         asked.append(code)
         if len(asked) <= times:
             raise RefusedError(code, "")
         return len(asked)
 
-    assert retried("epoch_gone", lambda: refuse("epoch_gone", 2)) == 3
+    with pytest.raises(StopIteration) as end:
+        next(retried("epoch_gone", lambda: refuse("epoch_gone", 2)))
+    assert end.value.value == 3
     for code, attempts in (("epoch_gone", 3), ("busy", 1)):
         asked.clear()
         with pytest.raises(RefusedError):
-            retried("epoch_gone", lambda code=code: refuse(code, 100))
+            next(retried("epoch_gone", lambda code=code: refuse(code, 100)))
         assert len(asked) == attempts

@@ -13,7 +13,8 @@ from triquad_format.errors import FormatError
 from triquad_format.messages import FlushReply, FlushRequest, Scan
 
 from triquad_client import checks
-from triquad_client.connection import Connection, Pending
+from triquad_client.call import Ask, Call, ask_each
+from triquad_client.connection import Connection
 from triquad_client.errors import InvalidInputError, InvalidScanError
 
 _REPLY_MARGIN_S = 5.0
@@ -77,12 +78,13 @@ class ScanPublisher:
             state.next_sequence += 1
             state.stamp_ns = stamp_ns
 
-    def flush(self, timeout_s: float, pending: int) -> FlushReport:
+    def flush(self, timeout_s: float, pending: int) -> Call[FlushReport]:
         """Wait for the server; arguments as in ``Client.flush``."""
         if timeout_s < 0 or pending < 0:
             raise InvalidInputError(f"timeout = {timeout_s!r}, pending = {pending!r}: negative")
-        waits = [self._send_flush(request) for request in self._requests(timeout_s, pending)]
-        replies = [wait.result() for wait in waits]
+        requests = list(self._requests(timeout_s, pending))
+        # All at once: each waits for its source, and they share the time.
+        replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
         refusals = [reply.last_refusal for reply in replies if reply.last_refusal is not None]
         return FlushReport(
             sum(reply.taken for reply in replies),
@@ -100,6 +102,7 @@ class ScanPublisher:
             if target >= 0:
                 yield FlushRequest(source, self._session, target, float(timeout_s))
 
-    def _send_flush(self, request: FlushRequest) -> Pending[FlushReply]:
-        wait_s = request.timeout_s + _REPLY_MARGIN_S
-        return self._connection.send(keys.FLUSH, request, FlushReply, timeout_s=wait_s)
+
+def _ask_flush(request: FlushRequest) -> Ask[FlushReply]:
+    wait_s = request.timeout_s + _REPLY_MARGIN_S
+    return Ask(keys.FLUSH, request, FlushReply, at_least_s=wait_s)
