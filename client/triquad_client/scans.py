@@ -13,7 +13,7 @@ from triquad_format.errors import FormatError
 from triquad_format.messages import FlushReply, FlushRequest, Scan
 
 from triquad_client import checks
-from triquad_client.call import Ask, Call, ask_each
+from triquad_client.call import Ask, Call, ask_each, worked
 from triquad_client.connection import Connection
 from triquad_client.errors import InvalidInputError, InvalidScanError
 
@@ -82,7 +82,8 @@ class ScanPublisher:
         """Wait for the server; arguments as in ``Client.flush``."""
         if timeout_s < 0 or pending < 0:
             raise InvalidInputError(f"timeout = {timeout_s!r}, pending = {pending!r}: negative")
-        requests = list(self._requests(timeout_s, pending))
+        # Work: a scan that the network is slow to take holds the lock.
+        requests = yield from worked(lambda _: list(self._requests(timeout_s, pending)))
         # All at once: each waits for its source, and they share the time.
         replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
         refusals = [reply.last_refusal for reply in replies if reply.last_refusal is not None]
