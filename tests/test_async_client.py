@@ -130,8 +130,8 @@ def test_scans_are_learnt_and_all_questions_answered_as_by_the_other_client(tmp_
             assert (await client.query_sdf(POINTS)).epoch == epoch
             assert (await client.query_sdf(POINTS)).status.max() == Status.UNKNOWN
             for name in ("map", "box"):
-                stored = StoredMap.open(tmp_path / f"{name}.triquad")
-                assert stored.manifest.facts.epoch == info.epoch
+                with StoredMap.open(tmp_path / f"{name}.triquad") as stored:
+                    assert stored.manifest.facts.epoch == info.epoch
 
         connected(endpoint, use)
 
@@ -340,13 +340,15 @@ def test_what_is_under_way_when_the_client_is_closed_says_so(tmp_path):
 
     async def use(client: AsyncClient) -> None:
         calls = [client.query_sdf(POINTS) for _ in range(40)]
-        calls += [client.settle(), client.download_map(tmp_path / "map.triquad")]
+        calls += [client.settle()]
+        calls += [client.download_map(tmp_path / f"{n}.triquad") for n in range(40)]
         tasks = [asyncio.ensure_future(call) for call in calls]
         await held.came(32)
         await held_files.came(1)
         await client.close()
         outcomes = await asyncio.gather(*tasks, return_exceptions=True)
-        assert [type(outcome) for outcome in outcomes] == [ClosedError] * 42
+        assert [type(outcome) for outcome in outcomes] == [ClosedError] * 81
+        assert not list(tmp_path.iterdir())
         await client.close()
         for call in (client.status(), client.maps(), client.publish_scan(POINTS, POSE)):
             with pytest.raises(ClosedError):

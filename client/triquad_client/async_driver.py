@@ -24,6 +24,9 @@ REQUESTS_IN_FLIGHT = 32
 """Requests of one operation, over all calls, that wait for their replies at the same time. Servers
 refuse what exceeds their queue (64, where it is not set otherwise) as ``busy``."""
 
+_WORKERS = 32
+"""Downloads and long computations that go on at the same time."""
+
 DoneT = TypeVar("DoneT")
 
 
@@ -34,6 +37,7 @@ class AsyncDriver:
         """``sender`` has one thread, and is used for nothing else."""
         self._connection = connection
         self._sender = sender
+        self._workers = ThreadPoolExecutor(_WORKERS, "triquad-worker")
         self._turns: defaultdict[str, asyncio.Semaphore] = defaultdict(
             lambda: asyncio.Semaphore(REQUESTS_IN_FLIGHT)
         )
@@ -55,11 +59,7 @@ class AsyncDriver:
 
     async def in_order(self, job: Callable[[], DoneT]) -> DoneT:
         """What ``job`` returns, run in the sending thread after all that was sent before."""
-        try:
-            done = self._sender.submit(job)
-        except RuntimeError as error:
-            raise closed_error() from error
-        return await asyncio.wrap_future(done)
+        return await _awaited(self._sender, job)
 
     async def maps(self) -> list[str]:
         """Names of the maps of all servers that can be reached."""
@@ -72,8 +72,14 @@ class AsyncDriver:
 
     async def close(self) -> None:
         """Close the connection; what is under way ends with :class:`ClosedError`."""
-        await asyncio.to_thread(self._connection.close)
-        self._sender.shutdown(wait=False)
+        # A thread of its own: all others may wait for what closing ends.
+        closer = ThreadPoolExecutor(1, "triquad-closer")
+        try:
+            await asyncio.wrap_future(closer.submit(self._connection.close))
+        finally:
+            closer.shutdown(wait=False)
+            self._sender.shutdown(wait=False)
+            self._workers.shutdown(wait=False)
 
     async def _take(self, step: Step) -> Any:
         if isinstance(step, Batch):
@@ -117,7 +123,7 @@ class AsyncDriver:
         """What a job returns; where the task is cancelled, so are the requests of the job."""
         with _cancelled_on_error() as cancellation:
             run = BlockingDriver(self._connection, cancellation).run
-            working = asyncio.ensure_future(asyncio.to_thread(job, run))
+            working = asyncio.ensure_future(_awaited(self._workers, lambda: job(run)))
             try:
                 return await asyncio.shield(working)
             except asyncio.CancelledError:
@@ -157,6 +163,14 @@ class _Pending:
 
     ask: Ask[Any]
     arrival: _Arrival
+
+
+async def _awaited(threads: ThreadPoolExecutor, job: Callable[[], DoneT]) -> DoneT:
+    try:
+        done = threads.submit(job)
+    except RuntimeError as error:  # they were shut down
+        raise closed_error() from error
+    return await asyncio.wrap_future(done)
 
 
 @contextmanager

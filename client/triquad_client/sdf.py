@@ -32,7 +32,10 @@ class SdfResult:
 
 def query(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResult]:
     """Distances at ``points`` [N, 3] of the map frame, metres; ``None`` is the newest epoch."""
-    checked = checks.query_points(points)
+    if isinstance(points, np.ndarray) and points.size > 3 * PART_POINTS:
+        checked = yield from worked(lambda _: checks.query_points(points))
+    else:
+        checked = checks.query_points(points)
     if at_epoch is not None:
         return (yield from _query(checked, gradient, checks.epoch(at_epoch)))
     # The map may go on while the parts are under way: then all of it is asked again.
