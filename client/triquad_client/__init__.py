@@ -12,6 +12,8 @@ from triquad_format import __version__
 from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_format.status import Status
 
+from triquad_client.async_client import AsyncClient, connect_async
+from triquad_client.async_queries import AsyncPinnedMap
 from triquad_client.checks import Bounds
 from triquad_client.client import Client, connect
 from triquad_client.errors import (
@@ -28,10 +30,13 @@ from triquad_client.errors import (
     UnknownMapError,
 )
 from triquad_client.mesh import Mesh
+from triquad_client.queries import PinnedMap
 from triquad_client.scans import FlushReport
 from triquad_client.sdf import SdfResult
 
 __all__ = [
+    "AsyncClient",
+    "AsyncPinnedMap",
     "BadReplyError",
     "Bounds",
     "CheckpointInfo",
@@ -45,6 +50,7 @@ __all__ = [
     "MapInfo",
     "Mesh",
     "NoReplyError",
+    "PinnedMap",
     "RefusedError",
     "RequestTimeoutError",
     "SdfResult",
@@ -55,4 +61,5 @@ __all__ = [
     "UnknownMapError",
     "__version__",
     "connect",
+    "connect_async",
 ]

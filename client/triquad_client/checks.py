@@ -1,6 +1,7 @@
 """Arguments turned into arrays of known dtype and shape, or refused."""
 
 import math
+import operator
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -89,6 +90,21 @@ def stamp_ns(stamp: float) -> int:
     if not math.isfinite(stamp) or not 0 <= stamp < 2**63 / 1e9:
         raise InvalidScanError(f"stamp = {stamp!r} is not a time in seconds since 1970")
     return round(stamp * 1e9)
+
+
+def epoch(number: int) -> int:
+    """The number of an epoch.
+
+    Raises:
+        InvalidInputError: it is none.
+    """
+    try:
+        checked = operator.index(number)
+    except TypeError as error:
+        raise InvalidInputError(f"at_epoch = {number!r} is not the number of an epoch") from error
+    if not 0 < checked < 2**63:
+        raise InvalidInputError(f"at_epoch = {number!r}: epochs are numbered from 1 on")
+    return checked
 
 
 def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

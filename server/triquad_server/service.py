@@ -24,6 +24,7 @@ from triquad_format.messages import (
 from triquad_server.checkpoints import Checkpoints
 from triquad_server.desk import Handler, RequestDesk
 from triquad_server.download import MapDownloads
+from triquad_server.epochs import ShelfLimits
 from triquad_server.flush import FlushDesk
 from triquad_server.gate import QueryGate
 from triquad_server.health import Counts, Health, Identity
@@ -144,7 +145,7 @@ class Service:
             self._served.mapper,
             inputs,
             limits.publish_period_s,
-            limits.epochs_kept,
+            ShelfLimits(limits.epochs_kept, limits.epochs_pinned, limits.pin_s),
             failed,
         )
         mapper.start()
