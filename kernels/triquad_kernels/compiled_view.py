@@ -11,7 +11,7 @@ from triquad_format.field_settings import FieldSettings
 from triquad_format.region import RegionIndex, leaf_coordinates
 from triquad_format.status import Status
 from triquad_query.confidence import faded
-from triquad_query.nearest import NearestSurface
+from triquad_query.nearest import NearestSurface, NearestUnknown
 from triquad_query.surfels import FieldSample
 
 from triquad_kernels.blended_field import BlendedField, FieldEngine
@@ -74,8 +74,13 @@ class CompiledView:
     """An immutable map: every answer comes from the same state. Safe to read from any thread."""
 
     def __init__(
-        self, settings: FieldSettings, regions: Sequence[RegionView], split: Split
+        self,
+        number: int,
+        settings: FieldSettings,
+        regions: Sequence[RegionView],
+        split: Split = in_one,
     ) -> None:
+        self.number = number
         self.region_views = tuple(regions)
         self._settings = settings
         self._split = split
@@ -162,17 +167,17 @@ class CompiledView:
         self._split(count, work, _LEAST_SEARCHES)
         return nearest
 
-    def unknown_distance(
-        self, points: NDArray[np.float64], max_distance_m: float
-    ) -> NDArray[np.float64]:
-        """Distances [N] from points [N, 3] to unknown space, at most ``max_distance_m``."""
-        distances = np.full(len(points), max_distance_m)
+    def nearest_unknown(self, points: NDArray[np.float64], max_distance_m: float) -> NearestUnknown:
+        """The nearest unknown space to points [N, 3], looked for as far as ``max_distance_m``."""
+        nearest = NearestUnknown(np.full(len(points), max_distance_m), points.copy())
 
         def work(first: int, last: int) -> None:
-            self._unknown.lower(points[first:last], distances[first:last], max_distance_m)
+            part = slice(first, last)
+            mine = NearestUnknown(nearest.distance[part], nearest.point[part])
+            self._unknown.improve(mine, points[part])
 
         self._split(len(points), work, _LEAST_SEARCHES)
-        return distances
+        return nearest
 
     def _improve(
         self,

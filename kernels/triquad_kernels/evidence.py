@@ -18,7 +18,7 @@ from triquad_format.status import Status
 
 from triquad_kernels.observations import Observations, Sighting
 from triquad_kernels.rows import with_room
-from triquad_kernels.unknown_search import find_unknown
+from triquad_kernels.unknown_search import SeenSpace, find_unknown
 from triquad_kernels.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 Masks = NDArray[np.uint8]
@@ -342,17 +342,16 @@ class Evidence:
         _ended_in(voxels, self._side, self._blocks.arrays, self._surface, ended)
         return ended
 
-    def to_unknown(
+    def find_unknown(
         self,
         voxels: NDArray[np.float64],
-        distances: NDArray[np.float64],
         cells: tuple[int, int],
+        distances: NDArray[np.float64],
+        nearest: NDArray[np.float64],
     ) -> None:
-        """Lower ``distances`` [N] to those from ``voxels`` [N, 3] to the nearest unknown voxel.
-
-        Only blocks whose indices are in ``range(*cells)`` on each axis are looked at.
-        """
-        find_unknown(voxels, self._blocks.arrays, self._surface, self._free, cells, distances)
+        """Find unknown voxels near ``voxels`` [N, 3]; see :func:`unknown_search.find_unknown`."""
+        seen = SeenSpace(self._blocks.arrays, self._surface, self._free)
+        find_unknown(voxels, seen, cells, distances, nearest)
 
     def surface_cells(self) -> NDArray[np.int64]:
         """Blocks [B, 3], in units of blocks, that hold any seen surface."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import BLOCK_VOXELS, RegionIndex, leaf_coordinates
+from triquad_query.nearest import NearestUnknown
 
 from triquad_kernels.evidence import Evidence
 
@@ -34,19 +35,14 @@ class UnknownSpace:
         self._settings = settings
         self._regions = {region.index: region for region in regions}
 
-    def lower(
-        self, points: NDArray[np.float64], distances: NDArray[np.float64], reach_m: float
-    ) -> None:
-        """Lower ``distances`` [N] to those from ``points`` [N, 3] to unknown space.
-
-        It is looked for as far as ``reach_m``.
-        """
-        for cell in self._cells_around(points, reach_m):
+    def improve(self, found: NearestUnknown, points: NDArray[np.float64]) -> None:
+        """Note in ``found`` what unknown space lies nearer to ``points`` [N, 3]."""
+        for cell in self._cells_around(points, float(found.distance.max(initial=0.0))):
             region = self._regions.get(cell)
             if region is None:
-                self._lower_to_cell(distances, points, cell)
+                self._look_in_cell(found, points, cell)
             else:
-                self._lower_in_region(distances, points, region)
+                self._look_in_region(found, points, region)
 
     def _cells_around(self, points: NDArray[np.float64], reach_m: float) -> list[RegionIndex]:
         """Cells of the region lattice that come within ``reach_m`` of any of the points."""
@@ -59,21 +55,31 @@ class UnknownSpace:
             cells |= {(x, y, z) for x in spans[0] for y in spans[1] for z in spans[2]}
         return sorted(cells)
 
-    def _lower_to_cell(
-        self, distances: NDArray[np.float64], points: NDArray[np.float64], cell: RegionIndex
+    def _look_in_cell(
+        self, found: NearestUnknown, points: NDArray[np.float64], cell: RegionIndex
     ) -> None:
         """Nothing is known of a cell without a region."""
         pitch = self._settings.region_pitch_m
-        gaps = np.maximum(np.abs(points - np.asarray(cell) * pitch) - pitch / 2, 0.0)
-        np.minimum(distances, np.sqrt((gaps**2).sum(axis=1)), out=distances)
+        middle = np.asarray(cell) * pitch
+        nearest = np.clip(points, middle - pitch / 2, middle + pitch / 2)
+        distance = np.linalg.norm(points - nearest, axis=1)
+        nearer = distance < found.distance
+        found.distance[nearer] = distance[nearer]
+        found.point[nearer] = nearest[nearer]
 
-    def _lower_in_region(
-        self, distances: NDArray[np.float64], points: NDArray[np.float64], region: PlacedEvidence
+    def _look_in_region(
+        self, found: NearestUnknown, points: NDArray[np.float64], region: PlacedEvidence
     ) -> None:
         """Look at what a region owns of the space around."""
+        leaf_m = self._settings.leaf_m
         blocks = (1 << self._settings.depth) // BLOCK_VOXELS
-        margin = round(self._settings.overlap_m / 2 / self._settings.leaf_m) // BLOCK_VOXELS
+        margin = round(self._settings.overlap_m / 2 / leaf_m) // BLOCK_VOXELS
         voxels = leaf_coordinates(self._settings, points - region.centre)
-        scaled = distances / self._settings.leaf_m
-        region.evidence.to_unknown(voxels, scaled, (margin, blocks - margin))
-        np.minimum(distances, scaled * self._settings.leaf_m, out=distances)
+        distances = found.distance / leaf_m
+        before = distances.copy()
+        nearest = np.empty((len(points), 3))
+        region.evidence.find_unknown(voxels, (margin, blocks - margin), distances, nearest)
+        nearer = distances < before
+        found.distance[nearer] = distances[nearer] * leaf_m
+        corner = region.centre - self._settings.region_side_m / 2
+        found.point[nearer] = corner + nearest[nearer] * leaf_m

@@ -1,5 +1,6 @@
 """True distances to the nearest surface, at any range."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ from triquad_format.status import Status
 
 from triquad_query.map_view import MapView
 from triquad_query.nearest import NearestSurface
+from triquad_query.unknown import Unknown, refuse_unknown
 
 _FIELD_VOXELS = 0.5
 """Up to here the trained field counts alone."""
@@ -27,15 +29,17 @@ class DistanceOptions:
 
 @dataclass(frozen=True)
 class Distances:
-    """Distances to the nearest seen surface from N points, metres, map frame."""
+    """Distances from N points to the nearest seen surface, metres, map frame, of one epoch."""
 
     distance: NDArray[np.float32]  # [N] negative behind a surface; at most max_distance_m
     gradient: NDArray[np.float32]  # [N, 3] its unit gradient, pointing to free space; 0: not found
     found: NDArray[np.bool_]  # [N] False: no surface within max_distance_m, which distance then is
-    status: NDArray[np.uint8]  # [N] Status of the point itself
-    confidence: NDArray[np.float32]  # [N] in [0, 1]; 0 where nothing was found or seen
+    status: NDArray[np.uint8]  # [N] Status of the points themselves
+    confidence: NDArray[np.float32]  # [N] in [0, 1]; 0 where nothing was found or the point unknown
     surface_point: NDArray[np.float64] | None  # [N, 3] nearest point; the point itself: not found
     unknown_distance: NDArray[np.float32] | None  # [N] to unknown space, at most max_distance_m
+    unknown_point: NDArray[np.float64] | None  # [N, 3] nearest point of it, within max_distance_m
+    epoch: int
 
 
 def distances(view: MapView, points: NDArray[np.float64], options: DistanceOptions) -> Distances:
@@ -51,7 +55,7 @@ def distances(view: MapView, points: NDArray[np.float64], options: DistanceOptio
     _join_field(view, points, nearest, status, distance, gradient)
     unknown = None
     if options.unknown_distance:
-        unknown = view.unknown_distance(points, options.max_distance_m).astype(np.float32)
+        unknown = view.nearest_unknown(points, options.max_distance_m)
     surface_point = None
     if options.surface_point:
         surface_point = np.where(nearest.found[:, None], nearest.point, points)
@@ -62,7 +66,40 @@ def distances(view: MapView, points: NDArray[np.float64], options: DistanceOptio
         status,
         np.where(status == Status.UNKNOWN, np.float32(0), nearest.confidence),
         surface_point,
-        unknown,
+        None if unknown is None else unknown.distance.astype(np.float32),
+        None if unknown is None else unknown.point,
+        view.number,
+    )
+
+
+def with_unknown(answer: Distances, points: NDArray[np.float64], unknown: Unknown) -> Distances:
+    """The answer for ``points`` [N, 3] where unknown space counts as asked.
+
+    As an obstacle it is a surface like others, of confidence 0.
+
+    Raises:
+        UnknownSpaceError: it is to be an error, and lies nearer than a surface.
+    """
+    if unknown is Unknown.FREE:
+        return answer
+    assert answer.unknown_distance is not None
+    assert answer.unknown_point is not None
+    nearer = answer.unknown_distance < answer.distance
+    if unknown is Unknown.ERROR:
+        refuse_unknown("point", nearer)
+    away = points - answer.unknown_point
+    lengths = np.linalg.norm(away, axis=1, keepdims=True)
+    gradient = np.where(lengths > 1e-6, away / np.maximum(lengths, 1e-6), 0.0)
+    surface_point = answer.surface_point
+    if surface_point is not None:
+        surface_point = np.where(nearer[:, None], answer.unknown_point, surface_point)
+    return dataclasses.replace(
+        answer,
+        distance=np.where(nearer, answer.unknown_distance, answer.distance),
+        gradient=np.where(nearer[:, None], gradient, answer.gradient).astype(np.float32),
+        found=answer.found | nearer,
+        confidence=np.where(nearer, np.float32(0), answer.confidence),
+        surface_point=surface_point,
     )
 
 

@@ -6,11 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.evaluator import Answer
 
-from triquad_query.nearest import NearestSurface
+from triquad_query.nearest import NearestSurface, NearestUnknown
 
 
 class MapView(Protocol):
     """A map that does not change. Points are [N, 3], metres, map frame, finite."""
+
+    @property
+    def number(self) -> int:
+        """Number of its epoch."""
 
     @property
     def voxel_m(self) -> float:
@@ -25,7 +29,5 @@ class MapView(Protocol):
     def nearest_surface(self, points: NDArray[np.float64], max_distance_m: float) -> NearestSurface:
         """The nearest seen surface, looked for as far as ``max_distance_m``."""
 
-    def unknown_distance(
-        self, points: NDArray[np.float64], max_distance_m: float
-    ) -> NDArray[np.float64]:
-        """Distances [N] to the nearest unknown space, at most ``max_distance_m``."""
+    def nearest_unknown(self, points: NDArray[np.float64], max_distance_m: float) -> NearestUnknown:
+        """The nearest unknown space, looked for as far as ``max_distance_m``."""

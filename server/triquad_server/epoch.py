@@ -48,8 +48,7 @@ class Epoch(CompiledView):
         mesh: MeshSettings,
         regions: tuple[FrozenRegion, ...],
     ) -> None:
-        super().__init__(settings, regions, ANSWERS.split)
-        self.number = number
+        super().__init__(number, settings, regions, ANSWERS.split)
         self.frozen_regions = regions
         self._name = name
         self._mesh = mesh
