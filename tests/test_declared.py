@@ -15,7 +15,6 @@ ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DISTRIBUTIONS = {
     "zenoh": "eclipse-zenoh",
-    "skimage": "scikit-image",
     "PIL": "pillow",
     "google": "protobuf",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",

@@ -28,6 +28,8 @@ from triquad_client.errors import (
     UnknownMapError,
 )
 from triquad_client.mesh import Mesh
+from triquad_client.mesh_tiles import HeldTiles, MeshTile
+from triquad_client.mesh_watch import MeshUpdate, MeshWatch
 from triquad_client.scans import FlushReport
 from triquad_client.sdf import SdfResult
 
@@ -40,10 +42,14 @@ __all__ = [
     "ConnectError",
     "DownloadError",
     "FlushReport",
+    "HeldTiles",
     "InvalidInputError",
     "InvalidScanError",
     "MapInfo",
     "Mesh",
+    "MeshTile",
+    "MeshUpdate",
+    "MeshWatch",
     "NoReplyError",
     "RefusedError",
     "RequestTimeoutError",

@@ -24,6 +24,8 @@ from triquad_client.connection import Connection, open_connection
 from triquad_client.download import MapDownload
 from triquad_client.errors import RequestTimeoutError
 from triquad_client.mesh import Mesh
+from triquad_client.mesh_tiles import HeldTiles
+from triquad_client.mesh_watch import MeshWatch
 from triquad_client.meshes import Meshes
 from triquad_client.scans import FlushReport, ScanPublisher
 from triquad_client.sdf import SdfQueries, SdfResult
@@ -145,6 +147,23 @@ class Client:
     def mesh(self, bounds: Bounds | None = None) -> Mesh:
         """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch."""
         return self._meshes.mesh(*checks.box(bounds))
+
+    def watch_mesh(
+        self,
+        bounds: Bounds | None = None,
+        level: int = 0,
+        max_bytes_per_s: int | None = None,
+        held: HeldTiles | None = None,
+    ) -> MeshWatch:
+        """Follow the mesh tiles that meet ``bounds``: they are fetched once, then as they change.
+
+        Args:
+            bounds: corners of a box; ``None``: everywhere.
+            level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
+            max_bytes_per_s: what this watch may take of the network; the server may allow less.
+            held: tiles of an earlier watch, which are not fetched again.
+        """
+        return MeshWatch(self._connection, *checks.box(bounds), level, max_bytes_per_s, held)
 
     def status(self) -> ServerStatus:
         """How the server is doing."""

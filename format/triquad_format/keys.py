@@ -13,6 +13,7 @@ SCHEMA_PREFIX = "application/msgpack;triquad."
 SDF = "query/sdf"
 TILE = "query/tile"
 TILE_LIST = "query/tiles"
+TILE_UPDATES = "query/tile_updates"
 STATUS = "query/status"
 FLUSH = "query/flush"
 MAP_INFO = "query/map"
@@ -21,7 +22,9 @@ MAP_CHUNK = "query/map_chunk"
 CHECKPOINT = "admin/checkpoint"
 RESET = "admin/reset"
 
-OPERATIONS = (SDF, TILE, TILE_LIST, STATUS, FLUSH, MAP_INFO, MAP_CHUNK, CHECKPOINT, RESET)
+OPERATIONS = (
+    SDF, TILE, TILE_LIST, TILE_UPDATES, STATUS, FLUSH, MAP_INFO, MAP_CHUNK, CHECKPOINT, RESET,
+)  # fmt: skip
 
 
 def check_name(kind: str, name: str) -> str:

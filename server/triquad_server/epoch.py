@@ -20,9 +20,11 @@ from triquad_kernels.region_lattice import Owned, RegionLattice
 from triquad_server.engine import Engine, FieldValues, make_engine
 from triquad_server.field import Field
 from triquad_server.field_record import region_record
-from triquad_server.mesher import TileMesh, mesh_tile
+from triquad_server.mesher import TileIndex, TileMesh, mesh_tile
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import ANSWERS
+from triquad_server.threads import ANSWERS, Team
+from triquad_server.tile_border import TileBorder
+from triquad_server.tile_lattice import TileLattice, tile_lattice, tiles_meeting
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,6 @@ class TileSet:
     """Mesh tiles that may hold a surface."""
 
     indices: NDArray[np.int32]  # [T, 3]
-    changed: NDArray[np.int64]  # [T] epoch in which each last changed
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,11 @@ class Epoch:
         return len(self.frozen_regions)
 
     @property
+    def field_settings(self) -> FieldSettings:
+        """Shape of the field."""
+        return self._settings
+
+    @property
     def vertices(self) -> int:
         """Quadtree vertices of all regions."""
         return sum(region.field.vertices for region in self.frozen_regions)
@@ -109,8 +115,8 @@ class Epoch:
         ANSWERS.split(count, work)
         return answer
 
-    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Signed distances [N] alone at points [N, 3] of the map frame."""
+    def distances(self, points: NDArray[np.float64], team: Team = ANSWERS) -> NDArray[np.float32]:
+        """Signed distances [N] alone at points [N, 3] of the map frame; ``team`` does the work."""
         distances = np.empty(len(points), np.float32)
 
         def work(first: int, last: int) -> None:
@@ -119,13 +125,14 @@ class Epoch:
             values = self._values(points[part], owners.groups(), owners.shared, gradient=False)
             distances[part] = values.sdf
 
-        ANSWERS.split(len(points), work)
+        team.split(len(points), work)
         return distances
 
     def status(
         self,
         points: NDArray[np.float64],
         reach_m: float | None = None,
+        team: Team = ANSWERS,
     ) -> NDArray[np.uint8]:
         """Status values [N] of points [N, 3]: what the evidence of each point's region says.
 
@@ -140,37 +147,36 @@ class Epoch:
             groups = self._lattice.owners(points[part]).groups()
             status[part] = self._status(points[part], groups, reach)
 
-        ANSWERS.split(len(points), work)
+        team.split(len(points), work)
         return status
 
-    def tiles(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> TileSet:
-        """Tiles that hold seen surface and meet the box between two corners [3]."""
-        changed: dict[tuple[int, int, int], int] = {}
-        for region in self.frozen_regions:
-            for x, y, z in self._surface_tiles(region).tolist():
-                changed[x, y, z] = max(region.changed, changed.get((x, y, z), 0))
-        indices = np.array(sorted(changed), np.int32).reshape(-1, 3)
-        low = indices * self._mesh.tile_side_m
-        meets = ((low <= maximum) & (low + self._mesh.tile_side_m >= minimum)).all(axis=1)
-        indices = indices[meets]
-        versions = [changed[(int(x), int(y), int(z))] for x, y, z in indices]
-        return TileSet(indices, np.array(versions, np.int64))
+    def tiles(
+        self, minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int = 0
+    ) -> TileSet:
+        """Tiles of a level that hold seen surface and meet the box between two corners [3]."""
+        lattice = tile_lattice(self._mesh, level)
+        tiles = {
+            (x, y, z)
+            for region in self.frozen_regions
+            for x, y, z in self._surface_tiles(region, lattice).tolist()
+        }
+        indices = np.array(sorted(tiles), np.int32).reshape(-1, 3)
+        low = indices * lattice.tile_side_m
+        meets = ((low <= maximum) & (low + lattice.tile_side_m >= minimum)).all(axis=1)
+        return TileSet(indices[meets])
 
-    def mesh(self, tile: tuple[int, int, int]) -> TileMesh:
-        """The mesh of one tile; empty where no surface was seen."""
-        return mesh_tile(self, tile, self._mesh)
+    def mesh(
+        self,
+        tile: TileIndex,
+        level: int = 0,
+        around: TileBorder | None = None,
+        team: Team = ANSWERS,
+    ) -> TileMesh:
+        """The mesh of one tile; empty where no surface was seen.
 
-    def changed(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> int:
-        """Epoch of the last change to any region that meets the box; 0 where there is none."""
-        half = self._settings.region_side_m / 2
-        return max(
-            (
-                region.changed
-                for region in self.frozen_regions
-                if ((region.centre - half <= high) & (region.centre + half >= low)).all()
-            ),
-            default=0,
-        )
+        ``around`` has distances at some lattice points that are used instead of the map's.
+        """
+        return mesh_tile(self, tile, tile_lattice(self._mesh, level), around, team)
 
     def record(self) -> MapRecord:
         """The epoch as a map file holds it, without training state."""
@@ -239,18 +245,12 @@ class Epoch:
         slopes = slopes[: len(points) if gradient else 0]
         return FieldValues(sdf.astype(np.float32), slopes.astype(np.float32))
 
-    def _surface_tiles(self, region: FrozenRegion) -> NDArray[np.int64]:
+    def _surface_tiles(self, region: FrozenRegion, lattice: TileLattice) -> NDArray[np.int64]:
         """Tiles [T, 3] that meet a block with seen surface, or what is meshed around it."""
         side = BLOCK_VOXELS * self._settings.leaf_m
         corner = region.centre - self._settings.region_side_m / 2
         low = region.evidence.surface_cells() * side + corner
-        first = np.floor((low - self._mesh.reach_m) / self._mesh.tile_side_m).astype(np.int64)
-        last = np.floor((low + side + self._mesh.reach_m) / self._mesh.tile_side_m).astype(np.int64)
-        tiles = [np.zeros((0, 3), np.int64)]
-        for offset in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
-            tile = first + offset
-            tiles.append(tile[(tile <= last).all(axis=1)])
-        return np.unique(np.concatenate(tiles), axis=0)
+        return tiles_meeting(low, low + side, lattice.reach_m, lattice)
 
 
 def frozen_region(

@@ -19,6 +19,7 @@ from triquad_format.messages import (
     StatusRequest,
     TileListRequest,
     TileRequest,
+    TileUpdatesRequest,
 )
 
 from triquad_server.checkpoints import Checkpoints
@@ -37,6 +38,8 @@ from triquad_server.settings import Settings
 from triquad_server.sources import SourceLedger
 from triquad_server.store import Store
 from triquad_server.tally import Tally
+from triquad_server.tile_feed import TileFeed
+from triquad_server.tile_shelf import TileShelf
 
 _TILE_WORKERS = 2  # one computes while another packs
 
@@ -118,7 +121,7 @@ class Service:
             self._mapper,
             checkpoints,
         )
-        self._open_desks(health)
+        self._open_desks(health, identity)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         # Closed before the last checkpoint is written: it shows every reset that was answered.
@@ -163,11 +166,22 @@ class Service:
         )
         self._parts.callback(intake.close)
 
-    def _open_desks(self, health: Health) -> None:
+    def _open_desks(self, health: Health, identity: Identity) -> None:
         """One desk per group of operations, so that none waits for a slower one."""
         limits = self._settings.service
         sdf = SdfQueries(self._mapper.epochs, self._gate, limits.max_query_points)
-        tiles = TileQueries(self._mapper.epochs, self._settings.mesh.tile_side_m)
+        shelf = TileShelf(self._settings.mesh)
+        tiles = TileQueries(self._mapper.epochs, shelf)
+        feed = TileFeed(
+            shelf,
+            self._mapper.epochs,
+            self._gate,
+            identity.server,
+            self._settings.mesh,
+            limits.request_queue,
+        )
+        feed.start()
+        self._parts.callback(feed.close)
         downloads = MapDownloads(self._mapper)
         flush = FlushDesk(
             self._ledger,
@@ -184,6 +198,13 @@ class Service:
                 keys.TILE: answering(TileRequest, tiles.tile),
             },
             _TILE_WORKERS,
+        )
+        self._open_desk(
+            {
+                keys.TILE_UPDATES: lambda request: feed.hold(
+                    request, request.read(TileUpdatesRequest)
+                ),
+            },
         )
         self._open_desk(
             {

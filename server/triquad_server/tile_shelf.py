@@ -1,0 +1,233 @@
+"""The mesh tiles of a map as they travel: made once, and the same bytes for everybody."""
+
+import hashlib
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.tile_code import encode_tile
+
+from triquad_server.epoch import Epoch
+from triquad_server.mesher import TileIndex
+from triquad_server.settings import MeshSettings
+from triquad_server.surface_changes import SurfaceChanges
+from triquad_server.threads import PATIENCE, Team
+from triquad_server.tile_border import TileBorder
+from triquad_server.tile_lattice import LEVELS, TileLattice, tile_lattice, tiles_meeting
+
+MESHING = Team("triquad-meshing", PATIENCE)
+"""For tiles that nobody waits for at the moment."""
+
+_AROUND = [
+    (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
+]
+
+
+@dataclass(frozen=True)
+class ShelvedTile:
+    """A tile that was made. Its bytes may be gone; what neighbours need of it never is."""
+
+    index: TileIndex
+    version: int  # epoch of which its bytes are
+    revision: int  # its place in the order in which bytes came to differ
+    made: int  # epoch with which it was last found to agree
+    empty: bool  # without faces
+    digest: bytes
+    border: TileBorder
+
+
+@dataclass(frozen=True)
+class TileNews:
+    """What somebody does not know of the tiles of a box."""
+
+    ready: list[ShelvedTile]  # by increasing revision
+    removed: list[TileIndex]
+    to_make: list[TileIndex]  # those that changed first come first
+    revision: int  # who knows all of this knows everything up to here
+
+
+class _Level:
+    """The tiles of one level of detail."""
+
+    def __init__(self, lattice: TileLattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, ShelvedTile] = {}
+        self.changed: dict[TileIndex, int] = {}  # epoch in which the surface last changed
+        self._indices = np.zeros((0, 3), np.int64)  # of ``changed``
+
+    def clean(self, index: TileIndex) -> ShelvedTile | None:
+        """The tile where it shows what the map has; None where it has to be made."""
+        tile = self.tiles.get(index)
+        return tile if tile is not None and self.changed.get(index, 0) <= tile.made else None
+
+    def touch(self, places: NDArray[np.float64], half_m: float, epoch: int) -> None:
+        """Note that the surface changed in voxels around ``places`` [N, 3]."""
+        margin_m = self.lattice.margin_m
+        touched = tiles_meeting(places - half_m, places + half_m, margin_m, self.lattice)
+        known = len(self.changed)
+        for x, y, z in touched.tolist():
+            self.changed[x, y, z] = epoch
+        if len(self.changed) > known:
+            self._indices = np.array(list(self.changed), np.int64)
+
+    def within(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> list[TileIndex]:
+        """Tiles that meet the box between two corners [3] and ever had a surface near."""
+        corners = self._indices * self.lattice.tile_side_m
+        meets = ((corners <= high) & (corners + self.lattice.tile_side_m >= low)).all(axis=1)
+        return [(x, y, z) for x, y, z in self._indices[meets].tolist()]
+
+
+class TileShelf:
+    """Makes tiles when they are asked for, and keeps them until their surface changes.
+
+    One thread makes tiles and looks for news; any thread may ask what changed.
+    """
+
+    def __init__(self, settings: MeshSettings) -> None:
+        self._lock = threading.Lock()
+        self._settings = settings
+        self._levels = [_Level(tile_lattice(settings, level)) for level in range(LEVELS)]
+        self._changes: SurfaceChanges | None = None
+        self._epoch: Epoch | None = None
+        self._revision = 0
+        self._made = 0
+        self._data: OrderedDict[tuple[int, TileIndex], bytes] = (
+            OrderedDict()
+        )  # longest unused first
+        self._bytes = 0
+
+    @property
+    def epoch(self) -> int:
+        """Number of the epoch that was looked at last; -1 before any."""
+        return -1 if self._epoch is None else self._epoch.number
+
+    @property
+    def revision(self) -> int:
+        """How often bytes of any tile came to differ."""
+        return self._revision
+
+    @property
+    def tiles_made(self) -> int:
+        """How many tiles were meshed so far."""
+        return self._made
+
+    @property
+    def size(self) -> int:
+        """Bytes of the encoded tiles that are kept."""
+        return self._bytes
+
+    def lattice(self, level: int) -> TileLattice:
+        """Where the tiles of a level lie."""
+        return self._levels[level].lattice
+
+    def look(self, epoch: Epoch) -> None:
+        """Find out what changed until ``epoch``; an older one than the last tells nothing."""
+        with self._lock:
+            if epoch.number <= self.epoch:
+                return
+            if self._changes is None:
+                self._changes = SurfaceChanges(
+                    epoch.field_settings, self._settings.tolerance_m, MESHING
+                )
+            places = self._changes.since_last(epoch.frozen_regions)
+            for level in self._levels:
+                level.touch(places, epoch.field_settings.leaf_m / 2, epoch.number)
+            self._epoch = epoch
+
+    def changed(self, level: int, indices: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Epochs [T] in which the surface of tiles [T, 3] last changed; 0 where none was seen."""
+        with self._lock:
+            changed = self._levels[level].changed
+            epochs = [changed.get((x, y, z), 0) for x, y, z in indices.tolist()]
+        return np.array(epochs, np.int64)
+
+    def news(
+        self,
+        level: int,
+        low: NDArray[np.float64],
+        high: NDArray[np.float64],
+        revision: int,
+        held: Mapping[TileIndex, int],
+    ) -> TileNews:
+        """What is new in a box to somebody who knows everything up to a revision.
+
+        ``held`` are versions of tiles that are known whatever the revision.
+        """
+        with self._lock:
+            shelf = self._levels[level]
+            ready: list[ShelvedTile] = []
+            removed = [index for index in held if index not in shelf.changed]
+            to_make: list[TileIndex] = []
+            for index in shelf.within(low, high):
+                tile = shelf.clean(index)
+                if tile is None:
+                    to_make.append(index)
+                elif tile.revision > revision and held.get(index) != tile.version:
+                    if not tile.empty:
+                        ready.append(tile)
+                    elif revision or index in held:
+                        removed.append(index)
+            ready.sort(key=lambda tile: tile.revision)
+            to_make.sort(key=lambda index: (shelf.changed[index], index))
+            return TileNews(ready, removed, to_make, self._revision)
+
+    def make(self, level: int, index: TileIndex) -> ShelvedTile:
+        """Make a tile from the epoch that was looked at last, to fit its neighbours."""
+        epoch = self._epoch
+        assert epoch is not None, "nothing was looked at"
+        shelf = self._levels[level]
+        with self._lock:
+            around = TileBorder.joined(_borders_around(shelf, index))
+        mesh = epoch.mesh(index, level, around, MESHING)
+        data = encode_tile(mesh.surface)
+        digest = hashlib.sha256(data).digest()
+        with self._lock:
+            self._made += 1
+            old = shelf.tiles.get(index)
+            if old is not None and old.digest == digest:
+                version, revision = old.version, old.revision
+            else:
+                self._revision += 1
+                version, revision = epoch.number, self._revision
+            tile = ShelvedTile(
+                index, version, revision, epoch.number, len(mesh.faces) == 0, digest, mesh.border
+            )
+            shelf.tiles[index] = tile
+            self._keep((level, index), data)
+        return tile
+
+    def data(self, level: int, tile: ShelvedTile) -> bytes | None:
+        """The bytes of a tile, None where they are gone; it has to be made anew then."""
+        with self._lock:
+            data = self._data.get((level, tile.index))
+            if data is not None:
+                self._data.move_to_end((level, tile.index))
+            return data
+
+    def _keep(self, key: tuple[int, TileIndex], data: bytes) -> None:
+        """Keep bytes; those unused for longest go where there are too many."""
+        self._bytes += len(data) - len(self._data.pop(key, b""))
+        self._data[key] = data
+        while self._bytes > self._settings.shelf_bytes and len(self._data) > 1:
+            _, gone = self._data.popitem(last=False)
+            self._bytes -= len(gone)
+
+
+def _borders_around(shelf: _Level, index: TileIndex) -> Iterable[TileBorder]:
+    """What a tile has to agree with.
+
+    That is its own border where only its bytes are gone, and those of all neighbours that show
+    what the map has: these agree with each other. The others will be made to fit it.
+    """
+    cells = shelf.lattice.cells
+    own = shelf.clean(index)
+    if own is not None:
+        yield own.border
+    for offset in _AROUND:
+        x, y, z = (a + b for a, b in zip(index, offset, strict=True))
+        neighbour = shelf.clean((x, y, z))
+        if neighbour is not None:
+            yield neighbour.border.seen_from(offset, cells)
