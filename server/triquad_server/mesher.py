@@ -189,7 +189,7 @@ def _corners(seen: NDArray[np.int64], volume: NDArray[np.float32]) -> NDArray[np
                 volume[x, y, z] = np.nan
                 points[count, 0], points[count, 1], points[count, 2] = x, y, z
                 count += 1
-    return points[:count].copy()
+    return points[:count]
 
 
 def _lattice_values(
