@@ -234,7 +234,7 @@ class TileFeed:
         news = self._shelf.news(
             asks.level, asks.minimum, asks.maximum, entry.revision, entry.versions
         )
-        if news.ready or news.removed:
+        if news.ready or (news.removed and not news.to_make):
             self._send(entry, self._filled(entry, news))
             return True
         if news.to_make:
@@ -266,6 +266,10 @@ class TileFeed:
         most = min(entry.asks.max_bytes, self._settings.reply_bytes, max(1.0, entry.rate * BURST_S))
         reply = _Reply(not news.to_make, entry.revision, removed=news.removed)
         for tile in news.ready:
+            if tile.empty:
+                reply.removed.append(tile.index)
+                reply.revision = tile.revision
+                continue
             codec, data = self._encoded(entry, tile)
             if data is None:  # it came out different: it is news again
                 reply.complete = False

@@ -43,8 +43,8 @@ class ShelvedTile:
 class TileNews:
     """What somebody does not know of the tiles of a box."""
 
-    ready: list[ShelvedTile]  # by increasing revision
-    removed: list[TileIndex]
+    ready: list[ShelvedTile]  # by increasing revision; empty ones are to be removed
+    removed: list[TileIndex]  # that are held, and were never here
     to_make: list[TileIndex]  # those that changed first come first
     revision: int  # who knows all of this knows everything up to here
 
@@ -165,11 +165,10 @@ class TileShelf:
                 tile = shelf.clean(index)
                 if tile is None:
                     to_make.append(index)
-                elif tile.revision > revision and held.get(index) != tile.version:
-                    if not tile.empty:
-                        ready.append(tile)
-                    elif revision or index in held:
-                        removed.append(index)
+                    continue
+                unknown = tile.revision > revision and held.get(index) != tile.version
+                if unknown and (not tile.empty or revision or index in held):
+                    ready.append(tile)
             ready.sort(key=lambda tile: tile.revision)
             to_make.sort(key=lambda index: (shelf.changed[index], index))
             return TileNews(ready, removed, to_make, self._revision)
