@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from exact_maps import SETTINGS, exact_map, flat
+from exact_maps import SETTINGS, exact_map, flat, table
 from numpy.typing import NDArray
 from small_world import settings, settle, world
 from triquad_format.tile_code import TileSurface, decode_tile
@@ -24,9 +24,11 @@ MESH = MeshSettings(tile_cells=16)
 
 def make_all(shelf: TileShelf, level: int = 0) -> list[TileIndex]:
     """Make what has to be made; returns it."""
-    made = shelf.news(level, *EVERYWHERE, 0, {}).to_make
-    for index in made:
-        shelf.make(level, index)
+    made: list[TileIndex] = []
+    while to_make := shelf.news(level, *EVERYWHERE, 0, {}).to_make:
+        for index in to_make:
+            shelf.make(level, index)
+        made += to_make
     return made
 
 
@@ -132,8 +134,10 @@ def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
         low, high = np.array([0.0, -8, -2]), np.array([10.0, 8, 6])
         wanted = shelf.news(level, low, high, 0, {})
         some_kept += len(wanted.ready)
-        for index in wanted.to_make[::-1]:
-            shelf.make(level, index)
+        while wanted.to_make:  # also those that no longer fit what was made beside them
+            for index in wanted.to_make[::-1]:
+                shelf.make(level, index)
+            wanted = shelf.news(level, low, high, 0, {})
     assert some_kept > 50
     assert len(set(versions(shelf, level).values())) > 3
 
@@ -204,6 +208,17 @@ def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up(
     assert make_all(shelf) == []
     shelf.look(ground(flat(0.312)))
     assert len(make_all(shelf)) > 100
+
+
+@pytest.mark.parametrize(("height_m", "tiles"), [(0.25, set()), (0.39, {-1, 0})])
+def test_a_few_voxels_count_where_the_surface_left_them(height_m: float, tiles: set[int]) -> None:
+    """Within one layer of voxels, so that the evidence stays the same."""
+    shelf = TileShelf(MESH)
+    shelf.look(ground(flat(0.21)))
+    make_all(shelf)
+    shelf.look(ground(table(0.21, height_m, 0.8)))
+    made = make_all(shelf)
+    assert {x for x, _, _ in made} == {y for _, y, _ in made} == tiles
 
 
 def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:

@@ -3,7 +3,7 @@
 import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from triquad_format.tile_code import encode_tile
 from triquad_server.epoch import Epoch
 from triquad_server.mesher import TileIndex
 from triquad_server.settings import MeshSettings
-from triquad_server.surface_changes import SurfaceChanges
+from triquad_server.surface_changes import Changes, SurfaceChanges
 from triquad_server.threads import PATIENCE, Team
 from triquad_server.tile_border import TileBorder
 from triquad_server.tile_lattice import LEVELS, TileLattice, tile_lattice, tiles_meeting
@@ -63,12 +63,15 @@ class _Level:
         tile = self.tiles.get(index)
         return tile if tile is not None and self.changed.get(index, 0) <= tile.made else None
 
-    def touch(self, places: NDArray[np.float64], half_m: float, epoch: int) -> None:
-        """Note that the surface changed in voxels around ``places`` [N, 3]."""
-        margin_m = self.lattice.margin_m
-        touched = tiles_meeting(places - half_m, places + half_m, margin_m, self.lattice)
+    def touch(self, changes: Changes, half_m: float, epoch: int) -> None:
+        """Note what changed; voxels have sides of twice ``half_m``."""
+        low, high = changes.places - half_m, changes.places + half_m
+        touched = [
+            *tiles_meeting(low, high, self.lattice.margin_m, self.lattice).tolist(),
+            *tiles_meeting(changes.drifted, changes.drifted, 0.0, self.lattice).tolist(),
+        ]
         known = len(self.changed)
-        for x, y, z in touched.tolist():
+        for x, y, z in touched:
             self.changed[x, y, z] = epoch
         if len(self.changed) > known:
             self._indices = np.array(list(self.changed), np.int64)
@@ -130,11 +133,14 @@ class TileShelf:
                 return
             if self._changes is None:
                 self._changes = SurfaceChanges(
-                    epoch.field_settings, self._settings.tolerance_m, MESHING
+                    epoch.field_settings,
+                    self._settings.tolerance_m,
+                    self._settings.tile_side_m,
+                    MESHING,
                 )
-            places = self._changes.since_last(epoch.frozen_regions)
+            changes = self._changes.since_last(epoch.frozen_regions)
             for level in self._levels:
-                level.touch(places, epoch.field_settings.leaf_m / 2, epoch.number)
+                level.touch(changes, epoch.field_settings.leaf_m / 2, epoch.number)
             self._epoch = epoch
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -179,7 +185,8 @@ class TileShelf:
         assert epoch is not None, "nothing was looked at"
         shelf = self._levels[level]
         with self._lock:
-            around = TileBorder.joined(_borders_around(shelf, index))
+            borders = _borders_around(shelf, index)
+        around = TileBorder.joined(self._agreeing(shelf, index, borders, epoch))
         mesh = epoch.mesh(index, level, around, MESHING)
         data = encode_tile(mesh.surface)
         digest = hashlib.sha256(data).digest()
@@ -198,6 +205,31 @@ class TileShelf:
             self._keep((level, index), data)
         return tile
 
+    def _agreeing(
+        self,
+        shelf: _Level,
+        index: TileIndex,
+        borders: dict[TileIndex, TileBorder],
+        epoch: Epoch,
+    ) -> Iterator[TileBorder]:
+        """The borders to be taken over; tiles of others will have to be made again.
+
+        Those are others whose surface is no longer where it was: else two tiles in turns could
+        hold on to what neither has any more.
+        """
+        lattice = shelf.lattice
+        corner = np.asarray(index) * lattice.cells
+        for other, border in borders.items():
+            near = np.abs(border.values) < lattice.cell_m
+            places = (border.points[near] + corner) * lattice.cell_m
+            if len(places) and shelf.tiles[other].made < epoch.number and other != index:
+                moved = np.abs(epoch.distances(places, MESHING) - border.values[near])
+                if 2 * np.count_nonzero(moved > self._settings.tolerance_m) > len(moved):
+                    with self._lock:
+                        shelf.changed[other] = max(shelf.changed[other], epoch.number)
+                    continue
+            yield border
+
     def data(self, level: int, tile: ShelvedTile) -> bytes | None:
         """The bytes of a tile, None where they are gone; it has to be made anew then."""
         with self._lock:
@@ -215,18 +247,19 @@ class TileShelf:
             self._bytes -= len(gone)
 
 
-def _borders_around(shelf: _Level, index: TileIndex) -> Iterable[TileBorder]:
-    """What a tile has to agree with.
+def _borders_around(shelf: _Level, index: TileIndex) -> dict[TileIndex, TileBorder]:
+    """What a tile has to agree with, by the tiles whose it is, in its own lattice.
 
     That is its own border where only its bytes are gone, and those of all neighbours that show
     what the map has: these agree with each other. The others will be made to fit it.
     """
-    cells = shelf.lattice.cells
+    found: dict[TileIndex, TileBorder] = {}
     own = shelf.clean(index)
     if own is not None:
-        yield own.border
+        found[index] = own.border
     for offset in _AROUND:
         x, y, z = (a + b for a, b in zip(index, offset, strict=True))
         neighbour = shelf.clean((x, y, z))
         if neighbour is not None:
-            yield neighbour.border.seen_from(offset, cells)
+            found[x, y, z] = neighbour.border.seen_from(offset, shelf.lattice.cells)
+    return found
