@@ -17,7 +17,16 @@ import triquad_client
 import zenoh
 from triquad_client import Client, InvalidInputError, MeshWatch
 from triquad_format import draco, keys, wire
-from triquad_format.messages import ErrorReply, ServerStatus, TileUpdates, TileUpdatesRequest
+from triquad_format.messages import (
+    ErrorReply,
+    ServerStatus,
+    Tile,
+    TileList,
+    TileListRequest,
+    TileRequest,
+    TileUpdates,
+    TileUpdatesRequest,
+)
 from triquad_format.tile_code import decode_tile
 from triquad_server.settings import MeshSettings
 
@@ -228,6 +237,36 @@ def test_bad_requests_are_refused(endpoint: str, changes: dict[str, object], cod
         peer = servers.RawPeer(session)
         assert peer.refusal(keys.TILE_UPDATES, request(**changes)) == code
         assert isinstance(peer.ask(keys.TILE_UPDATES, wire.encode(request())), bytes)
+
+
+@pytest.mark.parametrize("level", [-1, 3, 2**62])
+def test_levels_that_there_are_not_are_refused(endpoint: str, level: int) -> None:
+    everywhere = np.full(3, np.inf)
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        assert peer.refusal(keys.TILE, TileRequest(0, 0, 0, 0, level)) == "bad_request"
+        asks = TileListRequest(-everywhere, everywhere, 0, level)
+        assert peer.refusal(keys.TILE_LIST, asks) == "bad_request"
+
+
+def test_single_tiles_have_levels_too(client: Client, endpoint: str) -> None:
+    learn(client)
+    everywhere = np.full(3, np.inf)
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        answer = peer.ask(
+            keys.TILE_LIST, wire.encode(TileListRequest(-everywhere, everywhere, 0, 2))
+        )
+        assert isinstance(answer, bytes)
+        listed = wire.decode(TileList, answer)
+        assert listed.tile_side_m == pytest.approx(6.4)
+        assert (listed.changed > 0).all()
+        x, y, z = listed.tiles[0].tolist()
+        answer = peer.ask(keys.TILE, wire.encode(TileRequest(x, y, z, listed.epoch, 2)))
+        assert isinstance(answer, bytes)
+        tile = wire.decode(Tile, answer)
+        assert len(tile.faces) > 0
+        assert 3.0 < tile.vertices.max() <= 6.4
 
 
 @pytest.mark.parametrize(
