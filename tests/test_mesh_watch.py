@@ -218,7 +218,7 @@ def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: 
         ({"max_bytes": 0}, "bad_request"),
         ({"max_bytes_per_s": -1}, "bad_request"),
         ({"timeout_s": -1.0}, "bad_request"),
-        ({"timeout_s": 1e9}, "bad_request"),
+        ({"timeout_s": np.inf}, "bad_request"),
         ({"timeout_s": np.nan}, "bad_request"),
         ({"client": ""}, "bad_request"),
         ({"client": "a/b"}, "bad_request"),
@@ -474,7 +474,7 @@ def test_iteration_ends_with_the_watch(client: Client) -> None:
         assert seen.wait(servers.WAIT_S)
         watch.close()
         client.reset()  # ends the request that is under way
-        assert following.result(servers.WAIT_S) > 50
+        assert following.result(servers.WAIT_S) > 0
 
 
 @pytest.mark.skipif(not draco.AVAILABLE, reason="DracoPy is not installed")

@@ -85,7 +85,7 @@ class MeshSettings:
     reach_m: float = 0.02  # centres of faces lie at most this far from voxels with seen surface
     tolerance_m: float = 0.01  # a tile changes where its surface moved by more
     update_period_s: float = 0.5  # between looks at what changed, while somebody follows the mesh
-    update_timeout_max_s: float = 60.0  # longest time that a client may ask to wait for changes
+    update_timeout_max_s: float = 60.0  # longest that a request is held
     reply_bytes: int = 1_000_000  # of tiles in one reply; one tile may be larger
     client_bytes_per_s: int = 0  # of tiles to each client; 0: no limit
     shelf_bytes: int = 200_000_000  # of encoded tiles that are kept
@@ -170,7 +170,7 @@ class Settings:
             f"scan.thin_m = {self.scan.thin_m:g} is too fine for scan.range_max_m = {reach_m:g}",
         )
         _check_together(
-            4 * self.mesh.cell_m + self.mesh.reach_m <= 16 * self.field.leaf_m,
+            4 * (self.mesh.cell_m + self.mesh.reach_m) <= 16 * self.field.leaf_m,
             f"mesh.cell_m = {self.mesh.cell_m:g} and mesh.reach_m = {self.mesh.reach_m:g} are too "
             f"coarse for field.leaf_m = {self.field.leaf_m:g}",
         )

@@ -36,6 +36,8 @@ _GIVE_WAY_S = 0.1
 _MAX_LOOK_SHARE = 4
 """Looking for changes takes at most one part in so many of the thread's time."""
 
+_LOOK_GRACE_S = 10.0  # for a look at what is newer than the request; it takes a fraction of this
+
 _SENDERS = 2  # so that a client that does not read holds up nobody
 
 
@@ -126,7 +128,7 @@ class TileFeed:
             request,
             asks,
             self._epochs.newest.number,
-            time.monotonic() + asks.timeout_s,
+            time.monotonic() + min(asks.timeout_s, self._settings.update_timeout_max_s),
             self._rate(asks),
             restart,
             0 if restart else asks.revision,
@@ -151,12 +153,10 @@ class TileFeed:
             keys.check_name("client", asks.client)
         except FormatError as error:
             raise RequestError("bad_request", str(error)) from error
-        longest = self._settings.update_timeout_max_s
         # Written so that NaN is refused as well.
-        if not 0 <= asks.timeout_s <= longest:
+        if not 0 <= asks.timeout_s < math.inf:
             raise RequestError(
-                "bad_request",
-                f"timeout_s = {asks.timeout_s} is out of range: use 0 to {longest:g}",
+                "bad_request", f"timeout_s = {asks.timeout_s} is not a time: use 0 or more"
             )
         if asks.max_bytes < 1 or asks.max_bytes_per_s < 0:
             raise RequestError(
@@ -225,11 +225,12 @@ class TileFeed:
     def _serve(self, entry: _Held) -> bool:
         now = time.monotonic()
         state = (self._shelf.epoch, self._shelf.revision)
-        in_time = now < entry.deadline or self._shelf.epoch < entry.needs
+        looked = self._shelf.epoch >= entry.needs
         if entry.nothing_at == state or not self._may_send(entry, now):
-            if not in_time:
-                self._send(entry, _Reply(entry.nothing_at == state, entry.revision))
-            return not in_time
+            over = now >= entry.deadline + (0.0 if looked else _LOOK_GRACE_S)
+            if over:
+                self._send(entry, _Reply(looked and entry.nothing_at == state, entry.revision))
+            return over
         asks = entry.asks
         news = self._shelf.news(
             asks.level, asks.minimum, asks.maximum, entry.revision, entry.versions
@@ -240,7 +241,7 @@ class TileFeed:
         if news.to_make:
             self._make(entry, news.to_make)
             return True
-        if entry.restart and self._shelf.epoch >= entry.needs:
+        if entry.restart and looked:
             self._send(entry, _Reply(True, news.revision))
             return True
         entry.revision = news.revision
