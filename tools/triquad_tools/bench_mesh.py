@@ -1,7 +1,9 @@
 """``triquad-bench`` of the mesh: fetched, followed while one more scan comes, and joined later."""
 
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from triquad_server.warm_up import warm_up
 
 from triquad_tools.bench_figures import Figure, seconds
 from triquad_tools.bench_street import BenchStreet
+from triquad_tools.demo_probe import ask_until
 from triquad_tools.demo_server import DemoServer, ServerOptions, free_endpoint
 from triquad_tools.lidar import SimulatedScan
 from triquad_tools.progress import progress
@@ -23,6 +26,7 @@ from triquad_tools.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until
 _MAP = "bench"
 _SETTLE_LIMIT_S = 600.0
 _FETCH_LIMIT_S = 300.0
+_ASKED = 1_000
 _NEXT = 50  # the scan that comes again, from half a metre on
 _EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
@@ -53,7 +57,7 @@ def _network(made: BenchStreet) -> list[Figure]:
                         Figure("tiles that a late joiner holds otherwise", _differ(early, late), "",
                                at_most=0)
                     )  # fmt: skip
-            figures += _levels(client)
+            figures += _levels(client, other, made)
     return figures
 
 
@@ -123,14 +127,27 @@ def _differ(early: MeshWatch, late: MeshWatch) -> int:
     return differ + len(mine.keys() ^ theirs.keys())
 
 
-def _levels(client: Client) -> list[Figure]:
+def _levels(client: Client, planner: Client, made: BenchStreet) -> list[Figure]:
+    """The other levels, which are meshed for the first time while a planner asks."""
     figures = []
-    for level in (1, 2):
-        with client.watch_mesh(level=level) as watch:
-            watch.catch_up(_FETCH_LIMIT_S)
-            size = sum(tile.size for tile in watch.tiles.values())
-        figures.append(Figure(f"the street on level {level}", size / 1e6, "MB"))
-    return figures
+    stop = threading.Event()
+    points = np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
+    with ThreadPoolExecutor(1) as beside:
+        asking = beside.submit(ask_until, stop, planner, points, True)
+        for level in (1, 2):
+            with client.watch_mesh(level=level) as watch:
+                watch.catch_up(_FETCH_LIMIT_S)
+                size = sum(tile.size for tile in watch.tiles.values())
+            figures.append(Figure(f"the street on level {level}", size / 1e6, "MB"))
+        stop.set()
+        met = asking.result()
+    name = "1,000 points with gradient while tiles are meshed"
+    return [
+        *figures,
+        Figure(f"{name}, median", met.latency_p50_ms, "ms"),
+        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms"),
+        Figure(f"{name}, errors", met.errors, "", at_most=0),
+    ]
 
 
 def _one_more(made: BenchStreet) -> SimulatedScan:
