@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -100,6 +100,32 @@ def raw_session(
     config.insert_json5("connect/endpoints", json.dumps([connect] if connect else []))
     with zenoh.open(config) as session:
         yield session
+
+
+@contextmanager
+def answering(answers: dict[str, Callable[[zenoh.Query, str], None]]) -> Iterator[str]:
+    """A router that claims to have the default map, and answers by hand; yields its endpoint."""
+    endpoint = free_endpoint()
+    with raw_session("router", listen=endpoint) as session:
+        token = session.liveliness().declare_token(keys.alive_key(MAP, "x"))
+        queryables, threads = [], []
+        for operation, answer in answers.items():
+            key = keys.operation_key(MAP, operation)
+            queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(16))
+            queryables.append(queryable)
+
+            def serve(queryable=queryable, key=key, answer=answer) -> None:
+                for query in queryable:
+                    answer(query, key)
+
+            threads.append(threading.Thread(target=serve))
+            threads[-1].start()
+        yield endpoint
+        for queryable in queryables:
+            queryable.undeclare()
+        for thread in threads:
+            thread.join()
+        token.undeclare()
 
 
 @dataclass

@@ -4,8 +4,6 @@ import hashlib
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -25,7 +23,8 @@ from triquad_client import (
     TriquadError,
     UnknownMapError,
 )
-from triquad_client.connection import open_connection, retried
+from triquad_client.call import Call, retried
+from triquad_client.connection import open_connection
 from triquad_format import keys, wire
 from triquad_format.messages import (
     ErrorReply,
@@ -230,35 +229,9 @@ def test_far_coordinates_keep_their_precision(client):
     assert (client.query_sdf(far).status == triquad_client.Status.SURFACE).all()
 
 
-@contextmanager
-def answering(answers: dict[str, Callable[[zenoh.Query, str], None]]) -> Iterator[str]:
-    """A router that claims to have the default map, and answers by hand; yields its endpoint."""
-    endpoint = servers.free_endpoint()
-    with servers.raw_session("router", listen=endpoint) as session:
-        token = session.liveliness().declare_token(keys.alive_key(servers.MAP, "x"))
-        queryables, threads = [], []
-        for operation, answer in answers.items():
-            key = keys.operation_key(servers.MAP, operation)
-            queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(16))
-            queryables.append(queryable)
-
-            def serve(queryable=queryable, key=key, answer=answer) -> None:
-                for query in queryable:
-                    answer(query, key)
-
-            threads.append(threading.Thread(target=serve))
-            threads[-1].start()
-        yield endpoint
-        for queryable in queryables:
-            queryable.undeclare()
-        for thread in threads:
-            thread.join()
-        token.undeclare()
-
-
 def test_silence_though_the_map_is_there_is_told_apart():
     with (
-        answering({}) as endpoint,
+        servers.answering({}) as endpoint,
         triquad_client.connect(endpoint) as client,
         pytest.raises(NoReplyError, match="access control"),
     ):
@@ -268,7 +241,7 @@ def test_silence_though_the_map_is_there_is_told_apart():
 def test_a_reply_that_never_comes_is_a_timeout():
     held = []
     with (
-        answering({keys.SDF: lambda query, _: held.append(query)}) as endpoint,
+        servers.answering({keys.SDF: lambda query, _: held.append(query)}) as endpoint,
         triquad_client.connect(endpoint, timeout_s=0.2) as client,
     ):
         with pytest.raises(RequestTimeoutError, match=r"query/sdf within 0\.2 s"):
@@ -282,7 +255,7 @@ def test_a_reply_of_other_bytes_is_told_apart():
             query.reply(key, b"\xff\x00")
 
     with (
-        answering({keys.SDF: answer}) as endpoint,
+        servers.answering({keys.SDF: answer}) as endpoint,
         triquad_client.connect(endpoint) as client,
         pytest.raises(BadReplyError, match="query/sdf"),
     ):
@@ -294,7 +267,10 @@ def test_a_refusal_carries_its_code():
         with query:
             query.reply_err(wire.encode(ErrorReply("busy", "try later")))
 
-    with answering({keys.SDF: answer}) as endpoint, triquad_client.connect(endpoint) as client:
+    with (
+        servers.answering({keys.SDF: answer}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+    ):
         with pytest.raises(RefusedError, match="busy: try later") as caught:
             client.query_sdf(CLOUD)
         assert caught.value.code == "busy"
@@ -315,7 +291,7 @@ def test_a_query_whose_epoch_goes_starts_again_and_gives_up_after_three_tries():
             query.reply(key, wire.encode(reply))
 
     with (
-        answering({keys.SDF: answer}) as endpoint,
+        servers.answering({keys.SDF: answer}) as endpoint,
         triquad_client.connect(endpoint) as client,
         pytest.raises(RefusedError, match="epoch_gone"),
     ):
@@ -340,7 +316,7 @@ def test_a_download_with_wrong_bytes_leaves_nothing(tmp_path):
     path = tmp_path / "map.triquad"
     path.write_text("older")
     with (
-        answering({keys.MAP_INFO: info, keys.MAP_CHUNK: chunk}) as endpoint,
+        servers.answering({keys.MAP_INFO: info, keys.MAP_CHUNK: chunk}) as endpoint,
         triquad_client.connect(endpoint) as client,
         pytest.raises(DownloadError, match="SHA-256"),
     ):
@@ -364,15 +340,18 @@ def test_a_zenoh_configuration_file_is_used(endpoint, tmp_path):
 def test_only_the_expected_refusal_is_asked_again_and_not_for_ever():
     asked = []
 
-    def refuse(code: str, times: int) -> int:
+    def refuse(code: str, times: int) -> Call[int]:
+        yield from ()
         asked.append(code)
         if len(asked) <= times:
             raise RefusedError(code, "")
         return len(asked)
 
-    assert retried("epoch_gone", lambda: refuse("epoch_gone", 2)) == 3
+    with pytest.raises(StopIteration) as end:
+        next(retried("epoch_gone", lambda: refuse("epoch_gone", 2)))
+    assert end.value.value == 3
     for code, attempts in (("epoch_gone", 3), ("busy", 1)):
         asked.clear()
         with pytest.raises(RefusedError):
-            retried("epoch_gone", lambda code=code: refuse(code, 100))
+            next(retried("epoch_gone", lambda code=code: refuse(code, 100)))
         assert len(asked) == attempts

@@ -51,8 +51,9 @@ def imported(folder: str) -> set[str]:
     ("folder", "extras"),
     [
         ("format", ("draco",)),
-        ("kernels", ("server",)),
         ("client", ()),
+        ("query", ()),
+        ("kernels", ("server",)),
         ("server", ("server",)),
         ("tools", ("server", "tools")),
     ],
@@ -62,6 +63,6 @@ def test_what_is_imported_is_declared(folder, extras):
 
 
 def test_what_is_declared_is_imported():
-    folders = ("format", "kernels", "client", "server", "tools")
+    folders = ("format", "query", "kernels", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
     assert declared("server", "tools", "draco") <= used

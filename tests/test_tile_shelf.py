@@ -13,7 +13,6 @@ from triquad_server.epoch import Epoch
 from triquad_server.mapper import Mapper
 from triquad_server.mesher import TileIndex, mesh_tile
 from triquad_server.settings import MeshSettings, Settings
-from triquad_server.threads import ANSWERS, Team
 from triquad_server.tile_lattice import LEVELS, TileLattice, tile_lattice
 from triquad_server.tile_shelf import TileShelf
 from triquad_tools.lidar import SimulatedScan
@@ -68,7 +67,7 @@ class Patchwork:
     epochs: dict[TileIndex, Epoch]
     borders: dict[tuple[int, int, int], float]
 
-    def distances(self, points: NDArray[np.float64], team: Team = ANSWERS) -> NDArray[np.float32]:
+    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
         steps = np.rint(points / self.lattice.cell_m).astype(np.int64)
         values = np.ones(len(points), np.float32)
         for index, rows in self._owned(steps).items():
@@ -77,9 +76,7 @@ class Patchwork:
             values[row] = self.borders.get(tuple(steps[row].tolist()), 1.0)
         return values
 
-    def status(
-        self, points: NDArray[np.float64], reach_m: float, team: Team = ANSWERS
-    ) -> NDArray[np.uint8]:
+    def status(self, points: NDArray[np.float64], reach_m: float) -> NDArray[np.uint8]:
         status = np.zeros(len(points), np.uint8)
         for index, rows in self._owned(points / self.lattice.cell_m).items():
             status[rows] = self.epochs[index].status(points[rows], reach_m)
@@ -216,7 +213,7 @@ def test_a_few_voxels_count_where_the_surface_left_them(height_m: float, tiles: 
     shelf = TileShelf(MESH)
     shelf.look(ground(flat(0.21)))
     make_all(shelf)
-    shelf.look(ground(table(0.21, height_m, 0.8)))
+    shelf.look(ground(table(0.21, height_m, 1.6)))
     made = make_all(shelf)
     assert {x for x, _, _ in made} == {y for _, y, _ in made} == tiles
 

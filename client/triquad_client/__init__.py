@@ -11,7 +11,17 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 from triquad_format import __version__
 from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_format.status import Status
+from triquad_query.distance import Distances
+from triquad_query.errors import TriquadError, UnknownSpaceError
+from triquad_query.grid import Grid
+from triquad_query.polyline import Polyline
+from triquad_query.rays import Rays
+from triquad_query.segments import Segments
+from triquad_query.spheres import Spheres
+from triquad_query.unknown import Unknown
 
+from triquad_client.async_client import AsyncClient, connect_async
+from triquad_client.async_queries import AsyncPinnedMap
 from triquad_client.checks import Bounds
 from triquad_client.client import Client, connect
 from triquad_client.errors import (
@@ -24,24 +34,28 @@ from triquad_client.errors import (
     NoReplyError,
     RefusedError,
     RequestTimeoutError,
-    TriquadError,
     UnknownMapError,
 )
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles, MeshTile
 from triquad_client.mesh_watch import MeshUpdate, MeshWatch
+from triquad_client.queries import PinnedMap
+from triquad_client.questions.sdf import SdfResult
 from triquad_client.scans import FlushReport
-from triquad_client.sdf import SdfResult
 
 __all__ = [
+    "AsyncClient",
+    "AsyncPinnedMap",
     "BadReplyError",
     "Bounds",
     "CheckpointInfo",
     "Client",
     "ClosedError",
     "ConnectError",
+    "Distances",
     "DownloadError",
     "FlushReport",
+    "Grid",
     "HeldTiles",
     "InvalidInputError",
     "InvalidScanError",
@@ -51,14 +65,22 @@ __all__ = [
     "MeshUpdate",
     "MeshWatch",
     "NoReplyError",
+    "PinnedMap",
+    "Polyline",
+    "Rays",
     "RefusedError",
     "RequestTimeoutError",
     "SdfResult",
+    "Segments",
     "ServerStatus",
+    "Spheres",
     "Status",
     "TileList",
     "TriquadError",
+    "Unknown",
     "UnknownMapError",
+    "UnknownSpaceError",
     "__version__",
     "connect",
+    "connect_async",
 ]

@@ -1,42 +1,25 @@
 """The client: publishes scans to a map server, and asks it about the map."""
 
-import time
 from pathlib import Path
 from types import TracebackType
 
 from numpy.typing import ArrayLike
-from triquad_format import keys
-from triquad_format.messages import (
-    CheckpointInfo,
-    CheckpointRequest,
-    MapInfo,
-    ResetReply,
-    ResetRequest,
-    ServerStatus,
-    StatusRequest,
-    TileList,
-)
+from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_format.written_map import MapFileInfo
 
-from triquad_client import checks
+from triquad_client import checks, download, meshes, upkeep
+from triquad_client.blocking import BlockingDriver
 from triquad_client.checks import Bounds
 from triquad_client.connection import Connection, open_connection
-from triquad_client.download import MapDownload
-from triquad_client.errors import RequestTimeoutError
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles
 from triquad_client.mesh_watch import MeshWatch
-from triquad_client.meshes import Meshes
+from triquad_client.queries import MapQueries, PinnedMap
+from triquad_client.questions import sdf
 from triquad_client.scans import FlushReport, ScanPublisher
-from triquad_client.sdf import SdfQueries, SdfResult
-
-_SLOW_TIMEOUT_S = 60.0
-"""For requests that write to the server's disk."""
-
-_SETTLE_PAUSE_S = 0.2
 
 
-class Client:
+class Client(MapQueries):
     """A connection to one map of a server. Close it, or use it in a ``with`` statement.
 
     Positions are metres in the map frame. All methods may be called from several threads, and
@@ -48,10 +31,9 @@ class Client:
     def __init__(self, connection: Connection) -> None:
         """Use :func:`connect`."""
         self._connection = connection
+        self._driver = BlockingDriver(connection)
         self._scans = ScanPublisher(connection)
-        self._sdf = SdfQueries(connection)
-        self._meshes = Meshes(connection)
-        self._download = MapDownload(connection)
+        super().__init__(self._driver.run)
 
     def __enter__(self) -> "Client":
         return self
@@ -107,7 +89,7 @@ class Client:
         Raises:
             RefusedError: ``timeout``.
         """
-        return self._scans.flush(timeout, pending)
+        return self._run(self._scans.flush(timeout, pending))
 
     def settle(self, timeout: float = 600.0) -> ServerStatus:
         """Wait until the server has nothing left to learn from the scans that reached it.
@@ -118,35 +100,23 @@ class Client:
         Raises:
             RequestTimeoutError: it still had after that time.
         """
-        deadline = time.monotonic() + timeout
-        while not (status := self.status()).settled:
-            if time.monotonic() > deadline:
-                raise RequestTimeoutError(f"the server still learns after {timeout:g} s")
-            time.sleep(_SETTLE_PAUSE_S)
-        return status
+        return self._run(upkeep.settle(timeout))
 
-    def query_sdf(self, points: ArrayLike, gradient: bool = False) -> SdfResult:
-        """Signed distance and status, on request also the gradient, at ``points`` [N, 3].
-
-        Queries of any size are answered from one epoch.
-        """
-        return self._sdf.query(checks.query_points(points), gradient)
-
-    def query_gradient(self, points: ArrayLike) -> SdfResult:
-        """As :meth:`query_sdf`, with the gradient."""
-        return self.query_sdf(points, gradient=True)
+    def pinned(self) -> PinnedMap:
+        """The map as it is now, for queries that belong together."""
+        return PinnedMap(self._run, self._run(sdf.pin_newest()))
 
     def tiles(self, bounds: Bounds | None = None) -> TileList:
         """The mesh tiles that meet ``bounds``, with the epoch in which each last changed."""
-        return self._meshes.tiles(*checks.box(bounds))
+        return self._run(meshes.tiles(bounds))
 
     def mesh_tile(self, x: int, y: int, z: int) -> Mesh:
         """The newest mesh of one tile of the mesh lattice."""
-        return self._meshes.tile(x, y, z)
+        return self._run(meshes.tile(x, y, z))
 
     def mesh(self, bounds: Bounds | None = None) -> Mesh:
         """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch."""
-        return self._meshes.mesh(*checks.box(bounds))
+        return self._run(meshes.mesh(bounds))
 
     def watch_mesh(
         self,
@@ -167,20 +137,15 @@ class Client:
 
     def status(self) -> ServerStatus:
         """How the server is doing."""
-        return self._connection.ask(keys.STATUS, StatusRequest(), ServerStatus)
+        return self._run(upkeep.status())
 
     def checkpoint(self) -> CheckpointInfo:
         """Have the server write the map to its store now."""
-        return self._connection.ask(
-            keys.CHECKPOINT, CheckpointRequest(), CheckpointInfo, timeout_s=_SLOW_TIMEOUT_S
-        )
+        return self._run(upkeep.checkpoint())
 
     def reset(self, bounds: Bounds | None = None) -> int:
         """Forget what was learnt within ``bounds``; returns the first epoch without it."""
-        request = ResetRequest(*checks.box(bounds))
-        return self._connection.ask(
-            keys.RESET, request, ResetReply, timeout_s=_SLOW_TIMEOUT_S
-        ).epoch
+        return self._run(upkeep.reset(bounds))
 
     def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
         """Write the newest map to a file, checked against its digest, all of it or nothing.
@@ -193,7 +158,7 @@ class Client:
             DownloadError: what arrived is not what the server announced.
             OSError: the file cannot be written.
         """
-        return self._download.fetch(Path(path), training)
+        return self._run(download.fetch(Path(path), training))
 
     def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
         """Write to a file what the newest map needs to answer within ``bounds``.
@@ -209,11 +174,11 @@ class Client:
             DownloadError: nothing of the map lies in the box, or what arrived is not sound.
             OSError: the file cannot be written.
         """
-        return self._download.fetch_box(Path(path), *checks.filled_box(bounds))
+        return self._run(download.fetch_box(Path(path), bounds))
 
     def maps(self) -> list[str]:
         """Names of all maps that can be reached, also those of other servers."""
-        return self._connection.maps()
+        return self._driver.maps()
 
 
 def connect(

@@ -1,10 +1,9 @@
 """The Zenoh session of a client, and requests over it."""
 
 import json
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, TypeAlias
 
 import zenoh
 from triquad_format import keys, wire
@@ -12,6 +11,7 @@ from triquad_format.errors import FormatError, WireError
 from triquad_format.messages import ErrorReply
 from triquad_format.wire import Message
 
+from triquad_client.call import Ask, ReplyT
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
@@ -23,64 +23,10 @@ from triquad_client.errors import (
     UnknownMapError,
 )
 
-PARTS_IN_FLIGHT = 4
-"""Requests of one call that wait for their replies at the same time."""
-
 _LIVELINESS_TIMEOUT_S = 3.0
 
-_ATTEMPTS = 3
-
-ItemT = TypeVar("ItemT")
-ReplyT = TypeVar("ReplyT", bound=Message)
-ResultT = TypeVar("ResultT")
-
-
-class Pending(Generic[ReplyT]):
-    """A request on its way."""
-
-    def __init__(
-        self,
-        connection: "Connection",
-        replies: Iterable[zenoh.Reply],
-        kind: type[ReplyT],
-        key: str,
-        timeout_s: float,
-    ) -> None:
-        self._connection = connection
-        self._replies = replies
-        self._kind = kind
-        self._key = key
-        self._timeout_s = timeout_s
-
-    def result(self) -> ReplyT:
-        """The reply, once it is there.
-
-        Raises:
-            RefusedError: the server refused.
-            RequestTimeoutError: no reply came in time.
-            UnknownMapError: there is no such map.
-            NoReplyError: there is, but no reply came.
-            BadReplyError: the reply cannot be decoded.
-        """
-        for reply in self._replies:
-            if reply.ok is not None:
-                return self._decode(self._kind, reply.ok.payload.to_bytes())
-            if reply.err is not None:
-                raise self._refusal(reply.err)
-        raise self._connection.explain_silence(self._key)
-
-    def _refusal(self, error: zenoh.ReplyError) -> Exception:
-        payload = error.payload.to_bytes()
-        if payload == b"Timeout":
-            return RequestTimeoutError(f"no reply on {self._key} within {self._timeout_s:g} s")
-        reason = self._decode(ErrorReply, payload)
-        return RefusedError(reason.code, reason.message)
-
-    def _decode(self, kind: type[ItemT], payload: bytes) -> ItemT:
-        try:
-            return wire.decode(kind, payload)  # type: ignore[type-var]
-        except WireError as error:
-            raise BadReplyError(f"reply on {self._key}: {error}") from error
+Receiver: TypeAlias = Any
+"""``None``, or a ``zenoh.handlers.Callback[zenoh.Reply]``: the overloads of Zenoh take no union."""
 
 
 class Connection:
@@ -91,53 +37,67 @@ class Connection:
         self.map_name = map_name
         self.timeout_s = timeout_s
 
+    @property
+    def closed(self) -> bool:
+        """Whether the session was closed."""
+        return self._session.is_closed()
+
     def close(self) -> None:
-        """Close the session; closing twice does no harm."""
+        """Close the session; closing twice does no harm. What is under way ends unanswered."""
         self._session.close()
 
     def send(
         self,
-        operation: str,
-        request: Message,
-        kind: type[ReplyT],
-        *,
-        background: bool = False,
-        timeout_s: float | None = None,
-    ) -> Pending[ReplyT]:
-        """Send a request; its reply is a ``kind``.
-
-        Bulky requests go in the ``background``: a reply has the priority of its request, and a
-        slow reader of large replies must not hold up the distance queries of others.
-        """
-        key = keys.operation_key(self.map_name, operation)
-        wait_s = self.timeout_s if timeout_s is None else timeout_s
-        priority = zenoh.Priority.BACKGROUND if background else zenoh.Priority.DATA
+        ask: Ask[Any],
+        receiver: Receiver = None,
+        cancellation: zenoh.CancellationToken | None = None,
+    ) -> Iterable[zenoh.Reply]:
+        """Send a request; its reply comes from what is returned, or to ``receiver``."""
         try:
-            replies = self._session.get(
-                key,
-                payload=wire.encode(request),
-                encoding=keys.encoding(type(request)),
-                timeout=wait_s,
-                priority=priority,
+            replies: Iterable[zenoh.Reply] = self._session.get(
+                self._key(ask),
+                receiver,
+                payload=wire.encode(ask.message),
+                encoding=keys.encoding(type(ask.message)),
+                timeout=self._timeout_s(ask),
+                priority=zenoh.Priority.BACKGROUND if ask.background else zenoh.Priority.DATA,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 consolidation=zenoh.ConsolidationMode.NONE,
+                cancellation_token=cancellation,
             )
         except zenoh.ZError as error:
             raise self._broken(error) from error
-        return Pending(self, replies, kind, key, wait_s)
+        return replies
 
-    def ask(
-        self,
-        operation: str,
-        request: Message,
-        kind: type[ReplyT],
-        *,
-        background: bool = False,
-        timeout_s: float | None = None,
-    ) -> ReplyT:
-        """Send a request and wait for its reply; raises as :meth:`Pending.result`."""
-        pending = self.send(operation, request, kind, background=background, timeout_s=timeout_s)
-        return pending.result()
+    def read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
+        """The message of a reply.
+
+        Raises:
+            RefusedError: the server refused.
+            RequestTimeoutError: there was no reply in time.
+            BadReplyError: it cannot be decoded.
+        """
+        try:
+            if reply.ok is not None:
+                return wire.decode(ask.kind, reply.ok.payload.to_bytes())
+            payload = b"" if reply.err is None else reply.err.payload.to_bytes()
+            if payload == b"Timeout":
+                raise RequestTimeoutError(
+                    f"no reply on {self._key(ask)} within {self._timeout_s(ask):g} s"
+                )
+            reason = wire.decode(ErrorReply, payload)
+        except WireError as error:
+            raise BadReplyError(f"reply on {self._key(ask)}: {error}") from error
+        raise RefusedError(reason.code, reason.message)
+
+    def silence(self, ask: Ask[Any], available: list[str]) -> Exception:
+        """The error for a request that got no reply, where there are these maps."""
+        if self.map_name not in available:
+            return UnknownMapError(self.map_name, available)
+        return NoReplyError(
+            f"no reply on {self._key(ask)} although the map is there: the server is stopping, "
+            "access control forbids the request, or a message exceeds a size limit",
+        )
 
     def put(self, key: str, message: Message) -> None:
         """Publish a message; blocks where the network is slower than the publisher."""
@@ -153,31 +113,43 @@ class Connection:
         except zenoh.ZError as error:
             raise self._broken(error) from error
 
-    def maps(self) -> list[str]:
-        """Names of the maps of all servers that can be reached."""
+    def look_for_maps(
+        self,
+        receiver: Receiver = None,
+        cancellation: zenoh.CancellationToken | None = None,
+    ) -> Iterable[zenoh.Reply]:
+        """Ask all servers that can be reached for their maps; replies as of :meth:`send`."""
         try:
-            replies = self._session.liveliness().get(
-                keys.alive_key("*", "*"), timeout=_LIVELINESS_TIMEOUT_S
+            replies: Iterable[zenoh.Reply] = self._session.liveliness().get(
+                keys.alive_key("*", "*"),
+                receiver,
+                timeout=_LIVELINESS_TIMEOUT_S,
+                cancellation_token=cancellation,
             )
         except zenoh.ZError as error:
             raise self._broken(error) from error
-        names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
-        return sorted(names)
+        return replies
 
-    def explain_silence(self, key: str) -> Exception:
-        """The error for a request that got no reply."""
-        available = self.maps()
-        if self.map_name not in available:
-            return UnknownMapError(self.map_name, available)
-        return NoReplyError(
-            f"no reply on {key} although the map is there: the server is stopping, access "
-            "control forbids the request, or a message exceeds a size limit",
-        )
+    def _key(self, ask: Ask[Any]) -> str:
+        return keys.operation_key(self.map_name, ask.operation)
+
+    def _timeout_s(self, ask: Ask[Any]) -> float:
+        return max(self.timeout_s, ask.at_least_s)
 
     def _broken(self, error: Exception) -> Exception:
-        if self._session.is_closed():
-            return ClosedError("the client is closed")
+        if self.closed:
+            return closed_error()
         return ConnectError(f"the connection is broken: {error}")
+
+
+def closed_error() -> ClosedError:
+    """The error for what is asked of a closed client."""
+    return ClosedError("the client is closed")
+
+
+def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
+    """The maps that the replies to :meth:`Connection.look_for_maps` name."""
+    return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok})
 
 
 def open_connection(
@@ -207,41 +179,13 @@ def open_connection(
         ) from error
     connection = Connection(session, map_name, timeout_s)
     try:
-        available = connection.maps()
+        available = map_names(connection.look_for_maps())
         if map_name not in available:
             raise UnknownMapError(map_name, available)
     except BaseException:
         connection.close()
         raise
     return connection
-
-
-def in_flight(
-    send: Callable[[ItemT], Pending[ReplyT]],
-    items: Iterable[ItemT],
-) -> Iterator[ReplyT]:
-    """The replies for ``items`` in their order, a few requests being under way at a time."""
-    waiting: deque[Pending[ReplyT]] = deque()
-    for item in items:
-        waiting.append(send(item))
-        if len(waiting) >= PARTS_IN_FLIGHT:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
-
-
-def retried(code: str, ask: Callable[[], ResultT]) -> ResultT:
-    """What ``ask`` returns; where the server refuses with ``code``, it is asked a few times anew.
-
-    For questions of several requests, which the server can forget while they are under way.
-    """
-    for _ in range(_ATTEMPTS - 1):
-        try:
-            return ask()
-        except RefusedError as error:
-            if error.code != code:
-                raise
-    return ask()
 
 
 def _configuration(endpoint: str, timeout_s: float, file: Path | None) -> zenoh.Config:

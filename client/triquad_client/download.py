@@ -1,6 +1,7 @@
-"""Fetching the map as a file."""
+"""Fetching the map as a file; its chunks go in the background of everything else."""
 
 import hashlib
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,73 +15,67 @@ from triquad_format.messages import MapInfo, MapInfoRequest
 from triquad_format.stored_map import StoredMap
 from triquad_format.written_map import MapFileInfo
 
-from triquad_client.connection import Connection, retried
+from triquad_client import checks
+from triquad_client.call import Ask, Call, Run, ask, retried, worked
+from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError
 from triquad_client.remote_bytes import RemoteBytes
 
-_PREPARE_TIMEOUT_S = 120.0
+_PREPARE_S = 120.0
 """The server writes the file before it answers."""
 
 _BLOCK_BYTES = 2**23
 
 
-class MapDownload:
-    """Map files; their chunks go in the background of everything else."""
+def fetch(path: Path, training: bool) -> Call[MapInfo]:
+    """Write the newest map to ``path``, all of it or nothing.
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
+    Raises:
+        DownloadError: the bytes are not those the server announced.
+    """
+    # Newer map files may push this one out of the server: then the newest is taken.
+    return retried("chunk_gone", lambda: worked(lambda run: _fetch(run, path, training)))
 
-    def fetch(self, path: Path, training: bool) -> MapInfo:
-        """Write the newest map to ``path``, all of it or nothing.
 
-        Raises:
-            DownloadError: the bytes are not those the server announced.
-        """
-        # Newer map files may push this one out of the server: then the newest is taken.
-        return retried("chunk_gone", lambda: self._fetch(path, training))
+def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
+    """Write what answers in the bounds; only its parts travel.
 
-    def fetch_box(
-        self, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
-    ) -> MapFileInfo:
-        """Write what answers in the box between two corners [3]; only its parts travel.
+    Raises:
+        DownloadError: nothing of the map lies in the box, or its parts are not sound.
+    """
+    minimum, maximum = checks.filled_box(bounds)
+    job = partial(_fetch_box, path=path, minimum=minimum, maximum=maximum)
+    return (yield from retried("chunk_gone", lambda: worked(job)))
 
-        Raises:
-            DownloadError: nothing of the map lies in the box, or its parts are not sound.
-        """
-        return retried("chunk_gone", lambda: self._fetch_box(path, minimum, maximum))
 
-    def _fetch(self, path: Path, training: bool) -> MapInfo:
-        info = self._info(training)
-        remote = RemoteBytes(self._connection, info)
-        with replacing(path) as file:
-            _copy(remote, file, info.sha256)
-        return info
+def _fetch(run: Run, path: Path, training: bool) -> MapInfo:
+    info = run(_info(training))
+    with replacing(path) as file:
+        _copy(RemoteBytes(run, info), file, info.sha256)
+    return info
 
-    def _fetch_box(
-        self, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
-    ) -> MapFileInfo:
-        # Most clients fetch no box: they need none of what previews take.
-        from triquad_format.mapfile_writer import write_map
 
-        try:
-            stored = StoredMap(RemoteBytes(self._connection, self._info(training=False)))
-            record = crop_record(stored.box(minimum, maximum), minimum, maximum)
-            if not record.has_evidence:
-                raise DownloadError(
-                    f"nothing of the map lies between {minimum.tolist()} and {maximum.tolist()}"
-                )
-            return write_map(record, path, stamp_ns=stored.manifest.stamp_ns or None)
-        except FormatError as error:
-            raise DownloadError(str(error)) from error
+def _fetch_box(
+    run: Run, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
+) -> MapFileInfo:
+    # Most clients fetch no box: they need none of what previews take.
+    from triquad_format.mapfile_writer import write_map
 
-    def _info(self, training: bool) -> MapInfo:
-        return self._connection.ask(
-            keys.MAP_INFO,
-            MapInfoRequest(training),
-            MapInfo,
-            background=True,
-            timeout_s=max(self._connection.timeout_s, _PREPARE_TIMEOUT_S),
-        )
+    try:
+        stored = StoredMap(RemoteBytes(run, run(_info(training=False))))
+        record = crop_record(stored.box(minimum, maximum), minimum, maximum)
+        if not record.has_evidence:
+            raise DownloadError(
+                f"nothing of the map lies between {minimum.tolist()} and {maximum.tolist()}"
+            )
+        return write_map(record, path, stamp_ns=stored.manifest.stamp_ns or None)
+    except FormatError as error:
+        raise DownloadError(str(error)) from error
+
+
+def _info(training: bool) -> Call[MapInfo]:
+    request = MapInfoRequest(training)
+    return ask(Ask(keys.MAP_INFO, request, MapInfo, background=True, at_least_s=_PREPARE_S))
 
 
 def _copy(remote: RemoteBytes, file: BinaryIO, sha256: str) -> None:

@@ -9,12 +9,20 @@ from dataclasses import dataclass
 from types import MappingProxyType, TracebackType
 
 import numpy as np
+import zenoh
 from numpy.typing import NDArray
 from triquad_format import draco, keys
 from triquad_format.messages import TileUpdates, TileUpdatesRequest
+from triquad_query.errors import TriquadError
 
+from triquad_client.blocking import BlockingDriver
+from triquad_client.call import Ask, ask
 from triquad_client.connection import Connection
-from triquad_client.errors import BadReplyError, InvalidInputError, RequestTimeoutError
+from triquad_client.errors import (
+    BadReplyError,
+    InvalidInputError,
+    RequestTimeoutError,
+)
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles, MeshTile, TileIndex, unpacked
 from triquad_client.welding import joined
@@ -58,6 +66,8 @@ class MeshWatch:
         """Use :meth:`Client.watch_mesh`."""
         _check(level, max_bytes_per_s, held)
         self._connection = connection
+        self._cancellation = zenoh.CancellationToken()
+        self._driver = BlockingDriver(connection, self._cancellation)
         self._minimum, self._maximum = minimum, maximum
         self._level = level
         self._rate = max_bytes_per_s or 0
@@ -121,7 +131,12 @@ class MeshWatch:
         ends = math.inf if timeout is None else time.monotonic() + timeout
         while not self._closed:
             left_s = max(0.0, ends - time.monotonic())
-            update = self._ask(min(left_s, _LONGEST_WAIT_S))
+            try:
+                update = self._ask(min(left_s, _LONGEST_WAIT_S))
+            except TriquadError:
+                if self._closed:
+                    return None
+                raise
             if update.changed or update.removed:
                 return update
             if time.monotonic() >= ends:
@@ -158,8 +173,9 @@ class MeshWatch:
         return HeldTiles(self._server, self._level, self._side_m, tiles)
 
     def close(self) -> None:
-        """End: :meth:`next` and iteration return after the request that is under way."""
+        """End: :meth:`next` returns ``None``, and iteration ends, also in other threads."""
         self._closed = True
+        self._cancellation.cancel()
 
     def _within(self, held: HeldTiles) -> dict[TileIndex, MeshTile]:
         """The held tiles that meet the bounds: others would not be kept up to date."""
@@ -173,14 +189,14 @@ class MeshWatch:
 
     def _ask(self, wait_s: float) -> MeshUpdate:
         with self._asking:
-            reply = self._connection.ask(
+            request = Ask(
                 keys.TILE_UPDATES,
                 self._request(wait_s),
                 TileUpdates,
                 background=True,
-                timeout_s=wait_s + self._connection.timeout_s,
+                at_least_s=wait_s + self._connection.timeout_s,
             )
-            return self._applied(reply)
+            return self._applied(self._driver.run(ask(request)))
 
     def _request(self, wait_s: float) -> TileUpdatesRequest:
         # Until all is known, the server has to be told what is held; then the revision says it.

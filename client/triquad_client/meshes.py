@@ -1,42 +1,50 @@
-"""Fetching mesh tiles, and whole meshes from them."""
+"""Fetching mesh tiles, and whole meshes from them. It goes in the background of all else."""
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format import keys
 from triquad_format.messages import Tile, TileList, TileListRequest, TileRequest
 
-from triquad_client.connection import Connection, Pending, in_flight, retried
+from triquad_client import checks
+from triquad_client.call import Ask, Call, Run, ask, ask_each, retried, worked
+from triquad_client.checks import Bounds
 from triquad_client.mesh import Mesh
 from triquad_client.welding import joined
 
 
-class Meshes:
-    """Mesh requests; they go in the background of everything else."""
+def tiles(bounds: Bounds | None) -> Call[TileList]:
+    """The tiles that meet the bounds."""
+    return (yield from _tiles(*checks.box(bounds)))
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
 
-    def tiles(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> TileList:
-        """The tiles that meet the box between two corners [3]."""
-        request = TileListRequest(minimum, maximum, 0)
-        return self._connection.ask(keys.TILE_LIST, request, TileList, background=True)
+def tile(x: int, y: int, z: int) -> Call[Mesh]:
+    """The newest mesh of one tile."""
+    tile = yield from ask(_tile((x, y, z), 0))
+    return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
 
-    def tile(self, x: int, y: int, z: int) -> Mesh:
-        """The newest mesh of one tile."""
-        tile = self._send((x, y, z), 0).result()
-        return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
 
-    def mesh(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Mesh:
-        """The faces whose centroids lie in the box between two corners [3], from one epoch."""
-        return retried("epoch_gone", lambda: self._mesh(minimum, maximum))
+def mesh(bounds: Bounds | None) -> Call[Mesh]:
+    """The faces whose centroids lie in the bounds, from one epoch."""
+    minimum, maximum = checks.box(bounds)
+    return (yield from retried("epoch_gone", lambda: _mesh(minimum, maximum)))
 
-    def _mesh(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Mesh:
-        listed = self.tiles(minimum, maximum)
-        indices = [(int(x), int(y), int(z)) for x, y, z in listed.tiles]
-        tiles = in_flight(lambda index: self._send(index, listed.epoch), indices)
+
+def _mesh(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Call[Mesh]:
+    listed = yield from _tiles(minimum, maximum)
+    indices = [(int(x), int(y), int(z)) for x, y, z in listed.tiles]
+    tiles = yield from ask_each(indices, lambda index: _tile(index, listed.epoch))
+
+    def join(_: Run) -> Mesh:
         triangles = [(tile.origin + tile.vertices, tile.faces) for tile in tiles]
         return Mesh(*joined(triangles, listed.tile_side_m, minimum, maximum), listed.epoch)
 
-    def _send(self, index: tuple[int, int, int], epoch: int) -> Pending[Tile]:
-        request = TileRequest(*index, epoch)
-        return self._connection.send(keys.TILE, request, Tile, background=True)
+    return (yield from worked(join))
+
+
+def _tiles(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Call[TileList]:
+    request = TileListRequest(minimum, maximum, 0)
+    return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
+
+
+def _tile(index: tuple[int, int, int], epoch: int) -> Ask[Tile]:
+    return Ask(keys.TILE, TileRequest(*index, epoch), Tile, background=True)

@@ -4,17 +4,17 @@ from triquad_format import keys
 from triquad_format.messages import MapChunk, MapChunkRequest, MapInfo
 from triquad_format.random_access import check_range
 
-from triquad_client.connection import Connection, Pending, in_flight
+from triquad_client.call import Ask, Run, ask_each
 from triquad_client.errors import DownloadError
 
 
 class RemoteBytes:
     """The bytes of one map file on the server; see :class:`triquad_format.RandomAccess`."""
 
-    def __init__(self, connection: Connection, info: MapInfo) -> None:
+    def __init__(self, run: Run, info: MapInfo) -> None:
         self.name = f"the map of epoch {info.epoch}"
         self.size = info.bytes
-        self._connection = connection
+        self._run = run
         self._info = info
 
     def read(self, offset: int, length: int) -> bytes:
@@ -29,7 +29,7 @@ class RemoteBytes:
         end = offset + length
         step = max(1, self._info.chunk_bytes)
         data = bytearray()
-        for chunk in in_flight(lambda at: self._ask(at, end), range(offset, end, step)):
+        for chunk in self._run(ask_each(range(offset, end, step), lambda at: self._ask(at, end))):
             if chunk.offset != offset + len(data):
                 raise DownloadError(f"chunk at {chunk.offset} came, not {offset + len(data)}")
             data += chunk.data
@@ -40,7 +40,7 @@ class RemoteBytes:
     def close(self) -> None:
         """Nothing is held but the connection, which is not this object's."""
 
-    def _ask(self, offset: int, end: int) -> Pending[MapChunk]:
+    def _ask(self, offset: int, end: int) -> Ask[MapChunk]:
         length = min(self._info.chunk_bytes, end - offset)
         request = MapChunkRequest(self._info.sha256, offset, length)
-        return self._connection.send(keys.MAP_CHUNK, request, MapChunk, background=True)
+        return Ask(keys.MAP_CHUNK, request, MapChunk, background=True)

@@ -13,7 +13,8 @@ from triquad_format.errors import FormatError
 from triquad_format.messages import FlushReply, FlushRequest, Scan
 
 from triquad_client import checks
-from triquad_client.connection import Connection, Pending
+from triquad_client.call import Ask, Call, ask_each
+from triquad_client.connection import Connection
 from triquad_client.errors import InvalidInputError, InvalidScanError
 
 _REPLY_MARGIN_S = 5.0
@@ -44,7 +45,8 @@ class ScanPublisher:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._session = secrets.randbits(62)
-        self._lock = threading.Lock()
+        self._sending = threading.Lock()
+        self._lock = threading.Lock()  # of the dictionary, never held for long
         self._sources: dict[str, _Source] = {}
 
     def publish(
@@ -63,8 +65,8 @@ class ScanPublisher:
         cloud = np.ascontiguousarray(checks.scan_points(points))
         stamp_ns = time.time_ns() if stamp is None else checks.stamp_ns(stamp)
         # Held while sending: the server takes a scan that is overtaken by its successor for lost.
-        with self._lock:
-            state = self._sources.setdefault(source, _Source())
+        with self._sending:
+            state = self._source(source)
             if stamp_ns < state.stamp_ns and stamp is None:
                 stamp_ns = state.stamp_ns  # the system's clock was set back
             if stamp_ns < state.stamp_ns:
@@ -77,12 +79,13 @@ class ScanPublisher:
             state.next_sequence += 1
             state.stamp_ns = stamp_ns
 
-    def flush(self, timeout_s: float, pending: int) -> FlushReport:
+    def flush(self, timeout_s: float, pending: int) -> Call[FlushReport]:
         """Wait for the server; arguments as in ``Client.flush``."""
         if timeout_s < 0 or pending < 0:
             raise InvalidInputError(f"timeout = {timeout_s!r}, pending = {pending!r}: negative")
-        waits = [self._send_flush(request) for request in self._requests(timeout_s, pending)]
-        replies = [wait.result() for wait in waits]
+        requests = list(self._requests(timeout_s, pending))
+        # All at once: each waits for its source, and they share the time.
+        replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
         refusals = [reply.last_refusal for reply in replies if reply.last_refusal is not None]
         return FlushReport(
             sum(reply.taken for reply in replies),
@@ -90,6 +93,10 @@ class ScanPublisher:
             sum(reply.lost for reply in replies),
             refusals[-1] if refusals else None,
         )
+
+    def _source(self, name: str) -> _Source:
+        with self._lock:
+            return self._sources.setdefault(name, _Source())
 
     def _requests(self, timeout_s: float, pending: int) -> Iterator[FlushRequest]:
         """One request per source; the scans that may be pending are shared out among them."""
@@ -100,6 +107,7 @@ class ScanPublisher:
             if target >= 0:
                 yield FlushRequest(source, self._session, target, float(timeout_s))
 
-    def _send_flush(self, request: FlushRequest) -> Pending[FlushReply]:
-        wait_s = request.timeout_s + _REPLY_MARGIN_S
-        return self._connection.send(keys.FLUSH, request, FlushReply, timeout_s=wait_s)
+
+def _ask_flush(request: FlushRequest) -> Ask[FlushReply]:
+    wait_s = request.timeout_s + _REPLY_MARGIN_S
+    return Ask(keys.FLUSH, request, FlushReply, at_least_s=wait_s)

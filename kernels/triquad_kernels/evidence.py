@@ -6,6 +6,8 @@ answers as if it had been seen. Only a 3-D record can tell such ghosts from surf
 All coordinates here are voxel coordinates of the region (see :mod:`triquad_format.region`).
 """
 
+from dataclasses import dataclass
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +16,9 @@ from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_format.region import Evidence as EvidenceRecord
 from triquad_format.status import Status
 
+from triquad_kernels.observations import Observations, Sighting
 from triquad_kernels.rows import with_room
+from triquad_kernels.unknown_search import SeenSpace, find_unknown
 from triquad_kernels.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
 Masks = NDArray[np.uint8]
@@ -228,6 +232,24 @@ def _set_voxels(row_keys: NDArray[np.int64], masks: Masks) -> NDArray[np.int64]:
     return voxels
 
 
+@numba.njit(cache=True, nogil=True)
+def _ended_in(
+    voxels: NDArray[np.int64], side: int, index: Index, surface: Masks, ended: NDArray[np.bool_]
+) -> None:
+    for i in range(len(voxels)):
+        x, y, z = voxels[i, 0], voxels[i, 1], voxels[i, 2]
+        row = _block_of(index, x, y, z, side)
+        ended[i] = row >= 0 and _bit(surface, row, x, y, z) == 1
+
+
+@dataclass(frozen=True)
+class _Noted:
+    """What observations come down to."""
+
+    levels: NDArray[np.uint8]
+    seen_s: NDArray[np.int64]
+
+
 class Evidence:
     """Two bit masks over the voxels of a region, in sparse blocks of 8 x 8 x 8."""
 
@@ -237,14 +259,20 @@ class Evidence:
         self._blocks = VoxelIndex(256)
         self._surface = np.zeros((256, BLOCK_BYTES), np.uint8)
         self._free = np.zeros((256, BLOCK_BYTES), np.uint8)
+        self._observations = Observations(256)
+        self._noted: _Noted | None = None  # of a copy for reading, instead of observations
 
     @property
     def blocks(self) -> int:
         """Blocks in use."""
         return self._blocks.count
 
-    def mark_surface(self, voxels: NDArray[np.float64]) -> NDArray[np.int64]:
+    def mark_surface(
+        self, voxels: NDArray[np.float64], sighting: Sighting | None = None
+    ) -> NDArray[np.int64]:
         """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out.
+
+        ``sighting`` tells from where and when; without it they support the surface no better.
 
         Returns:
             The voxels [M, 3] in which no ray had ended before.
@@ -265,6 +293,8 @@ class Evidence:
             )
             if done < len(voxels):
                 self._grow()
+        if sighting is not None:
+            self._observations.note(voxels, self._side, self._blocks.arrays, sighting)
         return new[:found]
 
     def carve(
@@ -307,6 +337,46 @@ class Evidence:
         _status(voxels, reach, self._side, index, self._surface, self._free, status)
         return status
 
+    @property
+    def index(self) -> Index:
+        """The blocks, by place."""
+        return self._blocks.arrays
+
+    @property
+    def cells(self) -> NDArray[np.int64]:
+        """The blocks [B, 3], by row, in units of blocks."""
+        return self._blocks.cells()
+
+    @property
+    def surface(self) -> Masks:
+        """The voxels in which rays ended [B, BLOCK_BYTES]; not to be changed."""
+        return self._surface[: self.blocks]
+
+    def levels(self) -> NDArray[np.uint8]:
+        """How well each voxel in :attr:`surface` is supported, in their order."""
+        return self._noted.levels if self._noted else self._observations.levels(self.surface)
+
+    def seen_s(self) -> NDArray[np.int64]:
+        """When a ray last ended in each block [B], seconds since 1970; 0: never."""
+        return self._noted.seen_s if self._noted else self._observations.seen_s(self.blocks)
+
+    def ended_in(self, voxels: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether rays ended in ``voxels`` [N, 3]."""
+        ended = np.empty(len(voxels), np.bool_)
+        _ended_in(voxels, self._side, self._blocks.arrays, self._surface, ended)
+        return ended
+
+    def find_unknown(
+        self,
+        voxels: NDArray[np.float64],
+        cells: tuple[int, int],
+        distances: NDArray[np.float64],
+        nearest: NDArray[np.float64],
+    ) -> None:
+        """Find unknown voxels near ``voxels`` [N, 3]; see :func:`unknown_search.find_unknown`."""
+        seen = SeenSpace(self._blocks.arrays, self._surface, self._free)
+        find_unknown(voxels, seen, cells, distances, nearest)
+
     def surface_cells(self) -> NDArray[np.int64]:
         """Blocks [B, 3], in units of blocks, that hold any seen surface."""
         return self._blocks.cells()[self._surface[: self.blocks].any(axis=1)]
@@ -328,6 +398,7 @@ class Evidence:
             keep = np.packbits(kept, axis=-1, bitorder="little").reshape(BLOCK_BYTES)
             self._surface[row] &= keep
             self._free[row] &= keep
+        self._observations.forget(np.flatnonzero(near), self.surface)
 
     def copy(self) -> "Evidence":
         """A copy for reading, which later marks do not change."""
@@ -336,6 +407,7 @@ class Evidence:
             twin._blocks = self._blocks.copy()
             twin._surface = self._surface[: self.blocks].copy()
             twin._free = self._free[: self.blocks].copy()
+            twin._noted = _Noted(self.levels(), self.seen_s())
             self._twin = twin
         return self._twin
 

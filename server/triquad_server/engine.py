@@ -1,12 +1,12 @@
 """Two engines for one field: tensors on any device, compiled code on the CPU."""
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from triquad_kernels import field as compiled_field
+from triquad_kernels.blended_field import FieldEngine, FieldValues
 from triquad_kernels.encoding import Geometry
 from triquad_kernels.field import CompiledField, Touched
 from triquad_kernels.mlp import Mlp
@@ -25,19 +25,8 @@ Loss = float | torch.Tensor
 """A number, or a tensor that holds it on a device: to look at it there, one has to wait."""
 
 
-@dataclass(frozen=True)
-class FieldValues:
-    """Signed distances [N] and, where asked for, their gradients [N, 3] (else [0, 3])."""
-
-    sdf: NDArray[np.float32]
-    gradient: NDArray[np.float32]
-
-
-class Engine(Protocol):
-    """What computes a field."""
-
-    def evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
-        """The field at points [N, 3], metres from the region's centre."""
+class Engine(FieldEngine, Protocol):
+    """What computes a field and trains it."""
 
     def train(self, batch: Batch, rate: float, betas: Betas) -> Loss:
         """One optimiser step; returns the loss before it."""

@@ -1,20 +1,39 @@
 """The epochs that requests can ask for."""
 
 import threading
-from collections import OrderedDict
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from triquad_server.epoch import Epoch
 from triquad_server.errors import RequestError
 
 
-class EpochShelf:
-    """The newest epoch, and those that were published or asked for last."""
+@dataclass(frozen=True)
+class ShelfLimits:
+    """Which epochs stay."""
 
-    def __init__(self, first: Epoch, kept: int) -> None:
+    kept: int  # the newest, at least 1
+    pinned: int  # of the older ones, those that were asked for by number last,
+    pin_s: float  # and that for so long after they were
+
+
+class EpochShelf:
+    """The newest epochs, and older ones while they are asked for by number."""
+
+    def __init__(
+        self,
+        first: Epoch,
+        limits: ShelfLimits,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``clock`` tells seconds that never run backwards."""
         self._lock = threading.Lock()
-        self._kept = kept
+        self._limits = limits
+        self._clock = clock
         self._newest = first
-        self._epochs: OrderedDict[int, Epoch] = OrderedDict({first.number: first})
+        self._epochs = {first.number: first}  # oldest first
+        self._asked: dict[int, float] = {}  # when, by number; longest ago first
 
     @property
     def newest(self) -> Epoch:
@@ -22,32 +41,41 @@ class EpochShelf:
         return self._newest
 
     def add(self, epoch: Epoch) -> None:
-        """Make ``epoch`` the newest; the one that was used longest ago may go."""
+        """Make ``epoch`` the newest; older ones may go."""
         with self._lock:
             self._newest = epoch
             self._epochs[epoch.number] = epoch
-            self._epochs.move_to_end(epoch.number)
-            while len(self._epochs) > self._kept:
-                self._epochs.popitem(last=False)
+            self._tidy()
 
     def get(self, number: int) -> Epoch:
         """The epoch of that number, or the newest for 0.
 
-        Asking for an epoch keeps it: a long request in many parts does not lose its epoch while
-        it goes on.
+        Asking for an epoch by number pins it: a long request in many parts, or many requests that
+        belong together, do not lose their epoch while they go on.
 
         Raises:
             RequestError: ``epoch_gone``.
         """
         with self._lock:
-            if number == 0:
-                return self._newest
-            epoch = self._epochs.get(number)
+            epoch = self._epochs.get(number) if number else self._newest
             if epoch is None:
                 raise RequestError(
                     "epoch_gone",
                     f"epoch {number} is not kept; kept are {sorted(self._epochs)}",
                 )
-            self._epochs.move_to_end(number)
-            self._epochs.move_to_end(self._newest.number)
+            if number:
+                self._asked.pop(number, None)
+                self._asked[number] = self._clock()
+            self._tidy()
             return epoch
+
+    def _tidy(self) -> None:
+        """Let go of older epochs whose time is over, or that exceed the limit."""
+        older = list(self._epochs)[: -self._limits.kept]
+        since = self._clock() - self._limits.pin_s
+        pinned = [n for n, asked in self._asked.items() if n in older and asked >= since]
+        stay = pinned[max(0, len(pinned) - self._limits.pinned) :]
+        for number in older:
+            if number not in stay:
+                del self._epochs[number]
+                self._asked.pop(number, None)

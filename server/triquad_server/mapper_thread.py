@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from triquad_server.epochs import EpochShelf
+from triquad_server.epochs import EpochShelf, ShelfLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.gate import QueryGate
 from triquad_server.mapper import Mapper
@@ -58,7 +58,7 @@ class MapperThread:
         mapper: Mapper,
         inputs: MapperInputs,
         publish_period_s: float,
-        epochs_kept: int,
+        shelf: ShelfLimits,
         failed: Callable[[], None],
     ) -> None:
         """Publish the first epoch; ``failed`` is called where the thread ends by a defect."""
@@ -76,7 +76,7 @@ class MapperThread:
         self._unpublished = False
         self._scans_taken = 0
         self._loss = 0.0  # as of the newest epoch
-        self.epochs = EpochShelf(mapper.publish(), epochs_kept)
+        self.epochs = EpochShelf(mapper.publish(), shelf)
         self.progress = Progress()
         self._note_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
@@ -175,7 +175,9 @@ class MapperThread:
         if scan is None:
             return False
         try:
-            report = self._mapper.ingest(scan.points, scan.world_from_sensor)
+            report = self._mapper.ingest(
+                scan.points, scan.world_from_sensor, scan.stamp_ns // 1_000_000_000
+            )
         except ScanRefusedError as error:
             self._inputs.scans_dropped.add(error.reason)
             self._inputs.ledger.refuse(scan, str(error))

@@ -17,7 +17,6 @@ from triquad_format.status import Status
 from triquad_format.tile_code import STEPS, TileSurface
 
 from triquad_server.marching_cubes import Crossings
-from triquad_server.threads import ANSWERS, Team
 from triquad_server.tile_border import TileBorder
 from triquad_server.tile_lattice import TileLattice
 
@@ -51,14 +50,12 @@ class TileMesh:
 
 
 class Distances(Protocol):
-    """What the mesher asks of an epoch; ``team`` shares the work."""
+    """What the mesher asks of an epoch."""
 
-    def distances(self, points: NDArray[np.float64], team: Team = ANSWERS) -> NDArray[np.float32]:
+    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
         """Signed distances [N] at points [N, 3], metres."""
 
-    def status(
-        self, points: NDArray[np.float64], reach_m: float, team: Team = ANSWERS
-    ) -> NDArray[np.uint8]:
+    def status(self, points: NDArray[np.float64], reach_m: float) -> NDArray[np.uint8]:
         """Status values [N] at points [N, 3]."""
 
 
@@ -67,7 +64,6 @@ def mesh_tile(
     tile: TileIndex,
     lattice: TileLattice,
     around: TileBorder | None = None,
-    team: Team = ANSWERS,
 ) -> TileMesh:
     """The surface within one tile.
 
@@ -76,16 +72,15 @@ def mesh_tile(
         tile: indices of the tile, which covers ``[tile, tile + 1) * tile_side_m``.
         lattice: that of its level.
         around: distances at some lattice points, which are used instead of the map's.
-        team: shares the work.
     """
     first = np.asarray(tile, np.int64) * lattice.cells
-    seen = _seen_cells(source, first, lattice, team)
-    volume, points = _lattice_values(source, seen, first, lattice, around, team)
+    seen = _seen_cells(source, first, lattice)
+    volume, points = _lattice_values(source, seen, first, lattice, around)
     found = Crossings(seen, volume)
     places = found.points.astype(np.float64)
     places[np.arange(len(places)), found.axes] += found.fractions
     centroids = _centroids((places + first) * lattice.cell_m, found.faces)
-    kept = source.status(centroids, lattice.reach_m, team) == Status.SURFACE
+    kept = source.status(centroids, lattice.reach_m) == Status.SURFACE
     used, faces = _renumbered(found.faces[kept], len(places))
     return TileMesh(
         (first * lattice.cell_m).astype(np.float64),
@@ -99,7 +94,7 @@ def mesh_tile(
 
 
 def _seen_cells(
-    source: Distances, first: NDArray[np.int64], lattice: TileLattice, team: Team
+    source: Distances, first: NDArray[np.int64], lattice: TileLattice
 ) -> NDArray[np.int64]:
     """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
     reach_m = lattice.cell_m / 2 + lattice.reach_m
@@ -107,9 +102,9 @@ def _seen_cells(
     centres = _positions(groups, lattice.group / 2, first, lattice.cell_m)
     # A group is looked into where any of its cells may be such.
     wide = lattice.cell_m * (lattice.group - 1) / 2 + reach_m
-    groups = groups[source.status(centres, wide, team) == Status.SURFACE]
+    groups = groups[source.status(centres, wide) == Status.SURFACE]
     cells = _cells_of(groups, lattice.group, lattice.cells)
-    seen = source.status(_positions(cells, 0.5, first, lattice.cell_m), reach_m, team)
+    seen = source.status(_positions(cells, 0.5, first, lattice.cell_m), reach_m)
     return np.asarray(cells[seen == Status.SURFACE])
 
 
@@ -198,7 +193,6 @@ def _lattice_values(
     first: NDArray[np.int64],
     lattice: TileLattice,
     around: TileBorder | None,
-    team: Team,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Distances on the tile's lattice points [cells + 1] * 3, and the points [P, 3] at seen cells.
 
@@ -210,5 +204,5 @@ def _lattice_values(
     if around is not None:
         around.put(volume)
         asked = points[np.isnan(volume[tuple(points.T)])]
-    volume[tuple(asked.T)] = source.distances(_positions(asked, 0.0, first, lattice.cell_m), team)
+    volume[tuple(asked.T)] = source.distances(_positions(asked, 0.0, first, lattice.cell_m))
     return volume, points

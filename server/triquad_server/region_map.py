@@ -15,6 +15,7 @@ from triquad_format.region import (
     region_centre,
 )
 from triquad_kernels.evidence import Evidence
+from triquad_kernels.observations import Sighting
 from triquad_kernels.voxel_index import thin
 
 from triquad_server.adam import Betas
@@ -66,7 +67,7 @@ class RegionMap:
         self._fresh_owed = 0  # those of them meant for the newest scans
         self.changed = True  # since it was last published
 
-    def see(self, rays: Rays) -> Callable[[], None]:
+    def see(self, rays: Rays, stamp_s: int) -> Callable[[], None]:
         """Note where the rays ended, and grow the field there; outside the cube nothing is.
 
         Returns:
@@ -74,11 +75,12 @@ class RegionMap:
             may run beside :meth:`learn`.
         """
         ends = self.voxels(rays.ends)
-        new = self.evidence.mark_surface(ends)
+        origin = self.voxels(rays.origin[None])[0]
+        sighting = Sighting(origin, self._settings.leaf_m, stamp_s)
+        new = self.evidence.mark_surface(ends, sighting)
         # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
         self.field.grow(new)
         self.changed = True
-        origin = self.voxels(rays.origin[None])[0]
         short = _CARVE_SHORT_M / self._settings.leaf_m
         return lambda: self.evidence.carve(origin, ends[thin(ends, 1.0)], short)
 

@@ -11,7 +11,7 @@ THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity"
 """Threads that share the work: one per core that this process may use."""
 
 _MIN_SHARE = 2048
-"""Points below which splitting work between threads costs more than it gains."""
+"""Points of a field below which splitting work costs more than it gains."""
 
 
 class Team:
@@ -29,9 +29,12 @@ class Team:
         """Run ``work(part)`` for every part of ``range(THREADS)``, at the same time."""
         self._run(work, THREADS)
 
-    def split(self, count: int, work: Callable[[int, int], None]) -> None:
-        """Run ``work(first, last)`` over ``range(count)``, in parallel where it is worth it."""
-        parts = min(THREADS, max(1, count // _MIN_SHARE))
+    def split(self, count: int, work: Callable[[int, int], None], least: int = _MIN_SHARE) -> None:
+        """Run ``work(first, last)`` over ``range(count)``, in parallel where it is worth it.
+
+        ``least`` is how many a thread is given at least.
+        """
+        parts = min(THREADS, max(1, count // least))
         self._run(lambda part: work(*share(count, part, parts)), parts)
 
     @contextlib.contextmanager

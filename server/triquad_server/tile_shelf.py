@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.tile_code import encode_tile
+from triquad_kernels.compiled_view import CompiledView
 
 from triquad_server.epoch import Epoch
-from triquad_server.mesher import TileIndex
+from triquad_server.mesher import TileIndex, mesh_tile
 from triquad_server.settings import MeshSettings
 from triquad_server.surface_changes import Changes, SurfaceChanges
 from triquad_server.threads import PATIENCE, Team
@@ -95,6 +96,7 @@ class TileShelf:
         self._levels = [_Level(tile_lattice(settings, level)) for level in range(LEVELS)]
         self._changes: SurfaceChanges | None = None
         self._epoch: Epoch | None = None
+        self._view: CompiledView | None = None  # of that epoch
         self._revision = 0
         self._made = 0
         self._data: OrderedDict[tuple[int, TileIndex], bytes] = (
@@ -142,6 +144,10 @@ class TileShelf:
             for level in self._levels:
                 level.touch(changes, epoch.field_settings.leaf_m / 2, epoch.number)
             self._epoch = epoch
+            # Its work is shared by threads that are patient.
+            self._view = CompiledView(
+                epoch.number, epoch.field_settings, epoch.frozen_regions, MESHING.split
+            )
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> NDArray[np.int64]:
         """Epochs [T] in which the surface of tiles [T, 3] last changed; 0 where none was seen."""
@@ -181,13 +187,13 @@ class TileShelf:
 
     def make(self, level: int, index: TileIndex) -> ShelvedTile:
         """Make a tile from the epoch that was looked at last, to fit its neighbours."""
-        epoch = self._epoch
-        assert epoch is not None, "nothing was looked at"
+        view = self._view
+        assert view is not None, "nothing was looked at"
         shelf = self._levels[level]
         with self._lock:
             borders = _borders_around(shelf, index)
-        around = TileBorder.joined(self._agreeing(shelf, index, borders, epoch))
-        mesh = epoch.mesh(index, level, around, MESHING)
+        around = TileBorder.joined(self._agreeing(shelf, index, borders, view))
+        mesh = mesh_tile(view, index, shelf.lattice, around)
         data = encode_tile(mesh.surface)
         digest = hashlib.sha256(data).digest()
         with self._lock:
@@ -197,9 +203,9 @@ class TileShelf:
                 version, revision = old.version, old.revision
             else:
                 self._revision += 1
-                version, revision = epoch.number, self._revision
+                version, revision = view.number, self._revision
             tile = ShelvedTile(
-                index, version, revision, epoch.number, len(mesh.faces) == 0, digest, mesh.border
+                index, version, revision, view.number, len(mesh.faces) == 0, digest, mesh.border
             )
             shelf.tiles[index] = tile
             self._keep((level, index), data)
@@ -210,7 +216,7 @@ class TileShelf:
         shelf: _Level,
         index: TileIndex,
         borders: dict[TileIndex, TileBorder],
-        epoch: Epoch,
+        view: CompiledView,
     ) -> Iterator[TileBorder]:
         """The borders to be taken over; tiles of others will have to be made again.
 
@@ -222,11 +228,11 @@ class TileShelf:
         for other, border in borders.items():
             near = np.abs(border.values) < lattice.cell_m
             places = (border.points[near] + corner) * lattice.cell_m
-            if len(places) and shelf.tiles[other].made < epoch.number and other != index:
-                moved = np.abs(epoch.distances(places, MESHING) - border.values[near])
+            if len(places) and shelf.tiles[other].made < view.number and other != index:
+                moved = np.abs(view.distances(places) - border.values[near])
                 if 2 * np.count_nonzero(moved > self._settings.tolerance_m) > len(moved):
                     with self._lock:
-                        shelf.changed[other] = max(shelf.changed[other], epoch.number)
+                        shelf.changed[other] = max(shelf.changed[other], view.number)
                     continue
             yield border
 

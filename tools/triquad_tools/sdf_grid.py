@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.evaluator import Answer
 from triquad_format.region import MapRecord
-from triquad_server.epoch import Answer
 
 from triquad_tools.errors import ToolError
 from triquad_tools.map_source import Box

@@ -1,0 +1,157 @@
+"""The client for programs with an event loop."""
+
+import asyncio
+from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from numpy.typing import ArrayLike
+from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.written_map import MapFileInfo
+
+from triquad_client import download, meshes, upkeep
+from triquad_client.async_driver import AsyncDriver
+from triquad_client.async_queries import AsyncMapQueries, AsyncPinnedMap
+from triquad_client.checks import Bounds
+from triquad_client.connection import Connection, open_connection
+from triquad_client.mesh import Mesh
+from triquad_client.questions import sdf
+from triquad_client.scans import FlushReport, ScanPublisher
+
+
+class AsyncClient(AsyncMapQueries):
+    """As :class:`Client`, with methods to be awaited in one event loop.
+
+    Any number of calls may be awaited at the same time. Where the task of a call is cancelled, so
+    are its requests; where the client is closed, they raise :class:`ClosedError`.
+    """
+
+    def __init__(self, connection: Connection, driver: AsyncDriver) -> None:
+        """Use :func:`connect_async`."""
+        self._connection = connection
+        self._driver = driver
+        self._scans = ScanPublisher(connection)
+        super().__init__(driver.run)
+
+    @property
+    def map_name(self) -> str:
+        """The map this client works with."""
+        return self._connection.map_name
+
+    async def close(self) -> None:
+        """As :meth:`Client.close`."""
+        await self._driver.close()
+
+    async def publish_scan(
+        self,
+        points: ArrayLike,
+        world_from_sensor: ArrayLike,
+        stamp: float | None = None,
+        source: str = "default",
+    ) -> None:
+        """As :meth:`Client.publish_scan`; scans go out in the order of the calls."""
+        await self._driver.in_order(
+            lambda: self._scans.publish(points, world_from_sensor, stamp, source)
+        )
+
+    async def flush(self, timeout: float = 30.0, pending: int = 0) -> FlushReport:
+        """As :meth:`Client.flush`."""
+        return await self._run(self._scans.flush(timeout, pending))
+
+    async def settle(self, timeout: float = 600.0) -> ServerStatus:
+        """As :meth:`Client.settle`."""
+        return await self._run(upkeep.settle(timeout))
+
+    async def pinned(self) -> AsyncPinnedMap:
+        """As :meth:`Client.pinned`."""
+        return AsyncPinnedMap(self._run, await self._run(sdf.pin_newest()))
+
+    async def tiles(self, bounds: Bounds | None = None) -> TileList:
+        """As :meth:`Client.tiles`."""
+        return await self._run(meshes.tiles(bounds))
+
+    async def mesh_tile(self, x: int, y: int, z: int) -> Mesh:
+        """As :meth:`Client.mesh_tile`."""
+        return await self._run(meshes.tile(x, y, z))
+
+    async def mesh(self, bounds: Bounds | None = None) -> Mesh:
+        """As :meth:`Client.mesh`."""
+        return await self._run(meshes.mesh(bounds))
+
+    async def status(self) -> ServerStatus:
+        """As :meth:`Client.status`."""
+        return await self._run(upkeep.status())
+
+    async def checkpoint(self) -> CheckpointInfo:
+        """As :meth:`Client.checkpoint`."""
+        return await self._run(upkeep.checkpoint())
+
+    async def reset(self, bounds: Bounds | None = None) -> int:
+        """As :meth:`Client.reset`."""
+        return await self._run(upkeep.reset(bounds))
+
+    async def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
+        """As :meth:`Client.download_map`."""
+        return await self._run(download.fetch(Path(path), training))
+
+    async def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
+        """As :meth:`Client.download_box`."""
+        return await self._run(download.fetch_box(Path(path), bounds))
+
+    async def maps(self) -> list[str]:
+        """As :meth:`Client.maps`."""
+        return await self._driver.maps()
+
+
+class Connecting:
+    """A client that is being connected: await it, or use it in an ``async with`` statement."""
+
+    def __init__(self, open_: Callable[[], Connection]) -> None:
+        """Use :func:`connect_async`."""
+        self._open = open_
+
+    def __await__(self) -> Generator[Any, None, AsyncClient]:
+        return self._connect().__await__()
+
+    async def __aenter__(self) -> AsyncClient:
+        self._client = await self
+        return self._client
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self._client.close()
+
+    async def _connect(self) -> AsyncClient:
+        sender = ThreadPoolExecutor(1, "triquad-sender")
+        opening = sender.submit(self._open)
+        try:
+            connection = await asyncio.wrap_future(opening)
+        except BaseException:
+            opening.add_done_callback(_close_late)
+            sender.shutdown(wait=False)
+            raise
+        return AsyncClient(connection, AsyncDriver(connection, sender))
+
+
+def connect_async(
+    endpoint: str = "tcp/127.0.0.1:7447",
+    map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
+    *,
+    timeout_s: float = 10.0,
+    config: str | Path | None = None,
+) -> Connecting:
+    """As :func:`connect`: ``async with connect_async(...) as client``, or await it and close."""
+    file = None if config is None else Path(config)
+    return Connecting(lambda: open_connection(endpoint, map, timeout_s, file))
+
+
+def _close_late(opening: "Future[Connection]") -> None:
+    """Close what was opened although its task was cancelled meanwhile."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().close()
