@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import RegionIndex
+from triquad_kernels.surfel_index import surfel_voxels
 
 from triquad_server.epoch import FrozenRegion
 from triquad_server.threads import Team
@@ -125,7 +126,8 @@ class SurfaceChanges:
         return _Noted(region, voxels, self._offsets(region, voxels.centres))
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
-        voxels = region.surfels.voxels(region.evidence.cells)
+        evidence = region.evidence
+        voxels = surfel_voxels(evidence.cells, evidence.surface, len(region.surfels))
         keys = _key(voxels)
         order = np.argsort(keys)
         corner = region.centre - self._settings.region_side_m / 2
