@@ -342,18 +342,19 @@ def test_the_protocol_by_hand(client: Client, endpoint: str) -> None:
                 held=np.array(list(versions), np.int32).reshape(-1, 3),
                 held_versions=np.array(list(versions.values()), np.int64),
             )
-        for ((x, y, z),) in zip(reply.tiles.tolist()):
+        for x, y, z in reply.tiles.tolist():
             known[x, y, z] = reply.data
         with client.watch_mesh() as watch:
             watch.catch_up()
             assert watch.tiles.keys() == known.keys()
             for index, data in known.items():
                 surface = decode_tile(data)
-                assert len(surface.faces) == len(watch.tiles[index].faces)
-                if not draco.AVAILABLE:
-                    np.testing.assert_array_equal(
-                        surface.positions(0.1), watch.tiles[index].vertices
-                    )
+                tile = watch.tiles[index]
+                if draco.AVAILABLE:  # which leaves out faces that quantising made lines
+                    assert 0.9 * len(surface.faces) < len(tile.faces) <= len(surface.faces)
+                else:
+                    np.testing.assert_array_equal(surface.positions(0.1), tile.vertices)
+                    np.testing.assert_array_equal(surface.faces, tile.faces)
         later = tiles_by_hand(peer, server=reply.server, revision=reply.revision)
         assert (later.complete, len(later.tiles), later.restart) == (True, 0, False)
         strange = tiles_by_hand(peer, server="another", revision=10**6)

@@ -24,7 +24,7 @@ from triquad_format.messages import (
     ServerStatus,
     TileRequest,
 )
-from triquad_server.requests import SdfQueries
+from triquad_query.answers import Answers
 from triquad_server.store import Store
 
 POSE = np.eye(4)
@@ -310,14 +310,14 @@ def test_the_status_is_published(endpoint):
 
 def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
     begun, go_on = threading.Event(), threading.Event()
-    answer = SdfQueries.answer
+    answer = Answers.sdf
 
     def answer_later(queries, request):
         begun.set()
         assert go_on.wait(servers.WAIT_S)
         return answer(queries, request)
 
-    monkeypatch.setattr(SdfQueries, "answer", answer_later)
+    monkeypatch.setattr(Answers, "sdf", answer_later)
     limits = dataclasses.replace(servers.SMALL.service, request_queue=1, query_workers=1)
     settings = dataclasses.replace(servers.SMALL, service=limits)
     key = keys.operation_key(servers.MAP, keys.SDF)

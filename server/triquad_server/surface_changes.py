@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import RegionIndex
-from triquad_kernels.evidence import Evidence
+from triquad_kernels.surfel_index import surfel_voxels
 
 from triquad_server.epoch import FrozenRegion
 from triquad_server.threads import Team
@@ -122,14 +122,15 @@ class SurfaceChanges:
         if old is not None and old.region.evidence is region.evidence:
             voxels = old.voxels
         else:
-            voxels = self._voxels(region.evidence, region.centre)
+            voxels = self._voxels(region)
         return _Noted(region, voxels, self._offsets(region, voxels.centres))
 
-    def _voxels(self, evidence: Evidence, centre: NDArray[np.float64]) -> _Voxels:
-        voxels = evidence.surface_voxels()
+    def _voxels(self, region: FrozenRegion) -> _Voxels:
+        evidence = region.evidence
+        voxels = surfel_voxels(evidence.cells, evidence.surface, len(region.surfels))
         keys = _key(voxels)
         order = np.argsort(keys)
-        corner = centre - self._settings.region_side_m / 2
+        corner = region.centre - self._settings.region_side_m / 2
         centres = corner + (voxels[order] + 0.5) * self._settings.leaf_m
         cells = np.floor(centres / self._group_m).astype(np.int64)
         low = cells.min(axis=0, initial=0)
