@@ -14,6 +14,7 @@ _COARSE_POINTS = 500
 """So many find the way; all that follows asks for a few millimetres."""
 
 _FINE_POINTS = 2000
+_CELLS = 1 << 20  # along an axis, for thinning
 
 _PER_RANGE = 0.1
 """At first a point's distance counts less by this share a metre of its range: a wrong guess of the
@@ -299,16 +300,17 @@ def _finite(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _thinned(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """At most about ``most`` points, one a cell of cells as small as may be: evenly in space."""
+    """Some ``most`` of the points, evenly in space: the first of each cell of a grid."""
     if len(points) <= most:
         return points
-    corner = points.min(axis=0)
-    # From cells of which the surface in sight cannot have that many, to those that it does.
-    side_m = max(float(np.ptp(points, axis=0).max()), 1e-3) / (1 << 10)
+    offsets = points - np.median(points, axis=0)
+    # From cells of which the surfaces in sight fill more, to those of which they do not.
+    side_m = max(float(np.median(np.abs(offsets))), 1e-3) / 256
     while True:
-        cells = ((points - corner) / side_m).astype(np.int64)
-        keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
-        points = points[np.sort(np.unique(keys, return_index=True)[1])]
+        cells = np.clip(np.floor(offsets / side_m) + _CELLS / 2, 0, _CELLS - 1).astype(np.int64)
+        keys = (cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2]
+        first = np.sort(np.unique(keys, return_index=True)[1])
+        points, offsets = points[first], offsets[first]
         if len(points) <= 1.1 * most:
             return points
         side_m *= max(1.1, math.sqrt(len(points) / most))
