@@ -217,3 +217,19 @@ def test_no_points_are_no_error(client):
 def test_bad_questions_name_what_is_wrong(client, ask, words):
     with pytest.raises(triquad_client.TriquadError, match=words):
         ask(client)
+
+
+def test_a_scan_finds_its_place(client):
+    true = np.eye(4)
+    points = even_sphere(20_000, 0.3)
+    # A ball looks alike from all sides: what is not seen of the pose is kept, and said.
+    guess = true.copy()
+    guess[:3, 3] = (0.3, -0.2, 0.1)
+    answer = client.align(points, guess)
+    assert np.linalg.norm(answer.world_from_sensor[:3, 3]) < 0.05
+    assert answer.inlier_share > 0.9
+    assert not answer.converged
+    assert np.sqrt(np.diag(answer.covariance))[3:].min() > 1.0
+    assert np.sqrt(np.diag(answer.covariance))[:3].max() < 0.2
+    with pytest.raises(triquad_client.InvalidInputError, match="not rigid"):
+        client.align(points, 2 * true)

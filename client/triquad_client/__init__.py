@@ -11,6 +11,7 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 from triquad_format import __version__
 from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_format.status import Status
+from triquad_query.align import Alignment
 from triquad_query.distance import Distances
 from triquad_query.errors import TriquadError, UnknownSpaceError
 from triquad_query.grid import Grid
@@ -44,6 +45,7 @@ from triquad_client.questions.sdf import SdfResult
 from triquad_client.scans import FlushReport
 
 __all__ = [
+    "Alignment",
     "AsyncClient",
     "AsyncPinnedMap",
     "BadReplyError",

@@ -3,6 +3,7 @@
 from typing import Protocol
 
 from numpy.typing import ArrayLike
+from triquad_query.align import Alignment, AlignOptions
 from triquad_query.distance import DistanceOptions, Distances
 from triquad_query.grid import Grid
 from triquad_query.polyline import Polyline
@@ -13,7 +14,7 @@ from triquad_query.unknown import Unknown
 
 from triquad_client.call import Call, ResultT
 from triquad_client.checks import Bounds
-from triquad_client.questions import distance, grid, rays, sdf, segments, spheres
+from triquad_client.questions import alignment, distance, grid, rays, sdf, segments, spheres
 from triquad_client.questions.sdf import SdfResult
 
 
@@ -107,6 +108,18 @@ class AsyncMapQueries:
     ) -> Grid:
         """As :meth:`MapQueries.query_grid`."""
         return await self._run(grid.query(bounds, cell, max_distance, self._chosen(at_epoch)))
+
+    async def align(
+        self,
+        points: ArrayLike,
+        world_from_sensor_guess: ArrayLike,
+        max_distance: float = 6.0,
+        at_epoch: int | None = None,
+    ) -> Alignment:
+        """As :meth:`MapQueries.align`."""
+        options = AlignOptions(max_distance)
+        call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
+        return await self._run(call)
 
     def _chosen(self, at_epoch: int | None) -> int | None:
         return self._epoch if at_epoch is None else at_epoch

@@ -1,6 +1,7 @@
 """Questions about the map, which clients and pinned epochs answer alike."""
 
 from numpy.typing import ArrayLike
+from triquad_query.align import Alignment, AlignOptions
 from triquad_query.distance import DistanceOptions, Distances
 from triquad_query.grid import Grid
 from triquad_query.polyline import Polyline
@@ -11,7 +12,7 @@ from triquad_query.unknown import Unknown
 
 from triquad_client.call import Run
 from triquad_client.checks import Bounds
-from triquad_client.questions import distance, grid, rays, sdf, segments, spheres
+from triquad_client.questions import alignment, distance, grid, rays, sdf, segments, spheres
 from triquad_client.questions.sdf import SdfResult
 
 
@@ -144,6 +145,25 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         return self._run(grid.query(bounds, cell, max_distance, self._chosen(at_epoch)))
+
+    def align(
+        self,
+        points: ArrayLike,
+        world_from_sensor_guess: ArrayLike,
+        max_distance: float = 6.0,
+        at_epoch: int | None = None,
+    ) -> Alignment:
+        """Where a scan was taken: its points are moved until they lie on surfaces of the map.
+
+        Args:
+            points: [N, 3] metres, sensor frame; some thousands are enough.
+            world_from_sensor_guess: [4, 4]; off by a metre and ten degrees or so at most.
+            max_distance: points farther than this from any surface do not count.
+            at_epoch: see :class:`MapQueries`.
+        """
+        options = AlignOptions(max_distance)
+        call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
+        return self._run(call)
 
     def _chosen(self, at_epoch: int | None) -> int | None:
         return self._epoch if at_epoch is None else at_epoch

@@ -16,6 +16,7 @@ SPHERES = "query/spheres"
 SEGMENTS = "query/segments"
 RAYS = "query/rays"
 GRID = "query/grid"
+ALIGN = "query/align"
 TILE = "query/tile"
 TILE_LIST = "query/tiles"
 TILE_UPDATES = "query/tile_updates"
@@ -34,6 +35,7 @@ OPERATIONS = (
     SEGMENTS,
     RAYS,
     GRID,
+    ALIGN,
     TILE,
     TILE_LIST,
     TILE_UPDATES,

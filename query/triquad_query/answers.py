@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.messages import SdfReply, SdfRequest
 from triquad_format.query_messages import (
+    AlignReply,
+    AlignRequest,
     DistanceReply,
     DistanceRequest,
     GridReply,
@@ -23,15 +25,18 @@ from triquad_format.query_messages import (
     SpheresRequest,
 )
 
+from triquad_query.align import AlignOptions, align
 from triquad_query.distance import DistanceOptions, distances
 from triquad_query.grid import GridShape, grid
 from triquad_query.map_view import MapView
+from triquad_query.pose import is_rigid
 from triquad_query.rays import RayOptions, rays
 from triquad_query.segments import SegmentOptions, segments, steps_at_most
 from triquad_query.spheres import spheres
 
 MAX_DISTANCE_M = 100.0
 MAX_RANGE_M = 1_000.0
+MAX_ITERATIONS = 200
 
 _STEPS_EACH = 50
 """Places along a segment that count as much as a point that is asked for."""
@@ -161,6 +166,33 @@ class Answers:
         with self._view(request.epoch) as view:
             answer = grid(view, shape, reach_m)
         return GridReply(answer.epoch, answer.distance, answer.status)
+
+    def align(self, request: AlignRequest) -> AlignReply:
+        """The pose of a scan near a guess."""
+        self._check_count(len(request.points), f"{len(request.points)} points")
+        if not is_rigid(request.world_from_sensor):
+            raise QuestionError(
+                "bad_request",
+                f"world_from_sensor is no rotation and translation: {request.world_from_sensor}",
+            )
+        options = AlignOptions(
+            _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
+            int(_within("max_iterations", request.max_iterations, MAX_ITERATIONS)),
+        )
+        with self._view(request.epoch) as view:
+            answer = align(
+                view, request.points.astype(np.float64), request.world_from_sensor, options
+            )
+        return AlignReply(
+            answer.epoch,
+            answer.world_from_sensor,
+            answer.covariance,
+            answer.inlier_share,
+            answer.rms_m,
+            answer.converged,
+            answer.iterations,
+            answer.points,
+        )
 
     def _searched(
         self, what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32]

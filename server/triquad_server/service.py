@@ -22,6 +22,7 @@ from triquad_format.messages import (
     TileUpdatesRequest,
 )
 from triquad_format.query_messages import (
+    AlignRequest,
     DistanceRequest,
     GridRequest,
     RaysRequest,
@@ -219,6 +220,7 @@ class Service:
             },
             limits.query_workers,
         )
+        self._open_desk({keys.ALIGN: answering(AlignRequest, answers.align)})
         self._open_desk(
             {
                 keys.TILE_LIST: answering(TileListRequest, tiles.tiles),

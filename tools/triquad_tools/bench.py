@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
-PARTS = ("core", "server", "growth", "file", "store", "mesh", "answers")
+PARTS = ("core", "server", "growth", "file", "store", "mesh", "answers", "align")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         with sigterm_interrupts():
-            figures = measure(options.parts or list(PARTS), options.seed)
+            figures = measure(options.parts or list(PARTS), options.seed, options.recorded)
         _present(figures, options)
     except (ToolError, TriquadError, OSError) as error:
         return _complain(str(error), FAILED)
@@ -43,8 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return OK
 
 
-def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
-    """The figures of some parts on one street."""
+def measure(parts: Sequence[str], street_seed: int, recorded: Path | None = None) -> "list[Figure]":
+    """The figures of some parts on one street, and of ``align`` on a recorded folder, too."""
+    from triquad_tools.bench_align import measure_align
     from triquad_tools.bench_core import measure_core
     from triquad_tools.bench_file import measure_file
     from triquad_tools.bench_mesh import measure_mesh
@@ -54,7 +55,7 @@ def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
     from triquad_tools.bench_street import bench_street
 
     figures: list[Figure] = []
-    if {"core", "server", "file", "store", "mesh", "answers"} & set(parts):
+    if set(parts) - {"growth"}:
         made = bench_street(street_seed)
         if "server" in parts:
             figures += measure_server(made)
@@ -68,6 +69,8 @@ def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
             figures += measure_mesh(made)
         if "answers" in parts:
             figures += measure_planners(made)
+        if "align" in parts:
+            figures += measure_align(made, recorded)
     if "growth" in parts:
         figures += _growth(street_seed)
     return figures
@@ -133,7 +136,8 @@ def _parser() -> argparse.ArgumentParser:
         prog="triquad-bench",
         description="Measure triquad on this machine, on a simulated street: a server under a "
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
-        "file, checkpoints, and mesh tiles. Takes some minutes; nothing else should run meanwhile.",
+        "file, checkpoints, mesh tiles, answers to planners, and scans put back in place. Takes "
+        "a quarter of an hour; nothing else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument
@@ -141,6 +145,7 @@ def _parser() -> argparse.ArgumentParser:
         "parts", nargs="*", type=_part, metavar="PART", help=f"of {', '.join(PARTS)} (default: all)"
     )
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
+    add("--recorded", type=Path, metavar="FOLDER", help="KITTI-style scans to align, too")
     add("--json", type=Path, metavar="FILE", help="write the figures there, too")
     add("--record", type=Path, metavar="FILE.md", help="add a table to this page")
     return parser
