@@ -37,7 +37,7 @@ from triquad_client.errors import (
     UnknownMapError,
 )
 from triquad_client.mesh import Mesh
-from triquad_client.queries import PinnedMap
+from triquad_client.queries import MapQueries, PinnedMap
 from triquad_client.questions.sdf import SdfResult
 from triquad_client.scans import FlushReport
 
@@ -57,6 +57,7 @@ __all__ = [
     "InvalidInputError",
     "InvalidScanError",
     "MapInfo",
+    "MapQueries",
     "Mesh",
     "NoReplyError",
     "PinnedMap",
