@@ -37,6 +37,8 @@ from triquad_client.errors import (
     UnknownMapError,
 )
 from triquad_client.mesh import Mesh
+from triquad_client.mesh_tiles import HeldTiles, MeshTile
+from triquad_client.mesh_watch import MeshUpdate, MeshWatch
 from triquad_client.queries import MapQueries, PinnedMap
 from triquad_client.questions.sdf import SdfResult
 from triquad_client.scans import FlushReport
@@ -54,11 +56,15 @@ __all__ = [
     "DownloadError",
     "FlushReport",
     "Grid",
+    "HeldTiles",
     "InvalidInputError",
     "InvalidScanError",
     "MapInfo",
     "MapQueries",
     "Mesh",
+    "MeshTile",
+    "MeshUpdate",
+    "MeshWatch",
     "NoReplyError",
     "PinnedMap",
     "Polyline",

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format import morton
+from triquad_format.evidence_voxels import surface_counts
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_format.region import Evidence as EvidenceRecord
 from triquad_format.status import Status
@@ -19,12 +20,13 @@ from triquad_format.status import Status
 from triquad_kernels.observations import Observations, Sighting
 from triquad_kernels.rows import with_room
 from triquad_kernels.unknown_search import SeenSpace, find_unknown
-from triquad_kernels.voxel_index import Index, VoxelIndex, find_row, make_row, pack
+from triquad_kernels.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
 Masks = NDArray[np.uint8]
 
 _SHIFT = BLOCK_VOXELS.bit_length() - 1
 _LOW = BLOCK_VOXELS - 1
+_SEEN_STEP_S = 60
 _SURFACE = np.uint8(Status.SURFACE)
 _FREE = np.uint8(Status.FREE)
 _UNKNOWN = np.uint8(Status.UNKNOWN)
@@ -209,6 +211,30 @@ def _status(
 
 
 @numba.njit(cache=True, nogil=True)
+def _set_voxels(row_keys: NDArray[np.int64], masks: Masks) -> NDArray[np.int64]:
+    """The voxels [N, 3] whose bit is set in the blocks of some keys."""
+    count = 0
+    for row in range(len(row_keys)):
+        for byte in masks[row]:
+            while byte:
+                byte &= byte - 1
+                count += 1
+    voxels = np.empty((count, 3), np.int64)
+    found = 0
+    for row in range(len(row_keys)):
+        x, y, z = unpack(row_keys[row])
+        for column in range(len(masks[row])):
+            byte = masks[row, column]
+            for bit in range(8):
+                if (byte >> bit) & 1:
+                    voxels[found, 0] = (x << _SHIFT) + (column >> _SHIFT)
+                    voxels[found, 1] = (y << _SHIFT) + (column & _LOW)
+                    voxels[found, 2] = (z << _SHIFT) + bit
+                    found += 1
+    return voxels
+
+
+@numba.njit(cache=True, nogil=True)
 def _ended_in(
     voxels: NDArray[np.int64], side: int, index: Index, surface: Masks, ended: NDArray[np.bool_]
 ) -> None:
@@ -357,6 +383,11 @@ class Evidence:
         """Blocks [B, 3], in units of blocks, that hold any seen surface."""
         return self._blocks.cells()[self._surface[: self.blocks].any(axis=1)]
 
+    def surface_voxels(self) -> NDArray[np.int64]:
+        """Voxels [N, 3] in which rays ended."""
+        keys = self._blocks.arrays.row_keys[: self.blocks]
+        return np.asarray(_set_voxels(keys, self._surface[: self.blocks]))
+
     def clear(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
         self._twin = None
@@ -389,7 +420,14 @@ class Evidence:
         codes = morton.encode(self._blocks.cells()[used])
         order = np.argsort(codes)
         used = used[order]
-        return EvidenceRecord(codes[order], surface[used], free[used])
+        counts = surface_counts(surface)
+        firsts = np.cumsum(counts) - counts
+        # The levels block by block, in the order of the record.
+        runs = np.repeat(firsts[used] - (np.cumsum(counts[used]) - counts[used]), counts[used])
+        levels = self.levels()[runs + np.arange(len(runs))]
+        # In whole minutes: else each scan would change every part that it sees.
+        seen_s = np.where(counts > 0, self.seen_s() // _SEEN_STEP_S * _SEEN_STEP_S, 0)
+        return EvidenceRecord(codes[order], surface[used], free[used], levels, seen_s[used])
 
     @classmethod
     def restore(cls, side: int, record: EvidenceRecord) -> "Evidence":
@@ -398,6 +436,11 @@ class Evidence:
         evidence._blocks = VoxelIndex.of_cells(morton.decode(record.codes, 3))
         evidence._surface = with_room(record.surface, evidence._blocks.capacity)
         evidence._free = with_room(record.free, evidence._blocks.capacity)
+        if record.levels is not None:
+            seen_s = np.zeros(len(record.codes), np.int64)
+            evidence._observations = Observations.restore(
+                record.surface, record.levels, seen_s if record.seen_s is None else record.seen_s
+            )
         return evidence
 
     def _grow(self) -> None:

@@ -7,6 +7,7 @@ from triquad_query.distance import DistanceOptions, distances
 
 from triquad_server.mapper import Mapper
 from triquad_server.settings import Settings
+from triquad_server.tile_shelf import TileShelf
 
 _DIRECTIONS = 400
 _RADIUS_M = 3.0
@@ -34,4 +35,6 @@ def warm_up(
     epoch.query(directions, gradient=True)
     distances(epoch, directions, DistanceOptions(unknown_distance=True))
     report("meshes")
-    epoch.mesh((0, 0, 0))
+    shelf = TileShelf(settings.mesh)
+    shelf.look(epoch)
+    shelf.make(0, (0, 0, 0))
