@@ -37,11 +37,11 @@ def simulated_scan(view: MapQueries, world_from_sensor: NDArray[np.float64]) -> 
     return (answer.range[hit] + noise)[:, None] * rays[hit]
 
 
-def read_scan(path: Path) -> NDArray[np.float32]:
+def read_scan(path: Path) -> NDArray[np.float64]:
     """Points [N, 3] of a ``.npy`` of such points, or of a ``.bin`` of x, y, z, intensity."""
     if path.suffix == ".npy":
-        return np.asarray(np.load(path), np.float32)
-    return np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
+        return np.asarray(np.load(path), np.float64)
+    return np.fromfile(path, np.float32).reshape(-1, 4)[:, :3].astype(np.float64)
 
 
 def doubts(answer: Alignment) -> list[str]:
@@ -81,8 +81,9 @@ def main() -> None:
     )
     options = parser.parse_args()
     with open_view(options) as view:
-        points = read_scan(options.scan) if options.scan else None
-        if points is None:
+        if options.scan:
+            points = read_scan(options.scan)
+        else:
             points = simulated_scan(view, pose(*SIMULATED_AT))
         answer = view.align(points, pose(*options.guess), max_distance=2.0)
     found = answer.world_from_sensor

@@ -16,6 +16,7 @@ AVOID = 50.0  # weight of what is near against the path's length
 BOWS_M = (-3.0, -1.0, 1.0, 3.0)  # first guesses: how far to the side the middle lies
 
 Places = NDArray[np.float64]
+Answers = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def pull() -> NDArray[np.float64]:
     return matrix
 
 
-def push(distance: Places, gradient: Places, body: Body) -> Places:
+def push(distance: Answers, gradient: Answers, body: Body) -> Places:
     """The gradient [N, 3] of the price of being near: it falls evenly, then smoothly to nothing."""
     gap = distance - body.radius_m
     slope = np.where(gap < 0, -1.0, -np.clip(1 - gap / body.margin_m, 0, 1))
