@@ -133,7 +133,7 @@ def _levels(client: Client, planner: Client, made: BenchStreet) -> list[Figure]:
     stop = threading.Event()
     points = np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
     with ThreadPoolExecutor(1) as beside:
-        asking = beside.submit(ask_until, stop, planner, points, True)
+        asking = beside.submit(ask_until, stop, planner, points, "gradient")
         for level in (1, 2):
             with client.watch_mesh(level=level) as watch:
                 watch.catch_up(_FETCH_LIMIT_S)

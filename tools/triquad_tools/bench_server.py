@@ -67,7 +67,7 @@ def _stream(client: Client, endpoint: str, made: BenchStreet, folder: Path) -> P
     rng = np.random.default_rng(0)
     asked = folder / "points.npy"
     np.save(asked, rng.permutation(made.probes.near)[:_ASKED])
-    with Probe(endpoint, _MAP, asked, gradient=True) as probe:
+    with Probe(endpoint, _MAP, asked, question="gradient") as probe:
         started, stamp_s = time.monotonic(), time.time()
         with progress("streaming at 10 Hz", len(made.scans)) as report:
             for index, scan in enumerate(made.scans):

@@ -143,7 +143,7 @@ def _drive_on(
     checkpoints: Executor | None,
 ) -> ProbeReport:
     """Publish scans as a lidar does while another process asks."""
-    with Probe(endpoint, _MAP, asked, gradient=True) as probe:
+    with Probe(endpoint, _MAP, asked, question="gradient") as probe:
         started = time.monotonic()
         with progress("streaming at 10 Hz", len(made.scans)) as report:
             for number, scan in enumerate(made.scans):

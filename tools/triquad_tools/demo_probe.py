@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 
 PERIOD_S = 0.05
 _STOP_TIMEOUT_S = 60.0
+
+
+QUESTIONS: "dict[str, Callable[[Client, NDArray[np.float64]], int]]" = {
+    "sdf": lambda client, points: client.query_sdf(points).epoch,
+    "gradient": lambda client, points: client.query_gradient(points).epoch,
+    "distance": lambda client, points: client.query_distance(points).epoch,
+}
+"""What the planner may ask; each returns the epoch that answered."""
 
 
 class ProbeError(ToolError):
@@ -51,10 +59,9 @@ class ProbeReport:
 class Probe:
     """The planner's process; leaving the ``with`` statement ends it in any case."""
 
-    def __init__(self, endpoint: str, map_name: str, points: Path, gradient: bool = False) -> None:
-        """Start to ask for ``points``, an ``.npy`` file ``[N, 3]``."""
-        command = [sys.executable, "-m", __name__, endpoint, map_name, str(points)]
-        command += ["gradient"] if gradient else []
+    def __init__(self, endpoint: str, map_name: str, points: Path, question: str = "sdf") -> None:
+        """Start to ask a question of ``QUESTIONS`` at ``points``, an ``.npy`` file ``[N, 3]``."""
+        command = [sys.executable, "-m", __name__, endpoint, map_name, str(points), question]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -91,9 +98,9 @@ def ask_until(
     stop: threading.Event,
     client: "Client",
     points: NDArray[np.float64],
-    gradient: bool = False,
+    question: str = "sdf",
 ) -> ProbeReport:
-    """Ask for distances at ``points`` [N, 3] until ``stop`` is set."""
+    """Ask a question of ``QUESTIONS`` at ``points`` [N, 3] until ``stop`` is set."""
     from triquad_client import TriquadError
 
     latencies_s: list[float] = []
@@ -103,7 +110,7 @@ def ask_until(
     while not stop.is_set():
         started = time.perf_counter()
         try:
-            epochs.append(client.query_sdf(points, gradient).epoch)
+            epochs.append(QUESTIONS[question](client, points))
             latencies_s.append(time.perf_counter() - started)
         except TriquadError as error:
             errors += 1
@@ -134,11 +141,11 @@ def _report(
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the process; ``argv`` is endpoint, map, file of points and perhaps "gradient"."""
+    """Run the process; ``argv`` is endpoint, map, file of points and question."""
     from triquad_client import connect
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    endpoint, map_name, points, *gradient = argv
+    endpoint, map_name, points, question = argv
     stop = threading.Event()
 
     def wait_for_end() -> None:
@@ -147,7 +154,7 @@ def main(argv: Sequence[str]) -> int:
 
     threading.Thread(target=wait_for_end, daemon=True).start()
     with connect(endpoint, map_name) as client:
-        report = ask_until(stop, client, np.load(points), bool(gradient))
+        report = ask_until(stop, client, np.load(points), question)
     print(json.dumps(asdict(report)))
     return 0
 
