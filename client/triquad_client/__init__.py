@@ -40,7 +40,7 @@ from triquad_client.errors import (
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles, MeshTile
 from triquad_client.mesh_watch import MeshUpdate, MeshWatch
-from triquad_client.queries import PinnedMap
+from triquad_client.queries import MapQueries, PinnedMap
 from triquad_client.questions.sdf import SdfResult
 from triquad_client.scans import FlushReport
 
@@ -62,6 +62,7 @@ __all__ = [
     "InvalidInputError",
     "InvalidScanError",
     "MapInfo",
+    "MapQueries",
     "Mesh",
     "MeshTile",
     "MeshUpdate",

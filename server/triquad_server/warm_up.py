@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from triquad_query.distance import DistanceOptions, distances
 
 from triquad_server.mapper import Mapper
 from triquad_server.settings import Settings
@@ -32,6 +33,7 @@ def warm_up(
     epoch = mapper.publish()
     report("queries")
     epoch.query(directions, gradient=True)
+    distances(epoch, directions, DistanceOptions(unknown_distance=True))
     report("meshes")
     shelf = TileShelf(settings.mesh)
     shelf.look(epoch)
