@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
-from triquad_query.surfels import DISC_RADIUS, OUTSIDE, SurfelKind
+from triquad_query.surfels import DISC_RADIUS, FADED, OUTSIDE, SMOOTHING, SurfelKind
 
 from triquad_kernels.voxel_index import CELL_LIMIT, Index, VoxelIndex, find_row, pack, unpack
 
@@ -19,12 +19,6 @@ _SHIFT = BLOCK_VOXELS.bit_length() - 1
 _LOW = BLOCK_VOXELS - 1
 _GROUP_SHIFT = 2
 _GROUP_VOXELS = float(BLOCK_VOXELS << _GROUP_SHIFT)
-
-SMOOTHING = 0.1
-"""Surfels that are farther than the nearest by about this, in voxels, still count in the direction:
-on a wall many are nearly as near, and each is a little off."""
-
-_FADED = 3.0  # times SMOOTHING: what is farther does not count
 
 _DISC = int(SurfelKind.DISC)
 _NONE = int(SurfelKind.NONE)
@@ -170,7 +164,7 @@ def _box_distance(at: Place, boxes: Ints, row: int) -> float:
 @numba.njit(cache=True, nogil=True, inline="always")
 def _reach(state: Doubles) -> float:
     """How near a surfel must lie to count."""
-    return float(state[_BEST] + _FADED * SMOOTHING)
+    return float(state[_BEST] + FADED * SMOOTHING)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -194,7 +188,7 @@ def _weigh(
         distance = np.sqrt(square)
         qx, qy, qz = at[0] - offset[0], at[1] - offset[1], at[2] - offset[2]
     best = state[_BEST]
-    if distance > best + _FADED * SMOOTHING:
+    if distance > best + FADED * SMOOTHING:
         return False
     nearer: bool = distance < best
     if nearer:
