@@ -53,6 +53,8 @@ def imported(folder: str) -> set[str]:
     [
         ("format", ()),
         ("client", ()),
+        ("query", ()),
+        ("kernels", ("server",)),
         ("server", ("server",)),
         ("tools", ("server", "tools")),
     ],
@@ -62,6 +64,6 @@ def test_what_is_imported_is_declared(folder, extras):
 
 
 def test_what_is_declared_is_imported():
-    folders = ("format", "client", "server", "tools")
+    folders = ("format", "query", "kernels", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
     assert declared("server", "tools") <= used

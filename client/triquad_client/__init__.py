@@ -11,6 +11,14 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 from triquad_format import __version__
 from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_format.status import Status
+from triquad_query.distance import Distances
+from triquad_query.errors import TriquadError, UnknownSpaceError
+from triquad_query.grid import Grid
+from triquad_query.polyline import Polyline
+from triquad_query.rays import Rays
+from triquad_query.segments import Segments
+from triquad_query.spheres import Spheres
+from triquad_query.unknown import Unknown
 
 from triquad_client.async_client import AsyncClient, connect_async
 from triquad_client.async_queries import AsyncPinnedMap
@@ -26,13 +34,12 @@ from triquad_client.errors import (
     NoReplyError,
     RefusedError,
     RequestTimeoutError,
-    TriquadError,
     UnknownMapError,
 )
 from triquad_client.mesh import Mesh
 from triquad_client.queries import PinnedMap
+from triquad_client.questions.sdf import SdfResult
 from triquad_client.scans import FlushReport
-from triquad_client.sdf import SdfResult
 
 __all__ = [
     "AsyncClient",
@@ -43,22 +50,30 @@ __all__ = [
     "Client",
     "ClosedError",
     "ConnectError",
+    "Distances",
     "DownloadError",
     "FlushReport",
+    "Grid",
     "InvalidInputError",
     "InvalidScanError",
     "MapInfo",
     "Mesh",
     "NoReplyError",
     "PinnedMap",
+    "Polyline",
+    "Rays",
     "RefusedError",
     "RequestTimeoutError",
     "SdfResult",
+    "Segments",
     "ServerStatus",
+    "Spheres",
     "Status",
     "TileList",
     "TriquadError",
+    "Unknown",
     "UnknownMapError",
+    "UnknownSpaceError",
     "__version__",
     "connect",
     "connect_async",

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_format.written_map import MapFileInfo
 
-from triquad_client import download, meshes, sdf, upkeep
+from triquad_client import download, meshes, upkeep
 from triquad_client.async_driver import AsyncDriver
 from triquad_client.async_queries import AsyncMapQueries, AsyncPinnedMap
 from triquad_client.checks import Bounds
 from triquad_client.connection import Connection, open_connection
 from triquad_client.mesh import Mesh
+from triquad_client.questions import sdf
 from triquad_client.scans import FlushReport, ScanPublisher
 
 

@@ -3,10 +3,18 @@
 from typing import Protocol
 
 from numpy.typing import ArrayLike
+from triquad_query.distance import DistanceOptions, Distances
+from triquad_query.grid import Grid
+from triquad_query.polyline import Polyline
+from triquad_query.rays import RayOptions, Rays
+from triquad_query.segments import SegmentOptions, Segments
+from triquad_query.spheres import Spheres
+from triquad_query.unknown import Unknown
 
-from triquad_client import sdf
 from triquad_client.call import Call, ResultT
-from triquad_client.sdf import SdfResult
+from triquad_client.checks import Bounds
+from triquad_client.questions import distance, grid, rays, sdf, segments, spheres
+from triquad_client.questions.sdf import SdfResult
 
 
 class AsyncRun(Protocol):
@@ -32,8 +40,73 @@ class AsyncMapQueries:
         return await self._run(sdf.query(points, gradient, self._chosen(at_epoch)))
 
     async def query_gradient(self, points: ArrayLike, at_epoch: int | None = None) -> SdfResult:
-        """As :meth:`query_sdf`, with the gradient."""
+        """As :meth:`MapQueries.query_gradient`."""
         return await self.query_sdf(points, gradient=True, at_epoch=at_epoch)
+
+    async def query_distance(
+        self,
+        points: ArrayLike,
+        max_distance: float = 5.0,
+        *,
+        unknown: Unknown | str = Unknown.FREE,
+        surface_point: bool = False,
+        unknown_distance: bool = False,
+        at_epoch: int | None = None,
+    ) -> Distances:
+        """As :meth:`MapQueries.query_distance`."""
+        options = DistanceOptions(max_distance, surface_point, unknown_distance)
+        return await self._run(distance.query(points, options, unknown, self._chosen(at_epoch)))
+
+    async def query_spheres(
+        self, centres: ArrayLike, radii: ArrayLike, at_epoch: int | None = None
+    ) -> Spheres:
+        """As :meth:`MapQueries.query_spheres`."""
+        return await self._run(spheres.query(centres, radii, self._chosen(at_epoch)))
+
+    async def query_segments(
+        self,
+        starts: ArrayLike,
+        ends: ArrayLike,
+        radius: float = 0.0,
+        max_distance: float = 5.0,
+        at_epoch: int | None = None,
+    ) -> Segments:
+        """As :meth:`MapQueries.query_segments`."""
+        options = SegmentOptions(radius, max_distance)
+        return await self._run(segments.query(starts, ends, options, self._chosen(at_epoch)))
+
+    async def query_polyline(
+        self,
+        points: ArrayLike,
+        radius: float = 0.0,
+        max_distance: float = 5.0,
+        at_epoch: int | None = None,
+    ) -> Polyline:
+        """As :meth:`MapQueries.query_polyline`."""
+        options = SegmentOptions(radius, max_distance)
+        return await self._run(segments.query_polyline(points, options, self._chosen(at_epoch)))
+
+    async def query_rays(
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        max_range: float = 50.0,
+        through_unknown: bool = False,
+        at_epoch: int | None = None,
+    ) -> Rays:
+        """As :meth:`MapQueries.query_rays`."""
+        options = RayOptions(max_range, through_unknown)
+        return await self._run(rays.query(origins, directions, options, self._chosen(at_epoch)))
+
+    async def query_grid(
+        self,
+        bounds: Bounds,
+        cell: float = 0.1,
+        max_distance: float = 5.0,
+        at_epoch: int | None = None,
+    ) -> Grid:
+        """As :meth:`MapQueries.query_grid`."""
+        return await self._run(grid.query(bounds, cell, max_distance, self._chosen(at_epoch)))
 
     def _chosen(self, at_epoch: int | None) -> int | None:
         return self._epoch if at_epoch is None else at_epoch

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_query.unknown import Unknown
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
 
@@ -136,6 +137,99 @@ def filled_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]
     if not (minimum < maximum).all():
         raise InvalidInputError(f"bounds = {bounds!r} hold nothing")
     return minimum, maximum
+
+
+def chosen_epoch(at_epoch: int | None) -> int | None:
+    """As :func:`epoch`, or ``None`` for the newest."""
+    return None if at_epoch is None else epoch(at_epoch)
+
+
+def unknown_policy(unknown: Unknown | str) -> Unknown:
+    """How unknown space is to count.
+
+    Raises:
+        InvalidInputError: there is no such way.
+    """
+    try:
+        return Unknown(unknown)
+    except ValueError as error:
+        ways = ", ".join(repr(way.value) for way in Unknown)
+        raise InvalidInputError(f"unknown = {unknown!r}: use one of {ways}") from error
+
+
+def positive(name: str, value: float) -> float:
+    """A finite number above 0.
+
+    Raises:
+        InvalidInputError: it is none.
+    """
+    number = _number(name, value)
+    if not number > 0:
+        raise InvalidInputError(f"{name} = {value!r}: give more than 0")
+    return number
+
+
+def not_negative(name: str, value: float) -> float:
+    """A finite number, 0 or more.
+
+    Raises:
+        InvalidInputError: it is none.
+    """
+    number = _number(name, value)
+    if number < 0:
+        raise InvalidInputError(f"{name} = {value!r}: give 0 or more")
+    return number
+
+
+def radii(values: ArrayLike, count: int) -> NDArray[np.float32]:
+    """Radii [count], from as many or a single one.
+
+    Raises:
+        InvalidInputError: they are not finite numbers, 0 or more.
+    """
+    try:
+        array = np.broadcast_to(np.asarray(values, np.float32), (count,))
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"radii are not one number or {count}: {error}") from error
+    bad = ~(np.isfinite(array) & (array >= 0))
+    if bad.any():
+        index = int(bad.argmax())
+        raise InvalidInputError(f"radius {index} is {array[index]}: give 0 or more, in metres")
+    return array
+
+
+def place_or_places(points: ArrayLike) -> NDArray[np.float64]:
+    """Points [N, 3] or one [1, 3], from [3] or [N, 3].
+
+    Raises:
+        InvalidInputError: they are not.
+    """
+    array = np.asarray(points)
+    return query_points(array[None] if array.shape == (3,) else array)
+
+
+def directions(vectors: ArrayLike) -> NDArray[np.float64]:
+    """Unit vectors [N, 3] along ``vectors``.
+
+    Raises:
+        InvalidInputError: they are not vectors, or one has no direction.
+    """
+    array = query_points(vectors)
+    lengths = np.linalg.norm(array, axis=1)
+    if not (lengths > 0).all():
+        index = int((lengths <= 0).argmax())
+        raise InvalidInputError(f"direction {index} is {array[index]}: it has no length")
+    return np.asarray(array / lengths[:, None], np.float64)
+
+
+def _number(name: str, value: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"{name} = {value!r} is not a number") from error
+    if not math.isfinite(number):
+        raise InvalidInputError(f"{name} = {value!r} is not finite")
+    return number
 
 
 def _points(points: ArrayLike, dtype: Any, error: type[InvalidInputError]) -> NDArray[Any]:

@@ -1,8 +1,6 @@
 """The errors of the client. Each text says what to do about it."""
 
-
-class TriquadError(Exception):
-    """Base of all errors of the client."""
+from triquad_query.errors import TriquadError
 
 
 class ConnectError(TriquadError):

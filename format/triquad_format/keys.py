@@ -11,6 +11,11 @@ SCHEMA_PREFIX = "application/msgpack;triquad."
 
 # Operations on `triquad/<map>/query/...`: they read the map.
 SDF = "query/sdf"
+DISTANCE = "query/distance"
+SPHERES = "query/spheres"
+SEGMENTS = "query/segments"
+RAYS = "query/rays"
+GRID = "query/grid"
 TILE = "query/tile"
 TILE_LIST = "query/tiles"
 STATUS = "query/status"
@@ -21,7 +26,22 @@ MAP_CHUNK = "query/map_chunk"
 CHECKPOINT = "admin/checkpoint"
 RESET = "admin/reset"
 
-OPERATIONS = (SDF, TILE, TILE_LIST, STATUS, FLUSH, MAP_INFO, MAP_CHUNK, CHECKPOINT, RESET)
+OPERATIONS = (
+    SDF,
+    DISTANCE,
+    SPHERES,
+    SEGMENTS,
+    RAYS,
+    GRID,
+    TILE,
+    TILE_LIST,
+    STATUS,
+    FLUSH,
+    MAP_INFO,
+    MAP_CHUNK,
+    CHECKPOINT,
+    RESET,
+)
 
 
 def check_name(kind: str, name: str) -> str:

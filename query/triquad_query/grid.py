@@ -33,6 +33,7 @@ class GridShape:
 class Grid:
     """A map at the middles of a grid's cells, of one epoch."""
 
+    shape: GridShape
     distance: NDArray[np.float32]  # [x, y, z] to the nearest seen surface, at most max_distance_m
     status: NDArray[np.uint8]  # [x, y, z] Status
     epoch: int
@@ -42,5 +43,8 @@ def grid(view: MapView, shape: GridShape, max_distance_m: float) -> Grid:
     """Distance and status at all cells."""
     answer = distances(view, shape.middles(), DistanceOptions(max_distance_m))
     return Grid(
-        answer.distance.reshape(shape.counts), answer.status.reshape(shape.counts), view.number
+        shape,
+        answer.distance.reshape(shape.counts),
+        answer.status.reshape(shape.counts),
+        view.number,
     )

@@ -5,6 +5,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_query.errors import UnknownSpaceError
+
 
 class Unknown(str, Enum):
     """What unknown space counts as."""
@@ -12,18 +14,6 @@ class Unknown(str, Enum):
     OBSTACLE = "obstacle"
     FREE = "free"
     ERROR = "error"  # to meet it raises UnknownSpaceError
-
-
-class UnknownSpaceError(Exception):
-    """Something asked about meets unknown space, which was to count as an error."""
-
-    def __init__(self, what: str, index: int, count: int) -> None:
-        super().__init__(
-            f"{what} {index} meets unknown space, and {count - 1} others do: look there first, or "
-            "let unknown count as 'obstacle' or 'free'"
-        )
-        self.index = index
-        self.count = count
 
 
 def refuse_unknown(what: str, meets: NDArray[np.bool_]) -> None:

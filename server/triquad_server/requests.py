@@ -1,6 +1,7 @@
 """What each request gets: from its message to the answer's message."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 import numpy as np
@@ -8,16 +9,16 @@ from numpy.typing import NDArray
 from triquad_format.messages import (
     ResetReply,
     ResetRequest,
-    SdfReply,
-    SdfRequest,
     Tile,
     TileList,
     TileListRequest,
     TileRequest,
 )
 from triquad_format.wire import Message
+from triquad_query.answers import QuestionError
 
 from triquad_server.desk import Handler
+from triquad_server.epoch import Epoch
 from triquad_server.epochs import EpochShelf
 from triquad_server.errors import RequestError
 from triquad_server.gate import QueryGate
@@ -38,35 +39,27 @@ def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Ha
     """A handler that decodes a ``kind`` and replies with what ``answer`` makes of it."""
 
     def handle(request: Request) -> None:
-        request.answer(answer(request.read(kind)))
+        try:
+            reply = answer(request.read(kind))
+        except QuestionError as error:
+            raise RequestError(error.code, str(error)) from error
+        request.answer(reply)
 
     return handle
 
 
-class SdfQueries:
-    """Answers distance queries; training gives way meanwhile."""
+class EpochViews:
+    """The epochs as questions see them; training gives way while one is asked."""
 
-    def __init__(self, epochs: EpochShelf, gate: QueryGate, max_points: int) -> None:
+    def __init__(self, epochs: EpochShelf, gate: QueryGate) -> None:
         self._epochs = epochs
         self._gate = gate
-        self._max_points = max_points
 
-    def answer(self, request: SdfRequest) -> SdfReply:
-        """Distances, status and gradients at the request's points."""
-        if len(request.points) > self._max_points:
-            raise RequestError(
-                "too_large",
-                f"{len(request.points)} points exceed the limit of {self._max_points}",
-            )
-        points = request.origin + request.points.astype(np.float64)
-        bad = ~np.isfinite(points).all(axis=1)
-        if bad.any():
-            index = int(bad.argmax())
-            raise RequestError("bad_request", f"point {index} is not finite: {points[index]}")
+    @contextmanager
+    def view(self, number: int) -> Iterator[Epoch]:
+        """The epoch of that number, or the newest for 0."""
         with self._gate.query():
-            epoch = self._epochs.get(request.epoch)
-            answer = epoch.query(points, request.gradient)
-        return SdfReply(epoch.number, answer.sdf, answer.status, answer.gradient)
+            yield self._epochs.get(number)
 
 
 class TileQueries:

@@ -20,6 +20,14 @@ from triquad_format.messages import (
     TileListRequest,
     TileRequest,
 )
+from triquad_format.query_messages import (
+    DistanceRequest,
+    GridRequest,
+    RaysRequest,
+    SegmentsRequest,
+    SpheresRequest,
+)
+from triquad_query.answers import Answers, QuestionLimits
 
 from triquad_server.checkpoints import Checkpoints
 from triquad_server.desk import Handler, RequestDesk
@@ -32,7 +40,7 @@ from triquad_server.heartbeat import Heartbeat
 from triquad_server.mapper import Mapper
 from triquad_server.mapper_thread import MapperInputs, MapperThread
 from triquad_server.payload import payload_limit
-from triquad_server.requests import Resets, SdfQueries, TileQueries, answering
+from triquad_server.requests import EpochViews, Resets, TileQueries, answering
 from triquad_server.scan_queue import ScanIntake, ScanQueue
 from triquad_server.settings import Settings
 from triquad_server.sources import SourceLedger
@@ -167,7 +175,10 @@ class Service:
     def _open_desks(self, health: Health) -> None:
         """One desk per group of operations, so that none waits for a slower one."""
         limits = self._settings.service
-        sdf = SdfQueries(self._mapper.epochs, self._gate, limits.max_query_points)
+        views = EpochViews(self._mapper.epochs, self._gate)
+        answers = Answers(
+            views.view, QuestionLimits(limits.max_query_points, limits.max_search_points)
+        )
         tiles = TileQueries(self._mapper.epochs, self._settings.mesh.tile_side_m)
         downloads = MapDownloads(self._mapper)
         flush = FlushDesk(
@@ -178,7 +189,22 @@ class Service:
         )
         flush.start()
         self._parts.callback(flush.close)
-        self._open_desk({keys.SDF: answering(SdfRequest, sdf.answer)}, limits.query_workers)
+        self._open_desk(
+            {
+                keys.SDF: answering(SdfRequest, answers.sdf),
+                keys.DISTANCE: answering(DistanceRequest, answers.distance),
+                keys.SPHERES: answering(SpheresRequest, answers.spheres),
+            },
+            limits.query_workers,
+        )
+        self._open_desk(
+            {
+                keys.SEGMENTS: answering(SegmentsRequest, answers.segments),
+                keys.RAYS: answering(RaysRequest, answers.rays),
+                keys.GRID: answering(GridRequest, answers.grid),
+            },
+            limits.query_workers,
+        )
         self._open_desk(
             {
                 keys.TILE_LIST: answering(TileListRequest, tiles.tiles),

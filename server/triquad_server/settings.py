@@ -118,7 +118,8 @@ class ServiceSettings:
     scan_queue: int = 32  # scans waiting; the oldest is pushed out, and counted
     request_queue: int = 64  # requests waiting per group of operations
     query_workers: int = 2
-    max_query_points: int = 1_000_000  # of one request
+    max_query_points: int = 1_000_000  # of one request for the field
+    max_search_points: int = 250_000  # of one request that searches around points
     publish_period_s: float = 0.5  # between epochs while the map changes
     epochs_kept: int = 4  # newest epochs that requests can ask for by number
     epochs_pinned: int = 8  # older ones that stay because they were asked for by number
@@ -130,6 +131,7 @@ class ServiceSettings:
         check_range("request_queue", self.request_queue, 1, 10_000)
         check_range("query_workers", self.query_workers, 1, 64)
         check_range("max_query_points", self.max_query_points, 1, 20_000_000)
+        check_range("max_search_points", self.max_search_points, 1, 20_000_000)
         check_range("publish_period_s", self.publish_period_s, 0.01, 3600.0)
         check_range("epochs_kept", self.epochs_kept, 1, 1000)
         check_range("epochs_pinned", self.epochs_pinned, 0, 1000)

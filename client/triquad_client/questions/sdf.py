@@ -9,15 +9,11 @@ from triquad_format import keys
 from triquad_format.messages import SdfReply, SdfRequest
 
 from triquad_client import checks
-from triquad_client.call import Ask, Call, ask, ask_each, retried, worked
+from triquad_client.call import Ask, Call, ask, retried, worked
+from triquad_client.parts import NEWEST, in_parts, placed
 
 PART_POINTS = 100_000
 """Points of one request; a message of this size takes some milliseconds."""
-
-_ORIGIN_SAMPLE = 1000
-
-NEWEST = 0
-"""Asks for the newest epoch; another number pins the epoch of that number."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +32,13 @@ def query(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfRe
         checked = yield from worked(lambda _: checks.query_points(points))
     else:
         checked = checks.query_points(points)
-    if at_epoch is not None:
-        return (yield from _query(checked, gradient, checks.epoch(at_epoch)))
-    # The map may go on while the parts are under way: then all of it is asked again.
-    return (yield from retried("epoch_gone", lambda: _query(checked, gradient, NEWEST)))
+    epoch = checks.chosen_epoch(at_epoch)
+
+    def request(part: slice, number: int) -> Ask[SdfReply]:
+        return _ask(checked[part], gradient, number)
+
+    parts = yield from in_parts(len(checked), PART_POINTS, request, epoch)
+    return _joined(parts) if len(parts) == 1 else (yield from worked(lambda _: _joined(parts)))
 
 
 def pin_newest() -> Call[int]:
@@ -47,30 +46,16 @@ def pin_newest() -> Call[int]:
     nowhere = np.zeros((0, 3))
 
     def pin() -> Call[int]:
-        newest = yield from _query(nowhere, False, NEWEST)
-        return (yield from _query(nowhere, False, newest.epoch)).epoch
+        newest = yield from ask(_ask(nowhere, False, NEWEST))
+        return (yield from ask(_ask(nowhere, False, newest.epoch))).epoch
 
     return (yield from retried("epoch_gone", pin))
 
 
-def _query(points: NDArray[np.float64], gradient: bool, epoch: int) -> Call[SdfResult]:
-    first = yield from ask(_part(points[:PART_POINTS], gradient, epoch))
-    if len(points) <= PART_POINTS:
-        return _joined([first])
-    rest = yield from ask_each(
-        range(PART_POINTS, len(points), PART_POINTS),
-        lambda start: _part(points[start : start + PART_POINTS], gradient, first.epoch),
-    )
-    return (yield from worked(lambda _: _joined([first, *rest])))
-
-
-def _part(points: NDArray[np.float64], gradient: bool, epoch: int) -> Ask[SdfReply]:
-    # The median, so that a few far points do not cost the others their precision; of a sample,
-    # as it takes longer than all the rest.
-    some = points[:: max(1, len(points) // _ORIGIN_SAMPLE)]
-    origin = np.median(some, axis=0) if len(points) else np.zeros(3)
-    offsets = (points - origin).astype(np.float32)
-    return Ask(keys.SDF, SdfRequest(origin, offsets, gradient, epoch), SdfReply)
+def _ask(points: NDArray[np.float64], gradient: bool, epoch: int) -> Ask[SdfReply]:
+    place = placed(points)
+    request = SdfRequest(place.origin, place.offsets, gradient, epoch)
+    return Ask(keys.SDF, request, SdfReply)
 
 
 def _joined(parts: Sequence[SdfReply]) -> SdfResult:

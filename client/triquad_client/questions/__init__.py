@@ -1,0 +1,1 @@
+"""Calls that ask about the map."""
