@@ -36,14 +36,18 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
+from triquad_client.local_copy import SyncReport
 from triquad_client.mesh import Mesh
+from triquad_client.offline import OfflineMap, open_map
 from triquad_client.queries import PinnedMap
 from triquad_client.questions.sdf import SdfResult
 from triquad_client.scans import FlushReport
+from triquad_client.synced import AsyncSyncedMap, SyncedMap
 
 __all__ = [
     "AsyncClient",
     "AsyncPinnedMap",
+    "AsyncSyncedMap",
     "BadReplyError",
     "Bounds",
     "CheckpointInfo",
@@ -59,6 +63,7 @@ __all__ = [
     "MapInfo",
     "Mesh",
     "NoReplyError",
+    "OfflineMap",
     "PinnedMap",
     "Polyline",
     "Rays",
@@ -69,6 +74,8 @@ __all__ = [
     "ServerStatus",
     "Spheres",
     "Status",
+    "SyncReport",
+    "SyncedMap",
     "TileList",
     "TriquadError",
     "Unknown",
@@ -77,4 +84,5 @@ __all__ = [
     "__version__",
     "connect",
     "connect_async",
+    "open_map",
 ]

@@ -6,6 +6,7 @@ A server answers with this from its epochs, and a client from a map file: so the
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from triquad_format.query_messages import (
     SpheresReply,
     SpheresRequest,
 )
+from triquad_format.wire import Message
 
 from triquad_query.distance import DistanceOptions, distances
 from triquad_query.grid import GridShape, grid
@@ -63,6 +65,15 @@ class Answers:
     def __init__(self, views: Views, limits: QuestionLimits) -> None:
         self._view = views
         self._limits = limits
+
+    def answer(self, request: Message) -> Message:
+        """The answer to a question of any kind.
+
+        Raises:
+            QuestionError: it is not answered.
+            KeyError: it is no question about the map.
+        """
+        return _ANSWERS[type(request)](self, request)
 
     def sdf(self, request: SdfRequest) -> SdfReply:
         """The trained field, and status."""
@@ -173,6 +184,16 @@ class Answers:
                 "too_large",
                 f"{what} exceed the limit of {self._limits.searches} searches: split the request",
             )
+
+
+_ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
+    SdfRequest: Answers.sdf,
+    DistanceRequest: Answers.distance,
+    SpheresRequest: Answers.spheres,
+    SegmentsRequest: Answers.segments,
+    RaysRequest: Answers.rays,
+    GridRequest: Answers.grid,
+}
 
 
 def _points(
