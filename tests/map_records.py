@@ -145,6 +145,24 @@ def _integers(rng: np.random.RandomState, table: VertexTable, limit: int) -> Ver
     return dataclasses.replace(table, features=features, scale=2.0 ** -rng.randint(1, 9))
 
 
+def with_levels(record: MapRecord, seed: int = 0) -> MapRecord:
+    """The record with levels of its surface voxels, and times of its blocks, some not known."""
+    rng = np.random.RandomState(seed)
+    regions = tuple(
+        dataclasses.replace(region, evidence=_supported(rng, region.evidence))
+        for region in record.regions
+    )
+    return dataclasses.replace(record, regions=regions)
+
+
+def _supported(rng: np.random.RandomState, evidence: Evidence) -> Evidence:
+    counts = np.unpackbits(evidence.surface, axis=1).sum(axis=1)
+    levels = rng.randint(0, 8, int(counts.sum()), np.int64).astype(np.uint8)
+    seen_s = 1_700_000_000 + rng.randint(0, 400, len(counts), np.int64)
+    seen_s *= (counts > 0) & (rng.randint(0, 4, len(counts), np.int64) > 0)
+    return dataclasses.replace(evidence, levels=levels, seen_s=seen_s)
+
+
 def assert_same(have: object, want: object, where: str = "record") -> None:
     """Fail, naming the field, unless two records are equal in every value and dtype."""
     if dataclasses.is_dataclass(want):

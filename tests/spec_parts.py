@@ -138,6 +138,7 @@ class Region:
             for i, level in enumerate(settings.levels)
         }
         self.surface, self.free = self._evidence(own, "surface"), self._evidence(own, "free")
+        self.levels, self.seen = self._support(own)
 
     def _table(self, own: dict[Key, Any], plane: int, i: int, scale: Array) -> Table:
         bits = 2 * (8 - (self.settings.sizes - 1 - i))
@@ -158,6 +159,17 @@ class Region:
                 chunks.append((place(demorton(codes, 3)), plain(part[name])))
         return Table(chunks, 64, "|u1")
 
+    def _support(self, own: dict[Key, Any]) -> tuple[Table, Table]:
+        """Level of each voxel [512] of a block, in the order of bits; time of each block [1]."""
+        levels, times = [], []
+        for key, part in own.items():
+            if key[0] == "/triquad/evidence":
+                blocks = place(demorton(codes_of(part["codes"], key[3], 15), 3))
+                surface = np.unpackbits(plain(part["surface"]), axis=1, bitorder="little")
+                levels.append((blocks, levels_of(part, surface.astype(bool))))
+                times.append((blocks, times_of(part, surface.any(1))))
+        return Table(levels, 512, "|u1"), Table(times, 1, "<i8")
+
 
 def is_of(key: Key, index: Index) -> bool:
     return key[1] == index and key[0] in (
@@ -171,6 +183,28 @@ def agrees(key: Key, part: dict[str, Any]) -> bool:
     """Whether a part names its own key."""
     place_in_region = (part.get("plane", 0), part.get("cell", 0))
     return tuple(part["region"]) == key[1] and place_in_region == key[2:]
+
+
+def levels_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
+    """Section 5.4: levels [B, 512], where there are surface voxels; else 0."""
+    levels = np.zeros(surface.shape, np.uint8)
+    if "levels" in part:
+        stored = np.unpackbits(plain(part["levels"]), axis=1, bitorder="little")
+        check(stored.shape == (3, (surface.sum() + 7) // 8 * 8), "levels of other voxels")
+        a, b, c = stored[:, : surface.sum()]
+        levels[surface] = 4 * a + 2 * (a ^ b) + (a ^ b ^ c)
+    return levels
+
+
+def times_of(part: dict[str, Any], touched: NDArray[np.bool_]) -> Array:
+    """Section 5.4: times [B, 1] of the blocks that hold surface; else 0."""
+    times = np.zeros((len(touched), 1), np.int64)
+    if "seen_s" in part:
+        planes = plain(part["seen_s"]).astype(np.int64)
+        check(1 <= len(planes) <= 5 and planes.shape[1] == touched.sum(), "times of other blocks")
+        since = sum(row << 8 * k for k, row in enumerate(planes))
+        times[touched, 0] = np.where(since > 0, since + part["seen_from_s"], 0)
+    return times
 
 
 def features_of(level: dict[str, Any], scale: Array) -> Array:

@@ -16,7 +16,9 @@ def fuzz(*arguments):
 
 def test_readers_mind_two_thousand_spoilt_files():
     run = fuzz(
-        "--count", "2000", str(GOLDEN / "map_v1.triquad"), str(GOLDEN / "map_v2_next.triquad")
+        "--count",
+        "2000",
+        *(str(GOLDEN / f"map_{kind}.triquad") for kind in ("v1", "v2_next", "v2_levels")),
     )
     assert run.returncode == 0, run.stdout + run.stderr
     assert "2000 files, each read in two ways" in run.stdout

@@ -1,3 +1,4 @@
+import dataclasses
 import io
 import json
 import subprocess
@@ -100,6 +101,24 @@ def test_precision_of_integers(tmp_path, capsys):
     assert main([str(path)]) == 0
     text = f"(integers, in steps of {scales[0]:.3g} to {scales[-1]:.3g})"
     assert text in capsys.readouterr().out
+
+
+def test_surface_by_level_of_support(tmp_path, capsys):
+    path = tmp_path / "levels.triquad"
+    record = random_record(2)
+    write_map(record, path)
+    assert summary_of(path, capsys)["regions"][0]["surface_levels"] is None
+    evidence = record.regions[0].evidence
+    levels = np.full(int(np.unpackbits(evidence.surface).sum()), 7, np.uint8)
+    region = dataclasses.replace(
+        record.regions[0], evidence=dataclasses.replace(evidence, levels=levels)
+    )
+    write_map(dataclasses.replace(record, regions=(region,)), path)
+    summary = summary_of(path, capsys)["regions"][0]
+    voxels = round(summary["surface_m3"] / record.settings.leaf_m**3)
+    assert summary["surface_levels"] == [0] * 7 + [voxels]
+    assert main([str(path)]) == 0
+    assert "surface by level of support: 0: 0%, 1: 0%," in capsys.readouterr().out
 
 
 def test_a_delta_names_the_files_it_needs(delta, capsys):

@@ -9,7 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
-from map_records import SMALL, random_record
+from map_records import SMALL, random_record, with_levels
 from mapfile_surgery import (
     RawPart,
     edited,
@@ -29,7 +29,7 @@ from mcap.writer import IndexType
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.manifest import FileRef
 from triquad_format.mcap_records import MAX_CHUNK_BYTES
-from triquad_format.part import REGION, VERTICES, PartKey
+from triquad_format.part import EVIDENCE, REGION, VERTICES, PartKey
 from triquad_format.region import MapRecord
 
 DATA = file_bytes(random_record(12))
@@ -83,11 +83,19 @@ def bomb_of_codes(count):
     return edited(DATA, VERTICES, in_level(0, codes))
 
 
+def bomb_of_evidence(field, shape):
+    """A file whose evidence announces so many levels or times."""
+    column = set_array(field, np.ones(shape, np.uint8))
+    return edited(file_bytes(with_levels(random_record(12))), EVIDENCE, column)
+
+
 BOMBS = {
     "lists": lambda: bomb_of(msgpack.packb([[[[[]] * 60] * 60] * 60] * 60)),
     "texts": lambda: bomb_of(msgpack.packb([[["ab"] * 60] * 60] * 60)),
     "zeros": lambda: bomb_of(bytes(11 * 2**20)),
     "codes": lambda: bomb_of_codes(11 * 2**20),
+    "levels": lambda: bomb_of_evidence("levels", (3, 3 * 2**20)),
+    "times": lambda: bomb_of_evidence("seen_s", (1, 11 * 2**20)),
     "parts": lambda: bomb_of_parts(2**18),
 }
 

@@ -1,10 +1,11 @@
 """Files whose checksums and digests are all right, but whose values are not: each is refused."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
-from map_records import random_record, with_integers
+from map_records import random_record, with_integers, with_levels
 from mapfile_surgery import (
     RawPart,
     all_of,
@@ -165,6 +166,41 @@ def test_hostile_integers(case):
 def test_hostile_scales(scale):
     edit = set_array("scales", np.full(6, scale, "<f4"))
     assert_refused(edited(file_bytes(with_integers(random_record(12))), REGION, edit))
+
+
+HOSTILE_LEVELS = {
+    "levels of fewer voxels": (shorten("levels", 1), "levels: expected an array [3, 5]"),
+    "levels of two bits": (shorten("levels", 0), "levels: expected an array [3, 5]"),
+    "a level a byte": (set_array("levels", np.ones(40, np.uint8)), "levels: expected an array"),
+    "levels that are a number": (set_field("levels", 3), "levels: expected an array"),
+    "levels of astronomic size": (set_field("levels", ASTRONOMIC), "levels: shape"),
+    "times of fewer blocks": (shorten("seen_s", 1), "seen_s: expected an array"),
+    "times of nothing": (set_field("seen_s", None), "seen_s: expected an array"),
+    "times after nothing": (lambda b: b.pop("seen_from_s"), "seen_from_s = None is not int"),
+    "times before 1970": (set_field("seen_from_s", -400), "seen_from_s = -400 is not a count"),
+    "times beyond stamps": (set_field("seen_from_s", 9_223_372_037), "above 9223372036"),
+    "times that pass the end": (set_field("seen_from_s", 9_223_372_036), "time lies outside"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_LEVELS)
+def test_hostile_levels(case):
+    edit, message = HOSTILE_LEVELS[case]
+    data = edited(file_bytes(with_levels(random_record(12))), EVIDENCE, edit)
+    assert_refused(data)
+    with pytest.raises(DamagedMapFileError, match=re.escape(message).replace(r"\|", "|")):
+        read_bytes(data)
+
+
+@pytest.mark.parametrize("width", [0, 6, 8])
+def test_times_of_other_widths(width):
+    record = with_levels(random_record(12))
+    touched = int(record.regions[0].evidence.surface.any(axis=1).sum())
+    edit = set_array("seen_s", np.zeros((width, touched), np.uint8))
+    data = edited(file_bytes(record), EVIDENCE, edit)
+    assert_refused(data)
+    with pytest.raises(DamagedMapFileError, match=f"seen_s has {width} bytes per time"):
+        read_bytes(data)
 
 
 def test_integers_of_all_bytes_are_sound_or_refused():

@@ -9,7 +9,7 @@ from triquad_format import morton
 from triquad_format.errors import FormatError
 from triquad_format.field_settings import FieldSettings
 from triquad_format.mapfile import read_map, write_map
-from triquad_format.region import MAX_INTEGER
+from triquad_format.region import MAX_INTEGER, MAX_SEEN_S
 
 
 def with_table(record, **changes):
@@ -45,6 +45,41 @@ def test_unsound_records_are_not_written(tmp_path, case):
     with pytest.raises(FormatError):
         write_map(UNSOUND[case](random_record(15)), path)
     assert not list(tmp_path.iterdir())
+
+
+UNSOUND_EVIDENCE = {
+    "a level less": ("levels", np.zeros(39, np.uint8), r"levels: expected an array \[40\]"),
+    "wide levels": ("levels", np.zeros(40, np.int64), r"levels: expected .* of \|u1"),
+    "a level too high": ("levels", np.full(40, 8, np.uint8), "levels: one exceeds 7"),
+    "a time for each voxel": ("seen_s", np.zeros(40, np.int64), r"seen_s: expected .* \[38\]"),
+    "half seconds": ("seen_s", np.full(38, 0.5), "seen_s: expected .* of <i8"),
+    "a time before 1970": ("seen_s", np.full(38, -1), "seen_s: a time lies outside"),
+    "a time beyond stamps": ("seen_s", np.full(38, MAX_SEEN_S + 1), "seen_s: a time lies outside"),
+}
+
+
+def with_evidence(record, **changes):
+    """The record with changes to the evidence of its only region."""
+    region = record.regions[0]
+    region = dataclasses.replace(region, evidence=dataclasses.replace(region.evidence, **changes))
+    return dataclasses.replace(record, regions=(region,))
+
+
+@pytest.mark.parametrize("case", UNSOUND_EVIDENCE)
+def test_unsound_evidence_is_not_written(tmp_path, case):
+    field, array, message = UNSOUND_EVIDENCE[case]
+    with pytest.raises(FormatError, match=message):
+        write_map(with_evidence(random_record(15), **{field: array}), tmp_path / "map.triquad")
+    assert not list(tmp_path.iterdir())
+
+
+def test_blocks_without_surface_have_no_time(tmp_path):
+    record = random_record(15)
+    surface = record.regions[0].evidence.surface.copy()
+    surface[5] = 0
+    record = with_evidence(record, surface=surface, seen_s=np.ones(38, np.int64))
+    with pytest.raises(FormatError, match="seen_s: a block without surface has a time"):
+        write_map(record, tmp_path / "map.triquad")
 
 
 def test_features_beyond_half_precision(tmp_path):

@@ -13,6 +13,7 @@ import spec_reader
 from map_records import SMALL
 from numpy.typing import NDArray
 from spec_parts import Map, RefusedError
+from triquad_format import morton
 from triquad_format.errors import FormatError
 from triquad_format.evaluator import MapEvaluator
 from triquad_format.mapfile import read_map, write_map
@@ -52,6 +53,9 @@ VARIANTS = {
     ),
     "many squares": map_records.random_record(
         8, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000
+    ),
+    "levels": map_records.with_levels(
+        map_records.random_record(10, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
     ),
     "no vertices": map_records.random_record(9, points=0),
 }
@@ -94,18 +98,37 @@ def assert_agree(answers: Map, record: MapRecord, points: NDArray[np.float64]) -
     assert apart.any(1).mean() < 1e-3  # a sum that rounds to the other side of max(y, 0)
 
 
+def assert_same_support(answers: Map, record: MapRecord) -> None:
+    """Levels and times are those of the record, voxel by voxel; 0 where it has none."""
+    for region in record.regions:
+        evidence, have = region.evidence, answers.regions[region.index]
+        blocks = morton.decode(evidence.codes, 3)
+        bits = np.unpackbits(evidence.surface, axis=1, bitorder="little").astype(bool)
+        levels = have.levels(blocks)
+        assert not levels[~bits].any()
+        seen_s = have.seen(blocks)[:, 0]
+        np.testing.assert_array_equal(levels[bits], or_zeros(evidence.levels, bits.sum()))
+        np.testing.assert_array_equal(seen_s, or_zeros(evidence.seen_s, len(blocks)))
+
+
+def or_zeros(column: NDArray | None, count: int) -> NDArray:
+    return np.zeros(count) if column is None else column
+
+
 def write_variant(path: Path, name: str) -> Path:
     dtype = "<f4" if name.startswith("single") else "<f2"
     write_map(VARIANTS[name], path, feature_dtype=dtype)
     return path
 
 
-@pytest.mark.parametrize("name", ["map_v2.triquad", "map_v2_next.triquad"])
+@pytest.mark.parametrize("name", ["map_v2.triquad", "map_v2_next.triquad", "map_v2_levels.triquad"])
 def test_the_samples(name: str) -> None:
     answers = spec_reader.load(GOLDEN / name)
     points = probes(answers)
     assert {0, 2} <= set(answers.status(points))
-    assert_agree(answers, read_map(GOLDEN / name), points)
+    record = read_map(GOLDEN / name)
+    assert_agree(answers, record, points)
+    assert_same_support(answers, record)
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -115,7 +138,10 @@ def test_maps_of_every_kind(tmp_path: Path, name: str) -> None:
     points = probes(answers)
     if name != "no vertices":
         assert set(answers.status(points)) == {0, 1, 2}
-    assert_agree(answers, read_map(path), points)
+    record = read_map(path)
+    assert_agree(answers, record, points)
+    assert_same_support(answers, record)
+    assert (record.regions[0].evidence.levels is not None) == (name == "levels")
 
 
 # Section 9

@@ -7,6 +7,8 @@ from triquad_format import morton
 from triquad_format.leaf_box import LeafBox
 from triquad_format.region import BLOCK_VOXELS, Evidence
 
+_BITS_SET = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype="u1")
+
 _REACH_VOXELS = 0.5
 """A point is near a surface where one was seen this far away."""
 
@@ -32,8 +34,23 @@ def voxels_felt(evidence: Evidence, box: LeafBox) -> NDArray[np.uint8]:
     return mask.astype(np.uint8)
 
 
+def surface_counts(surface: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Numbers [B] of surface voxels in blocks with these masks [B, BLOCK_BYTES]."""
+    counts: NDArray[np.int64] = _BITS_SET[surface].sum(axis=1, dtype=np.int64)
+    return counts
+
+
 def masked(evidence: Evidence, mask: NDArray[np.uint8]) -> Evidence:
     """The evidence of the voxels whose bit is set in ``mask`` [B, BLOCK_BYTES]."""
     surface, free = evidence.surface & mask, evidence.free & mask
     rows = np.flatnonzero((surface | free).any(axis=1))
-    return Evidence(evidence.codes[rows], surface[rows], free[rows])
+    levels, seen_s = evidence.levels, evidence.seen_s
+    if levels is not None:
+        before, after = (
+            np.unpackbits(bits, bitorder="little").astype(bool)
+            for bits in (evidence.surface, surface)
+        )
+        levels = levels[after[before]]
+    if seen_s is not None:
+        seen_s = np.where(surface.any(axis=1), seen_s, 0)[rows]
+    return Evidence(evidence.codes[rows], surface[rows], free[rows], levels, seen_s)

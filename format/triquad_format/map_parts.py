@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.array import pack_array
-from triquad_format.cell import cube_shift, square_shift
+from triquad_format.cell import square_shift
 from triquad_format.errors import FormatError
+from triquad_format.evidence_part import evidence_bodies
 from triquad_format.field_settings import FieldSettings
 from triquad_format.map_facts import MapFacts, pack_facts
 from triquad_format.part import (
@@ -27,7 +28,6 @@ from triquad_format.part import (
 from triquad_format.part_body import pack_part
 from triquad_format.region import (
     AXES,
-    Evidence,
     Region,
     TrainingState,
     VertexTable,
@@ -116,16 +116,8 @@ def _pack_rows(
 
 
 def _pack_evidence(region: Region) -> Iterator[Part]:
-    evidence: Evidence = region.evidence
-    cells = evidence.codes >> cube_shift()
-    for cell in np.unique(cells).tolist():
-        rows = _rows_of(cells, cell)
-        body = {
-            **_place(region, 0, cell),
-            "codes": pack_array(shuffle_codes(evidence.codes[rows] - (cell << cube_shift()))),
-            "surface": pack_array(evidence.surface[rows]),
-            "free": pack_array(evidence.free[rows]),
-        }
+    for cell, fields in evidence_bodies(region.evidence):
+        body = {**_place(region, 0, cell), **fields}
         yield pack_part(PartKey(EVIDENCE, region.index, 0, cell), body)
 
 

@@ -80,6 +80,11 @@ class PartBody:
         self._topic = topic
         self._body = _checked(topic, body)
 
+    @property
+    def topic(self) -> str:
+        """The part's topic, for messages."""
+        return self._topic
+
     @classmethod
     def of(cls, topic: str, body: object) -> "PartBody":
         """A map within a part."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from triquad_format.cell import cube_shift, square_shift
 from triquad_format.errors import DamagedMapFileError
+from triquad_format.evidence_part import joined, read_evidence
 from triquad_format.field_settings import FieldSettings
 from triquad_format.manifest import Entry, Manifest
 from triquad_format.map_facts import check_map_part
@@ -27,7 +28,6 @@ from triquad_format.part import (
 from triquad_format.part_body import PartBody
 from triquad_format.region import (
     AXES,
-    BLOCK_BYTES,
     MLP_LAYERS,
     Evidence,
     MapRecord,
@@ -71,6 +71,7 @@ class RegionParts:
         self._settings = settings
         self._head: _Head | None = None
         self._training: _TrainingHead | None = None
+        self._cubes: dict[int, Evidence] = {}
         self._columns: dict[PartKey, tuple[Columns, ...]] = {}
 
     def add(self, key: PartKey, payload: bytes) -> None:
@@ -86,9 +87,11 @@ class RegionParts:
             self._head = _read_head(body)
         elif key.topic == TRAINING:
             self._training = _read_training_head(body)
+        elif key.topic == EVIDENCE:
+            _expect_place(body, key)
+            self._cubes[key.cell] = _read_evidence(body, key)
         elif key.topic in _READERS:
-            body.expect("plane", key.plane)
-            body.expect("cell", key.cell)
+            _expect_place(body, key)
             self._columns[key] = _READERS[key.topic](body, key, self._settings)
 
     def region(self) -> Region:
@@ -113,7 +116,7 @@ class RegionParts:
             frequencies=self._head.frequencies,
             mlp=self._head.mlp,
             tables=vertices,
-            evidence=self._evidence(),
+            evidence=joined([self._cubes[cell] for cell in sorted(self._cubes)]),
             training=self._training_state(),
         )
 
@@ -134,11 +137,6 @@ class RegionParts:
             _joined(topic, [square[h] for square in squares], empty)
             for h in range(self._settings.feature_levels)
         ]
-
-    def _evidence(self) -> Evidence:
-        masks = np.zeros((0, BLOCK_BYTES), np.uint8)
-        empty = (np.zeros(0, np.int64), masks, masks)
-        return Evidence(*_joined(EVIDENCE, [part[0] for part in self._of(EVIDENCE)], empty))
 
     def _training_state(self) -> TrainingState | None:
         head = self._training
@@ -218,6 +216,11 @@ def _joined(topic: str, portions: Iterable[Columns], empty: Columns) -> Columns:
     return tuple(np.concatenate(column) for column in zip(*kept, strict=True))
 
 
+def _expect_place(body: PartBody, key: PartKey) -> None:
+    body.expect("plane", key.plane)
+    body.expect("cell", key.cell)
+
+
 def _read_head(body: PartBody) -> _Head:
     mlp = Mlp(body.arrays("weights", MLP_LAYERS), body.arrays("biases", MLP_LAYERS))
     scales = body.array("scales", "<f4", None).tolist()
@@ -252,10 +255,9 @@ def _read_vertices(body: PartBody, key: PartKey, settings: FieldSettings) -> tup
     return tuple(levels)
 
 
-def _read_evidence(body: PartBody, key: PartKey, _settings: FieldSettings) -> tuple[Columns, ...]:
+def _read_evidence(body: PartBody, key: PartKey) -> Evidence:
     codes = _global(body.codes("codes", 1 << cube_shift()), key, cube_shift())
-    masks = [body.array(name, "|u1", len(codes), BLOCK_BYTES) for name in ("surface", "free")]
-    return ((codes, *masks),)
+    return read_evidence(body, codes)
 
 
 def _read_moments(body: PartBody, _key: PartKey, settings: FieldSettings) -> tuple[Columns, ...]:
@@ -281,7 +283,6 @@ def _read_samples(body: PartBody, _key: PartKey, _settings: FieldSettings) -> tu
 
 _READERS: Mapping[str, Callable[[PartBody, PartKey, FieldSettings], tuple[Columns, ...]]] = {
     VERTICES: _read_vertices,
-    EVIDENCE: _read_evidence,
     MOMENTS: _read_moments,
     SAMPLES: _read_samples,
 }

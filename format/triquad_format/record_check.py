@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from triquad_format import morton
 from triquad_format.array import ArraySpec
 from triquad_format.errors import FormatError
+from triquad_format.evidence_voxels import surface_counts
 from triquad_format.field_settings import FieldSettings
 from triquad_format.keys import check_name
 from triquad_format.region import (
@@ -16,6 +17,8 @@ from triquad_format.region import (
     BLOCK_BYTES,
     BLOCK_VOXELS,
     MAX_INTEGER,
+    MAX_LEVEL,
+    MAX_SEEN_S,
     MLP_LAYERS,
     Evidence,
     MapRecord,
@@ -103,6 +106,18 @@ def _check_evidence(settings: FieldSettings, evidence: Evidence) -> None:
     masks = ArraySpec("|u1", (len(evidence.codes), BLOCK_BYTES))
     masks.check("evidence surface", evidence.surface)
     masks.check("evidence free", evidence.free)
+    counts = surface_counts(evidence.surface)
+    if evidence.levels is not None:
+        ArraySpec("|u1", (int(counts.sum()),)).check("evidence levels", evidence.levels)
+        if evidence.levels.max(initial=0) > MAX_LEVEL:
+            raise FormatError(f"evidence levels: one exceeds {MAX_LEVEL}")
+    if evidence.seen_s is not None:
+        ArraySpec("<i8", counts.shape).check("evidence seen_s", evidence.seen_s)
+        low, high = evidence.seen_s.min(initial=0), evidence.seen_s.max(initial=0)
+        if low < 0 or high > MAX_SEEN_S:
+            raise FormatError(f"evidence seen_s: a time lies outside of 0 to {MAX_SEEN_S} s")
+        if evidence.seen_s[counts == 0].any():
+            raise FormatError("evidence seen_s: a block without surface has a time")
 
 
 def _check_training(settings: FieldSettings, region: Region, training: TrainingState) -> None:

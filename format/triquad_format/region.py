@@ -28,6 +28,12 @@ BLOCK_VOXELS = 8
 BLOCK_BYTES = BLOCK_VOXELS**3 // 8
 """Bytes of one bit mask of a block: voxel (x, y, z) is bit ``z`` of byte ``x * 8 + y``."""
 
+MAX_LEVEL = 7
+"""The level of the best supported surface."""
+
+MAX_SEEN_S = (2**63 - 1) // 10**9
+"""The latest time of a surface: stamps are nanoseconds below ``2**63``."""
+
 MAX_INTEGER = 32_639
 """Largest integer feature: its two bytes, both signed, reach no further."""
 
@@ -78,6 +84,17 @@ class Evidence:
     codes: NDArray[np.int64]  # [B] 3-D Morton codes of blocks, strictly increasing
     surface: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray ended in the voxel
     free: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray passed through the voxel
+    levels: NDArray[np.uint8] | None = None
+    """[S] How well each surface voxel is supported, from 0 to ``MAX_LEVEL``; ``None``: not known.
+
+    In the order of :func:`~triquad_format.evidence_voxels.seen_voxels`. What a level stands for is
+    up to those who set and read it; a higher one is better supported.
+    """
+    seen_s: NDArray[np.int64] | None = None
+    """[B] When a ray last ended in the block: whole seconds since 1970, by the stamps of scans.
+
+    0 where none did or it is not known; ``None``: nowhere known.
+    """
 
 
 @dataclass(frozen=True)

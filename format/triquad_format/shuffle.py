@@ -27,9 +27,7 @@ def unshuffle(planes: NDArray[np.uint8], dtype: str) -> NDArray[np.generic]:
 
 def shuffle_codes(codes: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Shuffled differences ``[B, V]`` of increasing codes ``[V]``, in as few bytes as hold them."""
-    differences = np.diff(codes, prepend=np.int64(0))
-    width = (int(differences.max(initial=1)).bit_length() + 7) // 8
-    return shuffle(differences)[:width]
+    return shuffle_counts(np.diff(codes, prepend=np.int64(0)))
 
 
 def unshuffle_codes(planes: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -38,9 +36,20 @@ def unshuffle_codes(planes: NDArray[np.uint8]) -> NDArray[np.int64]:
     Differences this small cannot pass over the negative numbers, so that codes which overflow
     are seen to decrease.
     """
+    return np.cumsum(unshuffle_counts(planes), dtype=np.int64)
+
+
+def shuffle_counts(counts: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Shuffled numbers ``[B, V]`` that are not negative, in as few bytes as hold them all."""
+    width = (int(counts.max(initial=1)).bit_length() + 7) // 8
+    return shuffle(counts)[:width]
+
+
+def unshuffle_counts(planes: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """The inverse of :func:`shuffle_counts`; it takes at most seven rows."""
     wide = np.zeros((8, planes.shape[1]), np.uint8)
     wide[: len(planes)] = planes
-    return np.cumsum(unshuffle(wide, "<i8").astype(np.int64), dtype=np.int64)
+    return unshuffle(wide, "<i8").astype(np.int64)
 
 
 def split_integers(integers: NDArray[np.int16]) -> NDArray[np.int8]:

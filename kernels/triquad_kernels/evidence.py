@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format import morton
+from triquad_format.evidence_voxels import surface_counts
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_format.region import Evidence as EvidenceRecord
 from triquad_format.status import Status
@@ -398,6 +399,18 @@ class Evidence:
         evidence._blocks = VoxelIndex.of_cells(morton.decode(record.codes, 3))
         evidence._surface = with_room(record.surface, evidence._blocks.capacity)
         evidence._free = with_room(record.free, evidence._blocks.capacity)
+        return evidence
+
+    @classmethod
+    def recorded(cls, side: int, record: EvidenceRecord) -> "Evidence":
+        """Evidence from its record, for reading."""
+        evidence = cls.restore(side, record)
+        levels, seen_s = record.levels, record.seen_s
+        if levels is None:
+            levels = np.zeros(int(surface_counts(record.surface).sum()), np.uint8)
+        if seen_s is None:
+            seen_s = np.zeros(len(record.codes), np.int64)
+        evidence._noted = _Noted(levels, seen_s)
         return evidence
 
     def _grow(self) -> None:

@@ -23,7 +23,7 @@ class RecordedRegion:
         self.index = region.index
         self.centre: NDArray[np.float64] = region_centre(settings, region.index)
         self.engine = RecordedEngine(settings, region)
-        self.evidence = Evidence.restore(1 << settings.depth, region.evidence)
+        self.evidence = Evidence.recorded(1 << settings.depth, region.evidence)
         self._settings = settings
         self._epoch = epoch
         self._fitting = threading.Lock()

@@ -5,13 +5,14 @@ Blocks that hold any are found by groups, cubes of 4 x 4 x 4 blocks, so that emp
 nothing.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
-from triquad_query.surfels import DISC_RADIUS, FADED, OUTSIDE, SMOOTHING, SurfelKind
+from triquad_query.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
 
 from triquad_kernels.voxel_index import CELL_LIMIT, Index, VoxelIndex, find_row, pack, unpack
 
@@ -20,8 +21,20 @@ _LOW = BLOCK_VOXELS - 1
 _GROUP_SHIFT = 2
 _GROUP_VOXELS = float(BLOCK_VOXELS << _GROUP_SHIFT)
 
+_STEPS = np.array(
+    sorted(itertools.product((-1, 0, 1), repeat=3), key=lambda step: np.abs(step).sum())
+)
+"""To the groups at and beside a place [27, 3], the near ones first."""
+
+_NEIGHBOURS = len(_STEPS)
+
+_FARTHEST = CELL_LIMIT / 2
+
+_CANDIDATES = 128
+"""How many of them are kept in mind."""
+
 _DISC = int(SurfelKind.DISC)
-_NONE = int(SurfelKind.NONE)
+_RADIUS = np.float32(DISC_RADIUS)
 
 Masks = NDArray[np.uint8]
 Ints = NDArray[np.int32]
@@ -29,8 +42,16 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Place = tuple[float, float, float]
 
-# What is known of the nearest surfel while it is searched for.
-_BEST, _WEIGHT, _FOOT_X, _FOOT_Y, _FOOT_Z, _MEAN_X, _MEAN_Y, _MEAN_Z = range(8)
+# The numbers of ``Search.state``.
+_BEST, _FOOT_X, _FOOT_Y, _FOOT_Z, _COUNT = range(5)
+
+
+class Search(NamedTuple):
+    """What is known while the nearest surfel of a point is searched for."""
+
+    state: Doubles  # [5] least distance, its foot, number of candidates
+    candidates: Doubles  # [_CANDIDATES, 4] distances and feet of what may count in the direction
+    squares: Floats  # [BLOCK_VOXELS**3] room for squares of distances
 
 
 class BlockGroups(NamedTuple):
@@ -51,7 +72,7 @@ class SurfelIndex(NamedTuple):
 
     groups: BlockGroups
     starts: Ints  # [blocks + 1] first surfel of each block
-    positions: Floats  # [surfels, 3] from the block's corner, voxels; far away where there is none
+    positions: Floats  # [3, surfels] from the block's corner, voxels; far away where there is none
     normals: Floats  # [surfels, 3]
     kinds: Masks  # [surfels] SurfelKind
 
@@ -161,114 +182,144 @@ def _box_distance(at: Place, boxes: Ints, row: int) -> float:
     return float(np.sqrt(a * a + b * b + c * c)) - OUTSIDE
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _reach(state: Doubles) -> float:
-    """How near a surfel must lie to count."""
-    return float(state[_BEST] + FADED * SMOOTHING)
-
-
 @numba.njit(cache=True, nogil=True)
-def _weigh(
-    index: SurfelIndex, surfel: int, offset: Place, square: float, at: Place, state: Doubles
-) -> bool:
-    """Let a surfel count, given the place ``at`` from it; whether it is the nearest so far."""
-    if index.kinds[surfel] == _DISC:
-        nx, ny, nz = index.normals[surfel, 0], index.normals[surfel, 1], index.normals[surfel, 2]
-        height = offset[0] * nx + offset[1] * ny + offset[2] * nz
-        lateral = np.sqrt(max(0.0, square - height * height))
-        beyond = max(0.0, lateral - DISC_RADIUS)
-        distance = np.sqrt(height * height + beyond * beyond)
-        # From the point down to the disc's plane, then back to its rim.
-        rim = beyond / max(lateral, 1e-9)
-        down = height * (1.0 - rim)
-        qx = at[0] - down * nx - rim * offset[0]
-        qy = at[1] - down * ny - rim * offset[1]
-        qz = at[2] - down * nz - rim * offset[2]
-    else:
-        distance = np.sqrt(square)
-        qx, qy, qz = at[0] - offset[0], at[1] - offset[1], at[2] - offset[2]
-    best = state[_BEST]
-    if distance > best + FADED * SMOOTHING:
-        return False
-    nearer: bool = distance < best
-    if nearer:
-        fade = np.exp((distance - best) / SMOOTHING)
-        state[_WEIGHT] *= fade
-        state[_MEAN_X] *= fade
-        state[_MEAN_Y] *= fade
-        state[_MEAN_Z] *= fade
-        state[_BEST] = distance
-        state[_FOOT_X], state[_FOOT_Y], state[_FOOT_Z] = qx, qy, qz
-        best = distance
-    weight = np.exp((best - distance) / SMOOTHING)
-    state[_WEIGHT] += weight
-    state[_MEAN_X] += weight * qx
-    state[_MEAN_Y] += weight * qy
-    state[_MEAN_Z] += weight * qz
-    return nearer
+def _search_block(
+    index: SurfelIndex, span: tuple[int, int], corner: Place, at: Place, search: Search
+) -> int:
+    """Look at the surfels ``range(*span)`` of a block; the nearest, or -1: none is nearer.
 
-
-@numba.njit(cache=True, nogil=True)
-def _search_block(index: SurfelIndex, member: int, at: Place, state: Doubles, nearest: int) -> int:
-    """Look at the surfels of a block; returns the number of the nearest so far."""
-    row = index.groups.members[member]
-    corner = index.groups.member_boxes[member]
-    x = at[0] - float(corner[0] & ~_LOW)
-    y = at[1] - float(corner[1] & ~_LOW)
-    z = at[2] - float(corner[2] & ~_LOW)
-    for surfel in range(index.starts[row], index.starts[row + 1]):
-        a = x - index.positions[surfel, 0]
-        b = y - index.positions[surfel, 1]
-        c = z - index.positions[surfel, 2]
-        square = a * a + b * b + c * c
-        if square <= (_reach(state) + DISC_RADIUS) ** 2 and _weigh(
-            index, surfel, (a, b, c), square, at, state
-        ):
-            nearest = surfel
+    Everything is relative to the block's corner, in single precision, and in local variables: to
+    reach into tuples of arrays for every surfel would take longer than the arithmetic.
+    """
+    state, candidates, squares = search.state, search.candidates, search.squares
+    normals, kinds = index.normals, index.kinds
+    start, count = span[0], span[1] - span[0]
+    # Slices of their own, which the compiler makes vector instructions of.
+    xs = index.positions[0, start : start + count]
+    ys = index.positions[1, start : start + count]
+    zs = index.positions[2, start : start + count]
+    x, y, z = (
+        np.float32(at[0] - corner[0]),
+        np.float32(at[1] - corner[1]),
+        np.float32(at[2] - corner[2]),
+    )
+    for i in range(count):
+        a, b, c = x - xs[i], y - ys[i], z - zs[i]
+        squares[i] = a * a + b * b + c * c
+    best, noted, nearest = state[_BEST], int(state[_COUNT]), -1
+    for i in range(count):
+        if squares[i] > (best + SMOOTHING + DISC_RADIUS) ** 2:
+            continue
+        surfel = start + i
+        a, b, c = x - xs[i], y - ys[i], z - zs[i]
+        nx, ny, nz = normals[surfel, 0], normals[surfel, 1], normals[surfel, 2]
+        height = a * nx + b * ny + c * nz
+        square, beside = squares[i], squares[i] - height * height
+        down, rim = height, np.float32(0)  # to the disc's plane, and back to its rim
+        if kinds[surfel] != _DISC:
+            down, rim = np.float32(0), np.float32(1)
+        elif beside <= _RADIUS * _RADIUS:
+            square = height * height
+        else:
+            lateral = np.sqrt(beside)
+            square = height * height + (lateral - _RADIUS) ** 2
+            rim = np.float32(1) - _RADIUS / lateral
+            down = height * (np.float32(1) - rim)
+        if square > (best + SMOOTHING) ** 2:
+            continue
+        distance = np.sqrt(np.float64(square))
+        if noted == _CANDIDATES:
+            noted = _still_near(candidates, best + SMOOTHING)
+        at_most = min(noted, _CANDIDATES - 1)
+        candidates[at_most, 0] = distance
+        candidates[at_most, 1] = at[0] - (down * nx + rim * a)
+        candidates[at_most, 2] = at[1] - (down * ny + rim * b)
+        candidates[at_most, 3] = at[2] - (down * nz + rim * c)
+        if distance < best:
+            best, nearest = distance, surfel
+            for axis in range(3):
+                state[_FOOT_X + axis] = candidates[at_most, axis + 1]
+        noted = at_most + 1
+    state[_BEST], state[_COUNT] = best, noted
     return nearest
 
 
 @numba.njit(cache=True, nogil=True)
-def _search_group(index: SurfelIndex, group: int, at: Place, state: Doubles, nearest: int) -> int:
-    """Look at the blocks of a group, the nearest first."""
-    boxes = index.groups.member_boxes
-    first, least = -1, np.inf
-    for member in range(index.groups.starts[group], index.groups.starts[group + 1]):
+def _still_near(candidates: Doubles, limit: float) -> int:
+    """Keep the candidates that are nearer than ``limit``; returns how many they are."""
+    count = 0
+    for i in range(len(candidates)):
+        if candidates[i, 0] <= limit:
+            candidates[count] = candidates[i]
+            count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _search_group(index: SurfelIndex, group: int, at: Place, search: Search) -> int:
+    """Look at the blocks of a group, the nearest first; the nearest surfel, or -1."""
+    boxes, members, starts = index.groups.member_boxes, index.groups.members, index.starts
+    start, end = index.groups.starts[group], index.groups.starts[group + 1]
+    first, least = start, np.inf
+    for member in range(start, end):
         distance = _box_distance(at, boxes, member)
         if distance < least:
             first, least = member, distance
-    if least > _reach(state):
-        return nearest
-    nearest = _search_block(index, first, at, state, nearest)
-    for member in range(index.groups.starts[group], index.groups.starts[group + 1]):
-        if member != first and _box_distance(at, boxes, member) <= _reach(state):
-            nearest = _search_block(index, member, at, state, nearest)
+    nearest = -1
+    for turn in range(start - 1, end):
+        member = first if turn < start else turn
+        if turn == first or _box_distance(at, boxes, member) > search.state[_BEST] + SMOOTHING:
+            continue
+        corner = (
+            float(boxes[member, 0] & ~_LOW),
+            float(boxes[member, 1] & ~_LOW),
+            float(boxes[member, 2] & ~_LOW),
+        )
+        row = members[member]
+        found = _search_block(index, (starts[row], starts[row + 1]), corner, at, search)
+        nearest = found if found >= 0 else nearest
     return nearest
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(index: SurfelIndex, at: Place, state: Doubles) -> int:
-    """Look at the groups around a point, then at all others; returns the number of the nearest."""
-    groups = index.groups
+def _search(index: SurfelIndex, at: Place, search: Search) -> int:
+    """Look at the groups around a point, then at all others; the nearest surfel, or -1."""
+    state, places, boxes = search.state, index.groups.places, index.groups.boxes
     x = int(np.floor(at[0] / _GROUP_VOXELS))
     y = int(np.floor(at[1] / _GROUP_VOXELS))
     z = int(np.floor(at[2] / _GROUP_VOXELS))
     nearest = -1
-    for neighbour in range(27):
-        # The own one first: what it holds may keep the others from being looked at.
-        number = (neighbour + 13) % 27
-        key = pack(x + number // 9 - 1, y + number // 3 % 3 - 1, z + number % 3 - 1)
-        group = find_row(groups.places, key)
-        if group >= 0 and _box_distance(at, groups.boxes, group) <= _reach(state):
-            nearest = _search_group(index, group, at, state, nearest)
-    if _reach(state) <= _GROUP_VOXELS:
+    for turn in range(_NEIGHBOURS):
+        key = pack(x + _STEPS[turn, 0], y + _STEPS[turn, 1], z + _STEPS[turn, 2])
+        group = find_row(places, key)
+        if group >= 0 and _box_distance(at, boxes, group) <= state[_BEST] + SMOOTHING:
+            found = _search_group(index, group, at, search)
+            nearest = found if found >= 0 else nearest
+    if state[_BEST] + SMOOTHING <= _GROUP_VOXELS:
         return nearest
-    for group in range(len(groups.boxes)):
-        cell = unpack(groups.places.row_keys[group])
-        beyond = max(abs(cell[0] - x), abs(cell[1] - y), abs(cell[2] - z)) > 1
-        if beyond and _box_distance(at, groups.boxes, group) <= _reach(state):
-            nearest = _search_group(index, group, at, state, nearest)
+    for group in range(len(boxes)):
+        if _box_distance(at, boxes, group) > state[_BEST] + SMOOTHING:
+            continue
+        a, b, c = unpack(places.row_keys[group])
+        if max(abs(a - x), abs(b - y), abs(c - z)) > 1:  # not looked at yet
+            found = _search_group(index, group, at, search)
+            nearest = found if found >= 0 else nearest
     return nearest
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _set_mean(search: Search, mean: Doubles) -> None:
+    """The mean [3] of all that is nearly as near as the nearest."""
+    total = 0.0
+    mean[:] = 0.0
+    for i in range(int(search.state[_COUNT])):
+        share = 1.0 - (search.candidates[i, 0] - search.state[_BEST]) / SMOOTHING
+        if share > 0.0:
+            weight = share * share
+            total += weight
+            for axis in range(3):
+                mean[axis] += weight * search.candidates[i, axis + 1]
+    mean /= total
 
 
 @numba.njit(cache=True, nogil=True)
@@ -277,17 +328,20 @@ def find_nearest(points: Doubles, index: SurfelIndex, found: Nearest) -> None:
 
     Points are leaf coordinates of the region and may lie outside of it.
     """
-    state = np.zeros(8)
+    search = Search(np.zeros(5), np.empty((_CANDIDATES, 4)), np.empty(BLOCK_VOXELS**3, np.float32))
     for i in range(len(points)):
         at = (points[i, 0], points[i, 1], points[i, 2])
-        state[:] = 0.0
-        state[_BEST] = found.distances[i]
-        if not max(abs(at[0]), abs(at[1]), abs(at[2])) + _reach(state) < CELL_LIMIT:
+        search.state[:] = 0.0
+        search.state[_BEST] = found.distances[i]
+        if (
+            not max(abs(at[0]), abs(at[1]), abs(at[2])) + search.state[_BEST] + SMOOTHING
+            < CELL_LIMIT
+        ):
             continue
-        nearest = _search(index, at, state)
+        nearest = _search(index, at, search)
         if nearest >= 0:
-            found.distances[i] = state[_BEST]
+            found.distances[i] = search.state[_BEST]
             for axis in range(3):
-                found.feet[i, axis] = state[_FOOT_X + axis]
-                found.means[i, axis] = state[_MEAN_X + axis] / state[_WEIGHT]
+                found.feet[i, axis] = search.state[_FOOT_X + axis]
+            _set_mean(search, found.means[i])
             found.rows[i] = nearest

@@ -59,7 +59,7 @@ class SurfelMap:
         self._index = SurfelIndex(
             block_groups(evidence.cells, self._surface),
             starts,
-            positions,
+            np.ascontiguousarray(positions.T),
             surfels.normals,
             surfels.kinds,
         )

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format import morton
 from triquad_format.evaluator import CHUNK_POINTS, Answer, MapEvaluator, RegionField
-from triquad_format.evidence_voxels import seen_voxels
+from triquad_format.evidence_voxels import seen_voxels, surface_counts
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import MapRecord, Region, region_corner
 
-from triquad_query.confidence import POINT_SHARE, level_confidence
+from triquad_query.confidence import POINT_SHARE, faded, level_confidence
 from triquad_query.nearest import NearestSurface, NearestUnknown
 from triquad_query.seen_space import SeenSpace
 from triquad_query.surfel_cloud import SurfelCloud
@@ -27,7 +27,10 @@ class RecordedMap:
         self._settings = record.settings
         self._evaluator = MapEvaluator(record)
         self._seen = SeenSpace(record)
-        self._surfaces = [_RegionSurface(record.settings, region) for region in record.regions]
+        newest_s = max((_newest_s(region) for region in record.regions), default=0)
+        self._surfaces = [
+            _RegionSurface(record.settings, region, newest_s) for region in record.regions
+        ]
 
     @property
     def voxel_m(self) -> float:
@@ -64,9 +67,11 @@ class RecordedMap:
 class _RegionSurface:
     """The surface seen in one region; surfels are fitted when they are first needed."""
 
-    def __init__(self, settings: FieldSettings, region: Region) -> None:
+    def __init__(self, settings: FieldSettings, region: Region, newest_s: int) -> None:
+        """``newest_s`` is when a ray last ended anywhere."""
         self._settings = settings
         self._region = region
+        self._newest_s = newest_s
         self._corner = region_corner(settings, region.index)
         self._fitting = threading.Lock()
         self._fitted: _FittedSurface | None = None
@@ -92,7 +97,7 @@ class _RegionSurface:
     def _surfels(self) -> "_FittedSurface":
         with self._fitting:
             if self._fitted is None:
-                self._fitted = _fit(self._settings, self._region)
+                self._fitted = _fit(self._settings, self._region, self._newest_s)
             return self._fitted
 
 
@@ -104,14 +109,24 @@ class _FittedSurface:
     confidence: NDArray[np.float32]  # [S] of each surfel
 
 
-def _fit(settings: FieldSettings, region: Region) -> _FittedSurface:
+def _newest_s(region: Region) -> int:
+    """When a ray last ended in a region, seconds since 1970; 0: never, or not known."""
+    seen_s = region.evidence.seen_s
+    return 0 if seen_s is None else int(seen_s.max(initial=0))
+
+
+def _fit(settings: FieldSettings, region: Region, newest_s: int) -> _FittedSurface:
     evidence = region.evidence
     voxels = seen_voxels(evidence, evidence.surface)
     ended = VoxelBlocks(morton.decode(evidence.codes, 3), evidence.surface)
     surfels = fit_surfels(voxels, _field_in_voxels(settings, region), ended.holds)
     share = np.where(surfels.kinds == SurfelKind.POINT, POINT_SHARE, 1.0)
-    confidence = (level_confidence()[0] * share).astype(np.float32)
-    return _FittedSurface(SurfelCloud(voxels, surfels), confidence)
+    levels = np.zeros(len(voxels), np.uint8) if evidence.levels is None else evidence.levels
+    confidence = level_confidence()[levels] * share
+    if evidence.seen_s is not None:
+        seen_s = np.repeat(evidence.seen_s, surface_counts(evidence.surface))
+        confidence *= faded((newest_s - seen_s).astype(np.float64))
+    return _FittedSurface(SurfelCloud(voxels, surfels), confidence.astype(np.float32))
 
 
 def _field_in_voxels(settings: FieldSettings, region: Region) -> Field:

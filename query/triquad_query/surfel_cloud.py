@@ -9,7 +9,6 @@ from triquad_format.region import BLOCK_VOXELS
 
 from triquad_query.surfels import (
     DISC_RADIUS,
-    FADED,
     OUTSIDE,
     SMOOTHING,
     SurfelKind,
@@ -65,7 +64,7 @@ class SurfelCloud:
             nearest = np.zeros(gaps.shape, np.bool_)
             nearest[np.arange(len(part)), gaps.argmin(axis=1)] = True
             self._improve(found, points, part, nearest & (gaps < limits[part, None]))
-            reach = found.distances[part, None] + FADED * SMOOTHING
+            reach = found.distances[part, None] + SMOOTHING
             self._improve(found, points, part, gaps <= reach)
         return found
 
@@ -115,8 +114,8 @@ class SurfelCloud:
         nearer &= (best < found.distances[asked]) | (found.rows[asked] >= 0)
         at_best = np.flatnonzero(distances == np.repeat(best, counts))
         winners = at_best[np.searchsorted(at_best, starts)]
-        weights = np.exp((np.repeat(best, counts) - distances) / SMOOTHING)
-        weights[distances > np.repeat(best, counts) + FADED * SMOOTHING] = 0.0
+        farther = distances - np.repeat(best, counts)
+        weights = np.maximum(1.0 - farther / SMOOTHING, 0.0) ** 2
         sums = np.add.reduceat(weights[:, None] * feet, starts)
         means = sums / np.add.reduceat(weights, starts)[:, None]
         rows = asked[nearer]

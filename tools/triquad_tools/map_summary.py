@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
 from triquad_format.mapfile import MapFile
 from triquad_format.part import TRAINING_TOPICS
-from triquad_format.region import MapRecord, Region, region_centre
+from triquad_format.region import MAX_LEVEL, MapRecord, Region, region_centre
 
 from triquad_tools.report import print_columns
 from triquad_tools.seen_space import evidence_box, owned_evidence
@@ -37,6 +37,7 @@ class RegionSummary:
     evidence_blocks: int
     evidence_box_m: tuple[tuple[float, ...], ...] | None  # two corners, to whole blocks
     surface_m3: float  # voxels in which rays ended
+    surface_levels: tuple[int, ...] | None  # number of such voxels by level; None: not known
     free_m3: float  # voxels through which rays only passed
     samples: int | None  # for replay; None: no training state
     visits_owed: int | None
@@ -130,6 +131,10 @@ def _print_region(region: RegionSummary) -> None:
         low, high = map(list, region.evidence_box_m)
         print(f"    evidence  {region.evidence_blocks:,} blocks in {low} to {high} m")
         print(f"              {region.surface_m3:,.1f} m3 surface, {region.free_m3:,.1f} m3 free")
+    if region.surface_levels is not None:
+        voxels = max(sum(region.surface_levels), 1)
+        shares = ", ".join(f"{i}: {n / voxels:.0%}" for i, n in enumerate(region.surface_levels))
+        print(f"              surface by level of support: {shares}")
     if region.samples is not None:
         print(f"    training  {region.samples:,} samples, {region.visits_owed:,} visits owed")
 
@@ -158,10 +163,15 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
         evidence_blocks=len(region.evidence.codes),
         evidence_box_m=None if box is None else tuple(map(_rounded, box)),
         surface_m3=_bits(evidence.surface) * voxel_m3,
+        surface_levels=None if evidence.levels is None else _by_level(evidence.levels),
         free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
         samples=None if training is None else len(training.sample_points),
         visits_owed=None if training is None else training.visits_owed,
     )
+
+
+def _by_level(levels: NDArray[np.uint8]) -> tuple[int, ...]:
+    return tuple(np.bincount(levels, minlength=MAX_LEVEL + 1).tolist())
 
 
 def _bits(masks: NDArray[np.uint8]) -> int:

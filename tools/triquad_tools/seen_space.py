@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format import morton
-from triquad_format.evidence_voxels import seen_voxels
+from triquad_format.evidence_voxels import masked, seen_voxels
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import (
     BLOCK_VOXELS,
@@ -32,9 +32,8 @@ def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
     # Regions meet in the middle of their overlap, one block inside of their cubes.
     blocks = morton.decode(region.evidence.codes, 3)
     last = (1 << settings.depth) // BLOCK_VOXELS - 1
-    rows = np.flatnonzero(((blocks >= 1) & (blocks < last)).all(axis=1))
-    evidence = region.evidence
-    return Evidence(evidence.codes[rows], evidence.surface[rows], evidence.free[rows])
+    owned = ((blocks >= 1) & (blocks < last)).all(axis=1, keepdims=True)
+    return masked(region.evidence, np.where(owned, np.uint8(0xFF), np.uint8(0)))
 
 
 def evidence_box(settings: FieldSettings, region: Region) -> NDArray[np.float64] | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from triquad_format import morton
+from triquad_format.evidence_voxels import surface_counts
 from triquad_format.field_settings import FieldSettings
 from triquad_format.manifest import FileRef
 from triquad_format.map_facts import MapFacts
@@ -17,6 +18,7 @@ from triquad_format.region import (
     AXES,
     BLOCK_BYTES,
     BLOCK_VOXELS,
+    MAX_LEVEL,
     Evidence,
     MapRecord,
     Mlp,
@@ -55,6 +57,7 @@ def sound_maps(folder: Path, given: Sequence[Path]) -> list[SoundMap]:
         "complete": plain,
         "training": _record(training=True),
         "integers": _with_integers(plain),
+        "levels": _with_levels(plain),
     }
     maps = [_complete(folder / kind, kind, record) for kind, record in kinds.items()]
     maps.append(_delta(folder / "delta", plain))
@@ -137,6 +140,15 @@ def _evidence(rng: np.random.Generator, leaves: np.ndarray) -> Evidence:
     codes = np.unique(morton.encode(leaves // BLOCK_VOXELS))
     masks = rng.integers(0, 256, (2, len(codes), BLOCK_BYTES)).astype(np.uint8)
     return Evidence(codes, masks[0], masks[1])
+
+
+def _with_levels(record: MapRecord) -> MapRecord:
+    (region,) = record.regions
+    counts = surface_counts(region.evidence.surface)
+    levels = np.resize(np.arange(MAX_LEVEL + 1, dtype=np.uint8), int(counts.sum()))
+    seen_s = np.where(counts > 0, 1_700_000_000 + np.arange(len(counts)), 0)
+    evidence = dataclasses.replace(region.evidence, levels=levels, seen_s=seen_s)
+    return dataclasses.replace(record, regions=(dataclasses.replace(region, evidence=evidence),))
 
 
 def _training(mlp: Mlp, tables: tuple[VertexTable, ...]) -> TrainingState:
