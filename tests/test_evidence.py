@@ -3,6 +3,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.status import Status
 from triquad_kernels.evidence import Evidence
+from triquad_kernels.observations import Sighting
+from triquad_query.confidence import LEVELS
 
 SIDE = 64
 RNG = np.random.default_rng(0)
@@ -105,3 +107,51 @@ def test_a_copy_does_not_change() -> None:
     evidence.mark_surface(voxel(40.5, 40.5, 40.5))
     assert twin.status(voxel(40.5, 40.5, 40.5))[0] == Status.UNKNOWN
     assert twin.status(voxel(1.5, 1.5, 1.5))[0] == Status.SURFACE
+
+
+def test_support_rises_with_each_look_from_near_and_from_other_sides():
+    ends = np.array([[20.5, 20.5, 20.5], [60.5, 20.5, 20.5]])
+
+    def level_after(*origins):
+        evidence = Evidence(SIDE)
+        for origin in origins:
+            evidence.mark_surface(ends[:1], Sighting(np.array(origin), 0.2, 1_000))
+        return int(evidence.levels()[0])
+
+    near, far = (25.0, 20.5, 20.5), (120.0, 20.5, 20.5)
+    assert level_after(near) > level_after(far)
+    assert level_after(near, near, near, near) > level_after(near)
+    other_side = (15.0, 20.5, 20.5)
+    assert level_after(near, other_side, near, other_side) > level_after(near, near, near, near)
+    assert level_after(*[near, other_side] * 100) == LEVELS - 1
+
+
+def test_levels_and_times_survive_a_record():
+    evidence = Evidence(SIDE)
+    origins = [np.array([64.0, 64, 64]), np.array([10.0, 64, 64])]
+    rng = np.random.default_rng(5)
+    for stamp_s, origin in zip((6_000, 9_000), origins, strict=True):
+        ends = rng.uniform(0, SIDE, (3_000, 3)) ** 2 / SIDE  # many in some blocks
+        evidence.mark_surface(ends, Sighting(origin, 0.2, stamp_s))
+    record = evidence.record()
+    again = Evidence.restore(SIDE, record).record()
+    np.testing.assert_array_equal(again.levels, record.levels)
+    np.testing.assert_array_equal(again.seen_s, record.seen_s)
+    assert len(np.unique(record.levels)) > 2
+    assert set(np.unique(record.seen_s)) == {6_000, 9_000}
+    twin = evidence.copy()
+    evidence.mark_surface(ends, Sighting(origins[0], 0.2, 12_000))
+    np.testing.assert_array_equal(twin.record().seen_s, record.seen_s)
+
+
+def test_what_is_forgotten_has_no_support():
+    evidence = Evidence(SIDE)
+    end = np.array([[20.5, 20.5, 20.5]])
+    for _ in range(50):
+        evidence.mark_surface(end, Sighting(np.array([25.0, 20, 20]), 0.2, 60))
+    evidence.clear(np.zeros(3), np.full(3, float(SIDE)))
+    record = evidence.record()
+    assert len(record.levels) == 0
+    assert not record.seen_s.any()
+    evidence.mark_surface(end, Sighting(np.array([200.0, 20, 20]), 0.2, 120))
+    assert evidence.levels().tolist() == [0]

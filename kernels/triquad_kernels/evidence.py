@@ -26,6 +26,7 @@ Masks = NDArray[np.uint8]
 
 _SHIFT = BLOCK_VOXELS.bit_length() - 1
 _LOW = BLOCK_VOXELS - 1
+_SEEN_STEP_S = 60
 _SURFACE = np.uint8(Status.SURFACE)
 _FREE = np.uint8(Status.FREE)
 _UNKNOWN = np.uint8(Status.UNKNOWN)
@@ -390,7 +391,14 @@ class Evidence:
         codes = morton.encode(self._blocks.cells()[used])
         order = np.argsort(codes)
         used = used[order]
-        return EvidenceRecord(codes[order], surface[used], free[used])
+        counts = surface_counts(surface)
+        firsts = np.cumsum(counts) - counts
+        # The levels block by block, in the order of the record.
+        runs = np.repeat(firsts[used] - (np.cumsum(counts[used]) - counts[used]), counts[used])
+        levels = self.levels()[runs + np.arange(len(runs))]
+        # In whole minutes: else each scan would change every part that it sees.
+        seen_s = np.where(counts > 0, self.seen_s() // _SEEN_STEP_S * _SEEN_STEP_S, 0)
+        return EvidenceRecord(codes[order], surface[used], free[used], levels, seen_s[used])
 
     @classmethod
     def restore(cls, side: int, record: EvidenceRecord) -> "Evidence":
@@ -399,6 +407,11 @@ class Evidence:
         evidence._blocks = VoxelIndex.of_cells(morton.decode(record.codes, 3))
         evidence._surface = with_room(record.surface, evidence._blocks.capacity)
         evidence._free = with_room(record.free, evidence._blocks.capacity)
+        if record.levels is not None:
+            seen_s = np.zeros(len(record.codes), np.int64)
+            evidence._observations = Observations.restore(
+                record.surface, record.levels, seen_s if record.seen_s is None else record.seen_s
+            )
         return evidence
 
     @classmethod
