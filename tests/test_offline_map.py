@@ -220,4 +220,4 @@ def test_without_numba_and_torch_it_answers_the_same(tmp_path):
         sdf = offline.query_sdf([[0, 0, 0.1]]).sdf
     compiled = [above.distance[0], above.surface_point[0, 2], sdf[0]]
     np.testing.assert_allclose(plain, compiled, atol=1e-5)
-    np.testing.assert_allclose(plain, [0.93, 0.07, 0.03], atol=1e-3)
+    np.testing.assert_allclose(plain, [0.93, 0.07, 0.03], atol=5e-3)

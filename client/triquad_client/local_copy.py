@@ -36,6 +36,11 @@ class SyncReport:
     parts_received: int
     parts_kept: int  # that were there already
 
+    @property
+    def parts(self) -> int:
+        """All that the copy holds."""
+        return self.parts_received + self.parts_kept
+
 
 @dataclass(frozen=True)
 class _State:
@@ -45,6 +50,7 @@ class _State:
     driver: LocalDriver
     epoch: int
     checked_s: float  # of the monotonic clock, when the server had nothing newer
+    report: SyncReport  # of the last update
 
 
 class LocalCopy:
@@ -70,6 +76,11 @@ class LocalCopy:
         """Seconds since the server had nothing newer."""
         return time.monotonic() - self._there().checked_s
 
+    @property
+    def report(self) -> SyncReport:
+        """What its last update took."""
+        return self._there().report
+
     def run(self, call: Call[ResultT]) -> ResultT:
         """Answer a call, all of it from one epoch."""
         return self._there().driver.run(call)
@@ -93,8 +104,9 @@ class LocalCopy:
             info = run(newest_file(training=False))
             known = self._state
             if known is not None and known.sha256 == info.sha256:
-                self._state = dataclasses.replace(known, checked_s=asked_s)
-                return SyncReport(info.epoch, 0, 0, 0)
+                report = SyncReport(info.epoch, 0, 0, known.report.parts)
+                self._state = dataclasses.replace(known, checked_s=asked_s, report=report)
+                return report
             remote = RemoteBytes(run, info)
             try:
                 parts = _Parts(StoredMap(remote), self._low, self._high)
@@ -104,9 +116,11 @@ class LocalCopy:
                 parts.write(self._path)
             except FormatError as error:
                 raise DownloadError(str(error)) from error
-            self._state = _State(info.sha256, LocalDriver(view_of(record)), info.epoch, asked_s)
             received = len(parts.wanted) - parts.kept
-            return SyncReport(info.epoch, remote.bytes_read, received, parts.kept)
+            report = SyncReport(info.epoch, remote.bytes_read, received, parts.kept)
+            driver = LocalDriver(view_of(record))
+            self._state = _State(info.sha256, driver, info.epoch, asked_s, report)
+            return report
 
 
 class _Parts:

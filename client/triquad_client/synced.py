@@ -31,6 +31,11 @@ class SyncedMap(MapQueries):
         """Seconds since the server had nothing newer: how old the copy may be at most."""
         return self._copy.age_s
 
+    @property
+    def report(self) -> SyncReport:
+        """What it took to bring the copy up to date the last time."""
+        return self._copy.report
+
     def refresh(self) -> SyncReport:
         """Fetch what changed on the server. Where that fails, the copy stays as it was.
 
@@ -60,6 +65,11 @@ class AsyncSyncedMap(AsyncMapQueries):
     def age_s(self) -> float:
         """As :attr:`SyncedMap.age_s`."""
         return self._copy.age_s
+
+    @property
+    def report(self) -> SyncReport:
+        """As :attr:`SyncedMap.report`."""
+        return self._copy.report
 
     async def refresh(self) -> SyncReport:
         """As :meth:`SyncedMap.refresh`."""
