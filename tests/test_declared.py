@@ -15,7 +15,6 @@ ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DISTRIBUTIONS = {
     "zenoh": "eclipse-zenoh",
-    "skimage": "scikit-image",
     "PIL": "pillow",
     "google": "protobuf",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
@@ -51,7 +50,7 @@ def imported(folder: str) -> set[str]:
 @pytest.mark.parametrize(
     ("folder", "extras"),
     [
-        ("format", ()),
+        ("format", ("draco",)),
         ("client", ()),
         ("query", ()),
         ("kernels", ("fast",)),
@@ -66,4 +65,4 @@ def test_what_is_imported_is_declared(folder, extras):
 def test_what_is_declared_is_imported():
     folders = ("format", "query", "kernels", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
-    assert declared("fast", "server", "tools") <= used
+    assert declared("fast", "server", "tools", "draco") <= used

@@ -17,6 +17,7 @@ from triquad_format.messages import (
     ServerStatus,
     StatusRequest,
     TileList,
+    TileRequest,
 )
 from triquad_format.wire import Message
 
@@ -83,7 +84,7 @@ def test_round_trip(message):
 
 def test_all_messages_are_frozen_records_with_known_fields():
     kinds = all_messages()
-    assert len(kinds) == 20
+    assert len(kinds) == 22
     for kind in kinds:
         assert kind.__dataclass_params__.frozen, kind
         assert list(kind.annotations()) == [part.name for part in dataclasses.fields(kind)]
@@ -113,6 +114,16 @@ def test_big_endian_and_strided_arrays_travel_as_little_endian():
 def test_fields_of_a_later_revision_are_ignored():
     body = msgpack.unpackb(wire.encode(StatusRequest()))
     assert wire.decode(StatusRequest, msgpack.packb(body | {"later": 1})) == StatusRequest()
+
+
+def test_fields_with_a_default_may_be_missing():
+    body = msgpack.unpackb(wire.encode(TileRequest(1, 2, 3, 4, 1)))
+    assert wire.decode(TileRequest, msgpack.packb(body)).level == 1
+    del body["level"]
+    assert wire.decode(TileRequest, msgpack.packb(body)) == TileRequest(1, 2, 3, 4, 0)
+    del body["x"]
+    with pytest.raises(WireError, match="TileRequest.x: missing"):
+        wire.decode(TileRequest, msgpack.packb(body))
 
 
 def changed(message: Message, **changes: object) -> bytes:

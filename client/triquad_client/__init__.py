@@ -38,6 +38,8 @@ from triquad_client.errors import (
 )
 from triquad_client.local_copy import SyncReport
 from triquad_client.mesh import Mesh
+from triquad_client.mesh_tiles import HeldTiles, MeshTile
+from triquad_client.mesh_watch import MeshUpdate, MeshWatch
 from triquad_client.offline import OfflineMap, open_map
 from triquad_client.queries import PinnedMap
 from triquad_client.questions.sdf import SdfResult
@@ -58,10 +60,14 @@ __all__ = [
     "DownloadError",
     "FlushReport",
     "Grid",
+    "HeldTiles",
     "InvalidInputError",
     "InvalidScanError",
     "MapInfo",
     "Mesh",
+    "MeshTile",
+    "MeshUpdate",
+    "MeshWatch",
     "NoReplyError",
     "OfflineMap",
     "PinnedMap",

@@ -7,12 +7,14 @@ from numpy.typing import ArrayLike
 from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_format.written_map import MapFileInfo
 
-from triquad_client import download, meshes, upkeep
+from triquad_client import checks, download, meshes, upkeep
 from triquad_client.blocking import BlockingDriver
 from triquad_client.checks import Bounds
 from triquad_client.connection import Connection, open_connection
 from triquad_client.local_copy import LocalCopy
 from triquad_client.mesh import Mesh
+from triquad_client.mesh_tiles import HeldTiles
+from triquad_client.mesh_watch import MeshWatch
 from triquad_client.queries import MapQueries, PinnedMap
 from triquad_client.questions import sdf
 from triquad_client.scans import FlushReport, ScanPublisher
@@ -117,6 +119,23 @@ class Client(MapQueries):
     def mesh(self, bounds: Bounds | None = None) -> Mesh:
         """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch."""
         return self._run(meshes.mesh(bounds))
+
+    def watch_mesh(
+        self,
+        bounds: Bounds | None = None,
+        level: int = 0,
+        max_bytes_per_s: int | None = None,
+        held: HeldTiles | None = None,
+    ) -> MeshWatch:
+        """Follow the mesh tiles that meet ``bounds``: they are fetched once, then as they change.
+
+        Args:
+            bounds: corners of a box; ``None``: everywhere.
+            level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
+            max_bytes_per_s: what this watch may take of the network; the server may allow less.
+            held: tiles of an earlier watch, which are not fetched again.
+        """
+        return MeshWatch(self._connection, *checks.box(bounds), level, max_bytes_per_s, held)
 
     def status(self) -> ServerStatus:
         """How the server is doing."""

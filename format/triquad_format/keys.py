@@ -18,6 +18,7 @@ RAYS = "query/rays"
 GRID = "query/grid"
 TILE = "query/tile"
 TILE_LIST = "query/tiles"
+TILE_UPDATES = "query/tile_updates"
 STATUS = "query/status"
 FLUSH = "query/flush"
 MAP_INFO = "query/map"
@@ -35,6 +36,7 @@ OPERATIONS = (
     GRID,
     TILE,
     TILE_LIST,
+    TILE_UPDATES,
     STATUS,
     FLUSH,
     MAP_INFO,

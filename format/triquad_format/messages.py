@@ -21,6 +21,8 @@ Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
 Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Epochs = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
+Codecs = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
+Sizes = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 Faces = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 
 
@@ -68,6 +70,7 @@ class TileListRequest(Message):
     minimum: Point
     maximum: Point
     epoch: int
+    level: int = 0  # of detail: cells are 2**level times as large as those of level 0
 
 
 @dataclass(frozen=True)
@@ -77,8 +80,7 @@ class TileList(Message):
     epoch: int
     tile_side_m: float
     tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
-    # [T] each tile last changed no later than this; at present, the last change of its region
-    changed: Epochs
+    changed: Epochs  # [T] the surface of each tile last changed in this epoch
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ class TileRequest(Message):
     y: int
     z: int
     epoch: int
+    level: int = 0  # of detail
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,43 @@ class Tile(Message):
     origin: Point  # metres, map frame: the tile's minimum corner
     vertices: Positions  # [V, 3] metres, relative to origin
     faces: Faces  # [F, 3], counter-clockwise seen from free space
+
+
+@dataclass(frozen=True)
+class TileUpdatesRequest(Message):
+    """What changed of the mesh tiles in a box; answered once something did, or in time."""
+
+    minimum: Point
+    maximum: Point  # of the box, map frame; an open side is infinite
+    level: int  # of detail
+    server: str  # of the reply before, whose word revision and held are; empty at first
+    revision: int  # of the reply before: everything up to it is known; 0 at first
+    held: TileIndices  # [H, 3] tiles that are known whatever the revision
+    held_versions: Epochs  # [H]
+    max_bytes: int  # of the reply's tiles; a single tile may have more
+    timeout_s: float
+    client: str  # a name, on which max_bytes_per_s is counted
+    max_bytes_per_s: int  # 0: whatever the server allows
+    draco: bool  # whether the client can decode Draco
+
+
+@dataclass(frozen=True)
+class TileUpdates(Message):
+    """Answer to :class:`TileUpdatesRequest`."""
+
+    server: str
+    revision: int  # for the next request
+    epoch: int  # the tiles show this epoch, where complete
+    complete: bool  # nothing more waits
+    restart: bool  # the request spoke of another server: tiles held from it are void
+    tile_side_m: float
+    cell_m: float
+    tiles: TileIndices  # [T, 3] that changed
+    versions: Epochs  # [T] epoch of which each is
+    codecs: Codecs  # [T] triquad_format.tile_code.Codec
+    sizes: Sizes  # [T] bytes of each
+    data: bytes  # of all, one behind the other
+    removed: TileIndices  # [R, 3] that have no faces any more
 
 
 @dataclass(frozen=True)

@@ -70,6 +70,8 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
     fields: dict[str, object] = {}
     for name, annotation in expected.annotations().items():
         if name not in body:
+            if hasattr(expected, name):  # it has a default, for those who speak as before it came
+                continue
             raise WireError(f"{expected.__name__}.{name}: missing")
         fields[name] = _unpack(f"{expected.__name__}.{name}", annotation, body[name])
     return expected(**fields)

@@ -20,7 +20,7 @@ from triquad_format.status import Status
 from triquad_kernels.observations import Observations, Sighting
 from triquad_kernels.rows import with_room
 from triquad_kernels.unknown_search import SeenSpace, find_unknown
-from triquad_kernels.voxel_index import Index, VoxelIndex, find_row, make_row, pack
+from triquad_kernels.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
 Masks = NDArray[np.uint8]
 
@@ -211,6 +211,30 @@ def _status(
 
 
 @numba.njit(cache=True, nogil=True)
+def _set_voxels(row_keys: NDArray[np.int64], masks: Masks) -> NDArray[np.int64]:
+    """The voxels [N, 3] whose bit is set in the blocks of some keys."""
+    count = 0
+    for row in range(len(row_keys)):
+        for byte in masks[row]:
+            while byte:
+                byte &= byte - 1
+                count += 1
+    voxels = np.empty((count, 3), np.int64)
+    found = 0
+    for row in range(len(row_keys)):
+        x, y, z = unpack(row_keys[row])
+        for column in range(len(masks[row])):
+            byte = masks[row, column]
+            for bit in range(8):
+                if (byte >> bit) & 1:
+                    voxels[found, 0] = (x << _SHIFT) + (column >> _SHIFT)
+                    voxels[found, 1] = (y << _SHIFT) + (column & _LOW)
+                    voxels[found, 2] = (z << _SHIFT) + bit
+                    found += 1
+    return voxels
+
+
+@numba.njit(cache=True, nogil=True)
 def _ended_in(
     voxels: NDArray[np.int64], side: int, index: Index, surface: Masks, ended: NDArray[np.bool_]
 ) -> None:
@@ -358,6 +382,11 @@ class Evidence:
     def surface_cells(self) -> NDArray[np.int64]:
         """Blocks [B, 3], in units of blocks, that hold any seen surface."""
         return self._blocks.cells()[self._surface[: self.blocks].any(axis=1)]
+
+    def surface_voxels(self) -> NDArray[np.int64]:
+        """Voxels [N, 3] in which rays ended."""
+        keys = self._blocks.arrays.row_keys[: self.blocks]
+        return np.asarray(_set_voxels(keys, self._surface[: self.blocks]))
 
     def clear(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""

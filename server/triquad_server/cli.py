@@ -25,7 +25,7 @@ exit codes:
      or the newest needs a newer release or more memory
 """
 
-_NEEDED = ("torch", "numba", "skimage")
+_NEEDED = ("torch", "numba")
 
 _log = logging.getLogger("triquad_server")
 

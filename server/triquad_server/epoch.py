@@ -13,9 +13,10 @@ from triquad_kernels.surfel_map import SurfelMap, SurfelTask, first_surfels
 from triquad_server.engine import make_engine
 from triquad_server.field import Field
 from triquad_server.field_record import region_record
-from triquad_server.mesher import TileMesh, mesh_tile
+from triquad_server.mesher import TileIndex, TileMesh, mesh_tile
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import ANSWERS, MAPPING
+from triquad_server.tile_lattice import TileLattice, tile_lattice, tiles_meeting
 
 _NOTICEABLE_M = 0.01
 """A surface that moves by less has not changed."""
@@ -26,7 +27,6 @@ class TileSet:
     """Mesh tiles that may hold a surface."""
 
     indices: NDArray[np.int32]  # [T, 3]
-    changed: NDArray[np.int64]  # [T] epoch in which each last changed
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,11 @@ class Epoch(CompiledView):
         return len(self.frozen_regions)
 
     @property
+    def field_settings(self) -> FieldSettings:
+        """Shape of the field."""
+        return self._settings
+
+    @property
     def vertices(self) -> int:
         """Quadtree vertices of all regions."""
         return sum(region.field.vertices for region in self.frozen_regions)
@@ -68,34 +73,24 @@ class Epoch(CompiledView):
         """Learnable numbers of all regions."""
         return sum(region.field.parameters for region in self.frozen_regions)
 
-    def tiles(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> TileSet:
-        """Tiles that hold seen surface and meet the box between two corners [3]."""
-        changed: dict[tuple[int, int, int], int] = {}
-        for region in self.frozen_regions:
-            for x, y, z in self._surface_tiles(region).tolist():
-                changed[x, y, z] = max(region.changed, changed.get((x, y, z), 0))
-        indices = np.array(sorted(changed), np.int32).reshape(-1, 3)
-        low = indices * self._mesh.tile_side_m
-        meets = ((low <= maximum) & (low + self._mesh.tile_side_m >= minimum)).all(axis=1)
-        indices = indices[meets]
-        versions = [changed[(int(x), int(y), int(z))] for x, y, z in indices]
-        return TileSet(indices, np.array(versions, np.int64))
+    def tiles(
+        self, minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int = 0
+    ) -> TileSet:
+        """Tiles of a level that hold seen surface and meet the box between two corners [3]."""
+        lattice = tile_lattice(self._mesh, level)
+        tiles = {
+            (x, y, z)
+            for region in self.frozen_regions
+            for x, y, z in self._surface_tiles(region, lattice).tolist()
+        }
+        indices = np.array(sorted(tiles), np.int32).reshape(-1, 3)
+        low = indices * lattice.tile_side_m
+        meets = ((low <= maximum) & (low + lattice.tile_side_m >= minimum)).all(axis=1)
+        return TileSet(indices[meets])
 
-    def mesh(self, tile: tuple[int, int, int]) -> TileMesh:
+    def mesh(self, tile: TileIndex, level: int = 0) -> TileMesh:
         """The mesh of one tile; empty where no surface was seen."""
-        return mesh_tile(self, tile, self._mesh)
-
-    def changed(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> int:
-        """Epoch of the last change to any region that meets the box; 0 where there is none."""
-        half = self._settings.region_side_m / 2
-        return max(
-            (
-                region.changed
-                for region in self.frozen_regions
-                if ((region.centre - half <= high) & (region.centre + half >= low)).all()
-            ),
-            default=0,
-        )
+        return mesh_tile(self, tile, tile_lattice(self._mesh, level))
 
     def record(self) -> MapRecord:
         """The epoch as a map file holds it, without training state."""
@@ -105,18 +100,12 @@ class Epoch(CompiledView):
         )
         return MapRecord(self._name, self.number, self._settings, regions)
 
-    def _surface_tiles(self, region: FrozenRegion) -> NDArray[np.int64]:
+    def _surface_tiles(self, region: FrozenRegion, lattice: TileLattice) -> NDArray[np.int64]:
         """Tiles [T, 3] that meet a block with seen surface, or what is meshed around it."""
         side = BLOCK_VOXELS * self._settings.leaf_m
         corner = region.centre - self._settings.region_side_m / 2
         low = region.evidence.surface_cells() * side + corner
-        first = np.floor((low - self._mesh.reach_m) / self._mesh.tile_side_m).astype(np.int64)
-        last = np.floor((low + side + self._mesh.reach_m) / self._mesh.tile_side_m).astype(np.int64)
-        tiles = [np.zeros((0, 3), np.int64)]
-        for offset in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
-            tile = first + offset
-            tiles.append(tile[(tile <= last).all(axis=1)])
-        return np.unique(np.concatenate(tiles), axis=0)
+        return tiles_meeting(low, low + side, lattice.reach_m, lattice)
 
 
 @dataclass(frozen=True)

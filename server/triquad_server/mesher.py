@@ -1,32 +1,52 @@
 """Meshes of tiles: marching cubes on a fixed lattice of the map frame.
 
-Lattice points are multiples of ``cell_m``, whatever the tile, so neighbouring tiles share the
-points of their common face and meet without seams. Only faces where the evidence saw a surface are
-kept: elsewhere the field has zeros that nobody taught it.
+Lattice points are multiples of the cell, whatever the tile, so neighbouring tiles share the
+points of their common face and meet without seams, also where they were meshed at different
+times: the later one takes over the values of the earlier one there. Only faces where the evidence
+saw a surface are kept: elsewhere the field has zeros that nobody taught it.
 """
 
+import functools
 from dataclasses import dataclass
 from typing import Protocol
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from skimage.measure import marching_cubes
 from triquad_format.status import Status
+from triquad_format.tile_code import STEPS, TileSurface
 
-from triquad_server.settings import MeshSettings
+from triquad_server.marching_cubes import Crossings
+from triquad_server.tile_border import TileBorder
+from triquad_server.tile_lattice import TileLattice
 
-_GROUP = 8  # cells along the side of the groups that are looked at first
+TileIndex = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
 class TileMesh:
-    """Triangles of one tile."""
+    """Triangles of one tile. Vertices are numbered in the order in which faces use them."""
 
     origin: NDArray[np.float64]  # [3] metres, map frame: the tile's minimum corner
-    vertices: NDArray[np.float32]  # [V, 3] metres, relative to the origin
+    cell_m: float
+    points: NDArray[np.uint16]  # [V, 3] lower lattice points of the edges that hold the vertices
+    axes: NDArray[np.uint8]  # [V] along which the edges run
+    fractions: NDArray[np.float64]  # [V] how far along them, 0 to 1
     faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
-    changed: int  # epoch in which the tile last changed
+    border: TileBorder  # what it was made of on its faces
+
+    @property
+    def vertices(self) -> NDArray[np.float32]:
+        """The vertices [V, 3], metres, relative to the origin."""
+        places = self.points.astype(np.float64)
+        places[np.arange(len(places)), self.axes] += self.fractions
+        return (places * self.cell_m).astype(np.float32)
+
+    @property
+    def surface(self) -> TileSurface:
+        """The mesh as it travels."""
+        steps = np.rint(self.fractions * STEPS).astype(np.uint8)
+        return TileSurface(self.points, self.axes, steps, self.faces)
 
 
 class Distances(Protocol):
@@ -38,69 +58,65 @@ class Distances(Protocol):
     def status(self, points: NDArray[np.float64], reach_m: float) -> NDArray[np.uint8]:
         """Status values [N] at points [N, 3]."""
 
-    def changed(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> int:
-        """Epoch of the last change between two corners [3]."""
 
-
-def mesh_tile(source: Distances, tile: tuple[int, int, int], settings: MeshSettings) -> TileMesh:
+def mesh_tile(
+    source: Distances,
+    tile: TileIndex,
+    lattice: TileLattice,
+    around: TileBorder | None = None,
+) -> TileMesh:
     """The surface within one tile.
 
     Args:
         source: the map.
         tile: indices of the tile, which covers ``[tile, tile + 1) * tile_side_m``.
-        settings: the lattice.
+        lattice: that of its level.
+        around: distances at some lattice points, which are used instead of the map's.
     """
-    cells = settings.tile_cells
-    first = np.asarray(tile, np.int64) * cells
-    origin = (first * settings.cell_m).astype(np.float64)
-    version = source.changed(origin, origin + settings.tile_side_m)
-    seen = _seen_cells(source, first, settings)
-    if len(seen) == 0:
-        return _empty(origin, version)
-    volume = _lattice_values(source, seen, first, settings)
-    crossed, low, high = _crossed(seen, volume)
-    if not crossed.any():
-        return _empty(origin, version)
-    box = tuple(slice(start, stop) for start, stop in zip(low, high, strict=True))
-    # Face order: the distance falls towards the solid.
-    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
-        volume[box],
-        0.0,
-        mask=crossed[box],
-        gradient_direction="descent",
+    first = np.asarray(tile, np.int64) * lattice.cells
+    seen = _seen_cells(source, first, lattice)
+    volume, points = _lattice_values(source, seen, first, lattice, around)
+    found = Crossings(seen, volume)
+    places = found.points.astype(np.float64)
+    places[np.arange(len(places)), found.axes] += found.fractions
+    centroids = _centroids((places + first) * lattice.cell_m, found.faces)
+    kept = source.status(centroids, lattice.reach_m) == Status.SURFACE
+    used, faces = _renumbered(found.faces[kept], len(places))
+    return TileMesh(
+        (first * lattice.cell_m).astype(np.float64),
+        lattice.cell_m,
+        found.points[used],
+        found.axes[used],
+        found.fractions[used],
+        faces,
+        TileBorder.of_tile(points, volume),
     )
-    vertices = (vertices + low) * settings.cell_m
-    centroids = origin + _centroids(vertices, faces)
-    kept = source.status(centroids, settings.reach_m) == Status.SURFACE
-    return TileMesh(origin, *_without_others(vertices, faces, kept), version)
 
 
 def _seen_cells(
-    source: Distances,
-    first: NDArray[np.int64],
-    settings: MeshSettings,
+    source: Distances, first: NDArray[np.int64], lattice: TileLattice
 ) -> NDArray[np.int64]:
     """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
-    reach_m = settings.cell_m / 2 + settings.reach_m
-    groups = _grid(-(-settings.tile_cells // _GROUP)) * _GROUP
-    centres = _positions(groups, _GROUP / 2, first, settings.cell_m)
+    reach_m = lattice.cell_m / 2 + lattice.reach_m
+    groups = _grid(-(-lattice.cells // lattice.group)) * lattice.group
+    centres = _positions(groups, lattice.group / 2, first, lattice.cell_m)
     # A group is looked into where any of its cells may be such.
-    wide = settings.cell_m * (_GROUP - 1) / 2 + reach_m
+    wide = lattice.cell_m * (lattice.group - 1) / 2 + reach_m
     groups = groups[source.status(centres, wide) == Status.SURFACE]
-    cells = _cells_of(groups, settings.tile_cells)
-    seen = source.status(_positions(cells, 0.5, first, settings.cell_m), reach_m)
+    cells = _cells_of(groups, lattice.group, lattice.cells)
+    seen = source.status(_positions(cells, 0.5, first, lattice.cell_m), reach_m)
     return np.asarray(cells[seen == Status.SURFACE])
 
 
 @numba.njit(cache=True, nogil=True)
-def _cells_of(groups: NDArray[np.int64], side: int) -> NDArray[np.int64]:
+def _cells_of(groups: NDArray[np.int64], group_side: int, side: int) -> NDArray[np.int64]:
     """Cells [C, 3] of groups, named by their least corners, of a tile of ``side`` cells."""
-    cells = np.empty((len(groups) * _GROUP**3, 3), np.int64)
+    cells = np.empty((len(groups) * group_side**3, 3), np.int64)
     count = 0
     for group in groups:
-        for x in range(group[0], min(group[0] + _GROUP, side)):
-            for y in range(group[1], min(group[1] + _GROUP, side)):
-                for z in range(group[2], min(group[2] + _GROUP, side)):
+        for x in range(group[0], min(group[0] + group_side, side)):
+            for y in range(group[1], min(group[1] + group_side, side)):
+                for z in range(group[2], min(group[2] + group_side, side)):
                     cells[count, 0], cells[count, 1], cells[count, 2] = x, y, z
                     count += 1
     return cells[:count]
@@ -118,12 +134,6 @@ def _positions(
     return positions
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _corner(cell: NDArray[np.int64], number: int) -> tuple[int, int, int]:
-    """Lattice point at one of the 8 corners of a cell."""
-    return cell[0] + (number >> 2), cell[1] + (number >> 1 & 1), cell[2] + (number & 1)
-
-
 @numba.njit(cache=True, nogil=True)
 def _centroids(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     centroids = np.empty((len(faces), 3))
@@ -135,45 +145,43 @@ def _centroids(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArr
 
 
 @numba.njit(cache=True, nogil=True)
-def _without_others(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32], kept: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """The faces that are kept, and the vertices that they use."""
-    numbers = np.full(len(vertices), -1, np.int32)
-    some_vertices = np.empty((len(vertices), 3), np.float32)
-    some_faces = np.empty((len(faces), 3), np.int32)
-    used = count = 0
+def _renumbered(
+    faces: NDArray[np.int32], vertices: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """The vertices that faces use, in the order in which they do, and the faces with these."""
+    numbers = np.full(vertices, -1, np.int32)
+    used = np.empty(vertices, np.int64)
+    renumbered = np.empty(faces.shape, np.int32)
+    count = 0
     for i in range(len(faces)):
-        if not kept[i]:
-            continue
         for corner in range(3):
             vertex = faces[i, corner]
             if numbers[vertex] < 0:
-                numbers[vertex] = used
-                for axis in range(3):
-                    some_vertices[used, axis] = vertices[vertex, axis]
-                used += 1
-            some_faces[count, corner] = numbers[vertex]
-        count += 1
-    return some_vertices[:used].copy(), some_faces[:count].copy()
+                numbers[vertex] = count
+                used[count] = vertex
+                count += 1
+            renumbered[i, corner] = numbers[vertex]
+    return used[:count], renumbered
 
 
+@functools.lru_cache(maxsize=8)
 def _grid(side: int) -> NDArray[np.int64]:
     """Cells [side**3, 3] of a cube."""
-    return np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    axes = [np.arange(side, dtype=np.int64)] * 3
+    cells: NDArray[np.int64] = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    return cells.reshape(-1, 3)
 
 
 @numba.njit(cache=True, nogil=True)
-def _corners(seen: NDArray[np.int64], side: int) -> NDArray[np.int64]:
-    """The different lattice points [P, 3] at the corners of cells [C, 3]."""
-    needed = np.zeros((side, side, side), np.bool_)
+def _corners(seen: NDArray[np.int64], volume: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The lattice points [P, 3] at the corners of cells [C, 3]; they become NaN in ``volume``."""
     points = np.empty((8 * len(seen), 3), np.int64)
     count = 0
     for cell in seen:
         for corner in range(8):
-            x, y, z = _corner(cell, corner)
-            if not needed[x, y, z]:
-                needed[x, y, z] = True
+            x, y, z = cell[0] + (corner >> 2), cell[1] + (corner >> 1 & 1), cell[2] + (corner & 1)
+            if not np.isnan(volume[x, y, z]):
+                volume[x, y, z] = np.nan
                 points[count, 0], points[count, 1], points[count, 2] = x, y, z
                 count += 1
     return points[:count]
@@ -183,39 +191,18 @@ def _lattice_values(
     source: Distances,
     seen: NDArray[np.int64],
     first: NDArray[np.int64],
-    settings: MeshSettings,
-) -> NDArray[np.float32]:
-    """Distances on the tile's lattice points [cells + 1] * 3; far ones, at no seen cell, are 1."""
-    side = settings.tile_cells + 1
-    points = _corners(seen, side)
-    volume = np.ones((side, side, side), np.float32)
-    lattice = _positions(points, 0.0, first, settings.cell_m)
-    volume[tuple(points.T)] = source.distances(lattice)
-    return volume
+    lattice: TileLattice,
+    around: TileBorder | None,
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Distances on the tile's lattice points [cells + 1] * 3, and the points [P, 3] at seen cells.
 
-
-@numba.njit(cache=True, nogil=True)
-def _crossed(
-    seen: NDArray[np.int64], volume: NDArray[np.float32]
-) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """Cells with corners on both sides of the surface, as skimage names them: by upper corner.
-
-    Also the corners of the box of lattice points around them, the upper one exclusive.
+    Those of other points mean nothing.
     """
-    mask = np.zeros(volume.shape, np.bool_)
-    low, high = np.full(3, len(volume)), np.zeros(3, np.int64)
-    for cell in seen:
-        least, greatest = np.inf, -np.inf
-        for corner in range(8):
-            x, y, z = _corner(cell, corner)
-            least, greatest = min(least, volume[x, y, z]), max(greatest, volume[x, y, z])
-        if least <= 0 < greatest:
-            mask[cell[0] + 1, cell[1] + 1, cell[2] + 1] = True
-            for axis in range(3):
-                low[axis] = min(low[axis], cell[axis])
-                high[axis] = max(high[axis], cell[axis] + 2)
-    return mask, low, high
-
-
-def _empty(origin: NDArray[np.float64], version: int) -> TileMesh:
-    return TileMesh(origin, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), version)
+    volume = np.zeros((lattice.cells + 1,) * 3, np.float32)
+    points = _corners(seen, volume)
+    asked = points
+    if around is not None:
+        around.put(volume)
+        asked = points[np.isnan(volume[tuple(points.T)])]
+    volume[tuple(asked.T)] = source.distances(_positions(asked, 0.0, first, lattice.cell_m))
+    return volume, points

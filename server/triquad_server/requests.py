@@ -25,6 +25,8 @@ from triquad_server.gate import QueryGate
 from triquad_server.mapper import Mapper
 from triquad_server.mapper_thread import MapperThread
 from triquad_server.request import Request
+from triquad_server.tile_lattice import LEVELS
+from triquad_server.tile_shelf import TileShelf
 
 TILE_INDEX_LIMIT = 1_000_000
 """Tile indices lie in ``[-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT]``."""
@@ -65,18 +67,23 @@ class EpochViews:
 class TileQueries:
     """Answers mesh queries."""
 
-    def __init__(self, epochs: EpochShelf, tile_side_m: float) -> None:
+    def __init__(self, epochs: EpochShelf, shelf: TileShelf) -> None:
+        """``shelf`` knows when tiles changed."""
         self._epochs = epochs
-        self._tile_side_m = tile_side_m
+        self._shelf = shelf
 
     def tiles(self, request: TileListRequest) -> TileList:
         """The tiles that meet the request's box."""
-        _check_box(request.minimum, request.maximum)
+        check_box(request.minimum, request.maximum)
+        check_level(request.level)
         epoch = self._epochs.get(request.epoch)
-        tiles = epoch.tiles(request.minimum, request.maximum)
+        tiles = epoch.tiles(request.minimum, request.maximum, request.level)
         if len(tiles.indices) > MAX_TILES:
             raise RequestError("too_large", f"{len(tiles.indices)} tiles: ask for a smaller box")
-        return TileList(epoch.number, self._tile_side_m, tiles.indices, tiles.changed)
+        side_m = self._shelf.lattice(request.level).tile_side_m
+        self._shelf.look(epoch)
+        changed = np.minimum(self._shelf.changed(request.level, tiles.indices), epoch.number)
+        return TileList(epoch.number, side_m, tiles.indices, changed)
 
     def tile(self, request: TileRequest) -> Tile:
         """The mesh of one tile."""
@@ -86,9 +93,14 @@ class TileQueries:
                 "bad_request",
                 f"tile {index} is out of range: use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
             )
+        check_level(request.level)
         epoch = self._epochs.get(request.epoch)
-        mesh = epoch.mesh(index)
-        return Tile(epoch.number, mesh.changed, mesh.origin, mesh.vertices, mesh.faces)
+        mesh = epoch.mesh(index, request.level)
+        # What nobody looked for yet shows in a later list: the tile is fetched once more then.
+        (changed,) = self._shelf.changed(request.level, np.array([index])).tolist()
+        return Tile(
+            epoch.number, min(changed, epoch.number), mesh.origin, mesh.vertices, mesh.faces
+        )
 
 
 class Resets:
@@ -99,7 +111,7 @@ class Resets:
 
     def answer(self, request: ResetRequest) -> ResetReply:
         """Forget the request's box; answered once an epoch shows it."""
-        _check_box(request.minimum, request.maximum)
+        check_box(request.minimum, request.maximum)
 
         def reset(mapper: Mapper) -> int:
             mapper.reset(request.minimum, request.maximum)
@@ -108,7 +120,13 @@ class Resets:
         return ResetReply(self._mapper.call(reset))
 
 
-def _check_box(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> None:
+def check_level(level: int) -> None:
+    """Refuse a level of detail that there is not."""
+    if not 0 <= level < LEVELS:
+        raise RequestError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
+
+
+def check_box(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> None:
     """Refuse a box [3], [3] with NaN or with corners the wrong way round; infinite is allowed."""
     if np.isnan([minimum, maximum]).any() or (minimum > maximum).any():
         raise RequestError(

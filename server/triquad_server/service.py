@@ -19,6 +19,7 @@ from triquad_format.messages import (
     StatusRequest,
     TileListRequest,
     TileRequest,
+    TileUpdatesRequest,
 )
 from triquad_format.query_messages import (
     DistanceRequest,
@@ -46,6 +47,8 @@ from triquad_server.settings import Settings
 from triquad_server.sources import SourceLedger
 from triquad_server.store import Store
 from triquad_server.tally import Tally
+from triquad_server.tile_feed import TileFeed
+from triquad_server.tile_shelf import TileShelf
 
 _TILE_WORKERS = 2  # one computes while another packs
 
@@ -127,7 +130,7 @@ class Service:
             self._mapper,
             checkpoints,
         )
-        self._open_desks(health)
+        self._open_desks(health, identity)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         # Closed before the last checkpoint is written: it shows every reset that was answered.
@@ -172,14 +175,25 @@ class Service:
         )
         self._parts.callback(intake.close)
 
-    def _open_desks(self, health: Health) -> None:
+    def _open_desks(self, health: Health, identity: Identity) -> None:
         """One desk per group of operations, so that none waits for a slower one."""
         limits = self._settings.service
         views = EpochViews(self._mapper.epochs, self._gate)
         answers = Answers(
             views.view, QuestionLimits(limits.max_query_points, limits.max_search_points)
         )
-        tiles = TileQueries(self._mapper.epochs, self._settings.mesh.tile_side_m)
+        shelf = TileShelf(self._settings.mesh)
+        tiles = TileQueries(self._mapper.epochs, shelf)
+        feed = TileFeed(
+            shelf,
+            self._mapper.epochs,
+            self._gate,
+            identity.server,
+            self._settings.mesh,
+            limits.request_queue,
+        )
+        feed.start()
+        self._parts.callback(feed.close)
         downloads = MapDownloads(self._mapper)
         flush = FlushDesk(
             self._ledger,
@@ -211,6 +225,13 @@ class Service:
                 keys.TILE: answering(TileRequest, tiles.tile),
             },
             _TILE_WORKERS,
+        )
+        self._open_desk(
+            {
+                keys.TILE_UPDATES: lambda request: feed.hold(
+                    request, request.read(TileUpdatesRequest)
+                ),
+            },
         )
         self._open_desk(
             {

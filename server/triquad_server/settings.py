@@ -83,11 +83,23 @@ class MeshSettings:
     cell_m: float = 0.1
     tile_cells: int = 64  # along the side of a tile
     reach_m: float = 0.02  # centres of faces lie at most this far from voxels with seen surface
+    tolerance_m: float = 0.01  # a tile changes where its surface moved by more
+    update_period_s: float = 0.5  # between looks at what changed, while somebody follows the mesh
+    update_timeout_max_s: float = 60.0  # longest that a request is held
+    reply_bytes: int = 1_000_000  # of tiles in one reply; one tile may be larger
+    client_bytes_per_s: int = 0  # of tiles to each client; 0: no limit
+    shelf_bytes: int = 200_000_000  # of encoded tiles that are kept
 
     def __post_init__(self) -> None:
         check_range("cell_m", self.cell_m, 0.01, 10.0)
         check_range("tile_cells", self.tile_cells, 4, 256)
         check_range("reach_m", self.reach_m, 0.0, 1.0)
+        check_range("tolerance_m", self.tolerance_m, 0.0, 1.0)
+        check_range("update_period_s", self.update_period_s, 0.01, 3600.0)
+        check_range("update_timeout_max_s", self.update_timeout_max_s, 0.1, 3600.0)
+        check_range("reply_bytes", self.reply_bytes, 1000, 100_000_000)
+        check_range("client_bytes_per_s", self.client_bytes_per_s, 0, 2**40)
+        check_range("shelf_bytes", self.shelf_bytes, 0, 2**40)
 
     @property
     def tile_side_m(self) -> float:
@@ -164,7 +176,7 @@ class Settings:
             f"scan.thin_m = {self.scan.thin_m:g} is too fine for scan.range_max_m = {reach_m:g}",
         )
         _check_together(
-            4 * self.mesh.cell_m + self.mesh.reach_m <= 16 * self.field.leaf_m,
+            4 * (self.mesh.cell_m + self.mesh.reach_m) <= 16 * self.field.leaf_m,
             f"mesh.cell_m = {self.mesh.cell_m:g} and mesh.reach_m = {self.mesh.reach_m:g} are too "
             f"coarse for field.leaf_m = {self.field.leaf_m:g}",
         )

@@ -6,6 +6,7 @@ import numpy as np
 
 from triquad_server.mapper import Mapper
 from triquad_server.settings import Settings
+from triquad_server.tile_shelf import TileShelf
 
 _DIRECTIONS = 400
 _RADIUS_M = 3.0
@@ -32,4 +33,6 @@ def warm_up(
     report("queries")
     epoch.query(directions, gradient=True)
     report("meshes")
-    epoch.mesh((0, 0, 0))
+    shelf = TileShelf(settings.mesh)
+    shelf.look(epoch)
+    shelf.make(0, (0, 0, 0))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
-PARTS = ("core", "server", "growth", "file", "store")
+PARTS = ("core", "server", "growth", "file", "store", "mesh")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,12 +47,13 @@ def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
     """The figures of some parts on one street."""
     from triquad_tools.bench_core import measure_core
     from triquad_tools.bench_file import measure_file
+    from triquad_tools.bench_mesh import measure_mesh
     from triquad_tools.bench_server import measure_server
     from triquad_tools.bench_store import measure_store
     from triquad_tools.bench_street import bench_street
 
     figures: list[Figure] = []
-    if {"core", "server", "file", "store"} & set(parts):
+    if {"core", "server", "file", "store", "mesh"} & set(parts):
         made = bench_street(street_seed)
         if "server" in parts:
             figures += measure_server(made)
@@ -62,6 +63,8 @@ def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
             figures += measure_file(made)
         if "store" in parts:
             figures += measure_store(made)
+        if "mesh" in parts:
+            figures += measure_mesh(made)
     if "growth" in parts:
         figures += _growth(street_seed)
     return figures
@@ -127,7 +130,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="triquad-bench",
         description="Measure triquad on this machine, on a simulated street: a server under a "
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
-        "file, and checkpoints. Takes some minutes; nothing else should run meanwhile.",
+        "file, checkpoints, and mesh tiles. Takes some minutes; nothing else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument
