@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
-PARTS = ("core", "server", "growth", "file", "store", "mesh")
+PARTS = ("core", "server", "growth", "file", "store", "mesh", "twin")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,9 +51,10 @@ def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
     from triquad_tools.bench_server import measure_server
     from triquad_tools.bench_store import measure_store
     from triquad_tools.bench_street import bench_street
+    from triquad_tools.bench_twin import measure_twin
 
     figures: list[Figure] = []
-    if {"core", "server", "file", "store", "mesh"} & set(parts):
+    if {"core", "server", "file", "store", "mesh", "twin"} & set(parts):
         made = bench_street(street_seed)
         if "server" in parts:
             figures += measure_server(made)
@@ -65,6 +66,8 @@ def measure(parts: Sequence[str], street_seed: int) -> "list[Figure]":
             figures += measure_store(made)
         if "mesh" in parts:
             figures += measure_mesh(made)
+        if "twin" in parts:
+            figures += measure_twin(made)
     if "growth" in parts:
         figures += _growth(street_seed)
     return figures
