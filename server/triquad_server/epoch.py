@@ -18,9 +18,6 @@ from triquad_server.settings import MeshSettings
 from triquad_server.threads import ANSWERS, MAPPING
 from triquad_server.tile_lattice import TileLattice, tile_lattice, tiles_meeting
 
-_NOTICEABLE_M = 0.01
-"""A surface that moves by less has not changed."""
-
 
 @dataclass(frozen=True)
 class TileSet:
@@ -125,7 +122,7 @@ def frozen_region(new: Publication, before: SurfelMap | None) -> FrozenRegion:
     field, evidence = new.field.copy(), new.evidence.copy()
     engine = make_engine(field)
     samples = field_samples(engine, new.settings, MAPPING.split)
-    task = SurfelTask(new.epoch, new.epoch, new.refitted, _NOTICEABLE_M / new.settings.leaf_m)
+    task = SurfelTask(new.epoch, new.refitted)
     surfels = (
         first_surfels(evidence, samples, task)
         if before is None
