@@ -40,7 +40,7 @@ class RecordedRegion:
 
     def _fitted(self) -> SurfelMap:
         samples = field_samples(self.engine, self._settings, _QUESTIONS.split)
-        task = SurfelTask(self._epoch, self._epoch, most=None, tolerance=0.0)
+        task = SurfelTask(self._epoch, most=None)
         return first_surfels(self.evidence, samples, task)
 
 
