@@ -209,9 +209,8 @@ def _points(
             "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
         )
     points = origin + offsets.astype(np.float64)
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
-        index = int(bad.argmax())
+    if not np.isfinite(points).all():
+        index = int(np.isfinite(points).all(axis=1).argmin())
         raise QuestionError("bad_request", f"{what} {index} is not finite: {points[index]}")
     return points
 
