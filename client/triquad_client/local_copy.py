@@ -57,7 +57,8 @@ class LocalCopy:
     """The copy; for several threads. It is empty until :meth:`update` has run."""
 
     def __init__(self, path: Path, bounds: Bounds) -> None:
-        """
+        """``path`` is the file, ``bounds`` are the corners of the box.
+
         Raises:
             InvalidInputError: the bounds are not a box, or hold nothing.
         """
