@@ -53,9 +53,9 @@ def imported(folder: str) -> set[str]:
         ("format", ("draco",)),
         ("client", ()),
         ("query", ()),
-        ("kernels", ("server",)),
-        ("server", ("server",)),
-        ("tools", ("server", "tools")),
+        ("kernels", ("fast",)),
+        ("server", ("fast", "server")),
+        ("tools", ("fast", "server", "tools")),
     ],
 )
 def test_what_is_imported_is_declared(folder, extras):
@@ -65,4 +65,4 @@ def test_what_is_imported_is_declared(folder, extras):
 def test_what_is_declared_is_imported():
     folders = ("format", "query", "kernels", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
-    assert declared("server", "tools", "draco") <= used
+    assert declared("fast", "server", "tools", "draco") <= used

@@ -37,17 +37,21 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
+from triquad_client.local_copy import SyncReport
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles, MeshTile
 from triquad_client.mesh_watch import MeshUpdate, MeshWatch
+from triquad_client.offline import OfflineMap, open_map
 from triquad_client.queries import MapQueries, PinnedMap
 from triquad_client.questions.sdf import SdfResult
 from triquad_client.scans import FlushReport
+from triquad_client.synced import AsyncSyncedMap, SyncedMap
 
 __all__ = [
     "Alignment",
     "AsyncClient",
     "AsyncPinnedMap",
+    "AsyncSyncedMap",
     "BadReplyError",
     "Bounds",
     "CheckpointInfo",
@@ -68,6 +72,7 @@ __all__ = [
     "MeshUpdate",
     "MeshWatch",
     "NoReplyError",
+    "OfflineMap",
     "PinnedMap",
     "Polyline",
     "Rays",
@@ -78,6 +83,8 @@ __all__ = [
     "ServerStatus",
     "Spheres",
     "Status",
+    "SyncReport",
+    "SyncedMap",
     "TileList",
     "TriquadError",
     "Unknown",
@@ -86,4 +93,5 @@ __all__ = [
     "__version__",
     "connect",
     "connect_async",
+    "open_map",
 ]

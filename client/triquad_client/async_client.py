@@ -16,9 +16,11 @@ from triquad_client.async_driver import AsyncDriver
 from triquad_client.async_queries import AsyncMapQueries, AsyncPinnedMap
 from triquad_client.checks import Bounds
 from triquad_client.connection import Connection, open_connection
+from triquad_client.local_copy import LocalCopy
 from triquad_client.mesh import Mesh
 from triquad_client.questions import sdf
 from triquad_client.scans import FlushReport, ScanPublisher
+from triquad_client.synced import AsyncSyncedMap
 
 
 class AsyncClient(AsyncMapQueries):
@@ -99,6 +101,12 @@ class AsyncClient(AsyncMapQueries):
     async def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
         """As :meth:`Client.download_box`."""
         return await self._run(download.fetch_box(Path(path), bounds))
+
+    async def sync(self, bounds: Bounds, path: str | Path) -> AsyncSyncedMap:
+        """As :meth:`Client.sync`."""
+        copy = LocalCopy(Path(path), bounds)
+        await self._run(copy.update())
+        return AsyncSyncedMap(copy, self._run)
 
     async def maps(self) -> list[str]:
         """As :meth:`Client.maps`."""

@@ -3,14 +3,12 @@
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
-from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import zenoh
 
-from triquad_client.call import Ask, Batch, Call, Pause, ResultT, Step
+from triquad_client.call import Ask, Batch, Call, Pause, ResultT, Step, finished
 from triquad_client.connection import Connection, closed_error, map_names
 
 
@@ -28,18 +26,7 @@ class BlockingDriver:
 
     def run(self, call: Call[ResultT]) -> ResultT:
         """What the call returns; raises what it raises."""
-        with closing(call):
-            resume = partial(call.send, None)
-            while True:
-                try:
-                    step = resume()
-                except StopIteration as end:
-                    result: ResultT = end.value
-                    return result
-                try:
-                    resume = partial(call.send, self._take(step))
-                except Exception as error:
-                    resume = partial(call.throw, error)
+        return finished(call, self._take)
 
     def maps(self) -> list[str]:
         """Names of the maps of all servers that can be reached."""

@@ -6,7 +6,9 @@ a call, write its generator with the helpers below, and a line in ``Client`` and
 """
 
 from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
 from triquad_format.wire import Message
@@ -74,6 +76,22 @@ class Run(Protocol):
     def __call__(self, call: Call[ResultT]) -> ResultT:
         """What the call returns; raises what it raises."""
         ...
+
+
+def finished(call: Call[ResultT], take: Callable[[Step], Any]) -> ResultT:
+    """What a call returns whose steps ``take`` deals with, in the thread that makes it."""
+    with closing(call):
+        resume = partial(call.send, None)
+        while True:
+            try:
+                step = resume()
+            except StopIteration as end:
+                result: ResultT = end.value
+                return result
+            try:
+                resume = partial(call.send, take(step))
+            except Exception as error:
+                resume = partial(call.throw, error)
 
 
 def ask(request: Ask[ReplyT]) -> Call[ReplyT]:

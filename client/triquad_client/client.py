@@ -11,12 +11,14 @@ from triquad_client import checks, download, meshes, upkeep
 from triquad_client.blocking import BlockingDriver
 from triquad_client.checks import Bounds
 from triquad_client.connection import Connection, open_connection
+from triquad_client.local_copy import LocalCopy
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles
 from triquad_client.mesh_watch import MeshWatch
 from triquad_client.queries import MapQueries, PinnedMap
 from triquad_client.questions import sdf
 from triquad_client.scans import FlushReport, ScanPublisher
+from triquad_client.synced import SyncedMap
 
 
 class Client(MapQueries):
@@ -175,6 +177,27 @@ class Client(MapQueries):
             OSError: the file cannot be written.
         """
         return self._run(download.fetch_box(Path(path), bounds))
+
+    def sync(self, bounds: Bounds, path: str | Path) -> SyncedMap:
+        """Keep a copy of what the map needs to answer within ``bounds``, and ask that.
+
+        What is in the file already is taken up: only the parts that changed are sent. The copy
+        goes on answering when the link drops, and when this client is closed.
+
+        Args:
+            bounds: corners of a box, metres, map frame. Surfaces are known as far as it reaches:
+                make it larger than where you ask by the largest distance that you ask for.
+            path: the file; one that is no sound map file is replaced. :func:`open_map` opens it
+                without a server.
+
+        Raises:
+            InvalidInputError: the bounds are not a box, or hold nothing.
+            DownloadError: what arrived is not sound.
+            OSError: the file cannot be read or written.
+        """
+        copy = LocalCopy(Path(path), bounds)
+        self._run(copy.update())
+        return SyncedMap(copy, self._run)
 
     def maps(self) -> list[str]:
         """Names of all maps that can be reached, also those of other servers."""

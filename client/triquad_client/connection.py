@@ -92,6 +92,10 @@ class Connection:
 
     def silence(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
+        if not self._linked:
+            return ConnectError(
+                "the link to the server is down; it is set up again once the server is back"
+            )
         if self.map_name not in available:
             return UnknownMapError(self.map_name, available)
         return NoReplyError(
@@ -129,6 +133,12 @@ class Connection:
         except zenoh.ZError as error:
             raise self._broken(error) from error
         return replies
+
+    @property
+    def _linked(self) -> bool:
+        """Whether the session has a link to anybody."""
+        info = self._session.info
+        return bool(info.routers_zid() or info.peers_zid())
 
     def _key(self, ask: Ask[Any]) -> str:
         return keys.operation_key(self.map_name, ask.operation)

@@ -49,7 +49,7 @@ def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
 
 
 def _fetch(run: Run, path: Path, training: bool) -> MapInfo:
-    info = run(_info(training))
+    info = run(newest_file(training))
     with replacing(path) as file:
         _copy(RemoteBytes(run, info), file, info.sha256)
     return info
@@ -62,7 +62,7 @@ def _fetch_box(
     from triquad_format.mapfile_writer import write_map
 
     try:
-        stored = StoredMap(RemoteBytes(run, run(_info(training=False))))
+        stored = StoredMap(RemoteBytes(run, run(newest_file(training=False))))
         record = crop_record(stored.box(minimum, maximum), minimum, maximum)
         if not record.has_evidence:
             raise DownloadError(
@@ -73,7 +73,8 @@ def _fetch_box(
         raise DownloadError(str(error)) from error
 
 
-def _info(training: bool) -> Call[MapInfo]:
+def newest_file(training: bool) -> Call[MapInfo]:
+    """The file of the newest epoch, which the server keeps for a while."""
     request = MapInfoRequest(training)
     return ask(Ask(keys.MAP_INFO, request, MapInfo, background=True, at_least_s=_PREPARE_S))
 

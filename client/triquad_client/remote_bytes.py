@@ -14,6 +14,7 @@ class RemoteBytes:
     def __init__(self, run: Run, info: MapInfo) -> None:
         self.name = f"the map of epoch {info.epoch}"
         self.size = info.bytes
+        self.bytes_read = 0
         self._run = run
         self._info = info
 
@@ -35,6 +36,7 @@ class RemoteBytes:
             data += chunk.data
         if len(data) != length:
             raise DownloadError(f"{len(data)} bytes came from {offset} on, not {length}")
+        self.bytes_read += length
         return bytes(data)
 
     def close(self) -> None:

@@ -47,7 +47,7 @@ class MapEvaluator:
 
     def __init__(self, record: MapRecord) -> None:
         self._settings = record.settings
-        self._regions = [_RegionField(record.settings, region) for region in record.regions]
+        self._regions = [RegionField(record.settings, region) for region in record.regions]
 
     def query(self, points: NDArray[np.floating], gradient: bool = False) -> Answer:
         """Signed distance, status and, on request, gradient.
@@ -71,6 +71,12 @@ class MapEvaluator:
             if slope is not None:
                 slope[rows] = slopes
         return Answer(sdf, status, slope)
+
+    def status(self, points: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """:class:`Status` values [N] of ``points`` [N, 3]; errors are those of :meth:`query`."""
+        positions: Doubles = np.asarray(points, np.float64)
+        check_points(positions)
+        return self._status(positions)
 
     def _blend(self, points: Doubles, gradient: bool) -> tuple[Doubles, Doubles]:
         """Distance [N] and gradient [N, 3] (zeros unless asked for), blended over the regions."""
@@ -144,8 +150,8 @@ class _VertexLookup:
         return features
 
 
-class _RegionField:
-    """The field and the evidence of one region."""
+class RegionField:
+    """The field and the evidence of one region. Outside of its cube it has no features."""
 
     def __init__(self, settings: FieldSettings, region: Region) -> None:
         self.index = region.index
@@ -194,7 +200,10 @@ class _RegionField:
             floor = np.floor(v)
             t = v - floor
             cell = floor.astype(np.int64)
+            outside = ((cell < 0) | (cell >= 1 << table.level)).any(axis=1)
+            cell[outside] = 0
             hat = np.stack([1 - t, t])  # [2, N, 2]
+            hat[:, outside] = 0
             for a, b in _CORNERS:
                 corner = lookup(cell + (a, b))
                 features[:, columns] += (hat[a, :, 0] * hat[b, :, 1])[:, None] * corner

@@ -116,15 +116,28 @@ class StoredMap:
             FormatError: the corners are not finite or not in order.
             MapFileError: a part is damaged.
         """
+        return self._assembled(self.parts_in(minimum, maximum))
+
+    def parts_in(self, minimum: ArrayLike, maximum: ArrayLike) -> tuple[Entry, ...]:
+        """The parts that :meth:`box` consists of; arguments and errors are the same."""
         low, high = check_box(minimum, maximum)
         boxes = {index: leaf_box(self._settings, index, low, high) for index in self._regions}
-        return self._assembled(
+        return tuple(
             entry
             for entry in self.manifest.entries
             if entry.key.topic in FIELD_TOPICS
             and boxes[entry.key.region].meets(whole_region(self._settings))
             and self._reaches(entry.key, boxes[entry.key.region])
         )
+
+    def payload(self, entry: Entry) -> bytes:
+        """The payload of a part that the manifest lists, as it is written.
+
+        Raises:
+            MapFileError: the part is damaged, or the file that holds it is missing or another.
+        """
+        with named(self.name):
+            return self._index.payload(entry)
 
     def _assembled(self, entries: Iterable[Entry]) -> MapRecord:
         chosen = dataclasses.replace(self.manifest, entries=tuple(entries))

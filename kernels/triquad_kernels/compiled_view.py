@@ -1,6 +1,6 @@
 """A map in compiled code: its regions, and the questions they answer together."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -39,9 +39,33 @@ def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
     work(0, count)
 
 
+class PlacedRegion(Protocol):
+    """One region of a map that does not change; surfels may be made when they are asked for."""
+
+    @property
+    def index(self) -> RegionIndex:
+        """Which region."""
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """[3] metres, map frame."""
+
+    @property
+    def engine(self) -> FieldEngine:
+        """What computes its field."""
+
+    @property
+    def evidence(self) -> Evidence:
+        """What rays have shown of it."""
+
+    @property
+    def surfels(self) -> SurfelMap:
+        """What stands for its surface. Not to be asked for within a :class:`Split`."""
+
+
 @dataclass(frozen=True)
 class RegionView:
-    """One region of a map that does not change."""
+    """A region of which all is there."""
 
     index: RegionIndex
     centre: NDArray[np.float64]  # [3] map frame
@@ -77,7 +101,7 @@ class CompiledView:
         self,
         number: int,
         settings: FieldSettings,
-        regions: Sequence[RegionView],
+        regions: Sequence[PlacedRegion],
         split: Split = in_one,
     ) -> None:
         self.number = number
@@ -87,7 +111,7 @@ class CompiledView:
         self._field = BlendedField(settings, self.region_views)
         self._unknown = UnknownSpace(settings, self.region_views)
         self._lattice = RegionLattice(settings, [region.index for region in regions])
-        self._newest_s = max((region.surfels.newest_s for region in regions), default=0)
+        self._newest_s = max((_newest_s(region.evidence) for region in regions), default=0)
 
     @property
     def voxel_m(self) -> float:
@@ -159,10 +183,14 @@ class CompiledView:
             np.zeros(count, np.float32),
         )
 
+        # Here, not in the threads of the split: to make surfels may take all of these.
+        near = [
+            region for region in self._regions_near(points, max_distance_m) if len(region.surfels)
+        ]
+
         def work(first: int, last: int) -> None:
-            for region in self.region_views:
-                if len(region.surfels):
-                    self._improve(nearest, points, slice(first, last), region)
+            for region in near:
+                self._improve(nearest, points, slice(first, last), region)
 
         self._split(count, work, _LEAST_SEARCHES)
         return nearest
@@ -179,12 +207,22 @@ class CompiledView:
         self._split(len(points), work, _LEAST_SEARCHES)
         return nearest
 
+    def _regions_near(self, points: NDArray[np.float64], reach_m: float) -> Iterator[PlacedRegion]:
+        """Regions that come within ``reach_m`` of the box around the points [N, 3]."""
+        if not len(points):
+            return
+        low, high = points.min(axis=0) - reach_m, points.max(axis=0) + reach_m
+        half = self._settings.region_side_m / 2
+        for region in self.region_views:
+            if (region.centre - half <= high).all() and (region.centre + half >= low).all():
+                yield region
+
     def _improve(
         self,
         nearest: NearestSurface,
         points: NDArray[np.float64],
         part: slice,
-        region: RegionView,
+        region: PlacedRegion,
     ) -> None:
         """Take what is nearer in a region."""
         leaf_m = self._settings.leaf_m
@@ -220,3 +258,8 @@ class CompiledView:
             voxels = leaf_coordinates(self._settings, points[owned.points] - region.centre)
             status[owned.points] = region.evidence.status(voxels, reach)
         return status
+
+
+def _newest_s(evidence: Evidence) -> int:
+    """When a ray last ended anywhere, seconds since 1970; 0: never, or not known."""
+    return int(evidence.seen_s().max(initial=0))

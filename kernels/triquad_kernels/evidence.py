@@ -401,17 +401,30 @@ class Evidence:
         return EvidenceRecord(codes[order], surface[used], free[used], levels, seen_s[used])
 
     @classmethod
-    def restore(cls, side: int, record: EvidenceRecord) -> "Evidence":
-        """Evidence from its record."""
+    def recorded(cls, side: int, record: EvidenceRecord) -> "Evidence":
+        """Evidence from its record, for reading."""
         evidence = cls(side)
         evidence._blocks = VoxelIndex.of_cells(morton.decode(record.codes, 3))
         evidence._surface = with_room(record.surface, evidence._blocks.capacity)
         evidence._free = with_room(record.free, evidence._blocks.capacity)
-        if record.levels is not None:
+        levels, seen_s = record.levels, record.seen_s
+        if levels is None:
+            levels = np.zeros(int(surface_counts(record.surface).sum()), np.uint8)
+        if seen_s is None:
             seen_s = np.zeros(len(record.codes), np.int64)
+        evidence._noted = _Noted(levels, seen_s)
+        return evidence
+
+    @classmethod
+    def restore(cls, side: int, record: EvidenceRecord) -> "Evidence":
+        """Evidence from its record, for going on."""
+        evidence = cls.recorded(side, record)
+        assert evidence._noted is not None
+        if record.levels is not None:
             evidence._observations = Observations.restore(
-                record.surface, record.levels, seen_s if record.seen_s is None else record.seen_s
+                record.surface, record.levels, evidence._noted.seen_s
             )
+        evidence._noted = None
         return evidence
 
     def _grow(self) -> None:

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
-from triquad_query.surfels import DISC_RADIUS, OUTSIDE, SurfelKind
+from triquad_query.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
 
 from triquad_kernels.voxel_index import CELL_LIMIT, Index, VoxelIndex, find_row, pack, unpack
 
@@ -20,10 +20,6 @@ _SHIFT = BLOCK_VOXELS.bit_length() - 1
 _LOW = BLOCK_VOXELS - 1
 _GROUP_SHIFT = 2
 _GROUP_VOXELS = float(BLOCK_VOXELS << _GROUP_SHIFT)
-
-SMOOTHING = 0.3
-"""Surfels that are farther than the nearest by less than this, in voxels, count in the direction:
-on a wall many are nearly as near, and each is a little off."""
 
 _STEPS = np.array(
     sorted(itertools.product((-1, 0, 1), repeat=3), key=lambda step: np.abs(step).sum())

@@ -56,7 +56,6 @@ class SurfelMap:
         shares = np.where(surfels.kinds == SurfelKind.POINT, POINT_SHARE, 1.0)
         self.confidence = (level_confidence()[evidence.levels()] * shares).astype(np.float32)
         self.seen_s = np.repeat(evidence.seen_s(), np.diff(starts))
-        self.newest_s = int(self.seen_s.max(initial=0))
 
     def __len__(self) -> int:
         return len(self._surfels.kinds)

@@ -6,6 +6,7 @@ A server answers with this from its epochs, and a client from a map file: so the
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from triquad_format.query_messages import (
     SpheresReply,
     SpheresRequest,
 )
+from triquad_format.wire import Message
 
 from triquad_query.align import AlignOptions, align
 from triquad_query.distance import DistanceOptions, distances
@@ -68,6 +70,15 @@ class Answers:
     def __init__(self, views: Views, limits: QuestionLimits) -> None:
         self._view = views
         self._limits = limits
+
+    def answer(self, request: Message) -> Message:
+        """The answer to a question of any kind.
+
+        Raises:
+            QuestionError: it is not answered.
+            KeyError: it is no question about the map.
+        """
+        return _ANSWERS[type(request)](self, request)
 
     def sdf(self, request: SdfRequest) -> SdfReply:
         """The trained field, and status."""
@@ -207,6 +218,16 @@ class Answers:
             )
 
 
+_ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
+    SdfRequest: Answers.sdf,
+    DistanceRequest: Answers.distance,
+    SpheresRequest: Answers.spheres,
+    SegmentsRequest: Answers.segments,
+    RaysRequest: Answers.rays,
+    GridRequest: Answers.grid,
+}
+
+
 def _points(
     what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32], most: int
 ) -> NDArray[np.float64]:
@@ -220,9 +241,8 @@ def _points(
             "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
         )
     points = origin + offsets.astype(np.float64)
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
-        index = int(bad.argmax())
+    if not np.isfinite(points).all():
+        index = int(np.isfinite(points).all(axis=1).argmin())
         raise QuestionError("bad_request", f"{what} {index} is not finite: {points[index]}")
     return points
 

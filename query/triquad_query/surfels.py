@@ -23,6 +23,10 @@ where it ends."""
 OUTSIDE = 0.5
 """How far a surfel reaches out of its voxel at most, in voxels."""
 
+SMOOTHING = 0.3
+"""Surfels that are farther than the nearest by less than this, in voxels, count in the direction:
+on a wall many are nearly as near, and each is a little off."""
+
 _STEPS = 3
 _LONGEST_STEP = 0.5
 _FLATTEST = 0.3

@@ -7,11 +7,12 @@ import time
 from concurrent.futures import Future
 
 from triquad_format.messages import CheckpointInfo, CheckpointRequest
+from triquad_kernels.team import be_patient
 
 from triquad_server.errors import RequestError, StoreBaseError, StoreError
 from triquad_server.mapper_thread import MapperThread
 from triquad_server.store import Store
-from triquad_server.threads import PATIENCE, be_patient
+from triquad_server.threads import PATIENCE
 
 _log = logging.getLogger(__name__)
 

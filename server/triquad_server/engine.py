@@ -7,15 +7,16 @@ import torch
 from numpy.typing import NDArray
 from triquad_kernels import field as compiled_field
 from triquad_kernels.blended_field import FieldEngine, FieldValues
-from triquad_kernels.encoding import Geometry
+from triquad_kernels.compiled_engine import field_values, make_field
 from triquad_kernels.field import CompiledField, Touched
 from triquad_kernels.mlp import Mlp
+from triquad_kernels.team import THREADS, share
 
 from triquad_server.adam import Betas, Parameter
 from triquad_server.compiled_adam import Moments, Rates, rates, step_row, step_touched
 from triquad_server.field import Field
 from triquad_server.sampling import Batch
-from triquad_server.threads import MAPPING, THREADS, share
+from triquad_server.threads import MAPPING
 
 _LAST_STEP = 2**31 - 1
 _CHUNK = 131_072  # points that tensors are made for at a time
@@ -108,11 +109,7 @@ class CompiledEngine:
     def evaluate(self, points: NDArray[np.float32], gradient: bool) -> FieldValues:
         """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
         field = self._frozen or self._compiled()
-        logits = np.empty(len(points), np.float32)
-        gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
-        compiled_field.evaluate(points, field, logits, gradients)
-        scale = np.float32(self._field.settings.logit_scale_m)
-        return FieldValues(logits * scale, gradients * scale)
+        return field_values(field, self._field.settings, points, gradient)
 
     def train(self, batch: Batch, rate: float, betas: Betas) -> float:
         """One optimiser step; returns the loss before it."""
@@ -156,21 +153,12 @@ class CompiledEngine:
             step_row(0, gradient, _moments(parameter), how_far)
 
     def _compiled(self) -> CompiledField:
-        settings, tree = self._field.settings, self._field.tree
-        geometry = Geometry(
-            np.float32(settings.leaf_m),
-            np.float32(1 << (settings.depth - 1)),
-            settings.feature_levels if settings.encoding != "fourier" else 0,
-            tree.shape,
-        )
-        w1, b1, w2, b2, w3, b3 = (part.values[0].numpy() for part in self._field.mlp)
-        turns = self._field.frequencies.numpy() / np.float32(settings.region_side_m / 2)
-        return CompiledField(
-            geometry,
-            tree.vertices,
+        return make_field(
+            self._field.settings,
+            self._field.tree,
             self._field.features.values.numpy(),
-            Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
-            turns if settings.encoding != "features" else turns[:0],
+            [part.values[0].numpy() for part in self._field.mlp],
+            self._field.frequencies.numpy(),
         )
 
 

@@ -9,6 +9,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from triquad_kernels.team import be_patient
+
 from triquad_server.epochs import EpochShelf, ShelfLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.gate import QueryGate
@@ -17,7 +19,7 @@ from triquad_server.scan import ScanRefusedError
 from triquad_server.scan_queue import ScanQueue
 from triquad_server.sources import SourceLedger
 from triquad_server.tally import Tally
-from triquad_server.threads import PATIENCE, be_patient
+from triquad_server.threads import PATIENCE
 
 _log = logging.getLogger(__name__)
 

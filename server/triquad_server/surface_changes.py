@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import RegionIndex
 from triquad_kernels.surfel_index import surfel_voxels
+from triquad_kernels.team import Team
 
 from triquad_server.epoch import FrozenRegion
-from triquad_server.threads import Team
 
 _KEY_BITS = 20  # of each coordinate of a voxel, or of a group, in its region
 

@@ -13,6 +13,7 @@ from triquad_format import draco, keys
 from triquad_format.errors import FormatError
 from triquad_format.messages import TileUpdates, TileUpdatesRequest
 from triquad_format.tile_code import Codec, decode_tile
+from triquad_kernels.team import be_patient
 
 from triquad_server.bandwidth import BURST_S, Bandwidth
 from triquad_server.epochs import EpochShelf
@@ -22,7 +23,7 @@ from triquad_server.mesher import TileIndex
 from triquad_server.request import Request
 from triquad_server.requests import check_box, check_level
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import PATIENCE, be_patient
+from triquad_server.threads import PATIENCE
 from triquad_server.tile_shelf import ShelvedTile, TileNews, TileShelf
 
 _log = logging.getLogger(__name__)

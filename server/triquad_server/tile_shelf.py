@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.tile_code import encode_tile
 from triquad_kernels.compiled_view import CompiledView
+from triquad_kernels.team import Team
 
 from triquad_server.epoch import Epoch
 from triquad_server.mesher import TileIndex, mesh_tile
 from triquad_server.settings import MeshSettings
 from triquad_server.surface_changes import Changes, SurfaceChanges
-from triquad_server.threads import PATIENCE, Team
+from triquad_server.threads import PATIENCE
 from triquad_server.tile_border import TileBorder
 from triquad_server.tile_lattice import LEVELS, TileLattice, tile_lattice, tiles_meeting
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
-PARTS = ("core", "server", "growth", "file", "store", "mesh", "answers", "align")
+PARTS = ("core", "server", "growth", "file", "store", "mesh", "answers", "align", "twin")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,6 +53,7 @@ def measure(parts: Sequence[str], street_seed: int, recorded: Path | None = None
     from triquad_tools.bench_server import measure_server
     from triquad_tools.bench_store import measure_store
     from triquad_tools.bench_street import bench_street
+    from triquad_tools.bench_twin import measure_twin
 
     figures: list[Figure] = []
     if set(parts) - {"growth"}:
@@ -71,6 +72,8 @@ def measure(parts: Sequence[str], street_seed: int, recorded: Path | None = None
             figures += measure_planners(made)
         if "align" in parts:
             figures += measure_align(made, recorded)
+        if "twin" in parts:
+            figures += measure_twin(made)
     if "growth" in parts:
         figures += _growth(street_seed)
     return figures

@@ -42,7 +42,7 @@ print(time.perf_counter() - started)
 
 def measure_file(made: BenchStreet) -> list[Figure]:
     """Figures of the street's map as a file."""
-    mapper = _settled(made)
+    mapper = settled_mapper(made)
     epoch = mapper.publish()
     record = epoch.record()
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
@@ -51,7 +51,8 @@ def measure_file(made: BenchStreet) -> list[Figure]:
         return figures + _opening(record, folder)
 
 
-def _settled(made: BenchStreet) -> Mapper:
+def settled_mapper(made: BenchStreet) -> Mapper:
+    """A mapper that has learnt the street."""
     settings = Settings()
     warm_up(settings, "cpu")
     mapper = Mapper("bench", settings, "cpu")
