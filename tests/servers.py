@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from triquad_server.retention import Retention
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store import Restored, Store
+from triquad_server.warm_up import warm_up
 
 MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
@@ -49,6 +51,12 @@ def sphere(count: int = 4000, radius_m: float = RADIUS_M) -> NDArray[np.float32]
     return (radius_m * directions).astype(np.float32)
 
 
+@cache
+def compiled() -> None:
+    """Have all kernels compiled: at the first start that takes longer than a request may."""
+    warm_up(SMALL, "cpu")
+
+
 @contextmanager
 def running_service(
     settings: Settings = SMALL,
@@ -57,6 +65,7 @@ def running_service(
     connect: tuple[str, ...] = (),
 ) -> Iterator[str]:
     """A service in this process; yields its endpoint."""
+    compiled()
     endpoint = free_endpoint()
     network = NetworkOptions((endpoint,), connect, multicast_scouting=False)
     opened = Store(store, map_name, Retention.chosen(settings.store)) if store else None

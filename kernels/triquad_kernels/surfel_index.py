@@ -207,6 +207,7 @@ def _search_block(
         a, b, c = x - xs[i], y - ys[i], z - zs[i]
         squares[i] = a * a + b * b + c * c
     best, noted, nearest = state[_BEST], int(state[_COUNT]), -1
+    sifted = np.inf  # the least distance when candidates were last left out
     for i in range(count):
         if squares[i] > (best + SMOOTHING + DISC_RADIUS) ** 2:
             continue
@@ -228,8 +229,10 @@ def _search_block(
         if square > (best + SMOOTHING) ** 2:
             continue
         distance = np.sqrt(np.float64(square))
-        if noted == _CANDIDATES:
-            noted = _still_near(candidates, best + SMOOTHING)
+        if noted == _CANDIDATES and best < sifted:
+            noted, sifted = _still_near(candidates, best + SMOOTHING), best
+        if noted == _CANDIDATES and distance >= best:
+            continue  # there are enough
         at_most = min(noted, _CANDIDATES - 1)
         candidates[at_most, 0] = distance
         candidates[at_most, 1] = at[0] - (down * nx + rim * a)
