@@ -23,6 +23,10 @@ rotation moves far points most."""
 _REACH_SCALES = 3.0
 """Farther than so many scales, a distance has hardly any weight."""
 
+_SURE_VOXELS = 5.0
+"""From this scale on, points count by the map's confidence: not at all in unknown space. Before,
+those count, too: of a scan that is off by a metre they lie behind walls, and lead back."""
+
 _FINAL_VOXELS = 0.5
 """Scale of the distances that count in the end; the noise of a lidar and of the map is less."""
 
@@ -33,7 +37,7 @@ _SCALE_STEPS = 3.0
 _OVERSHOOT = 1.5
 """Nearest points hold a scan back a little; going farther than they ask comes out sooner."""
 
-_COARSE_STEP_M, _FINE_STEP_M = 0.005, 0.001
+_COARSE_STEP_M, _FINE_STEP_M = 0.01, 0.002
 """A step that moves the points by less is the last with few points, and the last."""
 
 _INLIER_SCALES = 3.0
@@ -41,11 +45,12 @@ _LEAST_INLIER_SHARE = 0.5
 _LEAST_INLIERS = 50
 
 _OBSERVABLE = 0.01
-"""A direction in which the surfaces' distances change by less (mean square, per metre that the
-points move) is not seen: the map's normals are off by some degrees."""
+"""A motion under which distances change by less (mean square, by that of the points) is not seen:
+the map's normals are off by some degrees, which look like as much."""
 
-_CORRELATED = 20.0
-"""So many points say as much as one whose error were its own: neighbours share the map's."""
+_CORRELATED = 5.0
+"""So many points say as much as one whose error were its own: neighbours share the map's. With this
+the squared errors at real scans are on average what the covariance says."""
 
 _UNSEEN_M, _UNSEEN_RAD = 100.0, math.pi
 """Standard deviations along what is not seen at all."""
@@ -92,7 +97,8 @@ def align(
     The squared distances of its points to the nearest seen surface are made small by Gauss-Newton
     steps on distance and gradient. Points count by a Geman-McClure kernel whose scale shrinks
     from ``max_distance_m`` to half a voxel as the steps become small. Points in unknown space
-    pull at first (a scan that is off by a metre lies behind walls), and do not count in the end.
+    pull at first (a scan that is off by a metre lies behind walls); in the end points count by the
+    map's confidence, and those in unknown space not at all.
 
     Args:
         view: the map.
@@ -198,12 +204,10 @@ def _normal(
     reach_m = min(options.max_distance_m, _REACH_SCALES * scale)
     answer = distances(view, turned + pose[:3, 3], DistanceOptions(reach_m))
     distance = answer.distance.astype(np.float64)
-    if is_final:
-        spread = np.ones(len(points))
-        counts = answer.found & (answer.status != Status.UNKNOWN)
-    else:
-        spread = 1.0 + _PER_RANGE * np.linalg.norm(points, axis=1)
-        counts = answer.found
+    spread = 1.0 if is_final else 1.0 + _PER_RANGE * np.linalg.norm(points, axis=1)
+    counts = answer.found.astype(np.float64)
+    if scale <= _SURE_VOXELS * view.voxel_m:
+        counts = answer.confidence.astype(np.float64)  # 0 in unknown space
     weights = counts / spread / (1.0 + (distance / (scale * spread)) ** 2) ** 2
     weight = float(weights.sum())
     if weight <= 0.0:
