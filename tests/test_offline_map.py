@@ -43,8 +43,16 @@ QUESTIONS: dict[str, Question] = {
     "query_polyline": lambda view: view.query_polyline(0.3 * ENDS[:40], radius=0.1),
     "query_rays": lambda view: view.query_rays([0, 0, 0], ENDS),
     "query_grid": lambda view: view.query_grid(BOX, cell=0.5),
+    "align": lambda view: view.align(servers.sphere(3000), moved(0.2)),
 }
 """One of each kind."""
+
+
+def moved(x_m: float) -> np.ndarray:
+    """A pose [4, 4] off by that."""
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    return pose
 
 
 @dataclass(frozen=True)

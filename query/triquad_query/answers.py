@@ -225,6 +225,7 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
     SegmentsRequest: Answers.segments,
     RaysRequest: Answers.rays,
     GridRequest: Answers.grid,
+    AlignRequest: Answers.align,
 }
 
 
