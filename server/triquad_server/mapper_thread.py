@@ -78,6 +78,7 @@ class MapperThread:
         self._unpublished = False
         self._scans_taken = 0
         self._loss = 0.0  # as of the newest epoch
+        self._step_s = _GIVE_WAY_S  # what the last step of training took
         self.epochs = EpochShelf(mapper.publish(), shelf)
         self.progress = Progress()
         self._note_progress()
@@ -152,8 +153,11 @@ class MapperThread:
             return
         took_scan = self._ingest_next()
         if not self._mapper.settled:
-            self._inputs.gate.give_way(_GIVE_WAY_S)
+            # No longer than a step takes: however many ask, training keeps half of its rate.
+            self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s))
+            started = time.monotonic()
             self._mapper.train()
+            self._step_s = time.monotonic() - started
             self._unpublished = True
         if self._publish_soon.is_set() or self._publish_due():
             self._publish_soon.clear()
