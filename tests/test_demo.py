@@ -130,7 +130,7 @@ class _Planned:
         self._epochs = epochs
         self._stop = stop
 
-    def query_sdf(self, points: np.ndarray, gradient: bool) -> SdfResult:
+    def query_sdf(self, points: np.ndarray, gradient: bool = False) -> SdfResult:
         epoch = self._epochs.pop(0)
         if not self._epochs:
             self._stop.set()

@@ -15,7 +15,7 @@ def test_keys_are_those_of_the_specification():
 
 
 def test_each_operation_has_a_key_of_its_own():
-    assert len(set(keys.OPERATIONS)) == len(keys.OPERATIONS) == 15
+    assert len(set(keys.OPERATIONS)) == len(keys.OPERATIONS) == 16
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "*", "**", "a b", "$x", "@x", "_x", "é", "a" * 65])
