@@ -13,13 +13,12 @@ from triquad_kernels.compiled_view import CompiledView
 from triquad_kernels.evidence import Evidence
 from triquad_kernels.recorded_view import recorded_view
 from triquad_kernels.surfel_index import (
-    Nearest,
     SurfelIndex,
     block_groups,
-    find_nearest,
     surfel_starts,
     surfel_voxels,
 )
+from triquad_kernels.surfel_search import Nearest, find_nearest
 from triquad_query.distance import DistanceOptions, distances
 from triquad_query.grid import GridShape, grid
 from triquad_query.map_view import MapView

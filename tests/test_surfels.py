@@ -5,8 +5,8 @@ import pytest
 import small_world
 from triquad_kernels.compiled_view import field_samples, in_one
 from triquad_kernels.evidence import Evidence
-from triquad_kernels.surfel_index import Nearest
 from triquad_kernels.surfel_map import SurfelMap, SurfelTask, first_surfels
+from triquad_kernels.surfel_search import Nearest
 from triquad_query.surfels import FieldSample, SurfelKind, fit_surfels
 from triquad_server.epoch import FrozenRegion
 from triquad_server.mapper import Mapper

@@ -17,8 +17,8 @@ from triquad_query.surfels import FieldSample
 from triquad_kernels.blended_field import BlendedField, FieldEngine
 from triquad_kernels.evidence import Evidence
 from triquad_kernels.region_lattice import Owned, RegionLattice
-from triquad_kernels.surfel_index import Nearest
 from triquad_kernels.surfel_map import SampleField, SurfelMap
+from triquad_kernels.surfel_search import Nearest
 from triquad_kernels.unknown_space import UnknownSpace
 
 Work = Callable[[int, int], None]

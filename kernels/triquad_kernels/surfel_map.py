@@ -11,14 +11,13 @@ from triquad_query.surfels import FieldSample, SurfelKind, Surfels, fit_surfels
 
 from triquad_kernels.evidence import Evidence
 from triquad_kernels.surfel_index import (
-    Nearest,
     SurfelIndex,
     block_groups,
-    find_nearest,
     moved_rows,
     surfel_starts,
     surfel_voxels,
 )
+from triquad_kernels.surfel_search import Nearest, find_nearest
 
 _FAR = 1e6  # voxels
 _NEVER = -1
