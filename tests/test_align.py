@@ -212,16 +212,11 @@ def test_iterations_are_limited() -> None:
 
 
 @pytest.mark.parametrize(
-    ("guess", "words"),
-    [
-        (np.eye(3), "shape"),
-        (2 * np.eye(4), "rigid"),
-        (np.full((4, 4), np.nan), "rigid"),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "reflection"),
-    ],
+    "guess",
+    [np.eye(3), 2 * np.eye(4), np.full((4, 4), np.nan), np.diag([1.0, 1.0, -1.0, 1.0]), 0.0],
 )
-def test_a_guess_that_is_no_pose_is_refused(guess: NDArray[np.float64], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+def test_a_guess_that_is_no_pose_is_refused(guess: NDArray[np.float64]) -> None:
+    with pytest.raises(ValueError, match="not a rotation and a translation"):
         align(view_of(YARD), scan_of(YARD), guess, OPTIONS)
 
 

@@ -9,6 +9,7 @@ from triquad_format.status import Status
 
 from triquad_query.distance import DistanceOptions, distances
 from triquad_query.map_view import MapView
+from triquad_query.pose import moved, orthonormal
 
 _COARSE_POINTS = 500
 """So many find the way; all that follows asks for a few millimetres."""
@@ -108,10 +109,9 @@ def align(
         options: see there.
 
     Raises:
-        ValueError: ``points`` or ``guess`` are not of these shapes, or ``guess`` is no rigid
-            motion.
+        ValueError: ``points`` are not of this shape, or ``guess`` is no rigid pose.
     """
-    pose = _rigid(guess)
+    pose = orthonormal(guess)
     fine = _thinned(_finite(points), _FINE_POINTS)
     found = _descend(view, fine, pose, options)
     return _judged(view, fine, found, options)
@@ -180,7 +180,7 @@ def _descend(
         last = step
         taken = (overshoot if scale == final else 1.0) * step
         size = float(np.linalg.norm(taken))
-        pose = _moved(pose, taken[:3], taken[3:] / normal.arm_m)
+        pose = moved(pose, taken[:3], taken[3:] / normal.arm_m)
         if scale > final:
             shrunk = np.clip(_SCALE_STEPS * size, _SHRINK_MOST * scale, _SHRINK_LEAST * scale)
             scale = max(final, float(shrunk))
@@ -256,43 +256,6 @@ def _judged(
         len(points),
         view.number,
     )
-
-
-def _moved(
-    pose: NDArray[np.float64], translation: NDArray[np.float64], rotation: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """A pose moved, and turned about itself by a rotation vector, both in the map frame."""
-    moved: NDArray[np.float64] = pose.copy()
-    moved[:3, :3] = _rotation(rotation) @ pose[:3, :3]
-    moved[:3, 3] += translation
-    return moved
-
-
-def _rotation(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation [3, 3] about a vector [3] by its length (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    first = float(np.sinc(angle / math.pi))
-    second = 0.5 * float(np.sinc(angle / (2 * math.pi))) ** 2
-    rotation: NDArray[np.float64] = np.eye(3) + first * cross + second * (cross @ cross)
-    return rotation
-
-
-def _rigid(guess: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The guess as a new array, its rotation made orthonormal."""
-    pose = np.array(guess, np.float64)
-    if pose.shape != (4, 4):
-        raise ValueError(f"guess has the shape {pose.shape}: give a pose [4, 4]")
-    rotation = pose[:3, :3]
-    good = bool(np.isfinite(pose).all()) and np.allclose(pose[3], [0, 0, 0, 1])
-    if not (good and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)):
-        raise ValueError(f"guess is not a rigid motion: {pose.tolist()}")
-    if np.linalg.det(rotation) < 0:
-        raise ValueError("guess is a reflection: give a rotation of determinant 1")
-    left, _, right = np.linalg.svd(rotation)
-    pose[:3, :3] = left @ right
-    return pose
 
 
 def _finite(points: NDArray[np.float64]) -> NDArray[np.float64]:
