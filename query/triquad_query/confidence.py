@@ -13,11 +13,8 @@ LEVELS = 8
 NEAR_M = 10.0
 """At this range a ray counts half as much as at the sensor."""
 
-SECTORS = 8
-"""Of the horizon, in which a surface was looked at from."""
-
 SECTORS_COUNTED = 5
-"""More of them add nothing."""
+"""Of the eight sectors of the horizon that a surface was looked at from; more add nothing."""
 
 LEAST_STRENGTH = 0.25
 """Of level 1; each further level is twice as strong."""
