@@ -28,8 +28,6 @@ _STEPS = np.array(
 
 _NEIGHBOURS = len(_STEPS)
 
-_FARTHEST = CELL_LIMIT / 2
-
 _CANDIDATES = 128
 """How many of them are kept in mind."""
 
