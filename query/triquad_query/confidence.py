@@ -7,8 +7,9 @@ scale. ``docs/queries.md`` shows how far measured errors fall as the confidence 
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.region import MAX_LEVEL
 
-LEVELS = 8
+LEVELS = MAX_LEVEL + 1
 
 NEAR_M = 10.0
 """At this range a ray counts half as much as at the sensor."""
