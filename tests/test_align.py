@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from small_world import settings, settled_mapper, world
 from triquad_query.align import Alignment, AlignOptions, align
+from triquad_query.thinning import thinned
 from triquad_tools.bench_align import Offset, attempts, displaced, recorded
 from triquad_tools.lidar import Lidar
 from triquad_tools.scene import Scene
@@ -247,3 +248,12 @@ def test_withheld_real_scans_are_put_back() -> None:
     results = attempts(placed, Offset(0.5, 5.0), tries=10)
     assert len(results) == 20
     assert np.mean([one.good for one in results]) >= 0.95
+
+
+@hypothesis_settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.integers(0, 20_000))
+def test_to_thin_points_twice_changes_nothing(seed: int, count: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(count, 3)) * (20, 20, 2)
+    once = thinned(points, 2000)
+    assert len(once) <= 2200
+    np.testing.assert_array_equal(thinned(once, 2000), once)

@@ -10,12 +10,13 @@ from triquad_format.status import Status
 from triquad_query.distance import DistanceOptions, distances
 from triquad_query.map_view import MapView
 from triquad_query.pose import moved, orthonormal
+from triquad_query.thinning import thinned
 
 _COARSE_POINTS = 500
 """So many find the way; all that follows asks for a few millimetres."""
 
-_FINE_POINTS = 2000
-_CELLS = 1 << 20  # along an axis, for thinning
+FINE_POINTS = 2000
+"""Some so many are used in the end, however many are given."""
 
 _PER_RANGE = 0.1
 """At first a point's distance counts less by this share a metre of its range: a wrong guess of the
@@ -112,7 +113,7 @@ def align(
         ValueError: ``points`` are not of this shape, or ``guess`` is no rigid pose.
     """
     pose = orthonormal(guess)
-    fine = _thinned(_finite(points), _FINE_POINTS)
+    fine = thinned(points, FINE_POINTS)
     found = _descend(view, fine, pose, options)
     return _judged(view, fine, found, options)
 
@@ -166,7 +167,7 @@ def _descend(
     pose: NDArray[np.float64],
     options: AlignOptions,
 ) -> _Found:
-    points = _thinned(fine, _COARSE_POINTS)
+    points = thinned(fine, _COARSE_POINTS)
     final = _FINAL_VOXELS * view.voxel_m
     scale = max(options.max_distance_m, final)
     overshoot, last = _OVERSHOOT, np.zeros(6)
@@ -256,28 +257,3 @@ def _judged(
         len(points),
         view.number,
     )
-
-
-def _finite(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points have the shape {points.shape}: give [N, 3]")
-    finite: NDArray[np.float64] = points[np.isfinite(points).all(axis=1)]
-    return finite
-
-
-def _thinned(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Some ``most`` of the points, evenly in space: the first of each cell of a grid."""
-    if len(points) <= most:
-        return points
-    offsets = points - np.median(points, axis=0)
-    # From cells of which the surfaces in sight fill more, to those of which they do not.
-    side_m = max(float(np.median(np.abs(offsets))), 1e-3) / 256
-    while True:
-        cells = np.clip(np.floor(offsets / side_m) + _CELLS / 2, 0, _CELLS - 1).astype(np.int64)
-        keys = (cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2]
-        first = np.sort(np.unique(keys, return_index=True)[1])
-        points, offsets = points[first], offsets[first]
-        if len(points) <= 1.1 * most:
-            return points
-        side_m *= max(1.1, math.sqrt(len(points) / most))
