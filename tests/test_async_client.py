@@ -1,6 +1,7 @@
 """The client for event loops: many calls at a time, cancelled and closed in the midst of them."""
 
 import asyncio
+import inspect
 import subprocess
 import sys
 import threading
@@ -453,3 +454,28 @@ def test_other_tasks_run_while_a_program_waits():
 
     with servers.answering({keys.SDF: held}) as endpoint:
         connected(endpoint, use)
+
+
+ONLY_BLOCKING = {"watch_mesh"}  # a generator that waits
+
+
+@pytest.mark.parametrize(
+    ("blocking", "awaited"),
+    [
+        (triquad_client.Client, AsyncClient),
+        (triquad_client.PinnedMap, triquad_client.AsyncPinnedMap),
+        (triquad_client.SyncedMap, triquad_client.AsyncSyncedMap),
+    ],
+)
+def test_both_clients_are_asked_alike(blocking, awaited):
+    def parameters(kind: type) -> dict[str, list[tuple[str, object]]]:
+        return {
+            name: [(one.name, one.default) for one in inspect.signature(method).parameters.values()]
+            for name, method in inspect.getmembers(kind, inspect.isfunction)
+            if not name.startswith("_")
+        }
+
+    wanted = parameters(blocking)
+    for name in ONLY_BLOCKING:
+        wanted.pop(name, None)
+    assert parameters(awaited) == wanted

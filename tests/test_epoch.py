@@ -70,7 +70,7 @@ def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
     mapper.ingest(scan.points, scan.world_from_sensor)
     epoch = mapper.publish()
     low, high = np.array([3.0, -2.0, -1.0]), np.array([5.0, 2.0, 1.0])
-    listed = {tuple(tile) for tile in epoch.tiles(low, high).indices.tolist()}
+    listed = {tuple(tile) for tile in epoch.tiles(low, high).tolist()}
     side = small.mesh.tile_side_m
     for offset in np.ndindex(3, 6, 3):
         x, y, z = (np.floor(low / side).astype(int) + offset).tolist()
@@ -82,16 +82,16 @@ def test_an_empty_map_knows_nothing() -> None:
     epoch = Mapper("test", settings(), "cpu").publish()
     answer = epoch.query(np.zeros((3, 3)), gradient=False)
     assert (answer.status == Status.UNKNOWN).all()
-    assert len(epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf)).indices) == 0
+    assert len(epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf))) == 0
     assert len(epoch.mesh((0, 0, 0)).vertices) == 0
 
 
 def test_tiles_are_those_that_meet_the_bounds(epoch: Epoch) -> None:
     everything = epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf))
     side = settings().mesh.tile_side_m
-    tiles = {tuple(tile) for tile in everything.indices.tolist()}
+    tiles = {tuple(tile) for tile in everything.tolist()}
     seen = {tuple(tile) for tile in np.floor(world(3).hits / side).astype(int).tolist()}
     assert seen <= tiles
     low, high = np.array([0.1, 0.1, -1.0]), np.array([side + 0.1, side - 0.1, 1.0])
-    some = epoch.tiles(low, high).indices
+    some = epoch.tiles(low, high)
     assert {tuple(tile) for tile in some[:, :2].tolist()} == {(0, 0), (1, 0)}

@@ -144,12 +144,6 @@ def test_a_costmap_keeps_the_robot_off_what_it_would_touch(run: Run, tmp_path: P
     assert (cost[inside] == -1).any()
 
 
-needs_align = pytest.mark.skipif(
-    not hasattr(triquad_client.Client, "align"), reason="Client.align is not there yet"
-)
-
-
-@needs_align
 def test_a_scan_finds_its_place(run: Run, tmp_path: Path) -> None:
     scan = DRIVE.lidar.scan(SCENE, TRUE_POSE, np.random.default_rng(5))
     np.save(tmp_path / "scan.npy", scan.points)
@@ -162,14 +156,11 @@ def test_a_scan_finds_its_place(run: Run, tmp_path: Path) -> None:
         assert "\nbelieve it" in output
 
 
-@needs_align
 def test_a_scan_of_another_place_is_doubted(run: Run, tmp_path: Path) -> None:
     np.save(tmp_path / "scan.npy", servers.sphere())
     assert "do not use it" in run("localise.py", "--scan", tmp_path / "scan.npy")
 
 
-@needs_align
-@pytest.mark.skipif(not hasattr(triquad_client, "open_map"), reason="open_map is not there yet")
 def test_a_scan_finds_its_place_in_a_file(endpoint: str, run: Run, tmp_path: Path) -> None:
     with triquad_client.connect(endpoint, "demo") as client:
         client.download_map(tmp_path / "demo.triquad")

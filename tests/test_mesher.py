@@ -13,7 +13,7 @@ def epoch() -> Epoch:
 @pytest.fixture(scope="module")
 def tiles(epoch: Epoch) -> dict[tuple[int, int, int], TileMesh]:
     low, high = np.array([-12.0, -12, -3]), np.array([12.0, 12, 9])
-    return {(x, y, z): epoch.mesh((x, y, z)) for x, y, z in epoch.tiles(low, high).indices.tolist()}
+    return {(x, y, z): epoch.mesh((x, y, z)) for x, y, z in epoch.tiles(low, high).tolist()}
 
 
 def test_the_mesh_lies_on_the_surface(tiles: dict[tuple[int, int, int], TileMesh]) -> None:

@@ -231,5 +231,9 @@ def test_a_scan_finds_its_place(client):
     assert not answer.converged
     assert np.sqrt(np.diag(answer.covariance))[3:].min() > 1.0
     assert np.sqrt(np.diag(answer.covariance))[:3].max() < 0.2
+    # More than the server takes in one request: few of them travel.
+    dense = client.align(even_sphere(300_000, 0.1), guess)
+    assert dense.points < 2300
+    assert dense.inlier_share > 0.9
     with pytest.raises(triquad_client.InvalidInputError, match="not rigid"):
         client.align(points, 2 * true)

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_query.pose import RIGID_TOLERANCE
 from triquad_query.unknown import Unknown
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
@@ -15,8 +16,6 @@ Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
 
 FARTHEST_M = 1e9
-
-_RIGID_TOLERANCE = 1e-3
 
 
 def query_points(points: ArrayLike) -> NDArray[np.float64]:
@@ -67,12 +66,12 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
         raise InvalidScanError(f"world_from_sensor has values that are not finite:\n{pose}")
     rotation = pose[:3, :3]
     skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if skew > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+    if skew > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
         raise InvalidScanError(
             f"world_from_sensor is not rigid: R R^T is off by {skew:.2g}, det R = "
             f"{np.linalg.det(rotation):.3g}; remove scale, shear and mirroring",
         )
-    if np.abs(pose[3] - (0, 0, 0, 1)).max() > _RIGID_TOLERANCE:
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InvalidScanError(
             f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?",
         )

@@ -58,14 +58,8 @@ def _in_parts(
     first = yield from ask(request(slice(0, most), epoch))
     if count <= most:
         return [first]
-    number = epoch_of(first)
+    number: int = vars(first)["epoch"]
     rest = yield from ask_each(
         range(most, count, most), lambda start: request(slice(start, start + most), number)
     )
     return [first, *rest]
-
-
-def epoch_of(reply: Message) -> int:
-    """Number of the epoch that a reply comes from."""
-    number: int = vars(reply)["epoch"]
-    return number

@@ -156,7 +156,7 @@ class MapQueries:
         """Where a scan was taken: its points are moved until they lie on surfaces of the map.
 
         Args:
-            points: [N, 3] metres, sensor frame; some thousands are enough.
+            points: [N, 3] metres, sensor frame; any number, of which some 2,000 are used.
             world_from_sensor_guess: [4, 4]; off by a metre and ten degrees or so at most.
             max_distance: points farther than this from any surface do not count.
             at_epoch: see :class:`MapQueries`.

@@ -49,7 +49,9 @@ def decode_draco(data: bytes) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         WireError: these are not the bytes of a tile, or Draco is not installed.
     """
     if DracoPy is None:
-        raise WireError("a tile came as Draco, which is not installed: pip install DracoPy")
+        raise WireError(
+            "a tile came as Draco, which is not installed: pip install 'triquad[draco]'"
+        )
     try:
         mesh = DracoPy.decode(data)
         positions = np.asarray(mesh.points, np.float32).reshape(-1, 3)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format import morton
-from triquad_format.field_settings import FieldSettings
+from triquad_format.field_settings import OVERLAP_LEAVES, FieldSettings
 
 AXES = ((0, 1), (0, 2), (1, 2))
 """Coordinate axes of the planes XY, XZ and YZ."""
@@ -151,6 +151,15 @@ class MapRecord:
 def region_centre(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:
     """Centre [3] of a region in the map frame, metres."""
     return np.asarray(index, np.float64) * settings.region_pitch_m
+
+
+def owned_blocks(settings: FieldSettings) -> range:
+    """Blocks of evidence, along each axis, in the space that a region alone answers for.
+
+    Neighbours meet in the middle of their overlap.
+    """
+    margin = OVERLAP_LEAVES // 2 // BLOCK_VOXELS
+    return range(margin, (1 << settings.depth) // BLOCK_VOXELS - margin)
 
 
 def region_corner(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:

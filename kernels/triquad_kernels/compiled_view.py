@@ -174,15 +174,7 @@ class CompiledView:
 
     def nearest_surface(self, points: NDArray[np.float64], max_distance_m: float) -> NearestSurface:
         """The nearest seen surface to points [N, 3], looked for as far as ``max_distance_m``."""
-        count = len(points)
-        nearest = NearestSurface(
-            np.zeros(count, np.bool_),
-            np.full(count, max_distance_m),
-            np.zeros((count, 3)),
-            np.zeros((count, 3)),
-            np.zeros(count, np.float32),
-        )
-
+        nearest = NearestSurface.none(len(points), max_distance_m)
         # Here, not in the threads of the split: to make surfels may take all of these.
         near = [
             region for region in self._regions_near(points, max_distance_m) if len(region.surfels)
@@ -192,7 +184,7 @@ class CompiledView:
             for region in near:
                 self._improve(nearest, points, slice(first, last), region)
 
-        self._split(count, work, _LEAST_SEARCHES)
+        self._split(len(points), work, _LEAST_SEARCHES)
         return nearest
 
     def nearest_unknown(self, points: NDArray[np.float64], max_distance_m: float) -> NearestUnknown:

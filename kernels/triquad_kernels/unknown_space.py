@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.field_settings import FieldSettings
-from triquad_format.region import BLOCK_VOXELS, RegionIndex, leaf_coordinates
+from triquad_format.region import RegionIndex, leaf_coordinates, owned_blocks
 from triquad_query.nearest import NearestUnknown
 
 from triquad_kernels.evidence import Evidence
@@ -72,13 +72,12 @@ class UnknownSpace:
     ) -> None:
         """Look at what a region owns of the space around."""
         leaf_m = self._settings.leaf_m
-        blocks = (1 << self._settings.depth) // BLOCK_VOXELS
-        margin = round(self._settings.overlap_m / 2 / leaf_m) // BLOCK_VOXELS
+        mine = owned_blocks(self._settings)
         voxels = leaf_coordinates(self._settings, points - region.centre)
         distances = found.distance / leaf_m
         before = distances.copy()
         nearest = np.empty((len(points), 3))
-        region.evidence.find_unknown(voxels, (margin, blocks - margin), distances, nearest)
+        region.evidence.find_unknown(voxels, (mine.start, mine.stop), distances, nearest)
         nearer = distances < before
         found.distance[nearer] = distances[nearer] * leaf_m
         corner = region.centre - self._settings.region_side_m / 2

@@ -9,12 +9,14 @@ from triquad_format.status import Status
 
 from triquad_query.distance import DistanceOptions, distances
 from triquad_query.map_view import MapView
+from triquad_query.pose import moved, orthonormal
+from triquad_query.thinning import thinned
 
 _COARSE_POINTS = 500
 """So many find the way; all that follows asks for a few millimetres."""
 
-_FINE_POINTS = 2000
-_CELLS = 1 << 20  # along an axis, for thinning
+FINE_POINTS = 2000
+"""Some so many are used in the end, however many are given."""
 
 _PER_RANGE = 0.1
 """At first a point's distance counts less by this share a metre of its range: a wrong guess of the
@@ -108,11 +110,10 @@ def align(
         options: see there.
 
     Raises:
-        ValueError: ``points`` or ``guess`` are not of these shapes, or ``guess`` is no rigid
-            motion.
+        ValueError: ``points`` are not of this shape, or ``guess`` is no rigid pose.
     """
-    pose = _rigid(guess)
-    fine = _thinned(_finite(points), _FINE_POINTS)
+    pose = orthonormal(guess)
+    fine = thinned(points, FINE_POINTS)
     found = _descend(view, fine, pose, options)
     return _judged(view, fine, found, options)
 
@@ -166,7 +167,7 @@ def _descend(
     pose: NDArray[np.float64],
     options: AlignOptions,
 ) -> _Found:
-    points = _thinned(fine, _COARSE_POINTS)
+    points = thinned(fine, _COARSE_POINTS)
     final = _FINAL_VOXELS * view.voxel_m
     scale = max(options.max_distance_m, final)
     overshoot, last = _OVERSHOOT, np.zeros(6)
@@ -180,7 +181,7 @@ def _descend(
         last = step
         taken = (overshoot if scale == final else 1.0) * step
         size = float(np.linalg.norm(taken))
-        pose = _moved(pose, taken[:3], taken[3:] / normal.arm_m)
+        pose = moved(pose, taken[:3], taken[3:] / normal.arm_m)
         if scale > final:
             shrunk = np.clip(_SCALE_STEPS * size, _SHRINK_MOST * scale, _SHRINK_LEAST * scale)
             scale = max(final, float(shrunk))
@@ -256,65 +257,3 @@ def _judged(
         len(points),
         view.number,
     )
-
-
-def _moved(
-    pose: NDArray[np.float64], translation: NDArray[np.float64], rotation: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """A pose moved, and turned about itself by a rotation vector, both in the map frame."""
-    moved: NDArray[np.float64] = pose.copy()
-    moved[:3, :3] = _rotation(rotation) @ pose[:3, :3]
-    moved[:3, 3] += translation
-    return moved
-
-
-def _rotation(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation [3, 3] about a vector [3] by its length (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    first = float(np.sinc(angle / math.pi))
-    second = 0.5 * float(np.sinc(angle / (2 * math.pi))) ** 2
-    rotation: NDArray[np.float64] = np.eye(3) + first * cross + second * (cross @ cross)
-    return rotation
-
-
-def _rigid(guess: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The guess as a new array, its rotation made orthonormal."""
-    pose = np.array(guess, np.float64)
-    if pose.shape != (4, 4):
-        raise ValueError(f"guess has the shape {pose.shape}: give a pose [4, 4]")
-    rotation = pose[:3, :3]
-    good = bool(np.isfinite(pose).all()) and np.allclose(pose[3], [0, 0, 0, 1])
-    if not (good and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)):
-        raise ValueError(f"guess is not a rigid motion: {pose.tolist()}")
-    if np.linalg.det(rotation) < 0:
-        raise ValueError("guess is a reflection: give a rotation of determinant 1")
-    left, _, right = np.linalg.svd(rotation)
-    pose[:3, :3] = left @ right
-    return pose
-
-
-def _finite(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points have the shape {points.shape}: give [N, 3]")
-    finite: NDArray[np.float64] = points[np.isfinite(points).all(axis=1)]
-    return finite
-
-
-def _thinned(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Some ``most`` of the points, evenly in space: the first of each cell of a grid."""
-    if len(points) <= most:
-        return points
-    offsets = points - np.median(points, axis=0)
-    # From cells of which the surfaces in sight fill more, to those of which they do not.
-    side_m = max(float(np.median(np.abs(offsets))), 1e-3) / 256
-    while True:
-        cells = np.clip(np.floor(offsets / side_m) + _CELLS / 2, 0, _CELLS - 1).astype(np.int64)
-        keys = (cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2]
-        first = np.sort(np.unique(keys, return_index=True)[1])
-        points, offsets = points[first], offsets[first]
-        if len(points) <= 1.1 * most:
-            return points
-        side_m *= max(1.1, math.sqrt(len(points) / most))

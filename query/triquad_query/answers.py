@@ -188,7 +188,7 @@ class Answers:
             )
         options = AlignOptions(
             _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
-            int(_within("max_iterations", request.max_iterations, MAX_ITERATIONS)),
+            int(_within("max_iterations", request.max_iterations, MAX_ITERATIONS, least=1)),
         )
         with self._view(request.epoch) as view:
             answer = align(

@@ -7,17 +7,15 @@ scale. ``docs/queries.md`` shows how far measured errors fall as the confidence 
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.region import MAX_LEVEL
 
-LEVELS = 8
+LEVELS = MAX_LEVEL + 1
 
 NEAR_M = 10.0
 """At this range a ray counts half as much as at the sensor."""
 
-SECTORS = 8
-"""Of the horizon, in which a surface was looked at from."""
-
 SECTORS_COUNTED = 5
-"""More of them add nothing."""
+"""Of the eight sectors of the horizon that a surface was looked at from; more add nothing."""
 
 LEAST_STRENGTH = 0.25
 """Of level 1; each further level is twice as strong."""

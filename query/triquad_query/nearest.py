@@ -19,6 +19,17 @@ class NearestSurface:
     mean: NDArray[np.float64]  # [N, 3] about the same, over all that is nearly as near
     confidence: NDArray[np.float32]  # [N] in [0, 1]
 
+    @classmethod
+    def none(cls, count: int, max_distance_m: float) -> "NearestSurface":
+        """What ``count`` points begin with, before anything is found; to be improved in place."""
+        return cls(
+            np.zeros(count, np.bool_),
+            np.full(count, max_distance_m),
+            np.zeros((count, 3)),
+            np.zeros((count, 3)),
+            np.zeros(count, np.float32),
+        )
+
 
 @dataclass(frozen=True)
 class NearestUnknown:

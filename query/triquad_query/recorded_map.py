@@ -47,14 +47,7 @@ class RecordedMap:
 
     def nearest_surface(self, points: NDArray[np.float64], max_distance_m: float) -> NearestSurface:
         """The nearest seen surface to points [N, 3], looked for as far as ``max_distance_m``."""
-        count = len(points)
-        nearest = NearestSurface(
-            np.zeros(count, np.bool_),
-            np.full(count, max_distance_m),
-            np.zeros((count, 3)),
-            np.zeros((count, 3)),
-            np.zeros(count, np.float32),
-        )
+        nearest = NearestSurface.none(len(points), max_distance_m)
         for surface in self._surfaces:
             surface.improve(nearest, points)
         return nearest

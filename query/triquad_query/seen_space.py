@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format import morton
 from triquad_format.field_settings import OVERLAP_LEAVES, FieldSettings
-from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS, MapRecord, Region
+from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS, MapRecord, Region, owned_blocks
 
 from triquad_query.nearest import NearestUnknown
 from triquad_query.voxel_blocks import VoxelBlocks
@@ -24,9 +24,10 @@ class SeenSpace:
         self._leaf_m = record.settings.leaf_m
         cells = [np.zeros((0, 3), np.int64)]
         masks = [np.zeros((0, BLOCK_BYTES), np.uint8)]
+        mine = owned_blocks(record.settings)
         for region in record.regions:
             blocks = morton.decode(region.evidence.codes, 3)
-            owned = _owned(record.settings, blocks)
+            owned = ((blocks >= mine.start) & (blocks < mine.stop)).all(axis=1)
             cells.append(blocks[owned] + _first_block(record.settings, region))
             masks.append((region.evidence.surface | region.evidence.free)[owned])
         self._blocks = VoxelBlocks(np.concatenate(cells), np.concatenate(masks))
@@ -90,13 +91,6 @@ def _look_inside(
     rows = going[nearer]
     squares[rows] = gaps[each, best][nearer]
     nearest[rows] = places[each, best][nearer]
-
-
-def _owned(settings: FieldSettings, blocks: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which blocks [B, 3] of a region no other one answers for."""
-    margin = OVERLAP_LEAVES // 2 // BLOCK_VOXELS
-    side = (1 << settings.depth) // BLOCK_VOXELS
-    return np.asarray(((blocks >= margin) & (blocks < side - margin)).all(axis=1), np.bool_)
 
 
 def _first_block(settings: FieldSettings, region: Region) -> NDArray[np.int64]:

@@ -20,13 +20,6 @@ from triquad_server.tile_lattice import TileLattice, tile_lattice, tiles_meeting
 
 
 @dataclass(frozen=True)
-class TileSet:
-    """Mesh tiles that may hold a surface."""
-
-    indices: NDArray[np.int32]  # [T, 3]
-
-
-@dataclass(frozen=True)
 class FrozenRegion(RegionView):
     """A region as it was when it was published."""
 
@@ -72,8 +65,8 @@ class Epoch(CompiledView):
 
     def tiles(
         self, minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int = 0
-    ) -> TileSet:
-        """Tiles of a level that hold seen surface and meet the box between two corners [3]."""
+    ) -> NDArray[np.int32]:
+        """Tiles [T, 3] of a level that hold seen surface and meet the box of two corners [3]."""
         lattice = tile_lattice(self._mesh, level)
         tiles = {
             (x, y, z)
@@ -83,7 +76,7 @@ class Epoch(CompiledView):
         indices = np.array(sorted(tiles), np.int32).reshape(-1, 3)
         low = indices * lattice.tile_side_m
         meets = ((low <= maximum) & (low + lattice.tile_side_m >= minimum)).all(axis=1)
-        return TileSet(indices[meets])
+        return np.asarray(indices[meets])
 
     def mesh(self, tile: TileIndex, level: int = 0) -> TileMesh:
         """The mesh of one tile; empty where no surface was seen."""

@@ -78,12 +78,12 @@ class TileQueries:
         check_level(request.level)
         epoch = self._epochs.get(request.epoch)
         tiles = epoch.tiles(request.minimum, request.maximum, request.level)
-        if len(tiles.indices) > MAX_TILES:
-            raise RequestError("too_large", f"{len(tiles.indices)} tiles: ask for a smaller box")
+        if len(tiles) > MAX_TILES:
+            raise RequestError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
         side_m = self._shelf.lattice(request.level).tile_side_m
         self._shelf.look(epoch)
-        changed = np.minimum(self._shelf.changed(request.level, tiles.indices), epoch.number)
-        return TileList(epoch.number, side_m, tiles.indices, changed)
+        changed = np.minimum(self._shelf.changed(request.level, tiles), epoch.number)
+        return TileList(epoch.number, side_m, tiles, changed)
 
     def tile(self, request: TileRequest) -> Tile:
         """The mesh of one tile."""

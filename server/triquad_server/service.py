@@ -178,32 +178,23 @@ class Service:
 
     def _open_desks(self, health: Health, identity: Identity) -> None:
         """One desk per group of operations, so that none waits for a slower one."""
+        self._open_question_desks()
+        self._open_mesh_desks(identity)
+        self._open_status_desk(health)
+        downloads = MapDownloads(self._mapper)
+        self._open_desk(
+            {
+                keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
+                keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
+            },
+        )
+
+    def _open_question_desks(self) -> None:
         limits = self._settings.service
         views = EpochViews(self._mapper.epochs, self._gate)
         answers = Answers(
             views.view, QuestionLimits(limits.max_query_points, limits.max_search_points)
         )
-        shelf = TileShelf(self._settings.mesh)
-        tiles = TileQueries(self._mapper.epochs, shelf)
-        feed = TileFeed(
-            shelf,
-            self._mapper.epochs,
-            self._gate,
-            identity.server,
-            self._settings.mesh,
-            limits.request_queue,
-        )
-        feed.start()
-        self._parts.callback(feed.close)
-        downloads = MapDownloads(self._mapper)
-        flush = FlushDesk(
-            self._ledger,
-            self._mapper.publish_soon,
-            limits.flush_timeout_max_s,
-            limits.request_queue,
-        )
-        flush.start()
-        self._parts.callback(flush.close)
         self._open_desk(
             {
                 keys.SDF: answering(SdfRequest, answers.sdf),
@@ -221,6 +212,20 @@ class Service:
             limits.query_workers,
         )
         self._open_desk({keys.ALIGN: answering(AlignRequest, answers.align)})
+
+    def _open_mesh_desks(self, identity: Identity) -> None:
+        shelf = TileShelf(self._settings.mesh)
+        tiles = TileQueries(self._mapper.epochs, shelf)
+        feed = TileFeed(
+            shelf,
+            self._mapper.epochs,
+            self._gate,
+            identity.server,
+            self._settings.mesh,
+            self._settings.service.request_queue,
+        )
+        feed.start()
+        self._parts.callback(feed.close)
         self._open_desk(
             {
                 keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
@@ -235,16 +240,21 @@ class Service:
                 ),
             },
         )
+
+    def _open_status_desk(self, health: Health) -> None:
+        limits = self._settings.service
+        flush = FlushDesk(
+            self._ledger,
+            self._mapper.publish_soon,
+            limits.flush_timeout_max_s,
+            limits.request_queue,
+        )
+        flush.start()
+        self._parts.callback(flush.close)
         self._open_desk(
             {
                 keys.STATUS: answering(StatusRequest, health.answer),
                 keys.FLUSH: lambda request: flush.hold(request, request.read(FlushRequest)),
-            },
-        )
-        self._open_desk(
-            {
-                keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
-                keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
             },
         )
 

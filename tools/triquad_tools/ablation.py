@@ -47,7 +47,7 @@ def run_variant(encoding: str, through: SimulatedDrive) -> Variant:
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     count = 0
-    for x, y, z in epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf)).indices.tolist():
+    for x, y, z in epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf)).tolist():
         tile = epoch.mesh((x, y, z))
         vertices.append(tile.vertices + tile.origin)
         faces.append(tile.faces + count)

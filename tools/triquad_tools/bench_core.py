@@ -125,7 +125,7 @@ def _queries(epoch: Epoch, region: RegionMap, points: NDArray[np.float64]) -> li
 
 
 def _mesh_s(epoch: Epoch, made: BenchStreet) -> float:
-    tiles = epoch.tiles(*made.drive.scene.bounds).indices.tolist()
+    tiles = epoch.tiles(*made.drive.scene.bounds).tolist()
 
     def mesh_all() -> None:
         for x, y, z in tiles:

@@ -13,6 +13,7 @@ from triquad_format.region import (
     Evidence,
     MapRecord,
     Region,
+    owned_blocks,
     region_corner,
 )
 
@@ -29,10 +30,8 @@ class Columns:
 
 def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
     """The evidence that answers of the region hang on; the rest lies in its neighbours' space."""
-    # Regions meet in the middle of their overlap, one block inside of their cubes.
-    blocks = morton.decode(region.evidence.codes, 3)
-    last = (1 << settings.depth) // BLOCK_VOXELS - 1
-    owned = ((blocks >= 1) & (blocks < last)).all(axis=1, keepdims=True)
+    blocks, mine = morton.decode(region.evidence.codes, 3), owned_blocks(settings)
+    owned = ((blocks >= mine.start) & (blocks < mine.stop)).all(axis=1, keepdims=True)
     return masked(region.evidence, np.where(owned, np.uint8(0xFF), np.uint8(0)))
 
 

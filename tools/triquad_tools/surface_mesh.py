@@ -23,7 +23,7 @@ def surface_mesh(epoch: Epoch, box: Box | None, tile_side_m: float, report: Repo
     low, high = _EVERYWHERE if box is None else box
     tiles: list[Triangles] = []
     faces = 0
-    indices = epoch.tiles(low, high).indices.tolist()
+    indices = epoch.tiles(low, high).tolist()
     for number, (x, y, z) in enumerate(indices):
         tile = epoch.mesh((x, y, z))
         tiles.append((tile.origin + tile.vertices, tile.faces))
