@@ -37,10 +37,11 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
+from triquad_client.followed_mesh import MeshUpdate
 from triquad_client.local_copy import SyncReport
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles, MeshTile
-from triquad_client.mesh_watch import MeshUpdate, MeshWatch
+from triquad_client.mesh_watch import AsyncMeshWatch, MeshWatch
 from triquad_client.offline import OfflineMap, open_map
 from triquad_client.queries import MapQueries, PinnedMap
 from triquad_client.questions.sdf import SdfResult
@@ -50,6 +51,7 @@ from triquad_client.synced import AsyncSyncedMap, SyncedMap
 __all__ = [
     "Alignment",
     "AsyncClient",
+    "AsyncMeshWatch",
     "AsyncPinnedMap",
     "AsyncSyncedMap",
     "BadReplyError",

@@ -16,8 +16,11 @@ from triquad_client.async_driver import AsyncDriver
 from triquad_client.async_queries import AsyncMapQueries, AsyncPinnedMap
 from triquad_client.checks import Bounds
 from triquad_client.connection import Connection, open_connection
+from triquad_client.followed_mesh import FollowedMesh
 from triquad_client.local_copy import LocalCopy
 from triquad_client.mesh import Mesh
+from triquad_client.mesh_tiles import HeldTiles
+from triquad_client.mesh_watch import AsyncMeshWatch
 from triquad_client.questions import sdf
 from triquad_client.scans import FlushReport, ScanPublisher
 from triquad_client.synced import AsyncSyncedMap
@@ -70,17 +73,28 @@ class AsyncClient(AsyncMapQueries):
         """As :meth:`Client.pinned`."""
         return AsyncPinnedMap(self._run, await self._run(sdf.pin_newest()))
 
-    async def tiles(self, bounds: Bounds | None = None) -> TileList:
+    async def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
         """As :meth:`Client.tiles`."""
-        return await self._run(meshes.tiles(bounds))
+        return await self._run(meshes.tiles(bounds, level))
 
-    async def mesh_tile(self, x: int, y: int, z: int) -> Mesh:
+    async def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
         """As :meth:`Client.mesh_tile`."""
-        return await self._run(meshes.tile(x, y, z))
+        return await self._run(meshes.tile(x, y, z, level))
 
-    async def mesh(self, bounds: Bounds | None = None) -> Mesh:
+    async def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
         """As :meth:`Client.mesh`."""
-        return await self._run(meshes.mesh(bounds))
+        return await self._run(meshes.mesh(bounds, level))
+
+    def watch_mesh(
+        self,
+        bounds: Bounds | None = None,
+        level: int = 0,
+        max_bytes_per_s: int | None = None,
+        held: HeldTiles | None = None,
+    ) -> AsyncMeshWatch:
+        """As :meth:`Client.watch_mesh`; what it returns is awaited, not this."""
+        followed = FollowedMesh.to_begin_with(bounds, level, max_bytes_per_s, held)
+        return AsyncMeshWatch(self._run, followed)
 
     async def status(self) -> ServerStatus:
         """As :meth:`Client.status`."""

@@ -38,6 +38,7 @@ class Ask(Generic[ReplyT]):
     kind: type[ReplyT]  # of the reply
     background: bool = False
     at_least_s: float = 0.0  # waits that long for the reply, where the connection would not
+    held_s: float = 0.0  # and so much longer, as the server is asked to hold it for that time
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,9 @@ Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 
 FARTHEST_M = 1e9
 
+LEVELS = 3
+"""Levels of detail: cells of level ``l`` are ``2**l`` times as large as those of level 0."""
+
 
 def query_points(points: ArrayLike) -> NDArray[np.float64]:
     """Points [N, 3] as float64, all finite and at most ``FARTHEST_M`` from the map's origin.
@@ -123,6 +126,28 @@ def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]
     if not (minimum <= maximum).all():
         raise InvalidInputError(f"bounds = {bounds!r}: the minimum must not exceed the maximum")
     return minimum, maximum
+
+
+def level_of_detail(level: int) -> int:
+    """``level`` where the mesh has such a level of detail.
+
+    Raises:
+        InvalidInputError: it has not.
+    """
+    if type(level) is not int or not 0 <= level < LEVELS:
+        raise InvalidInputError(f"level = {level!r}: use 0 to {LEVELS - 1}")
+    return level
+
+
+def bytes_per_second(limit: int | None) -> int:
+    """A limit as it is sent: 0 is none.
+
+    Raises:
+        InvalidInputError: nothing could be sent within it.
+    """
+    if limit is not None and (type(limit) is not int or limit < 1):
+        raise InvalidInputError(f"max_bytes_per_s = {limit!r}: use 1 or more, or None")
+    return limit or 0
 
 
 def filled_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

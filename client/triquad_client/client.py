@@ -7,10 +7,11 @@ from numpy.typing import ArrayLike
 from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_format.written_map import MapFileInfo
 
-from triquad_client import checks, download, meshes, upkeep
+from triquad_client import download, meshes, upkeep
 from triquad_client.blocking import BlockingDriver
 from triquad_client.checks import Bounds
 from triquad_client.connection import Connection, open_connection
+from triquad_client.followed_mesh import FollowedMesh
 from triquad_client.local_copy import LocalCopy
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles
@@ -108,17 +109,27 @@ class Client(MapQueries):
         """The map as it is now, for queries that belong together."""
         return PinnedMap(self._run, self._run(sdf.pin_newest()))
 
-    def tiles(self, bounds: Bounds | None = None) -> TileList:
-        """The mesh tiles that meet ``bounds``, with the epoch in which each last changed."""
-        return self._run(meshes.tiles(bounds))
+    def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
+        """The mesh tiles that meet ``bounds``, with the epoch in which each last changed.
 
-    def mesh_tile(self, x: int, y: int, z: int) -> Mesh:
-        """The newest mesh of one tile of the mesh lattice."""
-        return self._run(meshes.tile(x, y, z))
+        Args:
+            bounds: corners of a box; ``None``: everywhere.
+            level: of detail: 0, 1 or 2, each with cells and tiles twice as large as the one before.
+        """
+        return self._run(meshes.tiles(bounds, level))
 
-    def mesh(self, bounds: Bounds | None = None) -> Mesh:
-        """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch."""
-        return self._run(meshes.mesh(bounds))
+    def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
+        """The newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
+        return self._run(meshes.tile(x, y, z, level))
+
+    def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
+        """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch.
+
+        Args:
+            bounds: corners of a box; ``None``: everywhere.
+            level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
+        """
+        return self._run(meshes.mesh(bounds, level))
 
     def watch_mesh(
         self,
@@ -135,7 +146,8 @@ class Client(MapQueries):
             max_bytes_per_s: what this watch may take of the network; the server may allow less.
             held: tiles of an earlier watch, which are not fetched again.
         """
-        return MeshWatch(self._connection, *checks.box(bounds), level, max_bytes_per_s, held)
+        followed = FollowedMesh.to_begin_with(bounds, level, max_bytes_per_s, held)
+        return MeshWatch(self._connection, followed)
 
     def status(self) -> ServerStatus:
         """How the server is doing."""

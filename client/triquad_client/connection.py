@@ -144,7 +144,7 @@ class Connection:
         return keys.operation_key(self.map_name, ask.operation)
 
     def _timeout_s(self, ask: Ask[Any]) -> float:
-        return max(self.timeout_s, ask.at_least_s)
+        return max(self.timeout_s, ask.at_least_s) + ask.held_s
 
     def _broken(self, error: Exception) -> Exception:
         if self.closed:

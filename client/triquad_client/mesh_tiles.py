@@ -1,6 +1,7 @@
 """Mesh tiles as a client holds them."""
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -48,6 +49,8 @@ def unpacked(updates: TileUpdates) -> list[MeshTile]:
     Raises:
         BadReplyError: they are not sound.
     """
+    if not (math.isfinite(updates.tile_side_m) and updates.tile_side_m > 0):
+        raise BadReplyError(f"tiles of side {updates.tile_side_m}")
     count = len(updates.tiles)
     sizes = updates.sizes
     lengths = {len(updates.versions), len(updates.codecs), len(sizes)}

@@ -1,86 +1,119 @@
 """Following the mesh of a box: only what changed travels."""
 
+import asyncio
 import math
-import secrets
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 from types import MappingProxyType, TracebackType
+from typing import Any
 
-import numpy as np
 import zenoh
-from numpy.typing import NDArray
-from triquad_format import draco, keys
-from triquad_format.messages import TileUpdates, TileUpdatesRequest
+from triquad_format import keys
+from triquad_format.messages import TileUpdates
 from triquad_query.errors import TriquadError
 
+from triquad_client.async_queries import AsyncRun
 from triquad_client.blocking import BlockingDriver
-from triquad_client.call import Ask, ask
+from triquad_client.call import Ask, Call, ResultT, ask, worked
 from triquad_client.connection import Connection
-from triquad_client.errors import (
-    BadReplyError,
-    InvalidInputError,
-    RequestTimeoutError,
-)
+from triquad_client.errors import ClosedError, RequestTimeoutError
+from triquad_client.followed_mesh import FollowedMesh, MeshUpdate
 from triquad_client.mesh import Mesh
 from triquad_client.mesh_tiles import HeldTiles, MeshTile, TileIndex, unpacked
-from triquad_client.welding import joined
-
-LEVELS = 3
-"""Levels of detail: cells of level ``l`` are ``2**l`` times as large as those of level 0."""
 
 _LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
-_REPLY_BYTES = 1_000_000
-_MAX_HELD = 100_000  # the server's limit; of more the rest travels again
 
 
-@dataclass(frozen=True)
-class MeshUpdate:
-    """What one reply changed."""
+class _WatchClosedError(ClosedError):
+    """The watch was closed, before the call or meanwhile."""
 
-    changed: tuple[TileIndex, ...]  # tiles that are new or different
-    removed: tuple[TileIndex, ...]
-    epoch: int
-    complete: bool  # all tiles show this epoch
-    size: int  # bytes of the tiles as they came
+    def __init__(self) -> None:
+        super().__init__("the watch is closed")
 
 
-class MeshWatch:
+class _Watch:
+    """What a watch holds, and the calls that change it; no matter who waits for the replies."""
+
+    def __init__(self, followed: FollowedMesh) -> None:
+        self._followed = followed
+        self._changing = threading.Lock()
+
+    @property
+    def tiles(self) -> Mapping[TileIndex, MeshTile]:
+        """The tiles as of the last update, by their indices; later updates do not change it."""
+        return MappingProxyType(self._followed.tiles)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last reply left nothing waiting."""
+        return self._followed.complete
+
+    @property
+    def level(self) -> int:
+        """Level of detail."""
+        return self._followed.level
+
+    def held(self) -> HeldTiles:
+        """The tiles, for a later watch to go on with."""
+        return self._followed.held()
+
+    def _next(self, timeout: float | None) -> Call[MeshUpdate | None]:
+        ends = math.inf if timeout is None else time.monotonic() + timeout
+        while True:
+            left_s = max(0.0, ends - time.monotonic())
+            update = yield from self._update(min(left_s, _LONGEST_WAIT_S))
+            if update.changed or update.removed:
+                return update
+            if time.monotonic() >= ends:
+                return None
+
+    def _catch_up(self, timeout: float) -> Call[None]:
+        ends = time.monotonic() + timeout
+        wait_s = 0.0
+        while not (update := (yield from self._update(wait_s))).complete:
+            if time.monotonic() > ends:
+                raise RequestTimeoutError(f"the mesh is not complete after {timeout:g} s")
+            # Nothing came although there is something: the bandwidth is used up for a while.
+            wait_s = 0.0 if update.changed else 1.0
+
+    def _update(self, wait_s: float) -> Call[MeshUpdate]:
+        """What one reply changed: nothing where that of another call came first."""
+        before = self._followed
+        request = Ask(
+            keys.TILE_UPDATES,
+            before.request(wait_s),
+            TileUpdates,
+            background=True,
+            held_s=wait_s,
+        )
+        reply = yield from ask(request)
+        tiles = yield from worked(lambda _: unpacked(reply))
+        changed = {tile.index: tile for tile in tiles}
+        after = before.after(reply, changed)
+        with self._changing:
+            if self._followed is not before:  # by what is known now, the reply may be old
+                return MeshUpdate((), (), self._followed.epoch, self._followed.complete, 0)
+            self._followed = after
+        removed = tuple(sorted(before.tiles.keys() - after.tiles.keys()))
+        return MeshUpdate(tuple(changed), removed, after.epoch, after.complete, len(reply.data))
+
+
+class MeshWatch(_Watch):
     """The mesh tiles of a box, kept up to date by :meth:`next`; nothing is asked in between.
 
     Use it in a ``with`` statement, or :meth:`close` it. Where a method raises, what is held stays,
     and it may be called again: after the server was restarted, all tiles are fetched anew, and the
-    old ones stay until then.
+    old ones stay until then. Several threads may use it: each change is told to one of them.
     """
 
-    def __init__(
-        self,
-        connection: Connection,
-        minimum: NDArray[np.float64],
-        maximum: NDArray[np.float64],
-        level: int,
-        max_bytes_per_s: int | None,
-        held: HeldTiles | None,
-    ) -> None:
+    def __init__(self, connection: Connection, followed: FollowedMesh) -> None:
         """Use :meth:`Client.watch_mesh`."""
-        _check(level, max_bytes_per_s, held)
-        self._connection = connection
+        super().__init__(followed)
+        self._closed = False
         self._cancellation = zenoh.CancellationToken()
         self._driver = BlockingDriver(connection, self._cancellation)
-        self._minimum, self._maximum = minimum, maximum
-        self._level = level
-        self._rate = max_bytes_per_s or 0
-        self._name = secrets.token_hex(8)
-        self._asking = threading.Lock()
-        self._closed = False
-        self._server = "" if held is None else held.server
-        self._side_m = math.nan if held is None else held.tile_side_m
-        self._tiles = {} if held is None else self._within(held)
-        self._void: set[TileIndex] = set()  # of a server that is no more
-        self._revision = 0
-        self._epoch = 0
-        self._complete = False
 
     def __enter__(self) -> "MeshWatch":
         return self
@@ -95,25 +128,7 @@ class MeshWatch:
 
     def __iter__(self) -> Iterator[MeshUpdate]:
         """Updates as they come, until the watch is closed."""
-        while not self._closed:
-            update = self.next(_LONGEST_WAIT_S)
-            if update is not None:
-                yield update
-
-    @property
-    def tiles(self) -> Mapping[TileIndex, MeshTile]:
-        """The tiles as of the last update, by their indices."""
-        return MappingProxyType(self._tiles)
-
-    @property
-    def complete(self) -> bool:
-        """Whether the last reply left nothing waiting."""
-        return self._complete
-
-    @property
-    def level(self) -> int:
-        """Level of detail."""
-        return self._level
+        return iter(self.next, None)
 
     def next(self, timeout: float | None = None) -> MeshUpdate | None:
         """Wait for the next change.
@@ -128,19 +143,8 @@ class MeshWatch:
             RefusedError: the server refused.
             RequestTimeoutError: it does not answer.
         """
-        ends = math.inf if timeout is None else time.monotonic() + timeout
-        while not self._closed:
-            left_s = max(0.0, ends - time.monotonic())
-            try:
-                update = self._ask(min(left_s, _LONGEST_WAIT_S))
-            except TriquadError:
-                if self._closed:
-                    return None
-                raise
-            if update.changed or update.removed:
-                return update
-            if time.monotonic() >= ends:
-                break
+        with suppress(_WatchClosedError):
+            return self._run(self._next(timeout))
         return None
 
     def catch_up(self, timeout: float = 60.0) -> None:
@@ -151,120 +155,91 @@ class MeshWatch:
 
         Raises:
             RequestTimeoutError: that was not all of it.
+            ClosedError: the watch was closed.
         """
-        ends = time.monotonic() + timeout
-        wait_s = 0.0
-        while not (update := self._ask(wait_s)).complete:
-            if time.monotonic() > ends:
-                raise RequestTimeoutError(f"the mesh is not complete after {timeout:g} s")
-            # Nothing came although there is something: the bandwidth is used up for a while.
-            wait_s = 0.0 if update.changed else 1.0
+        self._run(self._catch_up(timeout))
 
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""
-        triangles = [(tile.origin + tile.vertices, tile.faces) for tile in self._tiles.values()]
-        if not triangles:
-            return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), self._epoch)
-        return Mesh(*joined(triangles, self._side_m, self._minimum, self._maximum), self._epoch)
-
-    def held(self) -> HeldTiles:
-        """The tiles, for a later watch to go on with."""
-        tiles = {index: tile for index, tile in self._tiles.items() if index not in self._void}
-        return HeldTiles(self._server, self._level, self._side_m, tiles)
+        return self._followed.mesh()
 
     def close(self) -> None:
         """End: :meth:`next` returns ``None``, and iteration ends, also in other threads."""
         self._closed = True
         self._cancellation.cancel()
 
-    def _within(self, held: HeldTiles) -> dict[TileIndex, MeshTile]:
-        """The held tiles that meet the bounds: others would not be kept up to date."""
-        side_m = held.tile_side_m
-        return {
-            index: tile
-            for index, tile in held.tiles.items()
-            if (tile.origin <= self._maximum).all()
-            and (tile.origin + side_m >= self._minimum).all()
-        }
-
-    def _ask(self, wait_s: float) -> MeshUpdate:
-        with self._asking:
-            request = Ask(
-                keys.TILE_UPDATES,
-                self._request(wait_s),
-                TileUpdates,
-                background=True,
-                at_least_s=wait_s + self._connection.timeout_s,
-            )
-            return self._applied(self._driver.run(ask(request)))
-
-    def _request(self, wait_s: float) -> TileUpdatesRequest:
-        # Until all is known, the server has to be told what is held; then the revision says it.
-        known = (
-            []
-            if self._complete
-            else [tile for index, tile in self._tiles.items() if index not in self._void][
-                :_MAX_HELD
-            ]
-        )
-        return TileUpdatesRequest(
-            self._minimum,
-            self._maximum,
-            self._level,
-            self._server,
-            self._revision,
-            np.array([tile.index for tile in known], np.int32).reshape(-1, 3),
-            np.array([tile.version for tile in known], np.int64),
-            _REPLY_BYTES,
-            wait_s,
-            self._name,
-            self._rate,
-            draco.AVAILABLE,
-        )
-
-    def _applied(self, reply: TileUpdates) -> MeshUpdate:
-        if not (math.isfinite(reply.tile_side_m) and reply.tile_side_m > 0):
-            raise BadReplyError(f"tiles of side {reply.tile_side_m}")
-        changed = unpacked(reply)
-        if reply.restart:
-            self._void = set(self._tiles)
-        self._side_m = reply.tile_side_m
-        removed = {(x, y, z) for x, y, z in reply.removed.tolist()}
-        for tile in changed:
-            self._tiles[tile.index] = tile
-            self._void.discard(tile.index)
-        if reply.complete:
-            removed |= self._void
-            self._void = set()
-        removed &= self._tiles.keys()
-        for index in removed:
-            del self._tiles[index]
-        self._void -= removed
-        self._server, self._revision = reply.server, reply.revision
-        self._epoch, self._complete = reply.epoch, reply.complete
-        return MeshUpdate(
-            tuple(tile.index for tile in changed),
-            tuple(sorted(removed)),
-            reply.epoch,
-            reply.complete,
-            len(reply.data),
-        )
+    def _run(self, call: Call[ResultT]) -> ResultT:
+        try:
+            return self._driver.run(call)
+        except TriquadError as error:
+            if self._closed:
+                raise _WatchClosedError from error
+            raise
 
 
-def check_level(level: int) -> int:
-    """``level`` where there is such a level of detail.
+class AsyncMeshWatch(_Watch):
+    """As :class:`MeshWatch`, to be awaited: ``async with``, ``async for``.
 
-    Raises:
-        InvalidInputError: there is not.
+    Where the client is closed, what is awaited raises :class:`ClosedError`. Several tasks may use
+    it: each change is told to one of them. A task that is cancelled may take a change with it,
+    which then is in :attr:`tiles` without having been told; a ``timeout`` does not.
     """
-    if type(level) is not int or not 0 <= level < LEVELS:
-        raise InvalidInputError(f"level = {level!r}: use 0 to {LEVELS - 1}")
-    return level
 
+    def __init__(self, run: AsyncRun, followed: FollowedMesh) -> None:
+        """Use :meth:`AsyncClient.watch_mesh`."""
+        super().__init__(followed)
+        self._drive = run
+        self._closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
-def _check(level: int, max_bytes_per_s: int | None, held: HeldTiles | None) -> None:
-    check_level(level)
-    if max_bytes_per_s is not None and (type(max_bytes_per_s) is not int or max_bytes_per_s < 1):
-        raise InvalidInputError(f"max_bytes_per_s = {max_bytes_per_s!r}: use 1 or more, or None")
-    if held is not None and held.level != level:
-        raise InvalidInputError(f"the held tiles are of level {held.level}, not {level}")
+    async def __aenter__(self) -> "AsyncMeshWatch":
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    def __aiter__(self) -> "AsyncMeshWatch":
+        """Updates as they come, until the watch is closed."""
+        return self
+
+    async def __anext__(self) -> MeshUpdate:
+        update = await self.next()
+        if update is None:
+            raise StopAsyncIteration
+        return update
+
+    async def next(self, timeout: float | None = None) -> MeshUpdate | None:
+        """As :meth:`MeshWatch.next`."""
+        with suppress(_WatchClosedError):
+            return await self._run(self._next(timeout))
+        return None
+
+    async def catch_up(self, timeout: float = 60.0) -> None:
+        """As :meth:`MeshWatch.catch_up`."""
+        await self._run(self._catch_up(timeout))
+
+    async def mesh(self) -> Mesh:
+        """As :meth:`MeshWatch.mesh`; the tiles are joined in a thread."""
+        followed = self._followed
+        return await self._drive(worked(lambda _: followed.mesh()))
+
+    async def close(self) -> None:
+        """As :meth:`MeshWatch.close`, in other tasks."""
+        if not self._closed.done():
+            self._closed.set_result(None)
+
+    async def _run(self, call: Call[ResultT]) -> ResultT:
+        asking = asyncio.ensure_future(self._drive(call))
+        either: set[asyncio.Future[Any]] = {asking, self._closed}
+        try:
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+            if asking.done():
+                return asking.result()
+            raise _WatchClosedError
+        finally:
+            asking.cancel()
+            await asyncio.wait({asking})  # until its requests are cancelled

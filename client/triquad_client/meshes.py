@@ -12,27 +12,28 @@ from triquad_client.mesh import Mesh
 from triquad_client.welding import joined
 
 
-def tiles(bounds: Bounds | None) -> Call[TileList]:
+def tiles(bounds: Bounds | None, level: int) -> Call[TileList]:
     """The tiles that meet the bounds."""
-    return (yield from _tiles(*checks.box(bounds)))
+    return (yield from _tiles(*checks.box(bounds), checks.level_of_detail(level)))
 
 
-def tile(x: int, y: int, z: int) -> Call[Mesh]:
+def tile(x: int, y: int, z: int, level: int) -> Call[Mesh]:
     """The newest mesh of one tile."""
-    tile = yield from ask(_tile((x, y, z), 0))
+    tile = yield from ask(_tile((x, y, z), 0, checks.level_of_detail(level)))
     return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
 
 
-def mesh(bounds: Bounds | None) -> Call[Mesh]:
+def mesh(bounds: Bounds | None, level: int) -> Call[Mesh]:
     """The faces whose centroids lie in the bounds, from one epoch."""
     minimum, maximum = checks.box(bounds)
-    return (yield from retried("epoch_gone", lambda: _mesh(minimum, maximum)))
+    checks.level_of_detail(level)
+    return (yield from retried("epoch_gone", lambda: _mesh(minimum, maximum, level)))
 
 
-def _mesh(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Call[Mesh]:
-    listed = yield from _tiles(minimum, maximum)
+def _mesh(minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int) -> Call[Mesh]:
+    listed = yield from _tiles(minimum, maximum, level)
     indices = [(int(x), int(y), int(z)) for x, y, z in listed.tiles]
-    tiles = yield from ask_each(indices, lambda index: _tile(index, listed.epoch))
+    tiles = yield from ask_each(indices, lambda index: _tile(index, listed.epoch, level))
 
     def join(_: Run) -> Mesh:
         triangles = [(tile.origin + tile.vertices, tile.faces) for tile in tiles]
@@ -41,10 +42,12 @@ def _mesh(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Call[Me
     return (yield from worked(join))
 
 
-def _tiles(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> Call[TileList]:
-    request = TileListRequest(minimum, maximum, 0)
+def _tiles(
+    minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int
+) -> Call[TileList]:
+    request = TileListRequest(minimum, maximum, 0, level)
     return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
 
 
-def _tile(index: tuple[int, int, int], epoch: int) -> Ask[Tile]:
-    return Ask(keys.TILE, TileRequest(*index, epoch), Tile, background=True)
+def _tile(index: tuple[int, int, int], epoch: int, level: int) -> Ask[Tile]:
+    return Ask(keys.TILE, TileRequest(*index, epoch, level), Tile, background=True)
