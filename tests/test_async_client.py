@@ -456,9 +456,6 @@ def test_other_tasks_run_while_a_program_waits():
         connected(endpoint, use)
 
 
-ONLY_BLOCKING = {"watch_mesh"}  # a generator that waits
-
-
 @pytest.mark.parametrize(
     ("blocking", "awaited"),
     [
@@ -475,7 +472,4 @@ def test_both_clients_are_asked_alike(blocking, awaited):
             if not name.startswith("_")
         }
 
-    wanted = parameters(blocking)
-    for name in ONLY_BLOCKING:
-        wanted.pop(name, None)
-    assert parameters(awaited) == wanted
+    assert parameters(awaited) == parameters(blocking)
