@@ -46,19 +46,24 @@ class UnknownSpace:
         nowhere = np.flatnonzero(~known[owners])
         found.distance[nowhere] = 0.0
         found.point[nowhere] = points[nowhere]
-        for home in np.flatnonzero(known):
-            rows = np.flatnonzero(owners == home)
+        for number in np.flatnonzero(known):
+            rows = np.flatnonzero(owners == number)
             near = NearestUnknown(found.distance[rows], found.point[rows])
-            self._improve_near(near, points[rows])
+            x, y, z = homes[number].tolist()
+            self._improve_near(near, points[rows], (x, y, z))
             found.distance[rows], found.point[rows] = near.distance, near.point
 
-    def _improve_near(self, found: NearestUnknown, points: NDArray[np.float64]) -> None:
-        """As :meth:`improve`, of points in one cell."""
+    def _improve_near(
+        self, found: NearestUnknown, points: NDArray[np.float64], home: RegionIndex
+    ) -> None:
+        """As :meth:`improve`, of points in the cell of one region."""
+        # Mostly that is all: what it finds is nearer than the other cells.
+        self._look_in_region(found, points, self._regions[home])
         for cell in self._cells_around(points, float(found.distance.max())):
             region = self._regions.get(cell)
             if region is None:
                 self._look_in_cell(found, points, cell)
-            else:
+            elif cell != home:
                 self._look_in_region(found, points, region)
 
     def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
