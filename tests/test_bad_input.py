@@ -19,9 +19,21 @@ from triquad_format.messages import (
     TileListRequest,
     TileRequest,
 )
+from triquad_format.query_messages import RaysRequest, SegmentsRequest
 
 ORIGIN = np.zeros(3)
 ONE_POINT = np.zeros((1, 3), np.float32)
+
+
+def segments(count: int, length_m: float) -> SegmentsRequest:
+    starts = np.zeros((count, 3), np.float32)
+    ends = starts + np.array([length_m, 0, 0], np.float32)
+    return SegmentsRequest(ORIGIN, starts, ends, 0.1, 5.0, 0)
+
+
+def rays(count: int, range_m: float) -> RaysRequest:
+    ways = np.tile(np.array([1, 0, 0], np.float32), (count, 1))
+    return RaysRequest(ORIGIN, np.zeros_like(ways), ways, range_m, False, 0)
 
 
 @pytest.fixture(scope="module")
@@ -193,6 +205,9 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
             "too_large",
         ),
         *((operation, bytes(12_010_000), "too_large") for operation in keys.OPERATIONS),
+        (keys.SEGMENTS, segments(2_000, 900.0), "too_large"),
+        (keys.SEGMENTS, segments(1, 1_001.0), "bad_request"),
+        (keys.RAYS, rays(100_000, 1_000.0), "too_large"),
         (keys.TILE, TileRequest(2**62, 0, 0, 0), "bad_request"),
         (keys.TILE, TileRequest(0, -(2**63), 0, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),

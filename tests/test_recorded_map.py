@@ -195,6 +195,17 @@ def test_a_map_of_which_nothing_is_known(ground):
         assert np.isnan(view.query(places(10)).sdf).all()
 
 
+def test_points_far_from_the_map_are_unknown_however_far_apart(ground):
+    """Each lies in a cell of its own of the lattice of regions: one after the other is too slow."""
+    compiled, _ = ground
+    points = np.random.default_rng(1).uniform(-1e8, 1e8, (100_000, 3))
+    points[0], points[1] = (5.0, 0.0, 1.0), (1e22, 0.0, 0.0)
+    found = compiled.nearest_unknown(points, 100.0)
+    assert found.distance[0] > 0.5
+    assert not found.distance[1:].any()
+    np.testing.assert_array_equal(found.point[1:], points[1:])
+
+
 def test_no_points_get_no_answers(ground):
     for view in ground:
         answer = distances(view, np.zeros((0, 3)), DistanceOptions(unknown_distance=True))

@@ -1,5 +1,6 @@
 """How far it is to space of which nothing is known."""
 
+import itertools
 from collections.abc import Iterable
 from typing import Protocol
 
@@ -10,6 +11,7 @@ from triquad_format.region import RegionIndex, leaf_coordinates, owned_blocks
 from triquad_query.nearest import NearestUnknown
 
 from triquad_kernels.evidence import Evidence
+from triquad_kernels.voxel_index import CELL_LIMIT
 
 
 class PlacedEvidence(Protocol):
@@ -37,23 +39,44 @@ class UnknownSpace:
 
     def improve(self, found: NearestUnknown, points: NDArray[np.float64]) -> None:
         """Note in ``found`` what unknown space lies nearer to ``points`` [N, 3]."""
-        for cell in self._cells_around(points, float(found.distance.max(initial=0.0))):
+        homes, owners = np.unique(self._cells(points), axis=0, return_inverse=True)
+        owners = owners.reshape(-1)
+        known = np.array([tuple(home) in self._regions for home in homes.tolist()], np.bool_)
+        # Most points that are far from the map need nothing more, however many cells they lie in.
+        nowhere = np.flatnonzero(~known[owners])
+        found.distance[nowhere] = 0.0
+        found.point[nowhere] = points[nowhere]
+        for number in np.flatnonzero(known):
+            rows = np.flatnonzero(owners == number)
+            near = NearestUnknown(found.distance[rows], found.point[rows])
+            x, y, z = homes[number].tolist()
+            self._improve_near(near, points[rows], (x, y, z))
+            found.distance[rows], found.point[rows] = near.distance, near.point
+
+    def _improve_near(
+        self, found: NearestUnknown, points: NDArray[np.float64], home: RegionIndex
+    ) -> None:
+        """As :meth:`improve`, of points in the cell of one region."""
+        # Mostly that is all: what it finds is nearer than the other cells.
+        self._look_in_region(found, points, self._regions[home])
+        for cell in self._cells_around(points, float(found.distance.max())):
             region = self._regions.get(cell)
             if region is None:
                 self._look_in_cell(found, points, cell)
-            else:
+            elif cell != home:
                 self._look_in_region(found, points, region)
 
+    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Cells [N, 3] of the region lattice that hold the points; far ones at its ends."""
+        cells = np.floor(points / self._settings.region_pitch_m + 0.5)
+        return np.clip(cells, -CELL_LIMIT, CELL_LIMIT).astype(np.int64)
+
     def _cells_around(self, points: NDArray[np.float64], reach_m: float) -> list[RegionIndex]:
-        """Cells of the region lattice that come within ``reach_m`` of any of the points."""
-        pitch = self._settings.region_pitch_m
-        low = np.floor((points - reach_m) / pitch + 0.5).astype(np.int64)
-        high = np.floor((points + reach_m) / pitch + 0.5).astype(np.int64)
-        cells: set[RegionIndex] = set()
-        for pair in np.unique(np.concatenate([low, high], axis=1), axis=0).tolist():
-            spans = [range(pair[axis], pair[axis + 3] + 1) for axis in range(3)]
-            cells |= {(x, y, z) for x in spans[0] for y in spans[1] for z in spans[2]}
-        return sorted(cells)
+        """Cells that come within ``reach_m`` of the box around the points."""
+        low = self._cells(points.min(axis=0) - reach_m).tolist()
+        high = self._cells(points.max(axis=0) + reach_m).tolist()
+        x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
+        return list(itertools.product(x, y, z))
 
     def _look_in_cell(
         self, found: NearestUnknown, points: NDArray[np.float64], cell: RegionIndex

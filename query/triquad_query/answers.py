@@ -43,6 +43,9 @@ MAX_ITERATIONS = 200
 _STEPS_EACH = 50
 """Places along a segment that count as much as a point that is asked for."""
 
+_RANGE_EACH_M = 10.0
+"""Range of a ray that counts as much."""
+
 
 class QuestionError(Exception):
     """Why a question is not answered; ``code`` is one of ``messages.ERROR_CODES``."""
@@ -130,6 +133,7 @@ class Answers:
             _within("radius_m", request.radius_m, MAX_DISTANCE_M, least=0.0),
             _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
         )
+        _short("segment", np.linalg.norm(ends - starts, axis=1))
         with self._view(request.epoch) as view:
             steps = steps_at_most(view, starts, ends)
             self._check_count(steps / _STEPS_EACH, f"segments of {steps} steps")
@@ -158,6 +162,9 @@ class Answers:
                 "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
             )
         reach_m = _within("max_range_m", request.max_range_m, MAX_RANGE_M)
+        self._check_count(
+            len(starts) * reach_m / _RANGE_EACH_M, f"{len(starts)} rays of {reach_m:g} m"
+        )
         options = RayOptions(reach_m, request.through_unknown)
         with self._view(request.epoch) as view:
             answer = rays(view, starts, directions / lengths[:, None], options)
@@ -252,6 +259,16 @@ def _within(name: str, value: float, most: float, least: float = 1e-6) -> float:
     if not least <= value <= most:
         raise QuestionError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
     return float(value)
+
+
+def _short(what: str, lengths: NDArray[np.float64]) -> None:
+    """Refuse ways [N] that are too long: each of their steps waits for the one before."""
+    if lengths.max(initial=0.0) > MAX_RANGE_M:
+        worst = int(lengths.argmax())
+        raise QuestionError(
+            "bad_request",
+            f"{what} {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
+        )
 
 
 def _same_length(first: NDArray[np.float32], name: str, second: NDArray[np.float32]) -> None:
