@@ -101,6 +101,8 @@ def epoch(number: int) -> int:
         InvalidInputError: it is none.
     """
     try:
+        if isinstance(number, bool):
+            raise TypeError("a truth value")
         checked = operator.index(number)
     except TypeError as error:
         raise InvalidInputError(f"at_epoch = {number!r} is not the number of an epoch") from error

@@ -68,6 +68,10 @@ class FollowedMesh:
         empty = cls(minimum, maximum, level, rate, secrets.token_hex(8))
         if held is None:
             return empty
+        if not isinstance(held, HeldTiles):
+            raise InvalidInputError(
+                f"held = {held!r}: give what an earlier watch's held() returned"
+            )
         if held.level != level:
             raise InvalidInputError(f"the held tiles are of level {held.level}, not {level}")
         tiles = _meeting(minimum, maximum, held)

@@ -195,9 +195,9 @@ class Service:
         answers = Answers(
             views.view, QuestionLimits(limits.max_query_points, limits.max_search_points)
         )
+        self._open_desk({keys.SDF: answering(SdfRequest, answers.sdf)}, limits.query_workers)
         self._open_desk(
             {
-                keys.SDF: answering(SdfRequest, answers.sdf),
                 keys.DISTANCE: answering(DistanceRequest, answers.distance),
                 keys.SPHERES: answering(SpheresRequest, answers.spheres),
             },
