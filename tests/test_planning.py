@@ -238,3 +238,16 @@ def test_a_scan_finds_its_place(client):
     assert dense.inlier_share > 0.9
     with pytest.raises(triquad_client.InvalidInputError, match="not rigid"):
         client.align(points, 2 * true)
+
+
+def test_answers_do_not_hang_on_what_else_is_asked(client):
+    """Places on the faces of voxels, as people type them."""
+    places = np.round(np.random.default_rng(6).uniform(-5, 5, (300, 3)), 1)
+    ways = np.tile([1.0, 0, 0], (len(places), 1))
+    together = client.query_rays(places, ways, max_range=20.0)
+    status = client.query_spheres(places, 0.3).status
+    for i in range(0, len(places), 10):
+        alone = client.query_rays(places[i], ways[:1], max_range=20.0)
+        assert alone.status[0] == together.status[i]
+        assert alone.range[0] == pytest.approx(together.range[i], abs=1e-3)
+        assert client.query_spheres(places[i : i + 1], 0.3).status[0] == status[i]

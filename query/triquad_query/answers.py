@@ -40,6 +40,7 @@ MAX_DISTANCE_M = 100.0
 MAX_RANGE_M = 1_000.0
 MAX_ITERATIONS = 200
 
+_DECIMALS = 5  # of positions, metres
 _STEPS_EACH = 50
 """Places along a segment that count as much as a point that is asked for."""
 
@@ -248,7 +249,9 @@ def _points(
         raise QuestionError(
             "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
         )
-    points = origin + offsets.astype(np.float64)
+    # Single precision from an origin is good to that. Unrounded, a point that somebody chose on a
+    # face of voxels would lie on one side or the other by what else is in the request.
+    points = np.round(origin + offsets.astype(np.float64), _DECIMALS)
     if not np.isfinite(points).all():
         index = int(np.isfinite(points).all(axis=1).argmin())
         raise QuestionError("bad_request", f"{what} {index} is not finite: {points[index]}")

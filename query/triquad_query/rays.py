@@ -12,6 +12,9 @@ from triquad_query.segments import STEP_VOXELS
 
 _HIT_M = 0.005
 _LEAST_STEP_M = 0.02
+_TOUCH_M = 1e-5
+"""A ray that comes as near to unknown space has reached it: its places are no more exact."""
+
 _LOOK_AHEAD_M = 3.0
 """How far around a surface is looked for: farther costs more than shorter steps."""
 
@@ -96,7 +99,7 @@ def _stop_at_unknown(
     while len(going):
         points = origins[going] + at[going, None] * directions[going]
         free_m = view.nearest_unknown(points, _LOOK_AHEAD_M).distance
-        unknown = free_m <= 0.0
+        unknown = free_m <= _TOUCH_M
         ranges[going[unknown]] = at[going[unknown]]
         status[going[unknown]] = Status.UNKNOWN
         at[going] += np.maximum(free_m, step_m)
