@@ -23,7 +23,7 @@ from triquad_kernels.unknown_space import UnknownSpace
 
 Work = Callable[[int, int], None]
 
-_LEAST_SEARCHES = 256
+_LEAST_SEARCHES = 1024
 """Points for which it is worth while to start another thread that searches."""
 
 
