@@ -16,7 +16,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-DISC_RADIUS = 0.40
+DISC_RADIUS = 0.45
 """Of a surfel, in voxels: discs of neighbours overlap where a surface goes on, and jut out little
 where it ends."""
 

@@ -153,8 +153,8 @@ class MapperThread:
             return
         took_scan = self._ingest_next()
         if not self._mapper.settled:
-            # No longer than half a step takes: however many ask, training waits a third of its time.
-            self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
+            # No longer than a quarter of a step takes: however many ask, it waits a fifth of its time.
+            self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 4))
             started = time.monotonic()
             self._mapper.train()
             self._step_s = time.monotonic() - started

@@ -124,8 +124,8 @@ def _corridor(probes: AnswerProbes, view: MapView) -> list[Figure]:
     answer = distances(view, probes.corridor, DistanceOptions(REACH_M))
     false = (balls.status == Status.SURFACE) | (answer.distance <= 0)
     return [
-        Figure(f"{len(probes.corridor)} balls in the corridor: false obstacles", float(false.sum()), "",
-               at_most=0),
+        Figure(f"{len(probes.corridor)} balls in the corridor: false obstacles",
+               float(false.sum()), "", at_most=0),
         Figure("balls in the corridor: unknown", 100 * (balls.status == Status.UNKNOWN).mean(),
                "%"),
     ]  # fmt: skip
