@@ -153,7 +153,7 @@ class MapperThread:
             return
         took_scan = self._ingest_next()
         if not self._mapper.settled:
-            # No longer than a quarter of a step takes: however many ask, it waits a fifth of its time.
+            # However many ask, training waits a fifth of its time at most.
             self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 4))
             started = time.monotonic()
             self._mapper.train()
