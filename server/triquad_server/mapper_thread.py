@@ -153,8 +153,8 @@ class MapperThread:
             return
         took_scan = self._ingest_next()
         if not self._mapper.settled:
-            # However many ask, training waits a fifth of its time at most.
-            self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 4))
+            # However many ask, training waits a third of its time at most.
+            self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
             started = time.monotonic()
             self._mapper.train()
             self._step_s = time.monotonic() - started
