@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.evidence_voxels import surface_counts
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 from triquad_query.confidence import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
 
@@ -144,7 +145,7 @@ class Observations:
 
     def levels(self, surface: Masks) -> NDArray[np.uint8]:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
-        levels = np.zeros(int(np.unpackbits(surface).sum()), np.uint8)
+        levels = np.zeros(int(surface_counts(surface).sum()), np.uint8)
         self._make_room(len(surface))
         _levels(surface, self._observed, levels)
         return levels

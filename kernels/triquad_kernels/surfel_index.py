@@ -5,11 +5,14 @@ Blocks that hold any are found by groups, cubes of 4 x 4 x 4 blocks, so that emp
 nothing.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format import morton
+from triquad_format.evidence_voxels import surface_counts
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
 
 from triquad_kernels.voxel_index import Index, VoxelIndex
@@ -48,10 +51,26 @@ class SurfelIndex(NamedTuple):
     kinds: Masks  # [surfels] SurfelKind
 
 
+@dataclass(frozen=True)
+class SurfelPlaces:
+    """Where the surfels of the voxels in which rays ended stand."""
+
+    surface: Masks  # [blocks, BLOCK_BYTES] these voxels
+    starts: Ints  # [blocks + 1] first surfel of each block
+    voxels: NDArray[np.int64]  # [S, 3] voxel of each surfel
+    groups: BlockGroups
+
+
+def surfel_places(cells: NDArray[np.int64], surface: Masks) -> SurfelPlaces:
+    """Places for the voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks at ``cells`` [, 3]."""
+    starts = surfel_starts(surface)
+    voxels = surfel_voxels(cells, surface, int(starts[-1]))
+    return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface))
+
+
 def surfel_starts(surface: Masks) -> Ints:
     """The first surfel [blocks + 1] of the voxels in ``surface`` [blocks, BLOCK_BYTES]."""
-    counts = np.unpackbits(surface, axis=1).sum(axis=1, dtype=np.int32)
-    return np.concatenate([np.zeros(1, np.int32), np.cumsum(counts, dtype=np.int32)])
+    return np.concatenate([[0], np.cumsum(surface_counts(surface))]).astype(np.int32)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -117,17 +136,16 @@ def _block_boxes(cells: NDArray[np.int64], surface: Masks, rows: NDArray[np.int6
 def block_groups(cells: NDArray[np.int64], surface: Masks) -> BlockGroups:
     """The blocks at ``cells`` [blocks, 3] that hold any of ``surface``, in groups."""
     used = np.flatnonzero(surface.any(axis=1))
-    places = cells[used] >> GROUP_SHIFT
-    groups, owners = np.unique(places, axis=0, return_inverse=True)
-    order = np.argsort(owners.reshape(-1), kind="stable")
-    starts = np.searchsorted(owners.reshape(-1)[order], np.arange(len(groups) + 1))
+    codes, owners = np.unique(morton.encode(cells[used] >> GROUP_SHIFT), return_inverse=True)
+    order = np.argsort(owners, kind="stable")
+    starts = np.searchsorted(owners[order], np.arange(len(codes) + 1))
     boxes = _block_boxes(cells, surface, used[order])
-    around = np.zeros((len(groups), 6), np.int32)
-    if len(groups):
+    around = np.zeros((len(codes), 6), np.int32)
+    if len(codes):
         around[:, :3] = np.minimum.reduceat(boxes[:, :3], starts[:-1])
         around[:, 3:] = np.maximum.reduceat(boxes[:, 3:], starts[:-1])
     return BlockGroups(
-        VoxelIndex.of_cells(groups).arrays,
+        VoxelIndex.of_cells(morton.decode(codes, 3)).arrays,
         around,
         starts.astype(np.int32),
         used[order].astype(np.int32),

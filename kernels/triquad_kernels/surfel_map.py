@@ -6,17 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.region import BLOCK_VOXELS
-from triquad_query.confidence import POINT_SHARE, level_confidence
+from triquad_query.confidence import support_confidence
 from triquad_query.surfels import FieldSample, SurfelKind, Surfels, fit_surfels
 
 from triquad_kernels.evidence import Evidence
-from triquad_kernels.surfel_index import (
-    SurfelIndex,
-    block_groups,
-    moved_rows,
-    surfel_starts,
-    surfel_voxels,
-)
+from triquad_kernels.surfel_index import SurfelIndex, SurfelPlaces, moved_rows, surfel_places
 from triquad_kernels.surfel_search import Nearest, find_nearest
 
 _FAR = 1e6  # voxels
@@ -36,25 +30,29 @@ class SurfelTask:
 class SurfelMap:
     """Immutable: epochs share it."""
 
-    def __init__(self, evidence: Evidence, surfels: Surfels, fitted: NDArray[np.int32]) -> None:
+    def __init__(
+        self,
+        places: SurfelPlaces,
+        evidence: Evidence,
+        surfels: Surfels,
+        fitted: NDArray[np.int32],
+    ) -> None:
         """Use :func:`first_surfels` or :meth:`updated`; ``fitted`` are epochs of the last fit."""
+        self._places = places
         self._surfels = surfels
         self._fitted = fitted
-        self._surface = evidence.surface
-        starts = surfel_starts(self._surface)
-        voxels = surfel_voxels(evidence.cells, self._surface, len(surfels.kinds))
-        positions = (voxels % BLOCK_VOXELS + 0.5 + surfels.offsets).astype(np.float32)
+        positions = (places.voxels % BLOCK_VOXELS).astype(np.float32)
+        positions += surfels.offsets + np.float32(0.5)
         positions[surfels.kinds == SurfelKind.NONE] = _FAR
         self._index = SurfelIndex(
-            block_groups(evidence.cells, self._surface),
-            starts,
+            places.groups,
+            places.starts,
             np.ascontiguousarray(positions.T),
             surfels.normals,
             surfels.kinds,
         )
-        shares = np.where(surfels.kinds == SurfelKind.POINT, POINT_SHARE, 1.0)
-        self.confidence = (level_confidence()[evidence.levels()] * shares).astype(np.float32)
-        self.seen_s = np.repeat(evidence.seen_s(), np.diff(starts))
+        self.confidence = support_confidence(evidence.levels(), surfels.kinds)
+        self.seen_s = np.repeat(evidence.seen_s(), np.diff(places.starts))
 
     def __len__(self) -> int:
         return len(self._surfels.kinds)
@@ -65,28 +63,40 @@ class SurfelMap:
 
     def updated(self, evidence: Evidence, field: SampleField, task: SurfelTask) -> "SurfelMap":
         """The surfels of a later epoch: new ones are fitted, and of the others the oldest."""
-        total = int(surfel_starts(evidence.surface)[-1])
-        rows = moved_rows(self._surface, self._index.starts, evidence.surface, total)
-        known = rows >= 0
-        fitted = np.full(total, _NEVER, np.int32)
-        fitted[known] = self._fitted[rows[known]]
-        surfels = _empty(total)
-        for name, array in vars(surfels).items():
-            array[known] = getattr(self._surfels, name)[rows[known]]
-        chosen = np.flatnonzero(known)
-        if task.most is not None and len(chosen) > task.most:
-            chosen = chosen[np.argpartition(fitted[chosen], task.most)[: task.most]]
-        chosen = np.concatenate([np.flatnonzero(~known), chosen])
-        voxels = surfel_voxels(evidence.cells, evidence.surface, total)[chosen]
-        for name, array in vars(fit_surfels(voxels, field, evidence.ended_in)).items():
+        places, surfels, fitted = self._carried(evidence)
+        known = np.flatnonzero(fitted != _NEVER)
+        if task.most is not None and len(known) > task.most:
+            known = known[np.argpartition(fitted[known], task.most)[: task.most]]
+        chosen = np.concatenate([np.flatnonzero(fitted == _NEVER), known])
+        new = fit_surfels(places.voxels[chosen], field, evidence.ended_in)
+        for name, array in vars(new).items():
             getattr(surfels, name)[chosen] = array
         fitted[chosen] = task.epoch
-        return SurfelMap(evidence, surfels, fitted)
+        return SurfelMap(places, evidence, surfels, fitted)
+
+    def _carried(self, evidence: Evidence) -> tuple[SurfelPlaces, Surfels, NDArray[np.int32]]:
+        """Copies of the surfels in the places of ``evidence``, and when they were fitted last."""
+        before = self._places
+        if np.array_equal(before.surface, evidence.surface):
+            copies = {name: array.copy() for name, array in vars(self._surfels).items()}
+            return before, Surfels(**copies), self._fitted.copy()
+        places = surfel_places(evidence.cells, evidence.surface)
+        total = len(places.voxels)
+        rows = moved_rows(before.surface, before.starts, places.surface, total)
+        kept = np.flatnonzero(rows >= 0)
+        rows = rows[kept]
+        surfels, fitted = _empty(total), np.full(total, _NEVER, np.int32)
+        for name, array in vars(surfels).items():
+            array[kept] = getattr(self._surfels, name)[rows]
+        fitted[kept] = self._fitted[rows]
+        return places, surfels, fitted
 
 
 def first_surfels(evidence: Evidence, field: SampleField, task: SurfelTask) -> SurfelMap:
     """The surfels of all seen voxels."""
-    none = SurfelMap(Evidence(1), _empty(0), np.zeros(0, np.int32))
+    nothing = Evidence(1)
+    places = surfel_places(nothing.cells, nothing.surface)
+    none = SurfelMap(places, nothing, _empty(0), np.zeros(0, np.int32))
     return none.updated(evidence, field, task)
 
 

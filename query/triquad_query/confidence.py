@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.region import MAX_LEVEL
 
+from triquad_query.surfels import SurfelKind
+
 LEVELS = MAX_LEVEL + 1
 
 NEAR_M = 10.0
@@ -25,6 +27,12 @@ HALF_LIFE_S = 86_400.0
 
 POINT_SHARE = 0.5
 """Of the confidence, where rays ended but the field shows no surface."""
+
+
+def support_confidence(levels: NDArray[np.uint8], kinds: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The confidence [N] of surfels of some :class:`SurfelKind` at these levels, just seen."""
+    shares = np.where(kinds == SurfelKind.POINT, np.float32(POINT_SHARE), np.float32(1))
+    return np.asarray(level_confidence()[levels] * shares, np.float32)
 
 
 def level_confidence() -> NDArray[np.float32]:

@@ -11,11 +11,11 @@ from triquad_format.evidence_voxels import seen_voxels, surface_counts
 from triquad_format.field_settings import FieldSettings
 from triquad_format.region import MapRecord, Region, region_corner
 
-from triquad_query.confidence import POINT_SHARE, faded, level_confidence
+from triquad_query.confidence import faded, support_confidence
 from triquad_query.nearest import NearestSurface, NearestUnknown
 from triquad_query.seen_space import SeenSpace
 from triquad_query.surfel_cloud import SurfelCloud
-from triquad_query.surfels import Field, FieldSample, SurfelKind, fit_surfels
+from triquad_query.surfels import Field, FieldSample, fit_surfels
 from triquad_query.voxel_blocks import VoxelBlocks
 
 
@@ -113,13 +113,12 @@ def _fit(settings: FieldSettings, region: Region, newest_s: int) -> _FittedSurfa
     voxels = seen_voxels(evidence, evidence.surface)
     ended = VoxelBlocks(morton.decode(evidence.codes, 3), evidence.surface)
     surfels = fit_surfels(voxels, _field_in_voxels(settings, region), ended.holds)
-    share = np.where(surfels.kinds == SurfelKind.POINT, POINT_SHARE, 1.0)
     levels = np.zeros(len(voxels), np.uint8) if evidence.levels is None else evidence.levels
-    confidence = level_confidence()[levels] * share
+    confidence = support_confidence(levels, surfels.kinds)
     if evidence.seen_s is not None:
         seen_s = np.repeat(evidence.seen_s, surface_counts(evidence.surface))
         confidence *= faded((newest_s - seen_s).astype(np.float64))
-    return _FittedSurface(SurfelCloud(voxels, surfels), confidence.astype(np.float32))
+    return _FittedSurface(SurfelCloud(voxels, surfels), confidence)
 
 
 def _field_in_voxels(settings: FieldSettings, region: Region) -> Field:
