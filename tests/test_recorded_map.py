@@ -12,16 +12,12 @@ from triquad_format.region import MapRecord
 from triquad_kernels.compiled_view import CompiledView
 from triquad_kernels.evidence import Evidence
 from triquad_kernels.recorded_view import recorded_view
-from triquad_kernels.surfel_index import (
-    SurfelIndex,
-    block_groups,
-    surfel_starts,
-    surfel_voxels,
-)
-from triquad_kernels.surfel_search import Nearest, find_nearest
+from triquad_kernels.surfel_index import surfel_index, surfel_places
+from triquad_kernels.surfel_search import find_nearest
 from triquad_query.distance import DistanceOptions, distances
 from triquad_query.grid import GridShape, grid
 from triquad_query.map_view import MapView
+from triquad_query.nearest import no_surfels
 from triquad_query.rays import RayOptions, rays
 from triquad_query.recorded_map import RecordedMap
 from triquad_query.segments import SegmentOptions, segments
@@ -67,15 +63,13 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
     rng = np.random.default_rng(seed)
     evidence = Evidence(64)
     evidence.mark_surface(rng.uniform(0, 64, (count, 3)) * (1, 1, 0.3))
-    voxels = surfel_voxels(evidence.cells, evidence.surface, surfel_count(evidence))
-    surfels = random_surfels(rng, len(voxels))
+    places = surfel_places(evidence.cells, evidence.surface)
+    surfels = random_surfels(rng, len(places.voxels))
     points = rng.uniform(-20, 84, (400, 3))
     points[:200] = rng.uniform(0, 64, (200, 3)) * (1, 1, 0.3)
-    fast = Nearest(
-        np.full(400, reach), np.zeros((400, 3)), np.zeros((400, 3)), np.full(400, -1, np.int32)
-    )
-    find_nearest(points, surfel_index(evidence, voxels, surfels), fast)
-    slow = SurfelCloud(voxels, surfels).nearest(points, np.full(400, reach))
+    fast = no_surfels(np.full(400, reach))
+    find_nearest(points, surfel_index(places, surfels), fast)
+    slow = SurfelCloud(places.voxels, surfels).nearest(points, np.full(400, reach))
     np.testing.assert_allclose(fast.distances, slow.distances, atol=1e-4)
     np.testing.assert_array_equal(fast.rows >= 0, slow.rows >= 0)
     hit = slow.rows >= 0
@@ -87,10 +81,6 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
     np.testing.assert_allclose(fast.means[hit], slow.means[hit], atol=1e-3)
 
 
-def surfel_count(evidence: Evidence) -> int:
-    return int(surfel_starts(evidence.surface)[-1])
-
-
 def random_surfels(rng: np.random.Generator, count: int) -> Surfels:
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -98,18 +88,6 @@ def random_surfels(rng: np.random.Generator, count: int) -> Surfels:
         rng.uniform(-0.5, 0.5, (count, 3)).astype(np.float32),
         normals.astype(np.float32),
         rng.integers(0, len(SurfelKind), count).astype(np.uint8),
-    )
-
-
-def surfel_index(evidence: Evidence, voxels: np.ndarray, surfels: Surfels) -> SurfelIndex:
-    positions = (voxels % 8 + 0.5 + surfels.offsets).astype(np.float32)
-    positions[surfels.kinds == SurfelKind.NONE] = 1e6
-    return SurfelIndex(
-        block_groups(evidence.cells, evidence.surface),
-        surfel_starts(evidence.surface),
-        np.ascontiguousarray(positions.T),
-        surfels.normals,
-        surfels.kinds,
     )
 
 

@@ -6,7 +6,7 @@ import small_world
 from triquad_kernels.compiled_view import field_samples, in_one
 from triquad_kernels.evidence import Evidence
 from triquad_kernels.surfel_map import SurfelMap, SurfelTask, first_surfels
-from triquad_kernels.surfel_search import Nearest
+from triquad_query.nearest import NearestSurfels, no_surfels
 from triquad_query.surfels import FieldSample, SurfelKind, fit_surfels
 from triquad_server.epoch import FrozenRegion
 from triquad_server.mapper import Mapper
@@ -57,12 +57,8 @@ def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
     np.testing.assert_array_equal(surfels.offsets[0], 0)
 
 
-def nearest(surfels: SurfelMap, points: np.ndarray) -> Nearest:
-    count = len(points)
-    found = Nearest(
-        np.full(count, 40.0), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1)
-    )
-    found = found._replace(rows=found.rows.astype(np.int32))
+def nearest(surfels: SurfelMap, points: np.ndarray) -> NearestSurfels:
+    found = no_surfels(np.full(len(points), 40.0))
     surfels.find_nearest(points, found)
     return found
 

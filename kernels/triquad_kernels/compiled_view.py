@@ -11,15 +11,14 @@ from triquad_format.field_settings import FieldSettings
 from triquad_format.region import RegionIndex, leaf_coordinates
 from triquad_format.status import Status
 from triquad_query.confidence import faded
-from triquad_query.nearest import NearestSurface, NearestUnknown
+from triquad_query.nearest import NearestSurface, NearestUnknown, no_surfels
 from triquad_query.surfels import FieldSample
 
-from triquad_kernels.blended_field import BlendedField, FieldEngine
+from triquad_kernels.blended_field import BlendedField, FieldEngine, PlacedField
 from triquad_kernels.evidence import Evidence
 from triquad_kernels.region_lattice import Owned, RegionLattice
 from triquad_kernels.surfel_map import SampleField, SurfelMap
-from triquad_kernels.surfel_search import Nearest
-from triquad_kernels.unknown_space import UnknownSpace
+from triquad_kernels.unknown_space import PlacedEvidence, UnknownSpace
 
 Work = Callable[[int, int], None]
 
@@ -39,24 +38,8 @@ def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
     work(0, count)
 
 
-class PlacedRegion(Protocol):
+class PlacedRegion(PlacedField, PlacedEvidence, Protocol):
     """One region of a map that does not change; surfels may be made when they are asked for."""
-
-    @property
-    def index(self) -> RegionIndex:
-        """Which region."""
-
-    @property
-    def centre(self) -> NDArray[np.float64]:
-        """[3] metres, map frame."""
-
-    @property
-    def engine(self) -> FieldEngine:
-        """What computes its field."""
-
-    @property
-    def evidence(self) -> Evidence:
-        """What rays have shown of it."""
 
     @property
     def surfels(self) -> SurfelMap:
@@ -223,23 +206,15 @@ class CompiledView:
         near = np.flatnonzero((beyond**2).sum(axis=1) < nearest.distance[part] ** 2)
         if not len(near):
             return
-        found = Nearest(
-            nearest.distance[part][near] / leaf_m,
-            np.zeros((len(near), 3)),
-            np.zeros((len(near), 3)),
-            np.full(len(near), -1, np.int32),
-        )
-        region.surfels.find_nearest(leaf_coordinates(self._settings, offsets[near]), found)
+        found = no_surfels(nearest.distance[part][near] / leaf_m)
+        surfels = region.surfels
+        surfels.find_nearest(leaf_coordinates(self._settings, offsets[near]), found)
         hits = np.flatnonzero(found.rows >= 0)
-        rows = near[hits] + (part.start or 0)
-        surfels = found.rows[hits]
+        found = found.at(hits)
+        age_s = (self._newest_s - surfels.seen_s[found.rows]).astype(np.float64)
+        confidence = np.multiply(surfels.confidence[found.rows], faded(age_s))
         corner = region.centre - self._settings.region_side_m / 2
-        nearest.found[rows] = True
-        nearest.distance[rows] = found.distances[hits] * leaf_m
-        nearest.point[rows] = corner + found.feet[hits] * leaf_m
-        nearest.mean[rows] = corner + found.means[hits] * leaf_m
-        age_s = (self._newest_s - region.surfels.seen_s[surfels]).astype(np.float64)
-        nearest.confidence[rows] = np.multiply(region.surfels.confidence[surfels], faded(age_s))
+        nearest.take(near[hits] + (part.start or 0), found, corner, leaf_m, confidence)
 
     def _status(
         self, points: NDArray[np.float64], groups: Iterable[Owned], reach: float = 0.5

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from triquad_format import morton
 from triquad_format.evidence_voxels import surface_counts
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS
+from triquad_query.surfels import SurfelKind, Surfels
 
 from triquad_kernels.voxel_index import Index, VoxelIndex
 
 _SHIFT = BLOCK_VOXELS.bit_length() - 1
 _LOW = BLOCK_VOXELS - 1
+_FAR = 1e6  # voxels
 GROUP_SHIFT = 2
 GROUP_VOXELS = float(BLOCK_VOXELS << GROUP_SHIFT)
 
@@ -66,6 +68,20 @@ def surfel_places(cells: NDArray[np.int64], surface: Masks) -> SurfelPlaces:
     starts = surfel_starts(surface)
     voxels = surfel_voxels(cells, surface, int(starts[-1]))
     return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface))
+
+
+def surfel_index(places: SurfelPlaces, surfels: Surfels) -> SurfelIndex:
+    """The ``surfels`` [S] that stand in some places."""
+    positions = (places.voxels % BLOCK_VOXELS).astype(np.float32)
+    positions += surfels.offsets + np.float32(0.5)
+    positions[surfels.kinds == SurfelKind.NONE] = _FAR
+    return SurfelIndex(
+        places.groups,
+        places.starts,
+        np.ascontiguousarray(positions.T),
+        surfels.normals,
+        surfels.kinds,
+    )
 
 
 def surfel_starts(surface: Masks) -> Ints:

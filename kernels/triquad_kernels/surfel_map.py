@@ -5,15 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.region import BLOCK_VOXELS
 from triquad_query.confidence import support_confidence
-from triquad_query.surfels import FieldSample, SurfelKind, Surfels, fit_surfels
+from triquad_query.nearest import NearestSurfels
+from triquad_query.surfels import FieldSample, Surfels, fit_surfels
 
 from triquad_kernels.evidence import Evidence
-from triquad_kernels.surfel_index import SurfelIndex, SurfelPlaces, moved_rows, surfel_places
-from triquad_kernels.surfel_search import Nearest, find_nearest
+from triquad_kernels.surfel_index import SurfelPlaces, moved_rows, surfel_index, surfel_places
+from triquad_kernels.surfel_search import find_nearest
 
-_FAR = 1e6  # voxels
 _NEVER = -1
 
 SampleField = Callable[[NDArray[np.float64]], FieldSample]
@@ -41,23 +40,14 @@ class SurfelMap:
         self._places = places
         self._surfels = surfels
         self._fitted = fitted
-        positions = (places.voxels % BLOCK_VOXELS).astype(np.float32)
-        positions += surfels.offsets + np.float32(0.5)
-        positions[surfels.kinds == SurfelKind.NONE] = _FAR
-        self._index = SurfelIndex(
-            places.groups,
-            places.starts,
-            np.ascontiguousarray(positions.T),
-            surfels.normals,
-            surfels.kinds,
-        )
+        self._index = surfel_index(places, surfels)
         self.confidence = support_confidence(evidence.levels(), surfels.kinds)
         self.seen_s = np.repeat(evidence.seen_s(), np.diff(places.starts))
 
     def __len__(self) -> int:
         return len(self._surfels.kinds)
 
-    def find_nearest(self, points: NDArray[np.float64], found: Nearest) -> None:
+    def find_nearest(self, points: NDArray[np.float64], found: NearestSurfels) -> None:
         """Improve ``found`` where a surfel lies nearer to leaf coordinates ``points`` [N, 3]."""
         find_nearest(points, self._index, found)
 

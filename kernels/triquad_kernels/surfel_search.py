@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.region import BLOCK_VOXELS
+from triquad_query.nearest import NearestSurfels
 from triquad_query.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
 
 from triquad_kernels.surfel_index import GROUP_SHIFT, GROUP_VOXELS, SurfelIndex
@@ -40,15 +41,6 @@ Ints = NDArray[np.int32]
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Place = tuple[float, float, float]
-
-
-class Nearest(NamedTuple):
-    """The nearest surfels of N points, in leaf coordinates; kernels improve on what is there."""
-
-    distances: Doubles  # [N] voxels; what lies farther than this at first is not looked for
-    feet: Doubles  # [N, 3] the nearest point
-    means: Doubles  # [N, 3] about the same, over all that is nearly as near
-    rows: Ints  # [N] number of the surfel, -1 where there is none
 
 
 class Search(NamedTuple):
@@ -208,7 +200,9 @@ def _foot(index: SurfelIndex, surfel: int, member: int, at: Place) -> Place:
 
 
 @numba.njit(cache=True, nogil=True)
-def _note_found(index: SurfelIndex, at: Place, search: Search, i: int, nearest: Nearest) -> None:
+def _note_found(
+    index: SurfelIndex, at: Place, search: Search, i: int, nearest: NearestSurfels
+) -> None:
     """Write down what was found for point ``i``."""
     best = np.sqrt(search.best[0])
     surfel = search.found[_SURFEL]
@@ -230,7 +224,7 @@ def _note_found(index: SurfelIndex, at: Place, search: Search, i: int, nearest: 
 
 
 @numba.njit(cache=True, nogil=True)
-def find_nearest(points: Doubles, index: SurfelIndex, nearest: Nearest) -> None:
+def find_nearest(points: Doubles, index: SurfelIndex, nearest: NearestSurfels) -> None:
     """Improve ``nearest`` where a surfel of the region lies nearer to ``points`` [N, 3].
 
     Points are leaf coordinates of the region and may lie outside of it.

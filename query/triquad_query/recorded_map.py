@@ -80,12 +80,9 @@ class _RegionSurface:
         voxels = (points[near] - self._corner) / leaf_m
         found = surfels.cloud.nearest(voxels, nearest.distance[near] / leaf_m)
         hits = np.flatnonzero(found.rows >= 0)
-        rows = near[hits]
-        nearest.found[rows] = True
-        nearest.distance[rows] = found.distances[hits] * leaf_m
-        nearest.point[rows] = self._corner + found.feet[hits] * leaf_m
-        nearest.mean[rows] = self._corner + found.means[hits] * leaf_m
-        nearest.confidence[rows] = surfels.confidence[found.rows[hits]]
+        found = found.at(hits)
+        confidence = surfels.confidence[found.rows]
+        nearest.take(near[hits], found, self._corner, leaf_m, confidence)
 
     def _surfels(self) -> "_FittedSurface":
         with self._fitting:

@@ -1,12 +1,12 @@
 """The surfels of a region, and the nearest of them: the reference for compiled code."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.region import BLOCK_VOXELS
 
+from triquad_query.nearest import NearestSurfels, no_surfels
 from triquad_query.surfels import (
     DISC_RADIUS,
     OUTSIDE,
@@ -19,16 +19,6 @@ _PAIRS = 1 << 19
 """Points with blocks or surfels that are looked at together: what bounds the memory."""
 
 Doubles = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class FoundSurfels:
-    """The nearest surfels of N points, voxels."""
-
-    distances: Doubles  # [N]
-    feet: Doubles  # [N, 3] the nearest point of each
-    means: Doubles  # [N, 3] about the same, over all that is nearly as near
-    rows: NDArray[np.intp]  # [N] number of the surfel, -1 where none is near enough
 
 
 class SurfelCloud:
@@ -47,12 +37,10 @@ class SurfelCloud:
         self._starts = np.append(np.flatnonzero(first), len(cells))
         self._corners = cells[first] * BLOCK_VOXELS
 
-    def nearest(self, points: Doubles, limits: Doubles) -> FoundSurfels:
+    def nearest(self, points: Doubles, limits: Doubles) -> NearestSurfels:
         """The surfels nearest to ``points`` [N, 3] and less than ``limits`` [N] away."""
         count = len(points)
-        found = FoundSurfels(
-            limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.intp)
-        )
+        found = no_surfels(limits)
         blocks = len(self._corners)
         if not blocks:
             return found
@@ -79,7 +67,7 @@ class SurfelCloud:
 
     def _improve(
         self,
-        found: FoundSurfels,
+        found: NearestSurfels,
         points: Doubles,
         part: NDArray[np.intp],
         chosen: NDArray[np.bool_],
@@ -98,7 +86,7 @@ class SurfelCloud:
 
     def _take(
         self,
-        found: FoundSurfels,
+        found: NearestSurfels,
         points: Doubles,
         owners: NDArray[np.intp],
         surfels: NDArray[np.intp],
