@@ -9,20 +9,23 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 """
 
 from triquad_format import __version__
-from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
-from triquad_format.status import Status
-from triquad_query.align import Alignment
-from triquad_query.distance import Distances
-from triquad_query.errors import TriquadError, UnknownSpaceError
-from triquad_query.grid import Grid
-from triquad_query.polyline import Polyline
-from triquad_query.rays import Rays
-from triquad_query.segments import Segments
-from triquad_query.spheres import Spheres
-from triquad_query.unknown import Unknown
+from triquad_format.records.status import Status
+from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_map.errors import TriquadError, UnknownSpaceError
+from triquad_map.questions.align import Alignment
+from triquad_map.questions.distance import Distances
+from triquad_map.questions.grid import Grid
+from triquad_map.questions.polyline import Polyline
+from triquad_map.questions.rays import Rays
+from triquad_map.questions.segments import Segments
+from triquad_map.questions.spheres import Spheres
+from triquad_map.unknown import Unknown
 
 from triquad_client.async_client import AsyncClient, connect_async
-from triquad_client.async_queries import AsyncPinnedMap
+from triquad_client.calls.async_queries import AsyncPinnedMap
+from triquad_client.calls.queries import MapQueries, PinnedMap
+from triquad_client.calls.scans import FlushReport
+from triquad_client.calls.sdf import SdfResult
 from triquad_client.checks import Bounds
 from triquad_client.client import Client, connect
 from triquad_client.errors import (
@@ -37,16 +40,13 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
-from triquad_client.followed_mesh import MeshUpdate
-from triquad_client.local_copy import SyncReport
-from triquad_client.mesh import Mesh
-from triquad_client.mesh_tiles import HeldTiles, MeshTile
-from triquad_client.mesh_watch import AsyncMeshWatch, MeshWatch
-from triquad_client.offline import OfflineMap, open_map
-from triquad_client.queries import MapQueries, PinnedMap
-from triquad_client.questions.sdf import SdfResult
-from triquad_client.scans import FlushReport
-from triquad_client.synced import AsyncSyncedMap, SyncedMap
+from triquad_client.mesh.followed_mesh import MeshUpdate
+from triquad_client.mesh.mesh import Mesh
+from triquad_client.mesh.mesh_tiles import HeldTiles, MeshTile
+from triquad_client.mesh.mesh_watch import AsyncMeshWatch, MeshWatch
+from triquad_client.offline.local_copy import SyncReport
+from triquad_client.offline.offline import OfflineMap, open_map
+from triquad_client.offline.synced import AsyncSyncedMap, SyncedMap
 
 __all__ = [
     "Alignment",

@@ -8,22 +8,21 @@ from types import TracebackType
 from typing import Any
 
 from numpy.typing import ArrayLike
-from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
-from triquad_format.written_map import MapFileInfo
+from triquad_format.mapfile.written_map import MapFileInfo
+from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
-from triquad_client import download, meshes, upkeep
-from triquad_client.async_driver import AsyncDriver
-from triquad_client.async_queries import AsyncMapQueries, AsyncPinnedMap
+from triquad_client.calls import admin, download, meshes, sdf
+from triquad_client.calls.async_queries import AsyncMapQueries, AsyncPinnedMap
+from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds
-from triquad_client.connection import Connection, open_connection
-from triquad_client.followed_mesh import FollowedMesh
-from triquad_client.local_copy import LocalCopy
-from triquad_client.mesh import Mesh
-from triquad_client.mesh_tiles import HeldTiles
-from triquad_client.mesh_watch import AsyncMeshWatch
-from triquad_client.questions import sdf
-from triquad_client.scans import FlushReport, ScanPublisher
-from triquad_client.synced import AsyncSyncedMap
+from triquad_client.mesh.followed_mesh import FollowedMesh
+from triquad_client.mesh.mesh import Mesh
+from triquad_client.mesh.mesh_tiles import HeldTiles
+from triquad_client.mesh.mesh_watch import AsyncMeshWatch
+from triquad_client.net.async_driver import AsyncDriver
+from triquad_client.net.connection import Connection, open_connection
+from triquad_client.offline.local_copy import LocalCopy
+from triquad_client.offline.synced import AsyncSyncedMap
 
 
 class AsyncClient(AsyncMapQueries):
@@ -67,7 +66,7 @@ class AsyncClient(AsyncMapQueries):
 
     async def settle(self, timeout: float = 600.0) -> ServerStatus:
         """As :meth:`Client.settle`."""
-        return await self._run(upkeep.settle(timeout))
+        return await self._run(admin.settle(timeout))
 
     async def pinned(self) -> AsyncPinnedMap:
         """As :meth:`Client.pinned`."""
@@ -98,15 +97,15 @@ class AsyncClient(AsyncMapQueries):
 
     async def status(self) -> ServerStatus:
         """As :meth:`Client.status`."""
-        return await self._run(upkeep.status())
+        return await self._run(admin.status())
 
     async def checkpoint(self) -> CheckpointInfo:
         """As :meth:`Client.checkpoint`."""
-        return await self._run(upkeep.checkpoint())
+        return await self._run(admin.checkpoint())
 
     async def reset(self, bounds: Bounds | None = None) -> int:
         """As :meth:`Client.reset`."""
-        return await self._run(upkeep.reset(bounds))
+        return await self._run(admin.reset(bounds))
 
     async def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
         """As :meth:`Client.download_map`."""

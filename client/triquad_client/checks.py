@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_query.pose import RIGID_TOLERANCE
-from triquad_query.unknown import Unknown
+from triquad_map.questions.pose import RIGID_TOLERANCE
+from triquad_map.unknown import Unknown
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
 

@@ -4,22 +4,21 @@ from pathlib import Path
 from types import TracebackType
 
 from numpy.typing import ArrayLike
-from triquad_format.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
-from triquad_format.written_map import MapFileInfo
+from triquad_format.mapfile.written_map import MapFileInfo
+from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
-from triquad_client import download, meshes, upkeep
-from triquad_client.blocking import BlockingDriver
+from triquad_client.calls import admin, download, meshes, sdf
+from triquad_client.calls.queries import MapQueries, PinnedMap
+from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds
-from triquad_client.connection import Connection, open_connection
-from triquad_client.followed_mesh import FollowedMesh
-from triquad_client.local_copy import LocalCopy
-from triquad_client.mesh import Mesh
-from triquad_client.mesh_tiles import HeldTiles
-from triquad_client.mesh_watch import MeshWatch
-from triquad_client.queries import MapQueries, PinnedMap
-from triquad_client.questions import sdf
-from triquad_client.scans import FlushReport, ScanPublisher
-from triquad_client.synced import SyncedMap
+from triquad_client.mesh.followed_mesh import FollowedMesh
+from triquad_client.mesh.mesh import Mesh
+from triquad_client.mesh.mesh_tiles import HeldTiles
+from triquad_client.mesh.mesh_watch import MeshWatch
+from triquad_client.net.blocking import BlockingDriver
+from triquad_client.net.connection import Connection, open_connection
+from triquad_client.offline.local_copy import LocalCopy
+from triquad_client.offline.synced import SyncedMap
 
 
 class Client(MapQueries):
@@ -103,7 +102,7 @@ class Client(MapQueries):
         Raises:
             RequestTimeoutError: it still had after that time.
         """
-        return self._run(upkeep.settle(timeout))
+        return self._run(admin.settle(timeout))
 
     def pinned(self) -> PinnedMap:
         """The map as it is now, for queries that belong together."""
@@ -151,15 +150,15 @@ class Client(MapQueries):
 
     def status(self) -> ServerStatus:
         """How the server is doing."""
-        return self._run(upkeep.status())
+        return self._run(admin.status())
 
     def checkpoint(self) -> CheckpointInfo:
         """Have the server write the map to its store now."""
-        return self._run(upkeep.checkpoint())
+        return self._run(admin.checkpoint())
 
     def reset(self, bounds: Bounds | None = None) -> int:
         """Forget what was learnt within ``bounds``; returns the first epoch without it."""
-        return self._run(upkeep.reset(bounds))
+        return self._run(admin.reset(bounds))
 
     def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
         """Write the newest map to a file, checked against its digest, all of it or nothing.

@@ -1,6 +1,6 @@
 """The errors of the client. Each text says what to do about it."""
 
-from triquad_query.errors import TriquadError
+from triquad_map.errors import TriquadError
 
 
 class ConnectError(TriquadError):
@@ -30,7 +30,7 @@ class BadReplyError(TriquadError):
 
 
 class RefusedError(TriquadError):
-    """The server refused; ``code`` is one of ``triquad_format.messages.ERROR_CODES``."""
+    """The server refused; ``code`` is one of ``triquad_format.wire.messages.ERROR_CODES``."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(f"{code}: {message}")

@@ -7,11 +7,10 @@ region is right. So a region stays where all its vertices are intact.
 import dataclasses
 
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.field_settings import FieldSettings
-from triquad_format.manifest import MAX_ENTRIES
-from triquad_format.map_facts import unpack_facts
-from triquad_format.mcap_records import Message
-from triquad_format.part import (
+from triquad_format.mapfile.manifest import MAX_ENTRIES
+from triquad_format.mapfile.map_facts import unpack_facts
+from triquad_format.mapfile.mcap.records import Message
+from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     MANIFEST,
     MAP,
@@ -22,10 +21,11 @@ from triquad_format.part import (
     VERTICES,
     PartKey,
 )
-from triquad_format.part_body import PartBody
-from triquad_format.record_check import check_record
-from triquad_format.recovery import Loss, Recovery, loss_of
-from triquad_format.region import MapRecord, Region, RegionIndex
+from triquad_format.mapfile.parts.part_body import PartBody
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.record_check import check_record
+from triquad_format.records.region import MapRecord, Region, RegionIndex
+from triquad_format.recovery.recovery import Loss, Recovery, loss_of
 from triquad_format.version_1 import PartCursor, unpack_region
 
 

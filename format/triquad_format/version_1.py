@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.field_settings import FieldSettings
-from triquad_format.map_facts import unpack_facts
-from triquad_format.mcap_records import MAX_CHUNK_BYTES, Message
-from triquad_format.part import (
+from triquad_format.mapfile.map_facts import unpack_facts
+from triquad_format.mapfile.mcap.records import MAX_CHUNK_BYTES, Message
+from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     MANIFEST,
     MAP,
@@ -25,8 +24,10 @@ from triquad_format.part import (
     TRAINING,
     VERTICES,
 )
-from triquad_format.part_body import MAX_ITEMS, PartBody
-from triquad_format.region import (
+from triquad_format.mapfile.parts.part_body import MAX_ITEMS, PartBody
+from triquad_format.mapfile.parts.shuffle import unshuffle
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
     MLP_LAYERS,
@@ -38,7 +39,6 @@ from triquad_format.region import (
     TrainingState,
     VertexTable,
 )
-from triquad_format.shuffle import unshuffle
 
 MAX_PART_BYTES = MAX_CHUNK_BYTES - 65_536
 

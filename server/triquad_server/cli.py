@@ -11,7 +11,7 @@ from pathlib import Path
 
 import triquad_format
 from triquad_format.errors import FormatError
-from triquad_format.keys import check_name
+from triquad_format.wire.keys import check_name
 
 OK, UNEXPECTED, USAGE, CANNOT_LISTEN, STORE = 0, 1, 2, 3, 4
 
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from triquad_server.errors import ListenError, ServerError, StoreError
-    from triquad_server.network import NetworkOptions
+    from triquad_server.net.session import NetworkOptions
     from triquad_server.settings import Settings, load_settings
     from triquad_server.stop import Stop, Stops
 

@@ -1,6 +1,6 @@
-"""The errors of the server's shell. What a scan is refused for is in :mod:`triquad_server.scan`."""
+"""The errors of the server's shell; :mod:`triquad_server.intake.scan` has those of scans."""
 
-from triquad_format.messages import ERROR_CODES
+from triquad_format.wire.messages import ERROR_CODES
 
 
 class ServerError(Exception):

@@ -4,14 +4,14 @@ import time
 from dataclasses import dataclass
 
 import triquad_format
-from triquad_format.messages import ServerStatus, StatusRequest
+from triquad_format.wire.messages import ServerStatus, StatusRequest
 
-from triquad_server.checkpoints import Checkpoints
-from triquad_server.mapper_thread import MapperThread
+from triquad_server.counter import Tally
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.sources import SourceLedger
+from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.memory import resident_bytes
-from triquad_server.scan_queue import ScanQueue
-from triquad_server.sources import SourceLedger
-from triquad_server.tally import Tally
+from triquad_server.store.checkpoints import Checkpoints
 
 
 @dataclass(frozen=True)

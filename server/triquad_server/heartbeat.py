@@ -4,8 +4,8 @@ import logging
 import threading
 
 import zenoh
-from triquad_format import keys, wire
-from triquad_format.messages import ServerStatus
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import ServerStatus
 
 from triquad_server.health import Health
 
@@ -45,7 +45,7 @@ class Heartbeat:
             beat += 1
             try:
                 status = self._health.status()
-                self._publisher.put(wire.encode(status))
+                self._publisher.put(codec.encode(status))
             except Exception:
                 _log.exception("the status could not be published")
                 continue

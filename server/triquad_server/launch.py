@@ -11,14 +11,14 @@ from pathlib import Path
 import torch
 
 from triquad_server.errors import ServerError
-from triquad_server.mapper import Mapper
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.memory import give_back_early, spare_from_collection
-from triquad_server.network import NetworkOptions, listen_endpoints, open_session
-from triquad_server.retention import Retention
+from triquad_server.net.session import NetworkOptions, listen_endpoints, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.stop import Stop, Stops, wait_for_stop
-from triquad_server.store import Store
+from triquad_server.store.retention import Retention
+from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
 
 _log = logging.getLogger("triquad_server")

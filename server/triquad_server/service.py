@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from types import TracebackType
 
 import zenoh
-from triquad_format import keys
-from triquad_format.messages import (
+from triquad_format.wire import keys
+from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
     FlushRequest,
@@ -21,7 +21,7 @@ from triquad_format.messages import (
     TileRequest,
     TileUpdatesRequest,
 )
-from triquad_format.query_messages import (
+from triquad_format.wire.query_messages import (
     AlignRequest,
     DistanceRequest,
     GridRequest,
@@ -29,27 +29,27 @@ from triquad_format.query_messages import (
     SegmentsRequest,
     SpheresRequest,
 )
-from triquad_query.answers import Answers, QuestionLimits
+from triquad_map.questions.answers import Answers, QuestionLimits
 
-from triquad_server.checkpoints import Checkpoints
-from triquad_server.desk import Handler, RequestDesk
-from triquad_server.download import MapDownloads
-from triquad_server.epochs import ShelfLimits
-from triquad_server.flush import FlushDesk
-from triquad_server.gate import QueryGate
+from triquad_server.counter import Tally
+from triquad_server.epochs.epochs import ShelfLimits
+from triquad_server.epochs.gate import QueryGate
 from triquad_server.health import Counts, Health, Identity
 from triquad_server.heartbeat import Heartbeat
-from triquad_server.mapper import Mapper
-from triquad_server.mapper_thread import MapperInputs, MapperThread
-from triquad_server.payload import payload_limit
-from triquad_server.requests import EpochViews, Resets, TileQueries, answering
-from triquad_server.scan_queue import ScanIntake, ScanQueue
+from triquad_server.intake.flush import FlushDesk
+from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
+from triquad_server.intake.sources import SourceLedger
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
+from triquad_server.mesh.tile_cache import TileShelf
+from triquad_server.mesh.tile_feed import TileFeed
+from triquad_server.net.handlers import Handler, RequestDesk
+from triquad_server.net.payload import payload_limit
+from triquad_server.net.requests import EpochViews, Resets, TileQueries, answering
 from triquad_server.settings import Settings
-from triquad_server.sources import SourceLedger
-from triquad_server.store import Store
-from triquad_server.tally import Tally
-from triquad_server.tile_feed import TileFeed
-from triquad_server.tile_shelf import TileShelf
+from triquad_server.store.checkpoints import Checkpoints
+from triquad_server.store.download import MapDownloads
+from triquad_server.store.store import Store
 
 _TILE_WORKERS = 2  # one computes while another packs
 

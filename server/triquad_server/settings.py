@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from triquad_format.errors import SettingsError
-from triquad_format.field_settings import FieldSettings, check_range
+from triquad_format.records.field_settings import FieldSettings, check_range
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -1,6 +1,6 @@
 """The teams of threads between which the server's work is split."""
 
-from triquad_kernels.team import Team
+from triquad_map.compiled.team import Team
 
 ANSWERS = Team("triquad-answers")
 """For queries: someone waits."""

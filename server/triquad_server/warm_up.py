@@ -3,11 +3,11 @@
 from collections.abc import Callable
 
 import numpy as np
-from triquad_query.distance import DistanceOptions, distances
+from triquad_map.questions.distance import DistanceOptions, distances
 
-from triquad_server.mapper import Mapper
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.tile_cache import TileShelf
 from triquad_server.settings import Settings
-from triquad_server.tile_shelf import TileShelf
 
 _DIRECTIONS = 400
 _RADIUS_M = 3.0

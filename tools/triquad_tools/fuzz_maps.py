@@ -27,12 +27,12 @@ from types import FrameType
 
 import numpy as np
 from triquad_format.errors import FormatError, NoIndexError
-from triquad_format.mapfile import read_map
-from triquad_format.record_check import check_record
-from triquad_format.region import MapRecord
-from triquad_format.stored_map import StoredMap
+from triquad_format.mapfile.mapfile import read_map
+from triquad_format.records.record_check import check_record
+from triquad_format.records.region import MapRecord
+from triquad_map.stored_map import StoredMap
 
-from triquad_tools.arguments import count, not_negative, seed
+from triquad_tools.console.arguments import count, not_negative, seed
 from triquad_tools.map_mutations import MUTATIONS, Mutant
 from triquad_tools.sound_maps import SoundMap, sound_maps
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
-from triquad_format.mcap_records import CHUNK, MAGIC
+from triquad_format.mapfile.mcap.records import CHUNK, MAGIC
 
 from triquad_tools.sealed_mcap import (
     Dissected,

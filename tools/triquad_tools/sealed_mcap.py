@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import zstandard
-from triquad_format.mcap_records import (
+from triquad_format.mapfile.mcap.records import (
     CHANNEL,
     CHUNK,
     CHUNK_INDEX,

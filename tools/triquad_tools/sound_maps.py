@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from triquad_format import morton
-from triquad_format.evidence_voxels import surface_counts
-from triquad_format.field_settings import FieldSettings
-from triquad_format.manifest import FileRef
-from triquad_format.map_facts import MapFacts
-from triquad_format.mapfile import read_map_file, write_map
-from triquad_format.mapfile_writer import record_parts, write_parts
-from triquad_format.region import (
+from triquad_format.mapfile.manifest import FileRef
+from triquad_format.mapfile.map_facts import MapFacts
+from triquad_format.mapfile.mapfile import read_map_file, write_map
+from triquad_format.mapfile.writer import record_parts, write_parts
+from triquad_format.records import morton
+from triquad_format.records.evidence_voxels import surface_counts
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
     BLOCK_VOXELS,

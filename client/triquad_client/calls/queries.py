@@ -1,0 +1,182 @@
+"""Questions about the map, which clients and pinned epochs answer alike."""
+
+from numpy.typing import ArrayLike
+from triquad_map.questions.align import Alignment, AlignOptions
+from triquad_map.questions.distance import DistanceOptions, Distances
+from triquad_map.questions.grid import Grid
+from triquad_map.questions.polyline import Polyline
+from triquad_map.questions.rays import RayOptions, Rays
+from triquad_map.questions.segments import SegmentOptions, Segments
+from triquad_map.questions.spheres import Spheres
+from triquad_map.unknown import Unknown
+
+from triquad_client.calls import alignment, distance, grid, rays, sdf, segments, spheres
+from triquad_client.calls.sdf import SdfResult
+from triquad_client.checks import Bounds
+from triquad_client.net.call import Run
+
+
+class MapQueries:
+    """Asks about the map: of its newest epoch, or always of the same one.
+
+    Positions are metres in the map frame. Questions of any size are answered from one epoch:
+    ``at_epoch`` is its number, ``None`` is the newest; once the server does not keep it any more,
+    :class:`RefusedError` ``epoch_gone`` is raised.
+    """
+
+    def __init__(self, run: Run, epoch: int | None = None) -> None:
+        """``run`` answers the calls; ``epoch`` is asked where a query names none."""
+        self._run = run
+        self._epoch = epoch
+
+    def query_sdf(
+        self, points: ArrayLike, gradient: bool = False, at_epoch: int | None = None
+    ) -> SdfResult:
+        """The trained field at ``points`` [N, 3]: right near surfaces, saturated beyond.
+
+        Args:
+            points: metres, map frame.
+            gradient: whether the gradient is wanted.
+            at_epoch: see :class:`MapQueries`.
+        """
+        return self._run(sdf.query(points, gradient, self._chosen(at_epoch)))
+
+    def query_gradient(self, points: ArrayLike, at_epoch: int | None = None) -> SdfResult:
+        """As :meth:`query_sdf`, with the gradient."""
+        return self.query_sdf(points, gradient=True, at_epoch=at_epoch)
+
+    def query_distance(
+        self,
+        points: ArrayLike,
+        max_distance: float = 5.0,
+        *,
+        unknown: Unknown | str = Unknown.FREE,
+        surface_point: bool = False,
+        unknown_distance: bool = False,
+        at_epoch: int | None = None,
+    ) -> Distances:
+        """The true distance to the nearest seen surface, with its gradient, at ``points`` [N, 3].
+
+        Args:
+            points: metres, map frame.
+            max_distance: surfaces are looked for up to here, at most 100 m.
+            unknown: ``"obstacle"`` lets unknown space count as a surface, ``"error"`` refuses
+                points to which it is nearer.
+            surface_point: whether the nearest points of the surface are wanted.
+            unknown_distance: whether the distance to unknown space is wanted.
+            at_epoch: see :class:`MapQueries`.
+
+        Raises:
+            UnknownSpaceError: ``unknown`` is ``"error"`` and unknown space is nearer somewhere.
+        """
+        options = DistanceOptions(max_distance, surface_point, unknown_distance)
+        return self._run(distance.query(points, options, unknown, self._chosen(at_epoch)))
+
+    def query_spheres(
+        self, centres: ArrayLike, radii: ArrayLike, at_epoch: int | None = None
+    ) -> Spheres:
+        """What spheres around ``centres`` [N, 3] hold; ``radii`` are one number or [N]."""
+        return self._run(spheres.query(centres, radii, self._chosen(at_epoch)))
+
+    def query_segments(
+        self,
+        starts: ArrayLike,
+        ends: ArrayLike,
+        radius: float = 0.0,
+        max_distance: float = 5.0,
+        at_epoch: int | None = None,
+    ) -> Segments:
+        """What a ball meets that moves straight from each of ``starts`` to ``ends`` [N, 3].
+
+        Args:
+            starts: metres, map frame.
+            ends: as many.
+            radius: of the ball.
+            max_distance: clearance is looked for up to here, at most 100 m.
+            at_epoch: see :class:`MapQueries`.
+        """
+        options = SegmentOptions(radius, max_distance)
+        return self._run(segments.query(starts, ends, options, self._chosen(at_epoch)))
+
+    def query_polyline(
+        self,
+        points: ArrayLike,
+        radius: float = 0.0,
+        max_distance: float = 5.0,
+        at_epoch: int | None = None,
+    ) -> Polyline:
+        """What a ball meets that moves along ``points`` [N, 3], as :meth:`query_segments`."""
+        options = SegmentOptions(radius, max_distance)
+        return self._run(segments.query_polyline(points, options, self._chosen(at_epoch)))
+
+    def query_rays(
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        max_range: float = 50.0,
+        through_unknown: bool = False,
+        at_epoch: int | None = None,
+    ) -> Rays:
+        """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3].
+
+        Args:
+            origins: metres, map frame.
+            directions: of any length but 0.
+            max_range: at most 1,000 m.
+            through_unknown: let unknown space not stop them.
+            at_epoch: see :class:`MapQueries`.
+        """
+        options = RayOptions(max_range, through_unknown)
+        return self._run(rays.query(origins, directions, options, self._chosen(at_epoch)))
+
+    def query_grid(
+        self,
+        bounds: Bounds,
+        cell: float = 0.1,
+        max_distance: float = 5.0,
+        at_epoch: int | None = None,
+    ) -> Grid:
+        """Distance and status at the cells of side ``cell`` that fill ``bounds``.
+
+        Args:
+            bounds: corners of a box; where both have the same z, the grid is a slice there.
+            cell: metres.
+            max_distance: surfaces are looked for up to here, at most 100 m.
+            at_epoch: see :class:`MapQueries`.
+        """
+        return self._run(grid.query(bounds, cell, max_distance, self._chosen(at_epoch)))
+
+    def align(
+        self,
+        points: ArrayLike,
+        world_from_sensor_guess: ArrayLike,
+        max_distance: float = 6.0,
+        at_epoch: int | None = None,
+    ) -> Alignment:
+        """Where a scan was taken: its points are moved until they lie on surfaces of the map.
+
+        Args:
+            points: [N, 3] metres, sensor frame; any number, of which some 2,000 are used.
+            world_from_sensor_guess: [4, 4]; off by a metre and ten degrees or so at most.
+            max_distance: points farther than this from any surface do not count.
+            at_epoch: see :class:`MapQueries`.
+        """
+        options = AlignOptions(max_distance)
+        call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
+        return self._run(call)
+
+    def _chosen(self, at_epoch: int | None) -> int | None:
+        return self._epoch if at_epoch is None else at_epoch
+
+
+class PinnedMap(MapQueries):
+    """The map as it was in one epoch.
+
+    The server keeps an epoch for some time after it was last asked (``service.pin_s``, 30 s):
+    every query renews it. Once it is gone, queries raise :class:`RefusedError` ``epoch_gone``.
+    """
+
+    def __init__(self, run: Run, epoch: int) -> None:
+        """Use ``Client.pinned``."""
+        super().__init__(run, epoch)
+        self.epoch = epoch

@@ -1,0 +1,49 @@
+"""How far rays reach."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from triquad_format.wire import keys
+from triquad_format.wire.query_messages import RaysReply, RaysRequest
+from triquad_map.questions.rays import RayOptions, Rays
+
+from triquad_client import checks
+from triquad_client.errors import InvalidInputError
+from triquad_client.net.call import Ask, Call
+from triquad_client.net.parts import in_parts, placed
+
+PART_RAYS = 2_000
+"""Rays of one request."""
+
+
+def query(
+    origins: ArrayLike, directions: ArrayLike, options: RayOptions, at_epoch: int | None
+) -> Call[Rays]:
+    """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3]."""
+    ways = checks.directions(directions)
+    places = checks.place_or_places(origins)
+    if len(places) not in (1, len(ways)):
+        raise InvalidInputError(
+            f"{len(places)} origins for {len(ways)} directions: one, or as many"
+        )
+    starts = np.broadcast_to(places, ways.shape)
+    reach_m = checks.positive("max_range", options.max_range_m)
+
+    def request(part: slice, number: int) -> Ask[RaysReply]:
+        place = placed(starts[part])
+        message = RaysRequest(
+            place.origin,
+            place.offsets,
+            ways[part].astype(np.float32),
+            reach_m,
+            options.through_unknown,
+            number,
+        )
+        return Ask(keys.RAYS, message, RaysReply)
+
+    epoch = checks.chosen_epoch(at_epoch)
+    parts = yield from in_parts(len(ways), PART_RAYS, request, epoch)
+    return Rays(
+        np.concatenate([part.range for part in parts]),
+        np.concatenate([part.status for part in parts]),
+        parts[0].epoch,
+    )

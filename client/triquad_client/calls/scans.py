@@ -1,0 +1,113 @@
+"""Publishing scans, and waiting until they are in the map."""
+
+import secrets
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from triquad_format.errors import FormatError
+from triquad_format.wire import keys
+from triquad_format.wire.messages import FlushReply, FlushRequest, Scan
+
+from triquad_client import checks
+from triquad_client.errors import InvalidInputError, InvalidScanError
+from triquad_client.net.call import Ask, Call, ask_each
+from triquad_client.net.connection import Connection
+
+_REPLY_MARGIN_S = 5.0
+"""By how much the server's answer that the time is over may be late."""
+
+
+@dataclass(frozen=True)
+class FlushReport:
+    """What became of the scans that this client published."""
+
+    taken: int  # learnt from
+    refused: int  # seen by the server, but of no use
+    lost: int  # never arrived, or pushed out of the server's full queue
+    last_refusal: str | None  # why the last of the refused ones was
+
+
+@dataclass
+class _Source:
+    """How far a source has come."""
+
+    next_sequence: int = 0
+    stamp_ns: int = 0
+
+
+class ScanPublisher:
+    """Numbers and sends the scans of one client."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._session = secrets.randbits(62)
+        self._sending = threading.Lock()
+        self._lock = threading.Lock()  # of the dictionary, never held for long
+        self._sources: dict[str, _Source] = {}
+
+    def publish(
+        self,
+        points: ArrayLike,
+        world_from_sensor: ArrayLike,
+        stamp: float | None,
+        source: str,
+    ) -> None:
+        """Send a scan; arguments as in ``Client.publish_scan``."""
+        try:
+            key = keys.scan_key(self._connection.map_name, source)
+        except FormatError as error:
+            raise InvalidScanError(str(error)) from error
+        pose = checks.rigid_pose(world_from_sensor)
+        cloud = np.ascontiguousarray(checks.scan_points(points))
+        stamp_ns = time.time_ns() if stamp is None else checks.stamp_ns(stamp)
+        # Held while sending: the server takes a scan that is overtaken by its successor for lost.
+        with self._sending:
+            state = self._source(source)
+            if stamp_ns < state.stamp_ns and stamp is None:
+                stamp_ns = state.stamp_ns  # the system's clock was set back
+            if stamp_ns < state.stamp_ns:
+                raise InvalidScanError(
+                    f"stamp = {stamp!r} lies before {state.stamp_ns / 1e9!r}, that of an earlier "
+                    f"scan of source {source!r}; publish in order",
+                )
+            scan = Scan(cloud, pose, stamp_ns, source, self._session, state.next_sequence)
+            self._connection.put(key, scan)
+            state.next_sequence += 1
+            state.stamp_ns = stamp_ns
+
+    def flush(self, timeout_s: float, pending: int) -> Call[FlushReport]:
+        """Wait for the server; arguments as in ``Client.flush``."""
+        if timeout_s < 0 or pending < 0:
+            raise InvalidInputError(f"timeout = {timeout_s!r}, pending = {pending!r}: negative")
+        requests = list(self._requests(timeout_s, pending))
+        # All at once: each waits for its source, and they share the time.
+        replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
+        refusals = [reply.last_refusal for reply in replies if reply.last_refusal is not None]
+        return FlushReport(
+            sum(reply.taken for reply in replies),
+            sum(reply.refused for reply in replies),
+            sum(reply.lost for reply in replies),
+            refusals[-1] if refusals else None,
+        )
+
+    def _source(self, name: str) -> _Source:
+        with self._lock:
+            return self._sources.setdefault(name, _Source())
+
+    def _requests(self, timeout_s: float, pending: int) -> Iterator[FlushRequest]:
+        """One request per source; the scans that may be pending are shared out among them."""
+        with self._lock:
+            last = {name: state.next_sequence - 1 for name, state in self._sources.items()}
+        for source, sequence in last.items():
+            target = sequence - pending // len(last)
+            if target >= 0:
+                yield FlushRequest(source, self._session, target, float(timeout_s))
+
+
+def _ask_flush(request: FlushRequest) -> Ask[FlushReply]:
+    wait_s = request.timeout_s + _REPLY_MARGIN_S
+    return Ask(keys.FLUSH, request, FlushReply, at_least_s=wait_s)

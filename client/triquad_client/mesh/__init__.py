@@ -1,0 +1,1 @@
+"""Meshes: tiles joined, followed and saved."""

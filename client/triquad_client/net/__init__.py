@@ -1,0 +1,1 @@
+"""How calls travel: a Zenoh connection, and the drivers that run calls."""

@@ -1,0 +1,212 @@
+"""The Zenoh session of a client, and requests over it."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import zenoh
+from triquad_format.errors import FormatError, WireError
+from triquad_format.wire import codec, keys
+from triquad_format.wire.codec import Message
+from triquad_format.wire.messages import ErrorReply
+
+from triquad_client.errors import (
+    BadReplyError,
+    ClosedError,
+    ConnectError,
+    InvalidInputError,
+    NoReplyError,
+    RefusedError,
+    RequestTimeoutError,
+    UnknownMapError,
+)
+from triquad_client.net.call import Ask, ReplyT
+
+_LIVELINESS_TIMEOUT_S = 3.0
+
+Receiver: TypeAlias = Any
+"""``None``, or a ``zenoh.handlers.Callback[zenoh.Reply]``: the overloads of Zenoh take no union."""
+
+
+class Connection:
+    """An open session, bound to one map. Safe for use by several threads."""
+
+    def __init__(self, session: zenoh.Session, map_name: str, timeout_s: float) -> None:
+        self._session = session
+        self.map_name = map_name
+        self.timeout_s = timeout_s
+
+    @property
+    def closed(self) -> bool:
+        """Whether the session was closed."""
+        return self._session.is_closed()
+
+    def close(self) -> None:
+        """Close the session; closing twice does no harm. What is under way ends unanswered."""
+        self._session.close()
+
+    def send(
+        self,
+        ask: Ask[Any],
+        receiver: Receiver = None,
+        cancellation: zenoh.CancellationToken | None = None,
+    ) -> Iterable[zenoh.Reply]:
+        """Send a request; its reply comes from what is returned, or to ``receiver``."""
+        try:
+            replies: Iterable[zenoh.Reply] = self._session.get(
+                self._key(ask),
+                receiver,
+                payload=codec.encode(ask.message),
+                encoding=keys.encoding(type(ask.message)),
+                timeout=self._timeout_s(ask),
+                priority=zenoh.Priority.BACKGROUND if ask.background else zenoh.Priority.DATA,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                cancellation_token=cancellation,
+            )
+        except zenoh.ZError as error:
+            raise self._broken(error) from error
+        return replies
+
+    def read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
+        """The message of a reply.
+
+        Raises:
+            RefusedError: the server refused.
+            RequestTimeoutError: there was no reply in time.
+            BadReplyError: it cannot be decoded.
+        """
+        try:
+            if reply.ok is not None:
+                return codec.decode(ask.kind, reply.ok.payload.to_bytes())
+            payload = b"" if reply.err is None else reply.err.payload.to_bytes()
+            if payload == b"Timeout":
+                raise RequestTimeoutError(
+                    f"no reply on {self._key(ask)} within {self._timeout_s(ask):g} s"
+                )
+            reason = codec.decode(ErrorReply, payload)
+        except WireError as error:
+            raise BadReplyError(f"reply on {self._key(ask)}: {error}") from error
+        raise RefusedError(reason.code, reason.message)
+
+    def silence(self, ask: Ask[Any], available: list[str]) -> Exception:
+        """The error for a request that got no reply, where there are these maps."""
+        if not self._linked:
+            return ConnectError(
+                "the link to the server is down; it is set up again once the server is back"
+            )
+        if self.map_name not in available:
+            return UnknownMapError(self.map_name, available)
+        return NoReplyError(
+            f"no reply on {self._key(ask)} although the map is there: the server is stopping, "
+            "access control forbids the request, or a message exceeds a size limit",
+        )
+
+    def put(self, key: str, message: Message) -> None:
+        """Publish a message; blocks where the network is slower than the publisher."""
+        try:
+            self._session.put(
+                key,
+                codec.encode(message),
+                encoding=keys.encoding(type(message)),
+                # The default drops large samples even on an idle network.
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA,
+            )
+        except zenoh.ZError as error:
+            raise self._broken(error) from error
+
+    def look_for_maps(
+        self,
+        receiver: Receiver = None,
+        cancellation: zenoh.CancellationToken | None = None,
+    ) -> Iterable[zenoh.Reply]:
+        """Ask all servers that can be reached for their maps; replies as of :meth:`send`."""
+        try:
+            replies: Iterable[zenoh.Reply] = self._session.liveliness().get(
+                keys.alive_key("*", "*"),
+                receiver,
+                timeout=_LIVELINESS_TIMEOUT_S,
+                cancellation_token=cancellation,
+            )
+        except zenoh.ZError as error:
+            raise self._broken(error) from error
+        return replies
+
+    @property
+    def _linked(self) -> bool:
+        """Whether the session has a link to anybody."""
+        info = self._session.info
+        return bool(info.routers_zid() or info.peers_zid())
+
+    def _key(self, ask: Ask[Any]) -> str:
+        return keys.operation_key(self.map_name, ask.operation)
+
+    def _timeout_s(self, ask: Ask[Any]) -> float:
+        return max(self.timeout_s, ask.at_least_s) + ask.held_s
+
+    def _broken(self, error: Exception) -> Exception:
+        if self.closed:
+            return closed_error()
+        return ConnectError(f"the connection is broken: {error}")
+
+
+def closed_error() -> ClosedError:
+    """The error for what is asked of a closed client."""
+    return ClosedError("the client is closed")
+
+
+def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
+    """The maps that the replies to :meth:`Connection.look_for_maps` name."""
+    return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok})
+
+
+def open_connection(
+    endpoint: str,
+    map_name: str,
+    timeout_s: float,
+    config: Path | None,
+) -> Connection:
+    """A connection to the server at ``endpoint`` that has the map ``map_name``.
+
+    Raises:
+        ConnectError: nothing listens there, or it does not let us in.
+        UnknownMapError: there is no such map.
+        InvalidInputError: there cannot be a map of this name.
+    """
+    try:
+        keys.check_name("map", map_name)
+    except FormatError as error:
+        raise InvalidInputError(str(error)) from error
+    try:
+        session = zenoh.open(_configuration(endpoint, timeout_s, config))
+    except zenoh.ZError as error:
+        reason = str(error).split(" at /", 1)[0].strip()
+        raise ConnectError(
+            f"cannot connect to {endpoint}: {reason} Start triquad-server there, or check the "
+            "endpoint and its credentials.",
+        ) from error
+    connection = Connection(session, map_name, timeout_s)
+    try:
+        available = map_names(connection.look_for_maps())
+        if map_name not in available:
+            raise UnknownMapError(map_name, available)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _configuration(endpoint: str, timeout_s: float, file: Path | None) -> zenoh.Config:
+    if file is not None:
+        config: zenoh.Config = zenoh.Config.from_file(str(file))
+    else:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/timeout_ms", "0")  # one attempt, not retries
+        config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("transport/shared_memory/enabled", "false")
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("transport/unicast/open_timeout", str(int(timeout_s * 1000)))
+    return config

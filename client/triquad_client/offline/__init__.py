@@ -1,0 +1,1 @@
+"""Maps that answer without a server."""

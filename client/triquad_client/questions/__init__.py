@@ -1,1 +1,0 @@
-"""Calls that ask about the map."""

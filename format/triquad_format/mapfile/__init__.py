@@ -1,0 +1,1 @@
+"""The map file: writing, reading, and reading parts of it."""

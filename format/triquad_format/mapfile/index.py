@@ -1,0 +1,163 @@
+"""A map file opened by its index: its manifest at once, each part when it is asked for."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+from triquad_format.errors import (
+    DamagedMapFileError,
+    FormatError,
+    MapFileError,
+    NoIndexError,
+)
+from triquad_format.mapfile.container import METADATA_NAME
+from triquad_format.mapfile.file_metadata import (
+    check_agreement,
+    check_features,
+    one_metadata,
+    reader_version,
+)
+from triquad_format.mapfile.manifest import Entry, FileRef, unpack_manifest
+from triquad_format.mapfile.map_facts import check_map_part
+from triquad_format.mapfile.mcap.index import McapIndex
+from triquad_format.mapfile.parts.part import MANIFEST, MAP, PartKey
+from triquad_format.mapfile.random_access import FileBytes, RandomAccess
+
+DAMAGED_SUFFIX = ".damaged"
+"""Added to the names of files that are set aside."""
+
+OpenFile = Callable[[FileRef], RandomAccess]
+"""Opens another file of the same folder."""
+
+
+def files_in(folder: Path) -> OpenFile:
+    """Opens the other files that hold parts of a map, in the folder of the map file.
+
+    One that was set aside as damaged still serves with those of its parts that are sound.
+    """
+
+    return lambda file: FileBytes(file_in(folder, file.name))
+
+
+def file_in(folder: Path, name: str) -> Path:
+    """The file of this name; where it was set aside as damaged, under its new name."""
+    aside = folder / (name + DAMAGED_SUFFIX)
+    return aside if aside.exists() and not (folder / name).exists() else folder / name
+
+
+class OtherFiles:
+    """The other files that hold parts of a map; each is opened when it is needed."""
+
+    def __init__(self, open_file: OpenFile | None) -> None:
+        self._open_file = open_file
+        self._indices: dict[FileRef, MapIndex] = {}
+
+    def payload(self, entry: Entry) -> bytes:
+        """The payload of a part that another file holds.
+
+        Raises:
+            MapFileError: that file is missing, damaged or another.
+            OSError: the system refuses to read it.
+        """
+        assert entry.file is not None
+        if entry.file not in self._indices:
+            self._indices[entry.file] = self._open(entry.file)
+        index = self._indices[entry.file]
+        try:
+            return index.payload(index.find(entry))
+        except MapFileError as error:
+            raise DamagedMapFileError(f"{entry.file.name}, which holds parts: {error}") from error
+
+    def close(self) -> None:
+        """Close them."""
+        for index in self._indices.values():
+            index.close()
+
+    def _open(self, file: FileRef) -> "MapIndex":
+        if self._open_file is None:
+            raise MapFileError(f"parts lie in {file.name}, which cannot be reached from here")
+        try:
+            source = self._open_file(file)
+            try:
+                return _index_of(file, source)
+            except BaseException:
+                source.close()
+                raise
+        except FileNotFoundError as error:
+            raise DamagedMapFileError(
+                f"{file.name}, which holds parts, is missing; put it beside this file"
+            ) from error
+        except FormatError as error:
+            raise DamagedMapFileError(f"{file.name}, which holds parts: {error}") from error
+
+
+class MapIndex:
+    """The manifest of a map file, and its parts by random access.
+
+    What is read is checked: the summary and the manifest by their checksums, each part by its
+    digest. What is not read is not.
+    """
+
+    def __init__(self, source: RandomAccess, open_file: OpenFile | None = None) -> None:
+        """Read metadata and manifest.
+
+        Args:
+            source: the file; it is closed with this index.
+            open_file: opens the other files that hold parts; needed where there are any.
+
+        Raises:
+            MapFileError: it is not a map file, is damaged, or needs a newer reader.
+        """
+        self._source = source
+        self._others = OtherFiles(open_file)
+        self._mcap = McapIndex(source)
+        self.metadata = one_metadata(self._mcap.metadata(METADATA_NAME))
+        if reader_version(self.metadata) < 2:
+            raise NoIndexError("a map file of version 1 has no index: triquad-pack rewrites it")
+        last = self._mcap.chunks - 1
+        message = self._mcap.message(last) if last >= 0 else None
+        if message is None or message.topic != MANIFEST:
+            raise NoIndexError("its last chunk is not its manifest: triquad-pack rewrites it")
+        self.manifest = unpack_manifest(message.data, source.size)
+        self.manifest_sha256 = hashlib.sha256(message.data).digest()
+        own = self.manifest.own
+        if len(own) != last:
+            raise DamagedMapFileError(f"{last} parts, but its manifest lists {len(own)}")
+        check_agreement(self.metadata, self.manifest.facts)
+        check_features(self.metadata, self.manifest)
+        self._numbers = {entry.key: number for number, entry in enumerate(own)}
+        self._own = {entry.key: entry for entry in own}
+        if (stated := self._own.get(PartKey(MAP))) is not None:
+            check_map_part(self.payload(stated), self.manifest.facts)
+
+    def close(self) -> None:
+        """Close this file and the others that were opened."""
+        self._source.close()
+        self._others.close()
+
+    def payload(self, entry: Entry) -> bytes:
+        """The payload of a part that the manifest lists.
+
+        Raises:
+            MapFileError: the part is damaged, or the file that holds it is missing or another.
+        """
+        if entry.file is not None:
+            return self._others.payload(entry)
+        number = self._numbers[entry.key]
+        message = self._mcap.message(number)
+        entry.check(number, message.topic, message.data)
+        return message.data
+
+    def find(self, entry: Entry) -> Entry:
+        """The part of this file that another file's ``entry`` is about."""
+        own = self._own.get(entry.key)
+        if own is None or own.sha256 != entry.sha256:
+            raise DamagedMapFileError(f"it does not hold {entry.key}")
+        return own
+
+
+def _index_of(file: FileRef, source: RandomAccess) -> MapIndex:
+    index = MapIndex(source)
+    if index.manifest_sha256 != file.manifest_sha256:
+        raise DamagedMapFileError("it is not the file that the map was made with")
+    return index

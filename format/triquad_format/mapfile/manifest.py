@@ -1,0 +1,215 @@
+"""The manifest: the list of all parts of a map, and the files that hold them."""
+
+import dataclasses
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format.errors import DamagedMapFileError, FormatError
+from triquad_format.mapfile.map_facts import MapFacts, pack_facts, unpack_facts
+from triquad_format.mapfile.parts.part import (
+    MANIFEST,
+    MAP,
+    REGION,
+    REGION_TOPICS,
+    TRAINING,
+    Part,
+    PartKey,
+)
+from triquad_format.mapfile.parts.part_body import PartBody, pack_part
+from triquad_format.wire.array import pack_array
+
+MAX_ENTRIES = 1 << 20
+MAX_FILES = 4096
+DIGEST_BYTES = 32
+_MAX_FILE_NAME = 255
+_COLUMNS = {
+    "topic": ("|u1", ()),
+    "region": ("<i4", (3,)),
+    "plane": ("|u1", ()),
+    "cell": ("<i8", ()),
+    "bytes": ("<i8", ()),
+    "sha256": ("|u1", (DIGEST_BYTES,)),
+    "epoch": ("<i8", ()),
+    "stamp_ns": ("<i8", ()),
+    "file": ("<u2", ()),
+}
+
+
+@dataclass(frozen=True)
+class FileRef:
+    """Another map file of the same folder that holds parts."""
+
+    name: str
+    manifest_sha256: bytes  # of the payload of its manifest: what tells it from any other file
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A part as the manifest lists it."""
+
+    key: PartKey
+    size: int  # bytes of its payload
+    sha256: bytes
+    epoch: int  # in which it last changed
+    stamp_ns: int  # time of that epoch, nanoseconds since 1970; 0 if not known
+    file: FileRef | None = None  # None: the file that holds the manifest
+
+    def check(self, number: int, topic: str, data: bytes) -> None:
+        """Raise :class:`DamagedMapFileError` unless part ``number`` of its file is this one."""
+        fits = topic == self.key.topic and len(data) == self.size
+        if not fits or hashlib.sha256(data).digest() != self.sha256:
+            raise DamagedMapFileError(
+                f"part {number}, {topic:.80}, is not the one that the manifest lists there",
+            )
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """All parts of a map at one epoch."""
+
+    facts: MapFacts
+    stamp_ns: int  # when the epoch was written, nanoseconds since 1970; 0 if not known
+    entries: tuple[Entry, ...]  # those of this file in the order of the file
+
+    @property
+    def files(self) -> tuple[FileRef, ...]:
+        """The other files that are needed."""
+        return tuple(dict.fromkeys(e.file for e in self.entries if e.file is not None))
+
+    @property
+    def own(self) -> tuple[Entry, ...]:
+        """The parts in the manifest's own file, in their order."""
+        return tuple(entry for entry in self.entries if entry.file is None)
+
+    def elsewhere(self, own: FileRef) -> dict[PartKey, Entry]:
+        """The parts as another file lists them; ``own`` is the manifest's own file."""
+        return {e.key: dataclasses.replace(e, file=e.file or own) for e in self.entries}
+
+
+def pack_manifest(manifest: Manifest) -> Part:
+    """The manifest as the last part of its file.
+
+    Raises:
+        FormatError: it lists more than a manifest may.
+    """
+    entries = manifest.entries
+    files = manifest.files
+    if len(entries) > MAX_ENTRIES or len(files) > MAX_FILES:
+        raise FormatError(
+            f"{len(entries)} parts in {len(files)} other files; a manifest lists at most "
+            f"{MAX_ENTRIES} in {MAX_FILES}"
+        )
+    topics = sorted({entry.key.topic for entry in entries})
+    numbers: dict[FileRef | None, int] = {None: 0, **{f: i + 1 for i, f in enumerate(files)}}
+    columns: dict[str, Any] = {
+        "topic": [topics.index(entry.key.topic) for entry in entries],
+        "region": [entry.key.region for entry in entries],
+        "plane": [entry.key.plane for entry in entries],
+        "cell": [entry.key.cell for entry in entries],
+        "bytes": [entry.size for entry in entries],
+        "sha256": [np.frombuffer(entry.sha256, np.uint8) for entry in entries],
+        "epoch": [entry.epoch for entry in entries],
+        "stamp_ns": [entry.stamp_ns for entry in entries],
+        "file": [numbers[entry.file] for entry in entries],
+    }
+    body: dict[str, object] = {
+        **pack_facts(manifest.facts),
+        "created_ns": manifest.stamp_ns,
+        "files": [{"name": file.name, "manifest": file.manifest_sha256} for file in files],
+        "topics": topics,
+        "parts": {name: _packed(name, values) for name, values in columns.items()},
+    }
+    return pack_part(PartKey(MANIFEST), body)
+
+
+def _packed(name: str, values: Iterable[Any]) -> dict[str, object]:
+    dtype, row = _COLUMNS[name]
+    return pack_array(np.array(values, dtype).reshape(-1, *row))
+
+
+def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
+    """The manifest in a payload, which lies in a file of so many bytes.
+
+    Raises:
+        FormatError: it is malformed, lists a part twice, or parts of a region that it lacks.
+    """
+    body = PartBody(MANIFEST, payload, max_items=MAX_FILES)
+    facts = unpack_facts(body)
+    files: list[FileRef | None] = [None, *_files(body.value("files", list))]
+    topics = body.texts("topics")
+    packed = PartBody.of(MANIFEST, body.mapping("parts"))
+    columns = {
+        name: packed.array(name, dtype, None, *row) for name, (dtype, row) in _COLUMNS.items()
+    }
+    count = len(columns["topic"])
+    # Digests cannot be compressed: where the file has no room for them, they are not digests.
+    most = min(MAX_ENTRIES, file_bytes // DIGEST_BYTES)
+    if any(len(column) != count for column in columns.values()) or count > most:
+        raise DamagedMapFileError(f"{MANIFEST}: its columns differ in length, or are too long")
+    _check_columns(columns, len(topics), len(files))
+    entries = tuple(_entries(columns, topics, files))
+    if len({entry.key for entry in entries}) != count:
+        raise DamagedMapFileError(f"{MANIFEST}: it lists a part twice")
+    _check_keys([entry.key for entry in entries])
+    return Manifest(facts, body.count("created_ns"), entries)
+
+
+def _files(listed: list[Any]) -> list[FileRef]:
+    files = []
+    for item in listed:
+        file = PartBody.of(MANIFEST, item)
+        name, digest = file.value("name", str), file.value("manifest", bytes)
+        # A name, not a path: a manifest must not lead a reader to other folders.
+        if name in ("", ".", "..") or len(name) > _MAX_FILE_NAME or set(name) & set("/\\\0"):
+            raise DamagedMapFileError(f"{MANIFEST}: {name!r:.80} is not the name of a file")
+        if len(digest) != DIGEST_BYTES:
+            raise DamagedMapFileError(f"{MANIFEST}: the digest of {name!r:.80} is not a digest")
+        files.append(FileRef(name, digest))
+    if len({file.name for file in files}) != len(files):
+        raise DamagedMapFileError(f"{MANIFEST}: it names a file twice")
+    return files
+
+
+def _check_columns(columns: Mapping[str, NDArray[Any]], topics: int, files: int) -> None:
+    limits = {"topic": topics, "file": files, "plane": 3}
+    for name, limit in limits.items():
+        if (columns[name] >= limit).any():
+            raise DamagedMapFileError(f"{MANIFEST}: a number in {name!r} is out of range")
+    for name in ("cell", "bytes", "epoch", "stamp_ns"):
+        if (columns[name] < 0).any():
+            raise DamagedMapFileError(f"{MANIFEST}: a number in {name!r} is negative")
+
+
+def _check_keys(keys: list[PartKey]) -> None:
+    """Refuse parts of a region whose head is not listed, and cells of what has none."""
+    if PartKey(MAP) not in keys:
+        raise DamagedMapFileError(f"{MANIFEST}: it does not list the part {MAP}")
+    for key in keys:
+        if key.topic in (MAP, REGION, TRAINING) and (key.plane or key.cell):
+            raise DamagedMapFileError(f"{MANIFEST}: {key.topic} has plane or cell: {key}")
+    regions = {key.region for key in keys if key.topic == REGION}
+    for key in keys:
+        if key.topic in REGION_TOPICS and key.region not in regions:
+            raise DamagedMapFileError(f"the part {REGION} of {key.region} is missing")
+
+
+def _entries(
+    columns: Mapping[str, NDArray[Any]], topics: list[str], files: list[FileRef | None]
+) -> Iterable[Entry]:
+    listed = {name: columns[name].tolist() for name in columns if name != "sha256"}
+    for i in range(len(columns["topic"])):
+        x, y, z = listed["region"][i]
+        key = PartKey(topics[listed["topic"][i]], (x, y, z), listed["plane"][i], listed["cell"][i])
+        yield Entry(
+            key,
+            listed["bytes"][i],
+            columns["sha256"][i].tobytes(),
+            listed["epoch"][i],
+            listed["stamp_ns"][i],
+            files[listed["file"][i]],
+        )

@@ -1,0 +1,1 @@
+"""The MCAP container: records, chunk index and writer."""

@@ -1,0 +1,1 @@
+"""The parts of a map file: records to bytes and back."""

@@ -1,0 +1,169 @@
+"""Reading map files whole: nothing is believed before it is checked."""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from triquad_format import version_1
+from triquad_format.errors import DamagedMapFileError, TooLargeMapFileError
+from triquad_format.mapfile.container import (
+    MAX_MAP_BYTES,
+    MAX_PART_BYTES,
+    MESSAGE_ENCODING,
+    METADATA_NAME,
+)
+from triquad_format.mapfile.file_errors import named
+from triquad_format.mapfile.file_metadata import (
+    check_agreement,
+    check_features,
+    one_metadata,
+    reader_version,
+)
+from triquad_format.mapfile.index import OtherFiles, files_in
+from triquad_format.mapfile.manifest import DIGEST_BYTES, Entry, Manifest, unpack_manifest
+from triquad_format.mapfile.map_facts import MapFacts
+from triquad_format.mapfile.mcap.records import McapFile, Message, total_limit
+from triquad_format.mapfile.parts.part import MANIFEST, PREFIX, PREVIEW, TOPICS
+from triquad_format.mapfile.parts.unpack import assemble
+from triquad_format.mapfile.random_access import open_regular
+from triquad_format.records.record_check import check_record
+from triquad_format.records.region import MapRecord
+
+_BLOCK_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class StoredPart:
+    """A part as it lies in the file."""
+
+    topic: str
+    size: int  # bytes of its payload
+    stored_size: int  # bytes that it takes in the file, compressed
+
+
+@dataclass(frozen=True)
+class MapFile:
+    """A map file that has passed every check."""
+
+    record: MapRecord
+    metadata: dict[str, str]  # of the record "triquad"
+    parts: tuple[StoredPart, ...]  # of this file, without the manifest
+    size: int  # bytes
+    manifest: Manifest | None  # None: a file of version 1, which has another
+    manifest_sha256: bytes  # of the manifest's payload; empty for a file of version 1
+
+
+def read_map(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYTES) -> MapRecord:
+    """The record in a map file; see :func:`read_map_file`."""
+    return read_map_file(source, max_bytes=max_bytes).record
+
+
+def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYTES) -> MapFile:
+    """Read a map file and check all of it. Arrays may be read-only.
+
+    Args:
+        source: a path, or a binary stream, which is read to its end. Parts in other files are
+            looked for in the folder of the path.
+        max_bytes: limit on the file's size and, decompressed, on its parts together.
+
+    Raises:
+        DamagedMapFileError: bytes are missing or altered.
+        UnsupportedMapFileError: the file needs a newer reader.
+        TooLargeMapFileError: it exceeds ``max_bytes``, or the memory there is.
+        MapFileError: it is not a map file.
+        OSError: the file cannot be read.
+    """
+    if isinstance(source, (str, Path)):
+        with open_regular(Path(source)) as stream:
+            return _read(str(source), stream, max_bytes, Path(source).parent)
+    return _read(str(getattr(source, "name", "map file")), source, max_bytes, None)
+
+
+def _read(name: str, stream: BinaryIO, max_bytes: int, folder: Path | None) -> MapFile:
+    with named(name):
+        # Block by block: one read of the limit's size would reserve all of it.
+        data = bytearray()
+        while block := stream.read(_BLOCK_BYTES):
+            data += block
+            if len(data) > max_bytes:
+                raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
+        return _parse(memoryview(data), min(max_bytes, total_limit(len(data))), folder)
+
+
+def _parse(data: memoryview, max_bytes: int, folder: Path | None) -> MapFile:
+    mcap = McapFile(data)
+    metadata = one_metadata([entries for name, entries in mcap.metadata if name == METADATA_NAME])
+    version = reader_version(metadata)
+    messages = _parts(mcap.messages(max_bytes), version, len(data) // DIGEST_BYTES)
+    if version < 2:
+        parts: list[StoredPart] = []
+        record = version_1.read_record(_noted(messages, parts))
+        manifest, digest = None, b""
+    else:
+        found = list(messages)
+        parts = [_stored(message) for message in found]
+        digest = hashlib.sha256(found[-1].data).digest() if found else b""
+        record, manifest = _assemble(found, len(data), folder)
+        check_features(metadata, manifest)
+    check_agreement(metadata, MapFacts(record.name, record.epoch, record.settings))
+    check_record(record)
+    return MapFile(record, metadata, tuple(parts[:-1]), len(data), manifest, digest)
+
+
+def _parts(messages: Iterator[Message], version: int, most: int) -> Iterator[Message]:
+    """The messages that are parts, known or not; a file with more than ``most`` is refused."""
+    after = False
+    count = 0
+    for message in messages:
+        preview = version >= 2 and message.topic == PREVIEW
+        if not (preview or message.topic.startswith(PREFIX)):
+            continue
+        count += 1
+        if count > most:
+            raise DamagedMapFileError("it has more parts than its manifest has room to list")
+        if after:
+            raise DamagedMapFileError(f"the part {message.topic:.80} follows the manifest")
+        after = message.topic == MANIFEST
+        limit = MAX_PART_BYTES if version >= 2 else version_1.MAX_PART_BYTES
+        if len(message.data) > limit:
+            raise DamagedMapFileError(f"a part {message.topic:.80} exceeds {limit} bytes")
+        if message.topic in TOPICS and message.encoding != MESSAGE_ENCODING:
+            raise DamagedMapFileError(f"{message.topic} is encoded in {message.encoding!r:.40}")
+        yield message
+
+
+def _stored(message: Message) -> StoredPart:
+    return StoredPart(message.topic, len(message.data), message.stored_bytes)
+
+
+def _noted(messages: Iterator[Message], parts: list[StoredPart]) -> Iterator[Message]:
+    for message in messages:
+        parts.append(_stored(message))
+        yield message
+
+
+def _assemble(
+    messages: list[Message], file_bytes: int, folder: Path | None
+) -> tuple[MapRecord, Manifest]:
+    """The record of all parts, those in other files included, and their list."""
+    if not messages or messages[-1].topic != MANIFEST:
+        raise DamagedMapFileError(f"the part {MANIFEST} is missing at the end")
+    manifest = unpack_manifest(messages[-1].data, file_bytes)
+    own = manifest.own
+    if len(own) != len(messages) - 1:
+        raise DamagedMapFileError(f"{len(messages) - 1} parts, but its manifest lists {len(own)}")
+    payloads: dict[Entry, bytes] = {}
+    for number, (entry, message) in enumerate(zip(own, messages[:-1], strict=True)):
+        entry.check(number, message.topic, message.data)
+        payloads[entry] = message.data
+    messages.clear()
+    others = OtherFiles(None if folder is None else files_in(folder))
+    try:
+        record = assemble(
+            manifest, lambda e: payloads.pop(e) if e.file is None else others.payload(e)
+        )
+    finally:
+        others.close()
+    return record, manifest

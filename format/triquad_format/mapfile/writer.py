@@ -1,0 +1,254 @@
+"""Writing map files: the same record gives the same bytes, and a path gets all of them or none."""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import BinaryIO
+
+from triquad_map.reference.evaluator import MapEvaluator
+
+from triquad_format import __version__
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.container import (
+    BASE_FILES,
+    ENCODINGS,
+    FORMAT_VERSION,
+    MAX_MAP_BYTES,
+    MAX_PART_BYTES,
+    METADATA_NAME,
+    MIN_READER_VERSION,
+    PREVIEW_ENCODING,
+)
+from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
+from triquad_format.mapfile.map_facts import FRAME_ID, UNITS, MapFacts
+from triquad_format.mapfile.mcap.records import total_limit
+from triquad_format.mapfile.mcap.writer import ChannelSpec, McapWriter, SchemaSpec
+from triquad_format.mapfile.parts.pack import FEATURE_DTYPES, pack_map, pack_region
+from triquad_format.mapfile.parts.part import (
+    EVIDENCE,
+    MANIFEST,
+    MAP,
+    MOMENTS,
+    PREVIEW,
+    REGION,
+    SAMPLES,
+    TRAINING,
+    VERTICES,
+    Part,
+    PartKey,
+)
+from triquad_format.mapfile.preview import SCHEMA_NAME, Distances, pack_preview, schema_data
+from triquad_format.mapfile.written_map import MapFileInfo, WrittenMap
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.record_check import check_record
+from triquad_format.records.region import MapRecord, Region
+
+# Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
+# good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
+_LEVELS = {
+    MAP: 3,
+    REGION: 3,
+    VERTICES: 1,
+    EVIDENCE: 12,
+    TRAINING: 1,
+    MOMENTS: 1,
+    SAMPLES: 1,
+    PREVIEW: 19,
+    MANIFEST: 3,
+}
+_CHANNELS = tuple(
+    ChannelSpec(topic, encoding, _LEVELS[topic], SCHEMA_NAME if topic == PREVIEW else "")
+    for topic, encoding in ENCODINGS.items()
+)
+
+
+def write_map(
+    record: MapRecord,
+    file: BinaryIO | Path | str,
+    *,
+    feature_dtype: str = "<f2",
+    stamp_ns: int | None = None,
+    distances: Distances | None = None,
+    preview: bool = True,
+) -> MapFileInfo:
+    """Write a map file that needs no other.
+
+    A path is written under a temporary name (``.<name>.<random>.tmp``) in the same folder, synced
+    and renamed, so that the final name never holds half a file.
+
+    Args:
+        record: the map; it is checked first.
+        file: a path, or a binary stream at the place where the file begins.
+        feature_dtype: ``"<f2"`` or ``"<f4"``, the precision of features that are not int8.
+        stamp_ns: time of creation, nanoseconds since 1970; left out, the file holds no time.
+        distances: a faster way to the map's signed distances than numpy, for the preview.
+        preview: whether the file holds a coarse mesh for MCAP viewers.
+
+    Raises:
+        FormatError: the record is not sound, or exceeds a limit of the format.
+        OSError: the file cannot be written.
+    """
+    _check_dtype(feature_dtype)
+    if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
+        raise FormatError(f"stamp_ns = {stamp_ns} is out of range")
+    check_record(record)
+    facts = MapFacts(record.name, record.epoch, record.settings)
+    shown = distances or (lambda points: MapEvaluator(record).query(points).sdf)
+    parts = record_parts(record, feature_dtype, shown if preview else None, stamp_ns or 0)
+    return write_parts(file, facts, stamp_ns, parts, {}).info
+
+
+def _check_dtype(feature_dtype: str) -> None:
+    if feature_dtype not in FEATURE_DTYPES:
+        raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FEATURE_DTYPES}")
+
+
+def record_parts(
+    record: MapRecord, feature_dtype: str, distances: Distances | None, stamp_ns: int
+) -> Iterator[Part]:
+    """The parts of all regions of a checked record, with previews where there are distances."""
+    for region in record.regions:
+        yield from region_parts(region, record.settings, feature_dtype, distances, stamp_ns)
+
+
+def region_parts(
+    region: Region,
+    settings: FieldSettings,
+    feature_dtype: str,
+    distances: Distances | None,
+    stamp_ns: int,
+) -> Iterator[Part]:
+    """The parts of a checked region, with its preview where there are distances.
+
+    Raises:
+        FormatError: features do not fit ``feature_dtype``.
+    """
+    try:
+        yield from pack_region(region, settings, feature_dtype)
+    except FormatError as error:
+        raise FormatError(f"region {region.index}: {error}") from error
+    if distances is not None:
+        yield pack_preview(region, settings, distances, stamp_ns)
+
+
+def write_parts(
+    file: BinaryIO | Path | str,
+    facts: MapFacts,
+    stamp_ns: int | None,
+    parts: Iterable[Part | Entry],
+    known: Mapping[PartKey, Entry],
+) -> WrittenMap:
+    """Write a map file from parts.
+
+    Args:
+        file: as in :func:`write_map`.
+        facts: what the file says of the whole map.
+        stamp_ns: time of its epoch.
+        parts: what the map consists of. An entry stands for a part that lies in another file,
+            and is one of ``known``.
+        known: parts of earlier epochs: an equal one keeps its epoch and time, and is not stored
+            again where the entry names a file.
+
+    Raises:
+        FormatError: a limit of the format is exceeded.
+        OSError: the file cannot be written.
+    """
+    if isinstance(file, (str, Path)):
+        with replacing(Path(file)) as stream:
+            return _PartsWriter(stream, facts, stamp_ns, known).write(parts)
+    return _PartsWriter(file, facts, stamp_ns, known).write(parts)
+
+
+class _PartsWriter:
+    """Writes one file, noting what its manifest is to list."""
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        facts: MapFacts,
+        stamp_ns: int | None,
+        known: Mapping[PartKey, Entry],
+    ) -> None:
+        self._facts = facts
+        self._stamp_ns = stamp_ns
+        self._known = known
+        self._entries: list[Entry] = []
+        self._total = 0
+        schema = SchemaSpec(SCHEMA_NAME, PREVIEW_ENCODING, schema_data())
+        self._mcap = McapWriter(stream, f"triquad {__version__}", [schema], _CHANNELS)
+
+    def write(self, parts: Iterable[Part | Entry]) -> WrittenMap:
+        # Where parts of other files are known, some of them are needed as good as always.
+        needs_others = any(entry.file is not None for entry in self._known.values())
+        self._mcap.add_metadata(METADATA_NAME, self._metadata(needs_others))
+        whole = pack_map(self._facts)
+        self._put(whole, self._stamp_ns or 0)
+        self._entries.append(self._changed(whole))
+        for part in parts:
+            if isinstance(part, Entry):
+                self._entries.append(part)
+            else:
+                self._add(part)
+        manifest = Manifest(self._facts, self._stamp_ns or 0, tuple(self._entries))
+        packed = pack_manifest(manifest)
+        self._put(packed, self._stamp_ns or 0)
+        self._mcap.finish()
+        _check_total(self._mcap.size)
+        if self._total > total_limit(self._mcap.size):
+            raise FormatError(
+                f"the map's parts shrink from {self._total} to {self._mcap.size} bytes: "
+                "readers take that for an attack"
+            )
+        info = MapFileInfo(self._mcap.size, self._mcap.sha256, self._facts.epoch)
+        return WrittenMap(info, manifest, hashlib.sha256(packed.payload).digest())
+
+    def _add(self, part: Part) -> None:
+        """List a part; store it unless another file has it."""
+        entry = self._changed(part)
+        known = self._known.get(part.key)
+        if known is not None and known.sha256 == entry.sha256:
+            entry = known
+        if entry.file is None:
+            self._put(part, entry.stamp_ns)
+        self._entries.append(entry)
+
+    def _changed(self, part: Part) -> Entry:
+        """The entry of a part that this epoch changed."""
+        digest = hashlib.sha256(part.payload).digest()
+        stamp_ns = self._stamp_ns or 0
+        return Entry(part.key, len(part.payload), digest, self._facts.epoch, stamp_ns)
+
+    def _put(self, part: Part, stamp_ns: int) -> None:
+        if len(part.payload) > MAX_PART_BYTES:
+            raise FormatError(
+                f"the part {part.key.topic} has {len(part.payload)} bytes; "
+                f"a map file holds parts of at most {MAX_PART_BYTES}",
+            )
+        self._total += len(part.payload)
+        _check_total(self._total)
+        self._mcap.add_message(part.key.topic, part.payload, stamp_ns, part.seams)
+
+    def _metadata(self, needs_others: bool) -> dict[str, str]:
+        entries = {
+            "format_version": str(FORMAT_VERSION),
+            "min_reader_version": str(MIN_READER_VERSION),
+            "required_features": BASE_FILES if needs_others else "",
+            "producer": f"triquad {__version__}",
+            "map": self._facts.name,
+            "epoch": str(self._facts.epoch),
+            "frame_id": FRAME_ID,
+            "units": UNITS,
+        }
+        if self._stamp_ns is not None:
+            created = datetime.fromtimestamp(self._stamp_ns // 10**9, timezone.utc)
+            entries["created"] = created.strftime("%Y-%m-%dT%H:%M:%SZ")
+        return entries
+
+
+def _check_total(size: int) -> None:
+    if size > MAX_MAP_BYTES:
+        raise FormatError(
+            f"the map takes {size} bytes or more; a map file holds at most {MAX_MAP_BYTES}",
+        )

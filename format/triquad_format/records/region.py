@@ -1,0 +1,172 @@
+"""A region as plain arrays: what the map file holds and what the evaluator reads.
+
+A region is a cube of the world of side ``2**depth * leaf_m``. Region ``(i, j, k)`` is centred at
+``(i, j, k) * region_pitch_m`` of the map frame; neighbours overlap by ``overlap_m`` and are
+blended there (see :mod:`triquad_map.reference.evaluator`).
+
+Inside a region, ``u = (p - centre) / leaf_m + 2**(depth - 1)`` are leaf coordinates in
+``[0, 2**depth]``. At level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a
+plane lies at ``(a, b) * 2**(depth - l)``. Evidence voxels have the side of a leaf; a block is a
+cube of 8 x 8 x 8 voxels.
+"""
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format.records import morton
+from triquad_format.records.field_settings import OVERLAP_LEAVES, FieldSettings
+
+AXES = ((0, 1), (0, 2), (1, 2))
+"""Coordinate axes of the planes XY, XZ and YZ."""
+
+BLOCK_VOXELS = 8
+"""Voxels along the side of an evidence block."""
+
+BLOCK_BYTES = BLOCK_VOXELS**3 // 8
+"""Bytes of one bit mask of a block: voxel (x, y, z) is bit ``z`` of byte ``x * 8 + y``."""
+
+MAX_LEVEL = 7
+"""The level of the best supported surface."""
+
+MAX_SEEN_S = (2**63 - 1) // 10**9
+"""The latest time of a surface: stamps are nanoseconds below ``2**63``."""
+
+MAX_INTEGER = 32_639
+"""Largest integer feature: its two bytes, both signed, reach no further."""
+
+MLP_LAYERS = 3
+
+RegionIndex = tuple[int, int, int]
+
+_Float = TypeVar("_Float", bound=np.floating)
+
+
+@dataclass(frozen=True)
+class VertexTable:
+    """The vertices of one plane and level with their feature vectors."""
+
+    plane: int
+    level: int
+    codes: NDArray[np.int64]  # [V] Morton codes of (a, b), strictly increasing
+    features: NDArray[np.floating | np.int16]  # [V, feature_size]
+    scale: float | None = None  # of integer features: one step, in single precision
+
+    def vectors(self) -> NDArray[np.float32]:
+        """The feature vectors [V, feature_size] themselves: integers count steps of ``scale``."""
+        vectors = self.features.astype(np.float32)
+        return vectors if self.scale is None else vectors * np.float32(self.scale)
+
+    def rows_of(self, vertices: NDArray[np.integer]) -> NDArray[np.intp]:
+        """Rows [N] of the vertices at integer coordinates [N, 2]; ``V`` where there is none."""
+        if not len(self.codes):
+            return np.zeros(len(vertices), np.intp)
+        wanted = morton.encode(vertices)
+        rows = np.searchsorted(self.codes, wanted)
+        found = self.codes[np.minimum(rows, len(self.codes) - 1)] == wanted
+        return np.where(found, rows, len(self.codes))
+
+
+@dataclass(frozen=True)
+class Mlp:
+    """Weights of the decoder: three dense layers, ``y = x @ weight + bias``, ReLU between."""
+
+    weights: tuple[NDArray[np.float32], ...]  # [input, hidden], [hidden, hidden], [hidden, 1]
+    biases: tuple[NDArray[np.float32], ...]  # [hidden], [hidden], [1]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What rays have shown, as bit masks of voxels with the side of a leaf, in sparse blocks."""
+
+    codes: NDArray[np.int64]  # [B] 3-D Morton codes of blocks, strictly increasing
+    surface: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray ended in the voxel
+    free: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray passed through the voxel
+    levels: NDArray[np.uint8] | None = None
+    """[S] How well each surface voxel is supported, from 0 to ``MAX_LEVEL``; ``None``: not known.
+
+    In the order of :func:`~triquad_format.records.evidence_voxels.seen_voxels`. What a level
+    stands for is up to those who set and read it; a higher one is better supported.
+    """
+    seen_s: NDArray[np.int64] | None = None
+    """[B] When a ray last ended in the block: whole seconds since 1970, by the stamps of scans.
+
+    0 where none did or it is not known; ``None``: nowhere known.
+    """
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """What training needs beyond the field, to go on as if it had not stopped.
+
+    Adam's moments follow the order of the tables' rows and of the MLP's arrays.
+    """
+
+    table_means: tuple[NDArray[np.floating], ...]  # per table [V, feature_size]
+    table_variances: tuple[NDArray[np.floating], ...]  # per table [V, feature_size]
+    table_steps: tuple[NDArray[np.int32], ...]  # per table [V] steps that each row took
+    mlp_means: tuple[NDArray[np.float32], ...]  # weights, then biases
+    mlp_variances: tuple[NDArray[np.float32], ...]
+    mlp_steps: int
+    sample_points: NDArray[np.float32]  # [S, 3] replay samples, metres from the region's centre
+    sample_labels: NDArray[np.floating]  # [S] signed distance, metres
+    visits_owed: int  # training visits still to be made, 0 where all is learnt
+
+
+@dataclass(frozen=True)
+class Region:
+    """One region of a map, complete."""
+
+    index: RegionIndex
+    frequencies: NDArray[np.float32]  # [m] Fourier frequencies s_i
+    mlp: Mlp
+    tables: tuple[VertexTable, ...]  # plane-major: (plane 0, coarsest level), ...
+    evidence: Evidence
+    training: TrainingState | None
+
+    @property
+    def parameters(self) -> int:
+        """Learnable numbers: features, weights and biases."""
+        features = sum(table.features.size for table in self.tables)
+        return features + sum(array.size for array in (*self.mlp.weights, *self.mlp.biases))
+
+
+@dataclass(frozen=True)
+class MapRecord:
+    """A map at one epoch: what a map file holds."""
+
+    name: str
+    epoch: int
+    settings: FieldSettings
+    regions: tuple[Region, ...]
+
+    @property
+    def has_evidence(self) -> bool:
+        """Whether rays have shown anything; without evidence all is ``UNKNOWN``."""
+        return any(len(region.evidence.codes) for region in self.regions)
+
+
+def region_centre(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:
+    """Centre [3] of a region in the map frame, metres."""
+    return np.asarray(index, np.float64) * settings.region_pitch_m
+
+
+def owned_blocks(settings: FieldSettings) -> range:
+    """Blocks of evidence, along each axis, in the space that a region alone answers for.
+
+    Neighbours meet in the middle of their overlap.
+    """
+    margin = OVERLAP_LEAVES // 2 // BLOCK_VOXELS
+    return range(margin, (1 << settings.depth) // BLOCK_VOXELS - margin)
+
+
+def region_corner(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:
+    """Least corner [3] of a region's cube in the map frame, metres."""
+    return region_centre(settings, index) - settings.region_side_m / 2
+
+
+def leaf_coordinates(settings: FieldSettings, offset: NDArray[_Float]) -> NDArray[_Float]:
+    """Leaf coordinates [N, 3] at ``offset`` [N, 3] from a region's centre, metres."""
+    return np.asarray(offset / settings.leaf_m + (1 << (settings.depth - 1)), offset.dtype)

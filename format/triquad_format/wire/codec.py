@@ -1,0 +1,170 @@
+"""Encoding of messages: one generic pair of functions, driven by the dataclasses' annotations.
+
+A message is a msgpack map that holds ``triquad`` (the protocol version), ``kind`` (the name of
+its class) and its fields. The messages themselves are in :mod:`triquad_format.wire.messages`;
+``docs/wire-protocol.md`` is the specification.
+"""
+
+import functools
+import types
+import typing
+from typing import Any, TypeVar, get_args, get_origin
+
+import msgpack
+import numpy as np
+
+from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.wire.array import ArraySpec, pack_array, unpack_array
+from triquad_format.wire.structure import check_structure
+
+PROTOCOL_VERSION = 1
+MAX_MESSAGE_BYTES = 256 * 2**20
+_MAX_WIRE_STRING_BYTES = 65_536
+_MAX_ITEMS = 65_536
+
+MessageT = TypeVar("MessageT", bound="Message")
+
+
+class Message:
+    """Base of all wire messages; subclasses are frozen dataclasses."""
+
+    @classmethod
+    @functools.cache
+    def annotations(cls) -> dict[str, Any]:
+        """The fields' names and annotations."""
+        return typing.get_type_hints(cls, include_extras=True)
+
+
+def encode(message: Message) -> bytes:
+    """The bytes of a message.
+
+    Raises:
+        WireError: a field does not fit its annotation.
+    """
+    body: dict[str, object] = {"triquad": PROTOCOL_VERSION, "kind": type(message).__name__}
+    for name, annotation in message.annotations().items():
+        body[name] = _pack(f"{type(message).__name__}.{name}", annotation, getattr(message, name))
+    return typing.cast(bytes, msgpack.packb(body))
+
+
+def decode(expected: type[MessageT], payload: bytes) -> MessageT:
+    """The message in ``payload``, which must be of the class ``expected``.
+
+    Unknown fields are ignored, so that a later minor revision can add some.
+
+    Raises:
+        ProtocolVersionError: the message names another protocol version.
+        WireError: anything else is wrong; the text names the field.
+    """
+    body = _unpack_map(payload)
+    version = body.get("triquad")
+    if version is None:
+        raise WireError("not a triquad message: it names no protocol version")
+    if version != PROTOCOL_VERSION:
+        raise ProtocolVersionError(
+            f"protocol version {version!r} is not spoken here, only {PROTOCOL_VERSION}; "
+            "use client and server of the same release",
+        )
+    if body.get("kind") != expected.__name__:
+        raise WireError(f"expected a {expected.__name__}, got {body.get('kind')!r}")
+    fields: dict[str, object] = {}
+    for name, annotation in expected.annotations().items():
+        if name not in body:
+            if hasattr(expected, name):  # it has a default, for those who speak as before it came
+                continue
+            raise WireError(f"{expected.__name__}.{name}: missing")
+        fields[name] = _unpack(f"{expected.__name__}.{name}", annotation, body[name])
+    return expected(**fields)
+
+
+def _unpack_map(payload: bytes) -> dict[str, object]:
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise WireError(f"message of {len(payload)} bytes exceeds {MAX_MESSAGE_BYTES}")
+    check_structure(payload)
+    try:
+        body = msgpack.unpackb(
+            payload,
+            max_str_len=_MAX_WIRE_STRING_BYTES,
+            max_array_len=_MAX_ITEMS,
+            max_map_len=_MAX_ITEMS,
+        )
+    except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
+        raise WireError(f"not a triquad message: {error}") from error
+    if not isinstance(body, dict):
+        raise WireError(f"not a triquad message: a {type(body).__name__}, not a map")
+    return body
+
+
+def _pack(name: str, annotation: Any, value: object) -> object:
+    spec = _array_spec(annotation)
+    if spec is not None:
+        if not isinstance(value, np.ndarray):
+            raise WireError(f"{name}: expected an array, got {type(value).__name__}")
+        spec.check(name, value)
+        return pack_array(value)
+    origin = get_origin(annotation)
+    if origin in (types.UnionType, typing.Union):
+        return None if value is None else _pack(name, _required(annotation), value)
+    if isinstance(annotation, type) and issubclass(annotation, Message):
+        if not isinstance(value, annotation):
+            raise WireError(f"{name}: expected {annotation.__name__}, got {value!r}")
+        return {
+            key: _pack(f"{name}.{key}", hint, getattr(value, key))
+            for key, hint in annotation.annotations().items()
+        }
+    if origin is dict and isinstance(value, dict):
+        key_type, item = get_args(annotation)
+        return {
+            _scalar(f"{name} key", key_type, key): _pack(f"{name}[{key!r}]", item, entry)
+            for key, entry in value.items()
+        }
+    return _scalar(name, annotation, value)
+
+
+def _unpack(name: str, annotation: Any, value: object) -> object:
+    spec = _array_spec(annotation)
+    if spec is not None:
+        array = unpack_array(name, value)
+        spec.check(name, array)
+        return array
+    origin = get_origin(annotation)
+    if origin in (types.UnionType, typing.Union):
+        return None if value is None else _unpack(name, _required(annotation), value)
+    if isinstance(annotation, type) and issubclass(annotation, Message):
+        hints = annotation.annotations()
+        if not isinstance(value, dict) or not hints.keys() <= value.keys():
+            raise WireError(f"{name}: expected a map with {', '.join(hints)}")
+        return annotation(
+            **{key: _unpack(f"{name}.{key}", hint, value[key]) for key, hint in hints.items()},
+        )
+    if origin is dict and isinstance(value, dict):
+        key_type, item = get_args(annotation)
+        return {
+            _scalar(f"{name} key", key_type, key): _unpack(f"{name}[{key!r}]", item, entry)
+            for key, entry in value.items()
+        }
+    return _scalar(name, annotation, value)
+
+
+def _array_spec(annotation: Any) -> ArraySpec | None:
+    for extra in getattr(annotation, "__metadata__", ()):
+        if isinstance(extra, ArraySpec):
+            return extra
+    return None
+
+
+def _required(annotation: Any) -> Any:
+    (inner,) = (arg for arg in get_args(annotation) if arg is not type(None))
+    return inner
+
+
+def _scalar(name: str, annotation: Any, value: object) -> Any:
+    """``value`` where it is exactly an ``annotation`` (an int also serves as a float)."""
+    if annotation is float and type(value) is int:
+        return float(value)
+    if type(value) is not annotation:
+        wanted = getattr(annotation, "__name__", str(annotation))
+        raise WireError(f"{name}: expected {wanted}, got {type(value).__name__}")
+    if annotation is int and not -(2**63) <= typing.cast(int, value) < 2**63:
+        raise WireError(f"{name}: {value} does not fit 64 bits")
+    return value

@@ -1,0 +1,88 @@
+"""Zenoh key expressions: one key per operation, so that access control can tell them apart."""
+
+import re
+
+from triquad_format.errors import FormatError
+from triquad_format.wire.codec import PROTOCOL_VERSION, Message
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+SCHEMA_PREFIX = "application/msgpack;triquad."
+
+# Operations on `triquad/<map>/query/...`: they read the map.
+SDF = "query/sdf"
+DISTANCE = "query/distance"
+SPHERES = "query/spheres"
+SEGMENTS = "query/segments"
+RAYS = "query/rays"
+GRID = "query/grid"
+ALIGN = "query/align"
+TILE = "query/tile"
+TILE_LIST = "query/tiles"
+TILE_UPDATES = "query/tile_updates"
+STATUS = "query/status"
+FLUSH = "query/flush"
+MAP_INFO = "query/map"
+MAP_CHUNK = "query/map_chunk"
+# Operations on `triquad/<map>/admin/...`: they change the map or the disk.
+CHECKPOINT = "admin/checkpoint"
+RESET = "admin/reset"
+
+OPERATIONS = (
+    SDF,
+    DISTANCE,
+    SPHERES,
+    SEGMENTS,
+    RAYS,
+    GRID,
+    ALIGN,
+    TILE,
+    TILE_LIST,
+    TILE_UPDATES,
+    STATUS,
+    FLUSH,
+    MAP_INFO,
+    MAP_CHUNK,
+    CHECKPOINT,
+    RESET,
+)
+
+
+def check_name(kind: str, name: str) -> str:
+    """``name`` where it can stand in a key; a :class:`FormatError` names it otherwise."""
+    if not _NAME.fullmatch(name):
+        raise FormatError(
+            f"{kind} name {name!r} is not allowed: use 1 to 64 letters, digits, '_', '.', '-', "
+            "beginning with a letter or digit",
+        )
+    return name
+
+
+def operation_key(map_name: str, operation: str) -> str:
+    """Key of a query, such as ``triquad/default/query/sdf``."""
+    return f"triquad/{check_name('map', map_name)}/{operation}"
+
+
+def scan_key(map_name: str, source: str) -> str:
+    """Key on which a source publishes its scans."""
+    return f"triquad/{check_name('map', map_name)}/scan/{check_name('source', source)}"
+
+
+def all_scans_key(map_name: str) -> str:
+    """Key expression of the scans of all sources."""
+    return f"triquad/{check_name('map', map_name)}/scan/*"
+
+
+def status_key(map_name: str) -> str:
+    """Key on which the server publishes its status about once a second."""
+    return f"triquad/{check_name('map', map_name)}/status"
+
+
+def alive_key(map_name: str, server: str) -> str:
+    """Liveliness token of a server; ``*`` for both lists all servers and their maps."""
+    return f"triquad/{map_name}/@alive/{server}"
+
+
+def encoding(message: type[Message]) -> str:
+    """Zenoh encoding of a message, such as ``application/msgpack;triquad.SdfRequest.v1``."""
+    return f"{SCHEMA_PREFIX}{message.__name__}.v{PROTOCOL_VERSION}"

@@ -1,0 +1,282 @@
+"""The wire messages. ``docs/wire-protocol.md`` says on which key each travels.
+
+Positions are ``float32`` offsets from a ``float64`` origin, so that a map in large coordinates
+(UTM, say) loses nothing on the way. ``epoch`` in a request pins an epoch; 0 asks for the newest.
+Numbers of epochs compare only within one ``ServerStatus.server``.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format.wire.array import ArraySpec
+from triquad_format.wire.codec import Message
+
+Positions = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, 3))]
+Values = Annotated[NDArray[np.float32], ArraySpec("<f4", (None,))]
+StatusCodes = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
+Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
+Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
+TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
+Epochs = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
+Codecs = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
+Sizes = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
+Faces = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
+
+
+@dataclass(frozen=True)
+class Scan(Message):
+    """One scan of one source: put on ``triquad/<map>/scan/<source>``.
+
+    ``session`` is drawn at random when a publisher starts; ``sequence`` counts its scans
+    from 0, so that the server can count the lost ones. ``stamp_ns`` never runs backwards
+    within a session.
+    """
+
+    points: Positions  # [N, 3] metres, sensor frame
+    world_from_sensor: Pose  # rigid
+    stamp_ns: int  # nanoseconds since 1970
+    source: str
+    session: int
+    sequence: int
+
+
+@dataclass(frozen=True)
+class SdfRequest(Message):
+    """Signed distance, status and, on request, gradient at points of the map frame."""
+
+    origin: Point  # metres, map frame
+    points: Positions  # [N, 3] metres, relative to origin
+    gradient: bool
+    epoch: int
+
+
+@dataclass(frozen=True)
+class SdfReply(Message):
+    """Answer to :class:`SdfRequest`, all of it from one epoch."""
+
+    epoch: int
+    sdf: Values  # [N] metres, positive in free space; NaN where no region is
+    status: StatusCodes  # [N] triquad_format.records.status.Status
+    gradient: Positions | None  # [N, 3] d(sdf)/dx, map frame
+
+
+@dataclass(frozen=True)
+class TileListRequest(Message):
+    """Which mesh tiles meet a box of the map frame; an open side is infinite."""
+
+    minimum: Point
+    maximum: Point
+    epoch: int
+    level: int = 0  # of detail: cells are 2**level times as large as those of level 0
+
+
+@dataclass(frozen=True)
+class TileList(Message):
+    """Answer to :class:`TileListRequest`."""
+
+    epoch: int
+    tile_side_m: float
+    tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
+    changed: Epochs  # [T] the surface of each tile last changed in this epoch
+
+
+@dataclass(frozen=True)
+class TileRequest(Message):
+    """The mesh of one tile."""
+
+    x: int
+    y: int
+    z: int
+    epoch: int
+    level: int = 0  # of detail
+
+
+@dataclass(frozen=True)
+class Tile(Message):
+    """Answer to :class:`TileRequest`."""
+
+    epoch: int
+    changed: int  # as in TileList
+    origin: Point  # metres, map frame: the tile's minimum corner
+    vertices: Positions  # [V, 3] metres, relative to origin
+    faces: Faces  # [F, 3], counter-clockwise seen from free space
+
+
+@dataclass(frozen=True)
+class TileUpdatesRequest(Message):
+    """What changed of the mesh tiles in a box; answered once something did, or in time."""
+
+    minimum: Point
+    maximum: Point  # of the box, map frame; an open side is infinite
+    level: int  # of detail
+    server: str  # of the reply before, whose word revision and held are; empty at first
+    revision: int  # of the reply before: everything up to it is known; 0 at first
+    held: TileIndices  # [H, 3] tiles that are known whatever the revision
+    held_versions: Epochs  # [H]
+    max_bytes: int  # of the reply's tiles; a single tile may have more
+    timeout_s: float
+    client: str  # a name, on which max_bytes_per_s is counted
+    max_bytes_per_s: int  # 0: whatever the server allows
+    draco: bool  # whether the client can decode Draco
+
+
+@dataclass(frozen=True)
+class TileUpdates(Message):
+    """Answer to :class:`TileUpdatesRequest`."""
+
+    server: str
+    revision: int  # for the next request
+    epoch: int  # the tiles show this epoch, where complete
+    complete: bool  # nothing more waits
+    restart: bool  # the request spoke of another server: tiles held from it are void
+    tile_side_m: float
+    cell_m: float
+    tiles: TileIndices  # [T, 3] that changed
+    versions: Epochs  # [T] epoch of which each is
+    codecs: Codecs  # [T] triquad_format.wire.tile_codec.Codec
+    sizes: Sizes  # [T] bytes of each
+    data: bytes  # of all, one behind the other
+    removed: TileIndices  # [R, 3] that have no faces any more
+
+
+@dataclass(frozen=True)
+class StatusRequest(Message):
+    """How the server is doing."""
+
+
+@dataclass(frozen=True)
+class CheckpointInfo(Message):
+    """A checkpoint on the server's disk; also the answer to :class:`CheckpointRequest`."""
+
+    path: str
+    bytes: int
+    epoch: int
+    sha256: str
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class ServerStatus(Message):
+    """Answer to :class:`StatusRequest`; also put on ``triquad/<map>/status``."""
+
+    map_name: str
+    server: str  # a name of this server process
+    version: str
+    device: str
+    epoch: int
+    settled: bool  # True: nothing is left to learn from the scans so far
+    scans_taken: int
+    scans_dropped: dict[str, int]  # by reason
+    scans_lost: dict[str, int]  # by source: never arrived, or pushed out of the full queue
+    scans_waiting: int
+    points_dropped: dict[str, int]  # by reason, points of scans that were taken
+    requests_refused: dict[str, int]  # by error code
+    samples_trained: int
+    segments_kept: int  # what so many rays taught is in the replay pool
+    loss: float  # recent training loss, 0 before any training
+    regions: int
+    vertices: int
+    parameters: int
+    memory_bytes: int  # resident memory of the server process
+    uptime_s: float
+    last_checkpoint: CheckpointInfo | None
+    store_error: str | None  # why the map is not durable, None if it is
+
+
+@dataclass(frozen=True)
+class FlushRequest(Message):
+    """Wait until the scan ``sequence`` of this source and session has been dealt with."""
+
+    source: str
+    session: int
+    sequence: int
+    timeout_s: float
+
+
+@dataclass(frozen=True)
+class FlushReply(Message):
+    """Answer to :class:`FlushRequest`, with the counts of this source and session."""
+
+    taken: int
+    refused: int
+    lost: int
+    last_refusal: str | None
+
+
+@dataclass(frozen=True)
+class CheckpointRequest(Message):
+    """Write a checkpoint now; answered with :class:`CheckpointInfo` once it is on disk."""
+
+
+@dataclass(frozen=True)
+class ResetRequest(Message):
+    """Forget what was learnt within a box of the map frame; infinite sides are allowed."""
+
+    minimum: Point
+    maximum: Point
+
+
+@dataclass(frozen=True)
+class ResetReply(Message):
+    """Answer to :class:`ResetRequest`: the first epoch without the box's content."""
+
+    epoch: int
+
+
+@dataclass(frozen=True)
+class MapInfoRequest(Message):
+    """Prepare the newest epoch as a map file for download."""
+
+    training: bool  # with the state that training needs to go on
+
+
+@dataclass(frozen=True)
+class MapInfo(Message):
+    """Answer to :class:`MapInfoRequest`; the file is then fetched in chunks."""
+
+    epoch: int
+    bytes: int
+    sha256: str
+    chunk_bytes: int
+
+
+@dataclass(frozen=True)
+class MapChunkRequest(Message):
+    """Bytes ``[offset, offset + length)`` of the map file with this digest."""
+
+    sha256: str
+    offset: int
+    length: int  # at most chunk_bytes are sent
+
+
+@dataclass(frozen=True)
+class MapChunk(Message):
+    """Answer to :class:`MapChunkRequest`."""
+
+    offset: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class ErrorReply(Message):
+    """What an operation answers, as a Zenoh error reply, where it cannot do what was asked."""
+
+    code: str  # see ERROR_CODES
+    message: str
+
+
+ERROR_CODES = {
+    "bad_request": "the request is malformed or out of range",
+    "bad_version": "the request is of another protocol version",
+    "too_large": "the request exceeds a limit of the server; split it",
+    "epoch_gone": "the pinned epoch is no longer kept",
+    "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
+    "unknown_map": "the server has no map of this name",
+    "timeout": "the server could not finish in the time that the request allows",
+    "busy": "too many requests are waiting",
+    "store": "the checkpoint could not be written",
+    "internal": "a defect of the server; its log has the details",
+}

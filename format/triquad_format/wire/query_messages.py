@@ -1,0 +1,158 @@
+"""The wire messages of questions that planners ask; see :mod:`triquad_format.wire.messages`.
+
+All of a reply comes from one epoch. Flags are 0 or 1. What was not found has a flag that says so:
+no number stands for it.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format.wire.array import ArraySpec
+from triquad_format.wire.codec import Message
+from triquad_format.wire.messages import Point, Pose, Positions, StatusCodes, Values
+
+Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
+Volume = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, None, None))]
+StatusVolume = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None, None, None))]
+Counts = Annotated[NDArray[np.int32], ArraySpec("<i4", (3,))]
+Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
+
+
+@dataclass(frozen=True)
+class DistanceRequest(Message):
+    """True distances to the nearest seen surface, at any range."""
+
+    origin: Point  # metres, map frame
+    points: Positions  # [N, 3] metres, relative to origin
+    max_distance_m: float  # a surface is looked for up to here
+    surface_point: bool  # the nearest points of the surface are wanted, too
+    unknown_distance: bool  # so is the nearest unknown space
+    epoch: int
+
+
+@dataclass(frozen=True)
+class DistanceReply(Message):
+    """Answer to :class:`DistanceRequest`."""
+
+    epoch: int
+    distance: Values  # [N] metres, negative behind a surface; at most max_distance_m
+    gradient: Positions  # [N, 3] its unit gradient, map frame; zero where nothing was found
+    found: Flags  # [N] whether there is a surface within max_distance_m
+    status: StatusCodes  # [N] of the points themselves
+    confidence: Values  # [N] in [0, 1]
+    surface_point: Positions | None  # [N, 3] relative to origin; the point where nothing was found
+    unknown_distance: Values | None  # [N] metres, at most max_distance_m
+    unknown_point: Positions | None  # [N, 3] relative to origin; the point where there is none
+
+
+@dataclass(frozen=True)
+class SpheresRequest(Message):
+    """What spheres hold."""
+
+    origin: Point  # metres, map frame
+    centres: Positions  # [N, 3] metres, relative to origin
+    radii: Values  # [N] metres
+    epoch: int
+
+
+@dataclass(frozen=True)
+class SpheresReply(Message):
+    """Answer to :class:`SpheresRequest`."""
+
+    epoch: int
+    status: StatusCodes  # [N]
+
+
+@dataclass(frozen=True)
+class SegmentsRequest(Message):
+    """What a ball meets that moves along segments."""
+
+    origin: Point  # metres, map frame
+    starts: Positions  # [N, 3] metres, relative to origin
+    ends: Positions  # [N, 3]
+    radius_m: float  # of the ball
+    max_distance_m: float  # clearance is looked for up to here
+    epoch: int
+
+
+@dataclass(frozen=True)
+class SegmentsReply(Message):
+    """Answer to :class:`SegmentsRequest`; places are metres along the segment."""
+
+    epoch: int
+    length: Values  # [N]
+    blocked: Flags  # [N] the ball touches a seen surface
+    contact: Values  # [N] where it first does; the length where it does not
+    clearance: Values  # [N] least distance of the centre to a surface, up to the contact
+    clearance_at: Values  # [N] where
+    meets_unknown: Flags  # [N] the ball enters unknown space, before any contact
+    unknown_contact: Values  # [N] where it first does; the length where it does not
+
+
+@dataclass(frozen=True)
+class RaysRequest(Message):
+    """How far rays reach."""
+
+    origin: Point  # metres, map frame
+    starts: Positions  # [N, 3] metres, relative to origin
+    directions: Positions  # [N, 3] unit vectors, map frame
+    max_range_m: float
+    through_unknown: bool  # unknown space does not stop them
+    epoch: int
+
+
+@dataclass(frozen=True)
+class RaysReply(Message):
+    """Answer to :class:`RaysRequest`."""
+
+    epoch: int
+    range: Values  # [N] metres
+    status: StatusCodes  # [N] what it ends at: surface, unknown space, or the largest range (free)
+
+
+@dataclass(frozen=True)
+class GridRequest(Message):
+    """Distance and status at the middles of a grid's cells."""
+
+    corner: Point  # the grid's least corner, metres, map frame
+    cell_m: float
+    counts: Counts  # cells along x, y, z
+    max_distance_m: float
+    epoch: int
+
+
+@dataclass(frozen=True)
+class GridReply(Message):
+    """Answer to :class:`GridRequest`."""
+
+    epoch: int
+    distance: Volume  # [x, y, z] metres, as in DistanceReply
+    status: StatusVolume  # [x, y, z]
+
+
+@dataclass(frozen=True)
+class AlignRequest(Message):
+    """Find the pose of a scan near a guess."""
+
+    points: Positions  # [N, 3] metres, sensor frame
+    world_from_sensor: Pose  # the guess
+    max_distance_m: float  # points farther from any surface do not count
+    max_iterations: int
+    epoch: int
+
+
+@dataclass(frozen=True)
+class AlignReply(Message):
+    """Answer to :class:`AlignRequest`."""
+
+    epoch: int
+    world_from_sensor: Pose
+    covariance: Covariance  # of translation (metres) and rotation vector (radians), map frame
+    inlier_share: float
+    rms_m: float  # of the inliers' distances
+    converged: bool
+    iterations: int
+    points: int  # that were used

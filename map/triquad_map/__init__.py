@@ -1,0 +1,1 @@
+"""A map in memory, and what can be asked of it."""

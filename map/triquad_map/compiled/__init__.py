@@ -1,0 +1,1 @@
+"""A map answered by compiled code."""

@@ -1,0 +1,86 @@
+"""From the arrays of a field to its compiled form, and from points to its values."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import Region
+
+from triquad_map.compiled.blended_field import FieldValues
+from triquad_map.compiled.field import field as compiled_field
+from triquad_map.compiled.field.encoding import Geometry
+from triquad_map.compiled.field.field import CompiledField
+from triquad_map.compiled.field.mlp import Mlp
+from triquad_map.compiled.field.quadtree import TriQuadtree
+
+Floats = NDArray[np.float32]
+
+
+class RecordedEngine:
+    """The field of a region as a file holds it; it is not for training."""
+
+    def __init__(self, settings: FieldSettings, region: Region) -> None:
+        self._settings = settings
+        tree = TriQuadtree(settings)
+        features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
+        for table in region.tables:
+            h = table.level - settings.levels.start
+            tree.restore(table.plane, h, table.codes.astype(np.int64))
+            features.append(table.vectors())
+        layers = zip(region.mlp.weights, region.mlp.biases, strict=True)
+        self._field = make_field(
+            settings,
+            tree,
+            np.concatenate(features),
+            [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer],
+            np.asarray(region.frequencies, np.float32),
+        )
+
+    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
+        """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
+        return field_values(self._field, self._settings, points, gradient)
+
+
+def make_field(
+    settings: FieldSettings,
+    tree: TriQuadtree,
+    features: Floats,
+    mlp: Sequence[Floats],
+    frequencies: Floats,
+) -> CompiledField:
+    """The compiled form of a field; it shares memory with the arrays.
+
+    Args:
+        settings: of the field.
+        tree: its vertices.
+        features: [rows, feature_size] by the tree's rows; row 0 is zero.
+        mlp: weights and bias of each layer in turn.
+        frequencies: [m] Fourier frequencies, on coordinates normalised to [-1, 1].
+    """
+    geometry = Geometry(
+        np.float32(settings.leaf_m),
+        np.float32(1 << (settings.depth - 1)),
+        settings.feature_levels if settings.encoding != "fourier" else 0,
+        tree.shape,
+    )
+    w1, b1, w2, b2, w3, b3 = mlp
+    turns = frequencies / np.float32(settings.region_side_m / 2)
+    return CompiledField(
+        geometry,
+        tree.vertices,
+        features,
+        Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
+        turns if settings.encoding != "features" else turns[:0],
+    )
+
+
+def field_values(
+    field: CompiledField, settings: FieldSettings, points: Floats, gradient: bool
+) -> FieldValues:
+    """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
+    logits = np.empty(len(points), np.float32)
+    gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
+    compiled_field.evaluate(points, field, logits, gradients)
+    scale = np.float32(settings.logit_scale_m)
+    return FieldValues(logits * scale, gradients * scale)

@@ -1,0 +1,1 @@
+"""Kernels of the evidence: what rays have shown."""

@@ -1,0 +1,1 @@
+"""Kernels of the field: encoding, decoder, gradients."""

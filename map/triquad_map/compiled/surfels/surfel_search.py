@@ -1,0 +1,248 @@
+"""The search for the nearest surfel.
+
+Groups of blocks first, then their blocks, then the surfels of a block, each level by the boxes
+around what it holds. All of it becomes one function, and arrays are in local variables where a loop
+uses them: to pass them on, or to reach into tuples for them, takes longer than the arithmetic.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.region import BLOCK_VOXELS
+
+from triquad_map.compiled.surfels.surfel_index import GROUP_SHIFT, GROUP_VOXELS, SurfelIndex
+from triquad_map.compiled.voxel_index import CELL_LIMIT, find_row, pack, unpack
+from triquad_map.nearest import NearestSurfels
+from triquad_map.surface.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
+
+_STEPS = np.array(
+    sorted(itertools.product((-1, 0, 1), repeat=3), key=lambda step: np.abs(step).sum())
+)
+"""To the groups at and beside a place [27, 3], the near ones first."""
+
+_NEIGHBOURS = len(_STEPS)
+_FARTHEST = CELL_LIMIT / 2
+_LOW = BLOCK_VOXELS - 1
+_DISC = int(SurfelKind.DISC)
+_RADIUS = np.float32(DISC_RADIUS)
+
+_CANDIDATES = 128
+"""How many surfels are kept in mind for the direction."""
+
+_NONE = -1
+
+# The numbers of ``Search.found``.
+_SURFEL, _MEMBER, _COUNT = range(3)
+
+Ints = NDArray[np.int32]
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Place = tuple[float, float, float]
+
+
+class Search(NamedTuple):
+    """What is known while the nearest surfel of a point is searched for."""
+
+    best: Floats  # [1] square of the least distance
+    found: Ints  # [3] the nearest surfel, the block that holds it, and how many candidates
+    candidates: Ints  # [_CANDIDATES, 2] surfels that may count in the direction, and their blocks
+    nearness: Floats  # [_CANDIDATES] squares of their distances
+    squares: Floats  # [BLOCK_VOXELS**3] room for those of a block's surfels
+    away: Floats  # [blocks of a group] and for those of blocks
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _wider(square: float, by: float) -> float:
+    """Square of a distance that is larger ``by`` so much."""
+    reach = np.sqrt(square) + np.float32(by)
+    wider: float = np.float32(reach * reach)
+    return wider
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _sifted(search: Search, limit: float) -> int:
+    """Keep the candidates that are nearer than the root of ``limit``; how many they are."""
+    candidates, nearness = search.candidates, search.nearness
+    count = 0
+    for i in range(_CANDIDATES):
+        if nearness[i] <= limit:
+            nearness[count] = nearness[i]
+            candidates[count, 0], candidates[count, 1] = candidates[i, 0], candidates[i, 1]
+            count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) -> None:
+    """Look at the surfels of a block. All is relative to its corner, in single precision."""
+    row, boxes = index.groups.members[member], index.groups.member_boxes
+    x = np.float32(at[0] - (int(boxes[0, member]) & ~_LOW))
+    y = np.float32(at[1] - (int(boxes[1, member]) & ~_LOW))
+    z = np.float32(at[2] - (int(boxes[2, member]) & ~_LOW))
+    start, count = index.starts[row], index.starts[row + 1] - index.starts[row]
+    # Slices of their own, which the compiler makes vector instructions of.
+    xs = index.positions[0, start : start + count]
+    ys = index.positions[1, start : start + count]
+    zs = index.positions[2, start : start + count]
+    normals, kinds, squares = index.normals, index.kinds, search.squares
+    for i in range(count):
+        a, b, c = x - xs[i], y - ys[i], z - zs[i]
+        squares[i] = a * a + b * b + c * c
+    best, noted = search.best[0], search.found[_COUNT]
+    near, far = _wider(best, SMOOTHING), _wider(best, SMOOTHING + DISC_RADIUS)
+    sifted = best
+    for i in range(count):
+        if squares[i] > far:
+            continue
+        surfel, square = start + i, squares[i]
+        if kinds[surfel] == _DISC:
+            height = (
+                (x - xs[i]) * normals[surfel, 0]
+                + (y - ys[i]) * normals[surfel, 1]
+                + (z - zs[i]) * normals[surfel, 2]
+            )
+            beside = square - height * height
+            square = height * height
+            if beside > _RADIUS * _RADIUS:
+                beyond = np.sqrt(beside) - _RADIUS
+                square += beyond * beyond
+        if square > near:
+            continue
+        if noted == _CANDIDATES and best < sifted:
+            noted, sifted = _sifted(search, near), best
+        if noted < _CANDIDATES:
+            search.candidates[noted, 0], search.candidates[noted, 1] = surfel, member
+            search.nearness[noted] = square
+            noted += 1
+        if square < best:
+            best = square
+            search.found[_SURFEL], search.found[_MEMBER] = surfel, member
+            near, far = _wider(best, SMOOTHING), _wider(best, SMOOTHING + DISC_RADIUS)
+    search.best[0], search.found[_COUNT] = best, noted
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _search_group(index: SurfelIndex, group: int, at: Place, search: Search) -> None:
+    """Look at the blocks of a group, the nearest first."""
+    first, last = index.groups.starts[group], index.groups.starts[group + 1]
+    boxes, away = index.groups.member_boxes, search.away
+    x0, y0, z0 = boxes[0, first:last], boxes[1, first:last], boxes[2, first:last]
+    x1, y1, z1 = boxes[3, first:last], boxes[4, first:last], boxes[5, first:last]
+    x, y, z = np.float32(at[0]), np.float32(at[1]), np.float32(at[2])
+    zero = np.float32(0)
+    for i in range(last - first):
+        a = max(x0[i] - x, x - x1[i], zero)
+        b = max(y0[i] - y, y - y1[i], zero)
+        c = max(z0[i] - z, z - z1[i], zero)
+        away[i] = a * a + b * b + c * c
+    begin = 0
+    for i in range(1, last - first):
+        if away[i] < away[begin]:
+            begin = i
+    limit = _wider(search.best[0], SMOOTHING + OUTSIDE)
+    for turn in range(-1, last - first):
+        i = begin if turn < 0 else turn
+        if turn != begin and away[i] <= limit:
+            _search_block(index, first + i, at, search)
+            limit = _wider(search.best[0], SMOOTHING + OUTSIDE)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _reaches(index: SurfelIndex, group: int, at: Place, search: Search) -> bool:
+    """Whether a group may hold a surfel that counts."""
+    boxes = index.groups.boxes
+    a = max(boxes[group, 0] - at[0], at[0] - boxes[group, 3], 0.0)
+    b = max(boxes[group, 1] - at[1], at[1] - boxes[group, 4], 0.0)
+    c = max(boxes[group, 2] - at[2], at[2] - boxes[group, 5], 0.0)
+    return bool(a * a + b * b + c * c <= _wider(search.best[0], SMOOTHING + OUTSIDE))
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _search(index: SurfelIndex, at: Place, search: Search) -> None:
+    """Look at the groups around a point, then at all others."""
+    places = index.groups.places
+    x = int(np.floor(at[0] / GROUP_VOXELS))
+    y = int(np.floor(at[1] / GROUP_VOXELS))
+    z = int(np.floor(at[2] / GROUP_VOXELS))
+    for turn in range(_NEIGHBOURS + len(index.groups.boxes)):
+        if turn < _NEIGHBOURS:
+            key = pack(x + _STEPS[turn, 0], y + _STEPS[turn, 1], z + _STEPS[turn, 2])
+            group = find_row(places, key)
+        elif _wider(search.best[0], SMOOTHING) <= GROUP_VOXELS * GROUP_VOXELS:
+            break
+        else:
+            group = turn - _NEIGHBOURS
+            a, b, c = unpack(places.row_keys[group])
+            if max(abs(a - x), abs(b - y), abs(c - z)) <= 1:  # looked at already
+                continue
+        if group >= 0 and _reaches(index, group, at, search):
+            _search_group(index, group, at, search)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _foot(index: SurfelIndex, surfel: int, member: int, at: Place) -> Place:
+    """The point of a surfel that is nearest to a place."""
+    boxes = index.groups.member_boxes
+    qx = (int(boxes[0, member]) & ~_LOW) + float(index.positions[0, surfel])
+    qy = (int(boxes[1, member]) & ~_LOW) + float(index.positions[1, surfel])
+    qz = (int(boxes[2, member]) & ~_LOW) + float(index.positions[2, surfel])
+    if index.kinds[surfel] != _DISC:
+        return qx, qy, qz
+    nx, ny, nz = index.normals[surfel, 0], index.normals[surfel, 1], index.normals[surfel, 2]
+    a, b, c = at[0] - qx, at[1] - qy, at[2] - qz
+    height = a * nx + b * ny + c * nz
+    a, b, c = a - height * nx, b - height * ny, c - height * nz
+    share = min(1.0, DISC_RADIUS / max(np.sqrt(a * a + b * b + c * c), 1e-9))
+    return qx + share * a, qy + share * b, qz + share * c
+
+
+@numba.njit(cache=True, nogil=True)
+def _note_found(
+    index: SurfelIndex, at: Place, search: Search, i: int, nearest: NearestSurfels
+) -> None:
+    """Write down what was found for point ``i``."""
+    best = np.sqrt(search.best[0])
+    surfel = search.found[_SURFEL]
+    foot = _foot(index, surfel, search.found[_MEMBER], at)
+    total, x, y, z = 1.0, foot[0], foot[1], foot[2]
+    for k in range(search.found[_COUNT]):
+        share = 1.0 - (np.sqrt(search.nearness[k]) - best) / SMOOTHING
+        if share > 0.0 and search.candidates[k, 0] != surfel:
+            a, b, c = _foot(index, search.candidates[k, 0], search.candidates[k, 1], at)
+            weight = share * share
+            total += weight
+            x, y, z = x + weight * a, y + weight * b, z + weight * c
+    nearest.distances[i] = best
+    nearest.rows[i] = surfel
+    nearest.feet[i, 0], nearest.feet[i, 1], nearest.feet[i, 2] = foot
+    nearest.means[i, 0] = x / total
+    nearest.means[i, 1] = y / total
+    nearest.means[i, 2] = z / total
+
+
+@numba.njit(cache=True, nogil=True)
+def find_nearest(points: Doubles, index: SurfelIndex, nearest: NearestSurfels) -> None:
+    """Improve ``nearest`` where a surfel of the region lies nearer to ``points`` [N, 3].
+
+    Points are leaf coordinates of the region and may lie outside of it.
+    """
+    search = Search(
+        np.empty(1, np.float32),
+        np.empty(3, np.int32),
+        np.empty((_CANDIDATES, 2), np.int32),
+        np.empty(_CANDIDATES, np.float32),
+        np.empty(BLOCK_VOXELS**3, np.float32),
+        np.empty(1 << 3 * GROUP_SHIFT, np.float32),
+    )
+    for i in range(len(points)):
+        at = (points[i, 0], points[i, 1], points[i, 2])
+        if not max(abs(at[0]), abs(at[1]), abs(at[2])) < _FARTHEST:
+            continue
+        search.best[0] = nearest.distances[i] ** 2
+        search.found[_SURFEL], search.found[_COUNT] = _NONE, 0
+        _search(index, at, search)
+        if search.found[_SURFEL] != _NONE:
+            _note_found(index, at, search, i, nearest)

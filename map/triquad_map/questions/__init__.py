@@ -1,0 +1,1 @@
+"""Questions about a map, and the one way from request to reply."""

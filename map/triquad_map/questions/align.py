@@ -1,0 +1,259 @@
+"""Where a scan was taken: it is moved until its points lie on surfaces of the map."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.status import Status
+
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.pose import moved, orthonormal
+from triquad_map.questions.thinning import thinned
+from triquad_map.view import MapView
+
+_COARSE_POINTS = 500
+"""So many find the way; all that follows asks for a few millimetres."""
+
+FINE_POINTS = 2000
+"""Some so many are used in the end, however many are given."""
+
+_PER_RANGE = 0.1
+"""At first a point's distance counts less by this share a metre of its range: a wrong guess of the
+rotation moves far points most."""
+
+_REACH_SCALES = 3.0
+"""Farther than so many scales, a distance has hardly any weight."""
+
+_SURE_VOXELS = 5.0
+"""From this scale on, points count by the map's confidence: not at all in unknown space. Before,
+those count, too: of a scan that is off by a metre they lie behind walls, and lead back."""
+
+_FINAL_VOXELS = 0.5
+"""Scale of the distances that count in the end; the noise of a lidar and of the map is less."""
+
+_SHRINK_LEAST, _SHRINK_MOST = 0.8, 0.4
+_SCALE_STEPS = 3.0
+"""The scale follows the steps: what is left is seldom more than so many of the last."""
+
+_OVERSHOOT = 1.5
+"""Nearest points hold a scan back a little; going farther than they ask comes out sooner."""
+
+_COARSE_STEP_M, _FINE_STEP_M = 0.01, 0.002
+"""A step that moves the points by less is the last with few points, and the last."""
+
+_INLIER_SCALES = 3.0
+_LEAST_INLIER_SHARE = 0.5
+_LEAST_INLIERS = 50
+
+_OBSERVABLE = 0.01
+"""A motion under which distances change by less (mean square, by that of the points) is not seen:
+the map's normals are off by some degrees, which look like as much."""
+
+_CORRELATED = 5.0
+"""So many points say as much as one whose error were its own: neighbours share the map's. With this
+the squared errors at real scans are on average what the covariance says."""
+
+_UNSEEN_M, _UNSEEN_RAD = 100.0, math.pi
+"""Standard deviations along what is not seen at all."""
+
+
+@dataclass(frozen=True)
+class AlignOptions:
+    """How far a scan may be off, and how long to look."""
+
+    max_distance_m: float = 6.0
+    """Points farther than this from any surface do not count."""
+
+    max_iterations: int = 50
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Where a scan fits best near a guess, in one epoch of the map.
+
+    The covariance is that of an error ``(t, r)``: the true position is ``t`` away from the one
+    found, metres, map frame, and the true rotation is the one found turned by the rotation vector
+    ``r``, radians, map frame, about the sensor. Along what the surfaces do not tell (along a
+    corridor) the guess is kept and the variance is that of 100 m or half a turn.
+    """
+
+    world_from_sensor: NDArray[np.float64]  # [4, 4]
+    covariance: NDArray[np.float64]  # [6, 6] of translation, rotation; see above
+    inlier_share: float  # of the points that the map can tell about, those on a surface
+    rms_m: float  # of their distances; 0 where there are none
+    converged: bool  # it came to rest, most points are on surfaces, and these tell all directions
+    iterations: int
+    points: int  # that were used, of those given
+    epoch: int
+
+
+def align(
+    view: MapView,
+    points: NDArray[np.float64],
+    guess: NDArray[np.float64],
+    options: AlignOptions,
+) -> Alignment:
+    """Move a scan from where it is guessed to be to where it fits the map best.
+
+    The squared distances of its points to the nearest seen surface are made small by Gauss-Newton
+    steps on distance and gradient. Points count by a Geman-McClure kernel whose scale shrinks
+    from ``max_distance_m`` to half a voxel as the steps become small. Points in unknown space
+    pull at first (a scan that is off by a metre lies behind walls); in the end points count by the
+    map's confidence, and those in unknown space not at all.
+
+    Args:
+        view: the map.
+        points: [N, 3] metres, sensor frame; those that are not finite are left out, and the
+            rest is thinned to some 2000, evenly in space.
+        guess: [4, 4] world_from_sensor.
+        options: see there.
+
+    Raises:
+        ValueError: ``points`` are not of this shape, or ``guess`` is no rigid pose.
+    """
+    pose = orthonormal(guess)
+    fine = thinned(points, FINE_POINTS)
+    found = _descend(view, fine, pose, options)
+    return _judged(view, fine, found, options)
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Normal equations of the motion ``(t, r * arm)`` that brings points to surfaces."""
+
+    matrix: NDArray[np.float64]  # [6, 6] of mean square: the trace is that of one point
+    vector: NDArray[np.float64]  # [6]
+    arm_m: float  # RMS range of the points
+    weight: float  # sum of all points' weights
+    variance: float  # of the weighted distances
+
+    def seen(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions [6, S] that the surfaces tell, as columns, and their information [S]."""
+        values, vectors = np.linalg.eigh(self.matrix)
+        seen = values > _OBSERVABLE
+        return vectors[:, seen], values[seen]
+
+    def step(self) -> NDArray[np.float64]:
+        """The motion [6], none along what is not seen."""
+        vectors, values = self.seen()
+        step: NDArray[np.float64] = -vectors @ ((vectors.T @ self.vector) / values)
+        return step
+
+    def covariance(self) -> NDArray[np.float64]:
+        """Of translation and rotation [6, 6]."""
+        vectors, values = self.seen()
+        scaling = np.repeat([1.0, self.arm_m], 3)
+        information = (vectors * values) @ vectors.T * np.outer(scaling, scaling)
+        information *= self.weight / (_CORRELATED * max(self.variance, 1e-12))
+        weak = np.repeat([1 / _UNSEEN_M**2, 1 / _UNSEEN_RAD**2], 3)
+        covariance = np.linalg.inv(information + np.diag(weak))
+        symmetric: NDArray[np.float64] = (covariance + covariance.T) / 2
+        return symmetric
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Where the search ended."""
+
+    pose: NDArray[np.float64]  # [4, 4]
+    iterations: int
+    settled: bool
+
+
+def _descend(
+    view: MapView,
+    fine: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    options: AlignOptions,
+) -> _Found:
+    points = thinned(fine, _COARSE_POINTS)
+    final = _FINAL_VOXELS * view.voxel_m
+    scale = max(options.max_distance_m, final)
+    overshoot, last = _OVERSHOOT, np.zeros(6)
+    for iteration in range(1, options.max_iterations + 1):
+        normal = _normal(view, points, pose, scale, options, is_final=scale == final)
+        if normal is None:
+            return _Found(pose, iteration, False)
+        step = normal.step()
+        # Where it goes to and fro, shorter steps settle between.
+        overshoot = min(_OVERSHOOT, 1.25 * overshoot) if step @ last >= 0 else 0.5 * overshoot
+        last = step
+        taken = (overshoot if scale == final else 1.0) * step
+        size = float(np.linalg.norm(taken))
+        pose = moved(pose, taken[:3], taken[3:] / normal.arm_m)
+        if scale > final:
+            shrunk = np.clip(_SCALE_STEPS * size, _SHRINK_MOST * scale, _SHRINK_LEAST * scale)
+            scale = max(final, float(shrunk))
+        elif points is fine and size < _FINE_STEP_M:
+            return _Found(pose, iteration, True)
+        elif size < _COARSE_STEP_M:
+            points = fine
+    return _Found(pose, options.max_iterations, False)
+
+
+def _normal(
+    view: MapView,
+    points: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    scale: float,
+    options: AlignOptions,
+    is_final: bool,
+) -> _Normal | None:
+    """The normal equations at a pose; None where no point counts."""
+    turned = points @ pose[:3, :3].T
+    reach_m = min(options.max_distance_m, _REACH_SCALES * scale)
+    answer = distances(view, turned + pose[:3, 3], DistanceOptions(reach_m))
+    distance = answer.distance.astype(np.float64)
+    spread = 1.0 if is_final else 1.0 + _PER_RANGE * np.linalg.norm(points, axis=1)
+    counts = answer.found.astype(np.float64)
+    if scale <= _SURE_VOXELS * view.voxel_m:
+        counts = answer.confidence.astype(np.float64)  # 0 in unknown space
+    weights = counts / spread / (1.0 + (distance / (scale * spread)) ** 2) ** 2
+    weight = float(weights.sum())
+    if weight <= 0.0:
+        return None
+    share = weights / weight
+    arm_m = max(math.sqrt(float(share @ (turned**2).sum(axis=1))), 1e-6)
+    slope = answer.gradient.astype(np.float64)
+    rows = np.hstack([slope, np.cross(turned, slope) / arm_m])
+    weighted = share[:, None] * rows
+    return _Normal(
+        weighted.T @ rows,
+        weighted.T @ distance,
+        arm_m,
+        weight,
+        float(share @ distance**2),
+    )
+
+
+def _judged(
+    view: MapView, points: NDArray[np.float64], found: _Found, options: AlignOptions
+) -> Alignment:
+    """What to think of where the search ended."""
+    final = _FINAL_VOXELS * view.voxel_m
+    world = points @ found.pose[:3, :3].T + found.pose[:3, 3]
+    answer = distances(view, world, DistanceOptions(options.max_distance_m))
+    known = answer.status != Status.UNKNOWN
+    inliers = answer.found & known & (np.abs(answer.distance) <= _INLIER_SCALES * final)
+    count = int(inliers.sum())
+    share = count / max(int((answer.found | known).sum()), 1)
+    squares = answer.distance[inliers].astype(np.float64) ** 2
+    rms_m = math.sqrt(float(squares.sum()) / max(count, 1))
+    normal = _normal(view, points, found.pose, final, options, is_final=True)
+    covariance = np.diag(np.repeat([_UNSEEN_M**2, _UNSEEN_RAD**2], 3))
+    all_seen = False
+    if normal is not None:
+        covariance = normal.covariance()
+        all_seen = len(normal.seen()[1]) == 6
+    enough = count >= _LEAST_INLIERS and share >= _LEAST_INLIER_SHARE
+    return Alignment(
+        found.pose,
+        covariance,
+        share,
+        rms_m,
+        found.settled and enough and all_seen,
+        found.iterations,
+        len(points),
+        view.number,
+    )

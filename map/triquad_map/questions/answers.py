@@ -1,0 +1,285 @@
+"""From the message of a question to the message of its answer, for any map.
+
+A server answers with this from its epochs, and a client from a map file: so the two cannot differ.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.wire.codec import Message
+from triquad_format.wire.messages import SdfReply, SdfRequest
+from triquad_format.wire.query_messages import (
+    AlignReply,
+    AlignRequest,
+    DistanceReply,
+    DistanceRequest,
+    GridReply,
+    GridRequest,
+    RaysReply,
+    RaysRequest,
+    SegmentsReply,
+    SegmentsRequest,
+    SpheresReply,
+    SpheresRequest,
+)
+
+from triquad_map.questions.align import AlignOptions, align
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.grid import GridShape, grid
+from triquad_map.questions.pose import is_rigid
+from triquad_map.questions.rays import RayOptions, rays
+from triquad_map.questions.segments import SegmentOptions, segments, steps_at_most
+from triquad_map.questions.spheres import spheres
+from triquad_map.view import MapView
+
+MAX_DISTANCE_M = 100.0
+MAX_RANGE_M = 1_000.0
+MAX_ITERATIONS = 200
+
+_DECIMALS = 5  # of positions, metres
+_STEPS_EACH = 50
+"""Places along a segment that count as much as a point that is asked for."""
+
+_RANGE_EACH_M = 10.0
+"""Range of a ray that counts as much."""
+
+
+class QuestionError(Exception):
+    """Why a question is not answered; ``code`` is one of ``messages.ERROR_CODES``."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+@dataclass(frozen=True)
+class QuestionLimits:
+    """How much one question may ask."""
+
+    points: int  # at which the field is evaluated
+    searches: int  # points around which something is searched for, which takes ten times as long
+
+
+Views = Callable[[int], AbstractContextManager[MapView]]
+"""The map of the epoch of some number, 0 for the newest, while it is asked."""
+
+
+class Answers:
+    """Answers questions; as many threads may ask as the views allow."""
+
+    def __init__(self, views: Views, limits: QuestionLimits) -> None:
+        self._view = views
+        self._limits = limits
+
+    def answer(self, request: Message) -> Message:
+        """The answer to a question of any kind.
+
+        Raises:
+            QuestionError: it is not answered.
+            KeyError: it is no question about the map.
+        """
+        return _ANSWERS[type(request)](self, request)
+
+    def sdf(self, request: SdfRequest) -> SdfReply:
+        """The trained field, and status."""
+        points = _points("point", request.origin, request.points, self._limits.points)
+        with self._view(request.epoch) as view:
+            answer = view.query(points, request.gradient)
+            return SdfReply(view.number, answer.sdf, answer.status, answer.gradient)
+
+    def distance(self, request: DistanceRequest) -> DistanceReply:
+        """Distances to the nearest surface."""
+        points = self._searched("point", request.origin, request.points)
+        reach_m = _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
+        options = DistanceOptions(reach_m, request.surface_point, request.unknown_distance)
+        with self._view(request.epoch) as view:
+            answer = distances(view, points, options)
+        return DistanceReply(
+            answer.epoch,
+            answer.distance,
+            answer.gradient,
+            answer.found.astype(np.uint8),
+            answer.status,
+            answer.confidence,
+            _relative(answer.surface_point, request.origin),
+            answer.unknown_distance,
+            _relative(answer.unknown_point, request.origin),
+        )
+
+    def spheres(self, request: SpheresRequest) -> SpheresReply:
+        """What spheres hold."""
+        centres = self._searched("sphere", request.origin, request.centres)
+        _same_length(request.centres, "radii", request.radii)
+        good = (request.radii >= 0) & (request.radii <= MAX_DISTANCE_M)
+        if not good.all():
+            worst = int((~good).argmax())
+            raise QuestionError(
+                "bad_request",
+                f"radius {worst} is {request.radii[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
+            )
+        with self._view(request.epoch) as view:
+            answer = spheres(view, centres, request.radii.astype(np.float64))
+        return SpheresReply(answer.epoch, answer.status)
+
+    def segments(self, request: SegmentsRequest) -> SegmentsReply:
+        """What a ball meets on segments."""
+        starts = self._searched("start", request.origin, request.starts)
+        _same_length(request.starts, "ends", request.ends)
+        ends = self._searched("end", request.origin, request.ends)
+        options = SegmentOptions(
+            _within("radius_m", request.radius_m, MAX_DISTANCE_M, least=0.0),
+            _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
+        )
+        _short("segment", np.linalg.norm(ends - starts, axis=1))
+        with self._view(request.epoch) as view:
+            steps = steps_at_most(view, starts, ends)
+            self._check_count(steps / _STEPS_EACH, f"segments of {steps} steps")
+            answer = segments(view, starts, ends, options)
+        return SegmentsReply(
+            answer.epoch,
+            answer.length,
+            answer.blocked.astype(np.uint8),
+            answer.contact,
+            answer.clearance,
+            answer.clearance_at,
+            answer.meets_unknown.astype(np.uint8),
+            answer.unknown_contact,
+        )
+
+    def rays(self, request: RaysRequest) -> RaysReply:
+        """How far rays reach."""
+        starts = self._searched("start", request.origin, request.starts)
+        _same_length(request.starts, "directions", request.directions)
+        directions = request.directions.astype(np.float64)
+        lengths = np.linalg.norm(directions, axis=1)
+        bad = ~(np.abs(lengths - 1.0) < 1e-3)
+        if bad.any():
+            worst = int(bad.argmax())
+            raise QuestionError(
+                "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
+            )
+        reach_m = _within("max_range_m", request.max_range_m, MAX_RANGE_M)
+        self._check_count(
+            len(starts) * reach_m / _RANGE_EACH_M, f"{len(starts)} rays of {reach_m:g} m"
+        )
+        options = RayOptions(reach_m, request.through_unknown)
+        with self._view(request.epoch) as view:
+            answer = rays(view, starts, directions / lengths[:, None], options)
+        return RaysReply(answer.epoch, answer.range, answer.status)
+
+    def grid(self, request: GridRequest) -> GridReply:
+        """Distance and status at a grid's cells."""
+        counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
+        cell_m = _within("cell_m", request.cell_m, MAX_DISTANCE_M)
+        if min(counts) < 1 or not np.isfinite(request.corner).all():
+            raise QuestionError(
+                "bad_request", f"not a grid: counts {counts}, corner {request.corner}"
+            )
+        shape = GridShape(request.corner, cell_m, counts)
+        self._check_count(shape.cells, f"{shape.cells} cells")
+        reach_m = _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
+        with self._view(request.epoch) as view:
+            answer = grid(view, shape, reach_m)
+        return GridReply(answer.epoch, answer.distance, answer.status)
+
+    def align(self, request: AlignRequest) -> AlignReply:
+        """The pose of a scan near a guess."""
+        self._check_count(len(request.points), f"{len(request.points)} points")
+        if not is_rigid(request.world_from_sensor):
+            raise QuestionError(
+                "bad_request",
+                f"world_from_sensor is no rotation and translation: {request.world_from_sensor}",
+            )
+        options = AlignOptions(
+            _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
+            int(_within("max_iterations", request.max_iterations, MAX_ITERATIONS, least=1)),
+        )
+        with self._view(request.epoch) as view:
+            answer = align(
+                view, request.points.astype(np.float64), request.world_from_sensor, options
+            )
+        return AlignReply(
+            answer.epoch,
+            answer.world_from_sensor,
+            answer.covariance,
+            answer.inlier_share,
+            answer.rms_m,
+            answer.converged,
+            answer.iterations,
+            answer.points,
+        )
+
+    def _searched(
+        self, what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        return _points(what, origin, offsets, self._limits.searches)
+
+    def _check_count(self, count: float, what: str) -> None:
+        if count > self._limits.searches:
+            raise QuestionError(
+                "too_large",
+                f"{what} exceed the limit of {self._limits.searches} searches: split the request",
+            )
+
+
+_ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
+    SdfRequest: Answers.sdf,
+    DistanceRequest: Answers.distance,
+    SpheresRequest: Answers.spheres,
+    SegmentsRequest: Answers.segments,
+    RaysRequest: Answers.rays,
+    GridRequest: Answers.grid,
+    AlignRequest: Answers.align,
+}
+
+
+def _points(
+    what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32], most: int
+) -> NDArray[np.float64]:
+    """Points [N, 3] of the map frame.
+
+    Raises:
+        QuestionError: they are too many, or not all finite.
+    """
+    if len(offsets) > most:
+        raise QuestionError(
+            "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
+        )
+    # Single precision from an origin is good to that. Unrounded, a point that somebody chose on a
+    # face of voxels would lie on one side or the other by what else is in the request.
+    points = np.round(origin + offsets.astype(np.float64), _DECIMALS)
+    if not np.isfinite(points).all():
+        index = int(np.isfinite(points).all(axis=1).argmin())
+        raise QuestionError("bad_request", f"{what} {index} is not finite: {points[index]}")
+    return points
+
+
+def _within(name: str, value: float, most: float, least: float = 1e-6) -> float:
+    if not least <= value <= most:
+        raise QuestionError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
+    return float(value)
+
+
+def _short(what: str, lengths: NDArray[np.float64]) -> None:
+    """Refuse ways [N] that are too long: each of their steps waits for the one before."""
+    if lengths.max(initial=0.0) > MAX_RANGE_M:
+        worst = int(lengths.argmax())
+        raise QuestionError(
+            "bad_request",
+            f"{what} {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
+        )
+
+
+def _same_length(first: NDArray[np.float32], name: str, second: NDArray[np.float32]) -> None:
+    if len(first) != len(second):
+        raise QuestionError("bad_request", f"{len(second)} {name} for {len(first)} points")
+
+
+def _relative(
+    points: NDArray[np.float64] | None, origin: NDArray[np.float64]
+) -> NDArray[np.float32] | None:
+    return None if points is None else (points - origin).astype(np.float32)

@@ -1,0 +1,134 @@
+"""True distances to the nearest surface, at any range."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.status import Status
+
+from triquad_map.nearest import NearestSurface
+from triquad_map.unknown import Unknown, refuse_unknown
+from triquad_map.view import MapView
+
+_FIELD_VOXELS = 0.5
+"""Up to here the trained field counts alone."""
+
+_SURFEL_VOXELS = 1.5
+"""From here on the distance to the surfels counts alone."""
+
+
+@dataclass(frozen=True)
+class DistanceOptions:
+    """What is asked of a map."""
+
+    max_distance_m: float = 5.0
+    surface_point: bool = False
+    unknown_distance: bool = False
+
+
+@dataclass(frozen=True)
+class Distances:
+    """Distances from N points to the nearest seen surface, metres, map frame, of one epoch."""
+
+    distance: NDArray[np.float32]  # [N] negative behind a surface; at most max_distance_m
+    gradient: NDArray[np.float32]  # [N, 3] its unit gradient, pointing to free space; 0: not found
+    found: NDArray[np.bool_]  # [N] False: no surface within max_distance_m, which distance then is
+    status: NDArray[np.uint8]  # [N] Status of the points themselves
+    confidence: NDArray[np.float32]  # [N] in [0, 1]; 0 where nothing was found or the point unknown
+    surface_point: NDArray[np.float64] | None  # [N, 3] nearest point; the point itself: not found
+    unknown_distance: NDArray[np.float32] | None  # [N] to unknown space, at most max_distance_m
+    unknown_point: NDArray[np.float64] | None  # [N, 3] nearest point of it, within max_distance_m
+    epoch: int
+
+
+def distances(view: MapView, points: NDArray[np.float64], options: DistanceOptions) -> Distances:
+    """Distances from ``points`` [N, 3] to the nearest seen surface."""
+    nearest = view.nearest_surface(points, options.max_distance_m)
+    status = view.status(points)
+    away = points - nearest.mean
+    lengths = np.linalg.norm(away, axis=1)
+    clear = nearest.found & (lengths > 1e-6)
+    gradient = np.zeros((len(points), 3))
+    gradient[clear] = away[clear] / lengths[clear, None]
+    distance = nearest.distance.copy()
+    _join_field(view, points, nearest, status, distance, gradient)
+    unknown = None
+    if options.unknown_distance:
+        unknown = view.nearest_unknown(points, options.max_distance_m)
+    surface_point = None
+    if options.surface_point:
+        surface_point = np.where(nearest.found[:, None], nearest.point, points)
+    return Distances(
+        distance.astype(np.float32),
+        gradient.astype(np.float32),
+        nearest.found,
+        status,
+        np.where(status == Status.UNKNOWN, np.float32(0), nearest.confidence),
+        surface_point,
+        None if unknown is None else unknown.distance.astype(np.float32),
+        None if unknown is None else unknown.point,
+        view.number,
+    )
+
+
+def with_unknown(answer: Distances, points: NDArray[np.float64], unknown: Unknown) -> Distances:
+    """The answer for ``points`` [N, 3] where unknown space counts as asked.
+
+    As an obstacle it is a surface like others, of confidence 0.
+
+    Raises:
+        UnknownSpaceError: it is to be an error, and lies nearer than a surface.
+    """
+    if unknown is Unknown.FREE:
+        return answer
+    assert answer.unknown_distance is not None
+    assert answer.unknown_point is not None
+    nearer = answer.unknown_distance < answer.distance
+    if unknown is Unknown.ERROR:
+        refuse_unknown("point", nearer)
+    away = points - answer.unknown_point
+    lengths = np.linalg.norm(away, axis=1, keepdims=True)
+    gradient = np.where(lengths > 1e-6, away / np.maximum(lengths, 1e-6), 0.0)
+    surface_point = answer.surface_point
+    if surface_point is not None:
+        surface_point = np.where(nearer[:, None], answer.unknown_point, surface_point)
+    return dataclasses.replace(
+        answer,
+        distance=np.where(nearer, answer.unknown_distance, answer.distance),
+        gradient=np.where(nearer[:, None], gradient, answer.gradient).astype(np.float32),
+        found=answer.found | nearer,
+        confidence=np.where(nearer, np.float32(0), answer.confidence),
+        surface_point=surface_point,
+    )
+
+
+def _join_field(
+    view: MapView,
+    points: NDArray[np.float64],
+    nearest: NearestSurface,
+    status: NDArray[np.uint8],
+    distance: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+) -> None:
+    """Near a surface, take the side of it from the trained field, and by and by its value."""
+    low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
+    rows = np.flatnonzero(nearest.found & (distance < high) & (status == Status.SURFACE))
+    if not len(rows):
+        return
+    field = view.query(points[rows], gradient=True)
+    assert field.gradient is not None
+    usable = np.isfinite(field.sdf) & (np.abs(field.gradient).max(axis=1) > 0)
+    rows = rows[usable]
+    value = field.sdf[usable].astype(np.float64)
+    slope = field.gradient[usable].astype(np.float64)
+    slope /= np.linalg.norm(slope, axis=1, keepdims=True)
+    along = np.clip((distance[rows] - low) / (high - low), 0.0, 1.0)
+    share = along * along * (3.0 - 2.0 * along)
+    side = np.where(value < 0, -1.0, 1.0)
+    # The field is no more than a bound where it saturates.
+    value = np.clip(value, -high, distance[rows] + low)
+    joined = share[:, None] * side[:, None] * gradient[rows] + (1 - share)[:, None] * slope
+    lengths = np.linalg.norm(joined, axis=1, keepdims=True)
+    distance[rows] = share * side * distance[rows] + (1 - share) * value
+    gradient[rows] = np.where(lengths > 1e-6, joined / np.maximum(lengths, 1e-6), slope)

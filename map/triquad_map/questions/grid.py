@@ -1,0 +1,50 @@
+"""Dense grids of distance and status: costmaps and slices."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.view import MapView
+
+
+@dataclass(frozen=True)
+class GridShape:
+    """Where the middles of a grid's cells are."""
+
+    corner: NDArray[np.float64]  # [3] the grid's least corner, metres, map frame
+    cell_m: float
+    counts: tuple[int, int, int]  # cells along x, y and z; one along z is a slice
+
+    @property
+    def cells(self) -> int:
+        """How many there are."""
+        return self.counts[0] * self.counts[1] * self.counts[2]
+
+    def middles(self) -> NDArray[np.float64]:
+        """The middles [cells, 3], z running fastest."""
+        axes = [np.arange(count) for count in self.counts]
+        cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        return np.asarray(self.corner + (cells + 0.5) * self.cell_m, np.float64)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A map at the middles of a grid's cells, of one epoch."""
+
+    shape: GridShape
+    distance: NDArray[np.float32]  # [x, y, z] to the nearest seen surface, at most max_distance_m
+    status: NDArray[np.uint8]  # [x, y, z] Status
+    epoch: int
+
+
+def grid(view: MapView, shape: GridShape, max_distance_m: float) -> Grid:
+    """Distance and status at all cells."""
+    answer = distances(view, shape.middles(), DistanceOptions(max_distance_m))
+    return Grid(
+        shape,
+        answer.distance.reshape(shape.counts),
+        answer.status.reshape(shape.counts),
+        view.number,
+    )

@@ -1,0 +1,58 @@
+"""What a ball meets that moves along a polyline."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from triquad_map.errors import UnknownSpaceError
+from triquad_map.questions.segments import Segments
+from triquad_map.unknown import Unknown
+
+
+@dataclass(frozen=True)
+class Polyline:
+    """As :class:`Segments`, of several one after the other; places are metres from the start."""
+
+    length: float
+    blocked: bool
+    contact: float
+    clearance: float
+    clearance_at: float
+    meets_unknown: bool
+    unknown_contact: float
+    epoch: int
+
+    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> bool:
+        """Whether the ball can pass, where unknown space counts as asked.
+
+        Raises:
+            UnknownSpaceError: it counts as an error, and is met before any contact.
+            ValueError: ``unknown`` is no :class:`Unknown`.
+        """
+        if Unknown(unknown) is Unknown.ERROR and self.meets_unknown:
+            raise UnknownSpaceError("polyline", 0, 1)
+        return not self.blocked and (Unknown(unknown) is Unknown.FREE or not self.meets_unknown)
+
+
+def along_polyline(parts: Segments) -> Polyline:
+    """Consecutive segments as one way."""
+    lengths = parts.length.astype(np.float64)
+    begins = np.cumsum(lengths) - lengths
+    total = float(lengths.sum())
+    # Nothing behind the first contact is reached.
+    last = int(parts.blocked.argmax()) if parts.blocked.any() else len(lengths) - 1
+    narrowest = int(parts.clearance[: last + 1].argmin())
+    unknown = parts.meets_unknown[: last + 1]
+    first_unknown = int(unknown.argmax())
+    return Polyline(
+        total,
+        bool(parts.blocked[last]),
+        float(begins[last] + parts.contact[last]) if parts.blocked[last] else total,
+        float(parts.clearance[narrowest]),
+        float(begins[narrowest] + parts.clearance_at[narrowest]),
+        bool(unknown.any()),
+        float(begins[first_unknown] + parts.unknown_contact[first_unknown])
+        if unknown.any()
+        else total,
+        parts.epoch,
+    )

@@ -1,0 +1,106 @@
+"""How far rays reach: a simulated lidar, or what a localiser expects to see."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.status import Status
+
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.segments import STEP_VOXELS
+from triquad_map.view import MapView
+
+_HIT_M = 0.005
+_LEAST_STEP_M = 0.02
+_TOUCH_M = 1e-5
+"""A ray that comes as near to unknown space has reached it: its places are no more exact."""
+
+_LOOK_AHEAD_M = 3.0
+"""How far around a surface is looked for: farther costs more than shorter steps."""
+
+
+@dataclass(frozen=True)
+class RayOptions:
+    """How far rays go and what stops them."""
+
+    max_range_m: float
+    through_unknown: bool = False
+
+
+@dataclass(frozen=True)
+class Rays:
+    """How far N rays reach, metres, of one epoch.
+
+    ``SURFACE``: to a seen surface. ``UNKNOWN``: to where unknown space begins. ``FREE``: to the
+    largest range, through space that was seen to be free (or, where asked for, unknown).
+    """
+
+    range: NDArray[np.float32]  # [N]
+    status: NDArray[np.uint8]  # [N] Status
+    epoch: int
+
+
+def rays(
+    view: MapView,
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    options: RayOptions,
+) -> Rays:
+    """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach."""
+    status = np.full(len(origins), Status.FREE, np.uint8)
+    ranges = np.full(len(origins), options.max_range_m)
+    hit = _trace(view, origins, directions, ranges)
+    status[hit] = Status.SURFACE
+    if not options.through_unknown:
+        _stop_at_unknown(view, origins, directions, ranges, status)
+    return Rays(ranges.astype(np.float32), status, view.number)
+
+
+def _trace(
+    view: MapView,
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Shorten ``ranges`` [N] to the first surface (Hart 1996); whether each ray meets one."""
+    hit = np.zeros(len(origins), np.bool_)
+    at = np.zeros(len(origins))
+    before = np.zeros(len(origins))  # distance at the last place
+    step = np.zeros(len(origins))  # from there
+    going = np.arange(len(origins))
+    ask = DistanceOptions(min(_LOOK_AHEAD_M, float(ranges.max(initial=_HIT_M))))
+    while len(going):
+        points = origins[going] + at[going, None] * directions[going]
+        distance = distances(view, points, ask).distance.astype(np.float64)
+        inside = distance <= _HIT_M
+        # Between the last place and this one the distance falls about evenly.
+        share = np.clip(before[going] / np.maximum(before[going] - distance, 1e-9), 0.0, 1.0)
+        reached = np.where(distance < 0, at[going] - (1 - share) * step[going], at[going])
+        hit[going[inside]] = True
+        ranges[going[inside]] = np.clip(reached[inside], 0.0, ranges[going[inside]])
+        before[going] = distance
+        step[going] = np.maximum(distance, _LEAST_STEP_M)
+        at[going] += step[going]
+        going = going[~inside & (at[going] < ranges[going])]
+    return hit
+
+
+def _stop_at_unknown(
+    view: MapView,
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    status: NDArray[np.uint8],
+) -> None:
+    """Shorten the rays that enter unknown space."""
+    step_m = STEP_VOXELS * view.voxel_m
+    at = np.zeros(len(origins))
+    going = np.arange(len(origins))
+    while len(going):
+        points = origins[going] + at[going, None] * directions[going]
+        free_m = view.nearest_unknown(points, _LOOK_AHEAD_M).distance
+        unknown = free_m <= _TOUCH_M
+        ranges[going[unknown]] = at[going[unknown]]
+        status[going[unknown]] = Status.UNKNOWN
+        at[going] += np.maximum(free_m, step_m)
+        going = going[~unknown & (at[going] < ranges[going])]

@@ -1,0 +1,145 @@
+"""What a ball meets that moves along straight segments."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.unknown import Unknown, refuse_unknown
+from triquad_map.view import MapView
+
+STEP_VOXELS = 0.5
+"""Between places that are looked at, where nothing allows a longer step."""
+
+_Gap = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Distances [N] at points [N, 3]."""
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """What moves along the segments, and how far around surfaces are looked for."""
+
+    radius_m: float
+    max_distance_m: float
+
+
+@dataclass(frozen=True)
+class Segments:
+    """What a ball meets on N segments, metres, of one epoch.
+
+    Places are distances along the segment from its start. ``clearance`` is that of the ball's
+    centre, up to where it first touches a surface; it is right within half a step of half a voxel.
+    """
+
+    length: NDArray[np.float32]  # [N]
+    blocked: NDArray[np.bool_]  # [N] the ball touches a seen surface
+    contact: NDArray[np.float32]  # [N] where it first does; the length where it does not
+    clearance: NDArray[np.float32]  # [N] least distance to a surface, at most max_distance_m
+    clearance_at: NDArray[np.float32]  # [N] where
+    meets_unknown: NDArray[np.bool_]  # [N] the ball enters unknown space, before any contact
+    unknown_contact: NDArray[np.float32]  # [N] where it first does; the length where it does not
+    epoch: int
+
+    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> NDArray[np.bool_]:
+        """Whether the ball can pass each segment [N], where unknown space counts as asked.
+
+        Raises:
+            UnknownSpaceError: it counts as an error, and is met before any contact.
+            ValueError: ``unknown`` is no :class:`Unknown`.
+        """
+        if Unknown(unknown) is Unknown.ERROR:
+            refuse_unknown("segment", self.meets_unknown)
+        free = ~self.blocked
+        return free if Unknown(unknown) is Unknown.FREE else free & ~self.meets_unknown
+
+
+@dataclass(frozen=True)
+class _March:
+    """How far a walk along N segments went."""
+
+    blocked: NDArray[np.bool_]
+    contact: NDArray[np.float64]
+    clearance: NDArray[np.float64]
+    clearance_at: NDArray[np.float64]
+
+
+def steps_at_most(view: MapView, starts: NDArray[np.float64], ends: NDArray[np.float64]) -> int:
+    """How many places may have to be looked at between ``starts`` and ``ends`` [N, 3]."""
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    return int(np.ceil(lengths / (STEP_VOXELS * view.voxel_m)).sum()) + 2 * len(starts)
+
+
+def segments(
+    view: MapView,
+    starts: NDArray[np.float64],
+    ends: NDArray[np.float64],
+    options: SegmentOptions,
+) -> Segments:
+    """What a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    directions = (ends - starts) / np.maximum(lengths, 1e-12)[:, None]
+    reach_m = max(options.max_distance_m, options.radius_m + view.voxel_m)
+    step_m = STEP_VOXELS * view.voxel_m
+
+    def to_surface(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return distances(view, points, DistanceOptions(reach_m)).distance.astype(np.float64)
+
+    def to_unknown(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return view.nearest_unknown(points, reach_m).distance
+
+    radius = options.radius_m
+    solid = _march(to_surface, starts, directions, lengths, radius, step_m, clearance=True)
+    # Unknown space is entered, not touched: a ball may touch it from outside.
+    inside = np.nextafter(radius, 0.0) if radius > 0 else 0.0
+    unknown = _march(to_unknown, starts, directions, solid.contact, inside, step_m, clearance=False)
+    return Segments(
+        lengths.astype(np.float32),
+        solid.blocked,
+        solid.contact.astype(np.float32),
+        np.minimum(solid.clearance, options.max_distance_m).astype(np.float32),
+        solid.clearance_at.astype(np.float32),
+        unknown.blocked,
+        np.where(unknown.blocked, unknown.contact, lengths).astype(np.float32),
+        view.number,
+    )
+
+
+def _march(
+    gap: _Gap,
+    starts: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    lengths: NDArray[np.float64],
+    radius_m: float,
+    step_m: float,
+    clearance: bool,
+) -> _March:
+    """Walk along the segments as far as the distance allows, until the first contact.
+
+    A distance changes by no more than the way that is gone: the next contact is at least
+    ``distance - radius`` away, and a place with less clearance ``distance - clearance``.
+    """
+    count = len(starts)
+    march = _March(
+        np.zeros(count, np.bool_), lengths.copy(), np.full(count, np.inf), np.zeros(count)
+    )
+    at = np.zeros(count)
+    going = np.arange(count)
+    while len(going):
+        place = at[going]
+        distance = gap(starts[going] + place[:, None] * directions[going])
+        less = distance < march.clearance[going]
+        march.clearance[going[less]] = distance[less]
+        march.clearance_at[going[less]] = place[less]
+        touches = distance <= radius_m
+        march.blocked[going[touches]] = True
+        march.contact[going[touches]] = place[touches]
+        step = distance - radius_m
+        if clearance:
+            step = np.minimum(step, distance - march.clearance[going] + step_m)
+        # The end is looked at, too.
+        there = place >= lengths[going]
+        at[going] = np.minimum(place + np.maximum(step, step_m), lengths[going])
+        going = going[~touches & ~there]
+    return march

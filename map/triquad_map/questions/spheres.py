@@ -1,0 +1,48 @@
+"""Whether spheres are free: a robot's body, made of spheres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.status import Status
+
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.unknown import Unknown, refuse_unknown
+from triquad_map.view import MapView
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """What N spheres hold, of one epoch.
+
+    ``SURFACE``: a seen surface reaches into the sphere, or it lies behind one. ``UNKNOWN``: none
+    does, but unknown space. ``FREE``: all of it was seen to be free.
+    """
+
+    status: NDArray[np.uint8]  # [N] Status
+    epoch: int
+
+    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> NDArray[np.bool_]:
+        """Whether each sphere [N] can be entered, where unknown space counts as asked.
+
+        Raises:
+            UnknownSpaceError: it counts as an error, and a sphere without a surface meets it.
+            ValueError: ``unknown`` is no :class:`Unknown`.
+        """
+        meets = self.status == Status.UNKNOWN
+        free: NDArray[np.bool_] = self.status == Status.FREE
+        if Unknown(unknown) is Unknown.ERROR:
+            refuse_unknown("sphere", meets)
+        return free | meets if Unknown(unknown) is Unknown.FREE else free
+
+
+def spheres(view: MapView, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> Spheres:
+    """What the spheres around ``centres`` [N, 3] of ``radii`` [N] hold, metres."""
+    # A little beyond the largest, so that what touches it is found.
+    reach_m = float(radii.max(initial=0.0)) + view.voxel_m
+    answer = distances(view, centres, DistanceOptions(reach_m, unknown_distance=True))
+    assert answer.unknown_distance is not None
+    status = np.full(len(centres), Status.FREE, np.uint8)
+    status[(answer.unknown_distance < radii) | (answer.status == Status.UNKNOWN)] = Status.UNKNOWN
+    status[answer.found & (answer.distance <= radii)] = Status.SURFACE
+    return Spheres(status, view.number)

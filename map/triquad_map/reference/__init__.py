@@ -1,0 +1,1 @@
+"""A map answered with numpy alone: the reference for compiled code."""

@@ -1,0 +1,135 @@
+"""The surfels of a region, and the nearest of them: the reference for compiled code."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.region import BLOCK_VOXELS
+
+from triquad_map.nearest import NearestSurfels, no_surfels
+from triquad_map.surface.surfels import (
+    DISC_RADIUS,
+    OUTSIDE,
+    SMOOTHING,
+    SurfelKind,
+    Surfels,
+)
+
+_PAIRS = 1 << 19
+"""Points with blocks or surfels that are looked at together: what bounds the memory."""
+
+Doubles = NDArray[np.float64]
+
+
+class SurfelCloud:
+    """Surfels by blocks of voxels."""
+
+    def __init__(self, voxels: NDArray[np.int64], surfels: Surfels) -> None:
+        """``surfels`` of ``voxels`` [S, 3], of which those of a block follow each other."""
+        kept = np.flatnonzero(surfels.kinds != SurfelKind.NONE)
+        self._rows = kept
+        self._positions = voxels[kept] + 0.5 + surfels.offsets[kept]
+        self._normals = surfels.normals[kept].astype(np.float64)
+        self._discs = surfels.kinds[kept] == SurfelKind.DISC
+        cells = voxels[kept] // BLOCK_VOXELS
+        first = np.ones(len(cells), np.bool_)
+        first[1:] = (cells[1:] != cells[:-1]).any(axis=1)
+        self._starts = np.append(np.flatnonzero(first), len(cells))
+        self._corners = cells[first] * BLOCK_VOXELS
+
+    def nearest(self, points: Doubles, limits: Doubles) -> NearestSurfels:
+        """The surfels nearest to ``points`` [N, 3] and less than ``limits`` [N] away."""
+        count = len(points)
+        found = no_surfels(limits)
+        blocks = len(self._corners)
+        if not blocks:
+            return found
+        step = max(1, _PAIRS // blocks)
+        for first in range(0, count, step):
+            part = np.arange(first, min(first + step, count))
+            gaps = self._block_gaps(points[part])
+            # The nearest block first: what it holds keeps most others from being looked at.
+            nearest = np.zeros(gaps.shape, np.bool_)
+            nearest[np.arange(len(part)), gaps.argmin(axis=1)] = True
+            self._improve(found, points, part, nearest & (gaps < limits[part, None]))
+            reach = found.distances[part, None] + SMOOTHING
+            self._improve(found, points, part, gaps <= reach)
+        return found
+
+    def _block_gaps(self, points: Doubles) -> Doubles:
+        """How far [N, B] the surfels of each block are at least from each point."""
+        squares = np.zeros((len(points), len(self._corners)))
+        for axis in range(3):
+            low = self._corners[:, axis] - points[:, axis, None]
+            beyond = np.maximum(low, -low - BLOCK_VOXELS)
+            squares += np.maximum(beyond, 0.0) ** 2
+        return np.asarray(np.sqrt(squares) - OUTSIDE, np.float64)
+
+    def _improve(
+        self,
+        found: NearestSurfels,
+        points: Doubles,
+        part: NDArray[np.intp],
+        chosen: NDArray[np.bool_],
+    ) -> None:
+        """Look at the ``chosen`` [len(part), B] blocks of some points."""
+        sizes = np.diff(self._starts)
+        for some in _portions(chosen.astype(np.int64) @ sizes):
+            owners, blocks = np.nonzero(chosen[some])
+            if not len(owners):
+                continue
+            owners = np.repeat(part[some][owners], sizes[blocks])
+            ends = np.cumsum(sizes[blocks])
+            within = np.arange(ends[-1]) - np.repeat(ends - sizes[blocks], sizes[blocks])
+            surfels = np.repeat(self._starts[blocks], sizes[blocks]) + within
+            self._take(found, points, owners, surfels)
+
+    def _take(
+        self,
+        found: NearestSurfels,
+        points: Doubles,
+        owners: NDArray[np.intp],
+        surfels: NDArray[np.intp],
+    ) -> None:
+        """Let ``surfels`` [P] count for the points ``owners`` [P], which are in order."""
+        feet = self._feet(points[owners], surfels)
+        distances = np.linalg.norm(points[owners] - feet, axis=1)
+        starts = np.flatnonzero(np.append(True, owners[1:] != owners[:-1]))
+        counts = np.diff(np.append(starts, len(owners)))
+        best = np.minimum.reduceat(distances, starts)
+        asked = owners[starts]
+        nearer = best <= found.distances[asked]
+        nearer &= (best < found.distances[asked]) | (found.rows[asked] >= 0)
+        at_best = np.flatnonzero(distances == np.repeat(best, counts))
+        winners = at_best[np.searchsorted(at_best, starts)]
+        farther = distances - np.repeat(best, counts)
+        weights = np.maximum(1.0 - farther / SMOOTHING, 0.0) ** 2
+        sums = np.add.reduceat(weights[:, None] * feet, starts)
+        means = sums / np.add.reduceat(weights, starts)[:, None]
+        rows = asked[nearer]
+        found.distances[rows] = best[nearer]
+        found.feet[rows] = feet[winners[nearer]]
+        found.means[rows] = means[nearer]
+        found.rows[rows] = self._rows[surfels[winners[nearer]]]
+
+    def _feet(self, points: Doubles, surfels: NDArray[np.intp]) -> Doubles:
+        """The nearest point [P, 3] of each surfel to each point."""
+        offsets = points - self._positions[surfels]
+        normals = self._normals[surfels]
+        heights = (offsets * normals).sum(axis=1, keepdims=True)
+        lateral = offsets - heights * normals
+        lengths = np.linalg.norm(lateral, axis=1, keepdims=True)
+        within = lateral * np.minimum(1.0, DISC_RADIUS / np.maximum(lengths, 1e-9))
+        reached = np.where(self._discs[surfels, None], within, 0.0)
+        return np.asarray(self._positions[surfels] + reached, np.float64)
+
+
+def _portions(sizes: NDArray[np.int64]) -> Iterator[slice]:
+    """Cut ``range(len(sizes))`` so that the sizes of a portion add up to little."""
+    ends = np.cumsum(sizes)
+    first = 0
+    while first < len(sizes):
+        before = ends[first - 1] if first else 0
+        last = max(first + 1, int(np.searchsorted(ends, before + _PAIRS, "right")))
+        yield slice(first, last)
+        first = last

@@ -1,0 +1,205 @@
+"""A map file that answers without being read whole: parts are read when a point needs them."""
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from triquad_format.mapfile.file_errors import named
+from triquad_format.mapfile.index import MapIndex, OpenFile, files_in
+from triquad_format.mapfile.manifest import Entry, Manifest
+from triquad_format.mapfile.parts.cell import cells_near, extent, vertex_reach
+from triquad_format.mapfile.parts.part import (
+    EVIDENCE,
+    FIELD_TOPICS,
+    REGION,
+    REGION_TOPICS,
+    VERTICES,
+    PartKey,
+)
+from triquad_format.mapfile.parts.unpack import RegionParts, assemble
+from triquad_format.mapfile.random_access import FileBytes, RandomAccess
+from triquad_format.records.leaf_box import SLACK_LEAVES, LeafBox, check_box, leaf_box, whole_region
+from triquad_format.records.record_check import check_record
+from triquad_format.records.region import (
+    AXES,
+    MapRecord,
+    RegionIndex,
+    leaf_coordinates,
+    region_centre,
+)
+
+from triquad_map.reference.evaluator import Answer, MapEvaluator, check_points
+
+
+class StoredMap:
+    """A map file of version 2, open for reading. One thread at a time may use it."""
+
+    def __init__(self, source: RandomAccess, open_file: OpenFile | None = None) -> None:
+        """Read the manifest; arguments and errors are those of :class:`MapIndex`."""
+        self.name = source.name
+        with named(self.name):
+            self._index = MapIndex(source, open_file)
+        self._settings = self.manifest.facts.settings
+        self._parts: dict[RegionIndex, RegionParts] = {}
+        self._loaded: set[PartKey] = set()
+        self._by_key = {entry.key: entry for entry in self.manifest.entries}
+        self._regions = [e.key.region for e in self.manifest.entries if e.key.topic == REGION]
+        self._evaluator = MapEvaluator(self._record())
+
+    @classmethod
+    def open(cls, path: Path | str) -> "StoredMap":
+        """The map in a file; other files that it needs lie in the same folder.
+
+        Raises:
+            NoIndexError: only :func:`triquad_format.mapfile.mapfile.read_map` can read the file.
+            MapFileError: it is not a map file, is damaged, or needs a newer reader.
+            OSError: it cannot be read.
+        """
+        source = FileBytes(Path(path))
+        try:
+            return cls(source, files_in(Path(path).parent))
+        except BaseException:
+            source.close()
+            raise
+
+    def __enter__(self) -> "StoredMap":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @property
+    def manifest(self) -> Manifest:
+        """All parts of the map."""
+        return self._index.manifest
+
+    def close(self) -> None:
+        """Close all files."""
+        self._index.close()
+
+    def query(self, points: NDArray[np.floating], gradient: bool = False) -> Answer:
+        """Distance, status and, on request, gradient: see :meth:`MapEvaluator.query`.
+
+        Raises:
+            MapFileError: a part that is needed is damaged.
+        """
+        positions = np.asarray(points, np.float64)
+        check_points(positions)
+        with named(self.name):
+            self._load(self._needed_at(positions))
+        return self._evaluator.query(positions, gradient)
+
+    def record(self, training: bool = True) -> MapRecord:
+        """The whole map, read part by part.
+
+        Raises:
+            MapFileError: a part is damaged.
+        """
+        topics = REGION_TOPICS if training else FIELD_TOPICS
+        return self._assembled(
+            entry for entry in self.manifest.entries if entry.key.topic in topics
+        )
+
+    def box(self, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
+        """The part of the map that answers in a box, without training state.
+
+        It holds whole squares and cubes: :func:`triquad_format.records.crop.crop_record` takes off
+        what the box does not need.
+
+        Args:
+            minimum: ``[3]`` corner of the box, metres, map frame.
+            maximum: ``[3]`` opposite corner.
+
+        Raises:
+            FormatError: the corners are not finite or not in order.
+            MapFileError: a part is damaged.
+        """
+        return self._assembled(self.parts_in(minimum, maximum))
+
+    def parts_in(self, minimum: ArrayLike, maximum: ArrayLike) -> tuple[Entry, ...]:
+        """The parts that :meth:`box` consists of; arguments and errors are the same."""
+        low, high = check_box(minimum, maximum)
+        boxes = {index: leaf_box(self._settings, index, low, high) for index in self._regions}
+        return tuple(
+            entry
+            for entry in self.manifest.entries
+            if entry.key.topic in FIELD_TOPICS
+            and boxes[entry.key.region].meets(whole_region(self._settings))
+            and self._reaches(entry.key, boxes[entry.key.region])
+        )
+
+    def payload(self, entry: Entry) -> bytes:
+        """The payload of a part that the manifest lists, as it is written.
+
+        Raises:
+            MapFileError: the part is damaged, or the file that holds it is missing or another.
+        """
+        with named(self.name):
+            return self._index.payload(entry)
+
+    def _assembled(self, entries: Iterable[Entry]) -> MapRecord:
+        chosen = dataclasses.replace(self.manifest, entries=tuple(entries))
+        with named(self.name):
+            record = assemble(chosen, self._index.payload)
+            check_record(record)
+        return record
+
+    def _reaches(self, key: PartKey, box: LeafBox) -> bool:
+        """Whether a part holds something that answers in a box."""
+        slack = vertex_reach(self._settings) if key.topic == VERTICES else 1
+        return box.meets(extent(self._settings, key), slack)
+
+    def _needed_at(self, points: NDArray[np.float64]) -> set[PartKey]:
+        """Parts that answers at points [N, 3] hang on."""
+        needed: set[PartKey] = set()
+        half = self._settings.region_side_m / 2
+        reach = vertex_reach(self._settings) + SLACK_LEAVES
+        for index in self._regions:
+            offset = points - region_centre(self._settings, index)
+            offset = offset[(np.abs(offset) < half).all(axis=1)]
+            if not len(offset):
+                continue
+            needed.add(PartKey(REGION, index))
+            leaves = leaf_coordinates(self._settings, offset)
+            for plane, axes in enumerate(AXES):
+                cells = cells_near(leaves[:, axes], reach)
+                needed |= {PartKey(VERTICES, index, plane, cell) for cell in cells}
+            needed |= {PartKey(EVIDENCE, index, 0, cell) for cell in cells_near(leaves, 1)}
+        return needed & self._by_key.keys()
+
+    def _load(self, keys: set[PartKey]) -> None:
+        """Read what is not there yet."""
+        missing = keys - self._loaded
+        if not missing:
+            return
+        try:
+            for key in sorted(missing):
+                parts = self._parts.setdefault(key.region, RegionParts(key.region, self._settings))
+                parts.add(key, self._index.payload(self._by_key[key]))
+            record = self._record()
+            check_record(record)
+        except BaseException:
+            self._forget({key.region for key in missing})
+            raise
+        self._loaded |= missing
+        self._evaluator = MapEvaluator(record)
+
+    def _forget(self, regions: set[RegionIndex]) -> None:
+        """Let regions be read anew: what was read of them may be half of what they need."""
+        self._parts = {index: parts for index, parts in self._parts.items() if index not in regions}
+        self._loaded = {key for key in self._loaded if key.region not in regions}
+
+    def _record(self) -> MapRecord:
+        facts = self.manifest.facts
+        # Blending adds up regions in their order, which is that of the file.
+        loaded = [self._parts[index] for index in self._regions if index in self._parts]
+        regions = tuple(parts.region() for parts in loaded)
+        return MapRecord(facts.name, facts.epoch, facts.settings, regions)

@@ -1,0 +1,1 @@
+"""Surfels: what stands for the seen surface, and how well it is supported."""

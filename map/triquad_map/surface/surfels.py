@@ -1,0 +1,102 @@
+"""Surfels: small discs of surface, one in each voxel in which rays ended.
+
+The field is right within the band where it is trained and saturates beyond it. So distances over
+any range are measured to surfels: where the field crosses zero in a voxel with seen surface, and
+which way it faces there. A surfel hangs on the field around one voxel alone, which makes it cheap
+to keep up to date.
+
+Everything here is in voxel units: one is the side of a leaf, and the voxel at integer coordinates
+``v`` is the cube ``[v, v + 1)`` of leaf coordinates (see :mod:`triquad_format.records.region`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+DISC_RADIUS = 0.45
+"""Of a surfel, in voxels: discs of neighbours overlap where a surface goes on, and jut out little
+where it ends."""
+
+OUTSIDE = 0.5
+"""How far a surfel reaches out of its voxel at most, in voxels."""
+
+SMOOTHING = 0.3
+"""Surfels that are farther than the nearest by less than this, in voxels, count in the direction:
+on a wall many are nearly as near, and each is a little off."""
+
+_STEPS = 3
+_LONGEST_STEP = 0.5
+_FLATTEST = 0.3
+"""Where the field is flatter than this, it was not trained."""
+
+_ON_SURFACE = 0.15
+"""Of where the steps end, the field's value at most, in voxels."""
+
+_IN_VOXEL = 0.525
+_NEXT_VOXEL = 1.0
+
+
+class SurfelKind(IntEnum):
+    """What stands for the surface that was seen in a voxel."""
+
+    NONE = 0  # nothing: the surface lies in the next voxel, which has its own
+    DISC = 1
+    POINT = 2  # the field shows no surface to lay a disc on
+
+
+@dataclass(frozen=True)
+class Surfels:
+    """The surfels of N voxels."""
+
+    offsets: NDArray[np.float32]  # [N, 3] from the voxel's middle, voxels
+    normals: NDArray[np.float32]  # [N, 3] unit vectors to free space; of a POINT they mean little
+    kinds: NDArray[np.uint8]  # [N] SurfelKind
+
+
+@dataclass(frozen=True)
+class FieldSample:
+    """A field at N points, in voxels."""
+
+    values: NDArray[np.float32]  # [N]
+    gradients: NDArray[np.float32]  # [N, 3]
+
+
+Field = Callable[[NDArray[np.float64]], FieldSample]
+"""The field at leaf coordinates [N, 3]."""
+
+Seen = Callable[[NDArray[np.int64]], NDArray[np.bool_]]
+"""Whether rays ended in voxels [N, 3]."""
+
+
+def fit_surfels(voxels: NDArray[np.int64], field: Field, seen: Seen) -> Surfels:
+    """The surfels of ``voxels`` [N, 3], by Newton's method from their middles."""
+    middles = (voxels + 0.5).astype(np.float64)
+    points: NDArray[np.float64] = middles
+    for _ in range(_STEPS):
+        points = points + _step(field(points))
+    at_end = field(points)
+    steepness = np.linalg.norm(at_end.gradients, axis=1)
+    on_surface = (np.abs(at_end.values) < _ON_SURFACE) & (steepness > _FLATTEST)
+    offsets = points - middles
+    farthest = np.abs(offsets).max(axis=1, initial=0.0)
+    kinds = np.full(len(voxels), SurfelKind.POINT, np.uint8)
+    kinds[on_surface & (farthest <= _IN_VOXEL)] = SurfelKind.DISC
+    outside = on_surface & (farthest > _IN_VOXEL)
+    next_door = np.flatnonzero(outside & (farthest <= _NEXT_VOXEL))
+    kinds[next_door[seen(np.floor(points[next_door]).astype(np.int64))]] = SurfelKind.NONE
+    lost = (kinds == SurfelKind.POINT) & ~(on_surface & (farthest <= _NEXT_VOXEL))
+    offsets[lost] = 0.0
+    normals = at_end.gradients / np.maximum(steepness, 1e-6)[:, None]
+    return Surfels(offsets.astype(np.float32), normals.astype(np.float32), kinds)
+
+
+def _step(sample: FieldSample) -> NDArray[np.float64]:
+    """The step [N, 3] to where the field is zero, if it were linear."""
+    squares = np.maximum((sample.gradients**2).sum(axis=1), _FLATTEST**2)
+    steps = -(sample.values / squares)[:, None] * sample.gradients
+    lengths = np.linalg.norm(steps, axis=1)
+    shorter = np.minimum(1.0, _LONGEST_STEP / np.maximum(lengths, 1e-9))
+    return np.asarray(steps * shorter[:, None], np.float64)

@@ -1,0 +1,1 @@
+"""The field that is trained: on tensors and compiled, with its optimiser."""

@@ -1,0 +1,1 @@
+"""Published, immutable states of the map."""

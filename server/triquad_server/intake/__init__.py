@@ -1,0 +1,1 @@
+"""Scans, from the wire to rays."""

@@ -1,0 +1,1 @@
+"""The thread that owns the live map: regions, training labels, replay."""

@@ -1,0 +1,248 @@
+"""The live map: takes in scans, trains, publishes epochs. Owned by one thread."""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from triquad_format.records.region import MapRecord, RegionIndex
+
+from triquad_server.engine.engine import GradientSums, Loss
+from triquad_server.epochs.epoch import Epoch, FrozenRegion, Publication, frozen_region
+from triquad_server.intake.scan import IngestReport, Rays, ScanRefusedError, usable_rays
+from triquad_server.mapping.normals import SurfaceNormals
+from triquad_server.mapping.region_map import RegionMap, RegionSetup
+from triquad_server.settings import Settings
+from triquad_server.threads import MAPPING
+
+_LOSS_MEMORY = 0.95
+_POOL_STEP = 1.1
+_SURFELS_REFITTED = 8_000
+"""With each epoch while the field is being trained: some 10 ms."""
+
+
+@dataclass(frozen=True)
+class MapChanges:
+    """What a checkpoint needs that follows another."""
+
+    record: MapRecord  # of the regions that changed, with training state
+    regions: tuple[RegionIndex, ...]  # all that there are
+    epoch: Epoch  # the same state, for questions
+
+
+class Mapper:
+    """A map that grows and learns. It knows no files and no clocks."""
+
+    def __init__(
+        self,
+        name: str,
+        settings: Settings,
+        device: str,
+        record: MapRecord | None = None,
+    ) -> None:
+        self._name = name
+        self._settings = settings
+        self._field_settings = record.settings if record else settings.field
+        self._device = torch.device(device)
+        if self._device.type == "cpu":
+            # Its threads spin between operations, and would take the cores from the kernels.
+            torch.set_num_threads(1)
+        self._normals = SurfaceNormals()
+        self._setup = RegionSetup(
+            self._field_settings,
+            settings.scan,
+            settings.training,
+            self._device,
+            GradientSums(),
+        )
+        self._regions: dict[RegionIndex, RegionMap] = {}
+        self._number = record.epoch if record else 0
+        self._epoch: Epoch | None = None
+        self._structure_changed = True
+        self.samples_trained = 0
+        self._loss: Loss | None = None
+        for region in record.regions if record else ():
+            self._regions[region.index] = RegionMap.restore(region, self._setup)
+        self._share_pool()
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to learn from the scans so far."""
+        return not any(region.owed for region in self._regions.values())
+
+    @property
+    def loss(self) -> float:
+        """The loss of the last steps; on a GPU, to read it waits for all of them."""
+        return 0.0 if self._loss is None else float(self._loss)
+
+    @property
+    def regions(self) -> list[RegionMap]:
+        """The regions, for looking at."""
+        return list(self._regions.values())
+
+    @property
+    def segments_kept(self) -> int:
+        """Segments in the replay pools."""
+        return sum(len(region.pool) for region in self._regions.values())
+
+    def ingest(
+        self,
+        points: NDArray[np.float32],
+        world_from_sensor: NDArray[np.float64],
+        stamp_s: int = 0,
+    ) -> IngestReport:
+        """Take in a scan: ``points`` [N, 3] in metres of the sensor frame, pose [4, 4].
+
+        ``stamp_s`` is when it was taken, seconds since 1970.
+
+        Raises:
+            ScanRefusedError: the scan cannot be used; the map is unchanged.
+        """
+        rays = usable_rays(points, world_from_sensor, self._settings.scan)
+        around = self._regions_around(rays)
+        self._check_regions(around)
+        regions = [self._region(index) for index in around]
+        with MAPPING.beside() as beside:
+            for region in regions:
+                beside(region.see(rays, stamp_s))
+            normals = self._normals.add(rays.ends, rays.origin)
+            for region in regions:
+                region.learn(rays, normals)
+            self._share_pool()
+        return rays.report
+
+    def train(self) -> None:
+        """One optimiser step in the region that owes the most; nothing where all is settled."""
+        region = max(self._regions.values(), key=lambda region: region.owed, default=None)
+        if region is None or region.owed == 0:
+            return
+        loss = region.train()
+        before = loss if self._loss is None else self._loss
+        self._loss = _LOSS_MEMORY * before + (1 - _LOSS_MEMORY) * loss
+        self.samples_trained += self._settings.training.batch
+
+    def publish(self) -> Epoch:
+        """The newest epoch: a new one where the map changed since the last."""
+        changed = self._structure_changed or any(r.changed for r in self._regions.values())
+        if self._epoch is not None and not changed:
+            return self._epoch
+        if self._epoch is not None or not self._number:
+            self._number += 1
+        before = (
+            {region.index: region for region in self._epoch.frozen_regions} if self._epoch else {}
+        )
+        regions = tuple(self._freeze(region, before) for region in self._regions.values())
+        self._epoch = Epoch(
+            self._name,
+            self._number,
+            self._field_settings,
+            self._settings.mesh,
+            regions,
+        )
+        self._structure_changed = False
+        return self._epoch
+
+    def reset(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> None:
+        """Forget what lies between two corners [3]; regions wholly between them disappear."""
+        half = self._field_settings.region_side_m / 2
+        for index, region in list(self._regions.items()):
+            low, high = region.centre - half, region.centre + half
+            if ((minimum <= low) & (maximum >= high)).all():
+                del self._regions[index]
+            elif ((minimum < high) & (maximum > low)).all():
+                region.forget(np.maximum(minimum, low), np.minimum(maximum, high))
+        self._normals.forget(minimum, maximum)
+        self._share_pool()
+        self._structure_changed = True
+
+    def changes_since(self, epoch: int | None) -> MapChanges:
+        """The newest epoch, with training state, of the regions that changed after ``epoch``.
+
+        ``None``: of all regions.
+        """
+        newest = self.publish()
+        changed = {
+            frozen.index
+            for frozen in newest.frozen_regions
+            if epoch is None or frozen.changed > epoch
+        }
+        regions = tuple(
+            region.record(True) for index, region in self._regions.items() if index in changed
+        )
+        return MapChanges(
+            MapRecord(self._name, newest.number, self._field_settings, regions),
+            tuple(self._regions),
+            newest,
+        )
+
+    def _freeze(
+        self,
+        region: RegionMap,
+        before: dict[RegionIndex, FrozenRegion],
+    ) -> FrozenRegion:
+        """The region as it is now; the last frozen one where it did not change since."""
+        if not region.changed and region.index in before:
+            return before[region.index]
+        region.changed = False
+        new = Publication(
+            region.index,
+            self._field_settings,
+            region.field,
+            region.evidence,
+            self._number,
+            None if region.owed == 0 else _SURFELS_REFITTED,
+        )
+        known = before.get(region.index)
+        return frozen_region(new, known.surfels if known else None)
+
+    def _regions_around(self, rays: Rays) -> list[RegionIndex]:
+        """Regions whose cubes hold an end point or the sensor, and those of the map in between."""
+        pitch = self._field_settings.region_pitch_m
+        half = self._field_settings.region_side_m / 2
+        columns = [np.append(rays.ends[:, axis], rays.origin[axis]) for axis in range(3)]
+        low = [math.floor((column.min() - half) / pitch) + 1 for column in columns]
+        high = [math.ceil((column.max() + half) / pitch) - 1 for column in columns]
+        x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
+        around = list(itertools.product(x, y, z))
+        if len(around) == 1:
+            return around
+
+        def holds_any(index: RegionIndex) -> bool:
+            near = [
+                np.abs(column - i * pitch) < half for column, i in zip(columns, index, strict=True)
+            ]
+            return bool((near[0] & near[1] & near[2]).any())
+
+        return [index for index in around if index in self._regions or holds_any(index)]
+
+    def _check_regions(self, wanted: list[RegionIndex]) -> None:
+        limit = self._settings.training.max_regions
+        count = len(self._regions.keys() | set(wanted))
+        if count > limit:
+            raise ScanRefusedError(
+                "too_many_regions",
+                f"the scan would make {count} regions of the map, more than "
+                f"training.max_regions = {limit}",
+            )
+
+    def _region(self, index: RegionIndex) -> RegionMap:
+        if index not in self._regions:
+            self._regions[index] = RegionMap(index, self._setup)
+            self._share_pool()
+            self._structure_changed = True
+        return self._regions[index]
+
+    def _share_pool(self) -> None:
+        """Let the regions keep as many segments as they were offered, all up to one limit."""
+        left = self._settings.training.pool_segments
+        offered = sorted(region.pool.offered for region in self._regions.values())
+        limit = left
+        for position, count in enumerate(offered):
+            limit = max(1, left // (len(offered) - position))
+            left -= min(count, limit)
+        # In coarse steps: to lower it is dear.
+        limit = int(_POOL_STEP ** math.floor(math.log(limit, _POOL_STEP)))
+        for region in self._regions.values():
+            region.pool.limit(max(1, limit))

@@ -1,0 +1,236 @@
+"""The thread that owns the live map: takes scans, trains in slices, publishes epochs."""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from triquad_map.compiled.team import be_patient
+
+from triquad_server.counter import Tally
+from triquad_server.epochs.epochs import EpochShelf, ShelfLimits
+from triquad_server.epochs.gate import QueryGate
+from triquad_server.errors import MapperStoppedError
+from triquad_server.intake.scan import ScanRefusedError
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.sources import SourceLedger
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.threads import PATIENCE
+
+_log = logging.getLogger(__name__)
+
+_GIVE_WAY_S = 0.1
+_MIN_PUBLISH_SHARE = 5
+"""Publishing takes at most one part in so many of the thread's time."""
+
+ResultT = TypeVar("ResultT")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The mapper's numbers, as of its last slice."""
+
+    settled: bool = True  # nothing is left to learn, and the newest epoch shows all
+    scans_taken: int = 0
+    samples_trained: int = 0
+    segments_kept: int = 0
+    loss: float = 0.0
+
+
+@dataclass(frozen=True)
+class MapperInputs:
+    """What the mapper thread reads from, and reports to."""
+
+    scans: ScanQueue
+    ledger: SourceLedger
+    gate: QueryGate
+    scans_dropped: Tally
+    points_dropped: Tally
+
+
+class MapperThread:
+    """Runs a :class:`Mapper`; everything that touches the live map goes through here."""
+
+    def __init__(
+        self,
+        mapper: Mapper,
+        inputs: MapperInputs,
+        publish_period_s: float,
+        shelf: ShelfLimits,
+        failed: Callable[[], None],
+    ) -> None:
+        """Publish the first epoch; ``failed`` is called where the thread ends by a defect."""
+        self._mapper = mapper
+        self._inputs = inputs
+        self._period_s = publish_period_s
+        self._failed = failed
+        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._wake = threading.Event()
+        self._publish_soon = threading.Event()
+        self._resting = threading.Event()
+        self._stopping = threading.Event()
+        self._ended = threading.Event()
+        self._next_publish = 0.0
+        self._unpublished = False
+        self._scans_taken = 0
+        self._loss = 0.0  # as of the newest epoch
+        self._step_s = _GIVE_WAY_S  # what the last step of training took
+        self.epochs = EpochShelf(mapper.publish(), shelf)
+        self.progress = Progress()
+        self._note_progress()
+        self._thread = threading.Thread(target=self._run, name="mapper")
+
+    def start(self) -> None:
+        """Begin to map."""
+        self._thread.start()
+
+    def rest(self) -> None:
+        """Take no more scans and train no more, but go on carrying out commands."""
+        self._resting.set()
+        self._wake.set()
+
+    def close(self) -> None:
+        """End after the current slice; commands that wait are still carried out."""
+        self._stopping.set()
+        self._wake.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def wake(self) -> None:
+        """Look for scans."""
+        self._wake.set()
+
+    def publish_soon(self) -> None:
+        """Publish once the current slice is over, without waiting for the period."""
+        self._publish_soon.set()
+        self._wake.set()
+
+    def call(self, command: Callable[[Mapper], ResultT]) -> ResultT:
+        """What ``command`` returns when run on the mapper thread, between slices.
+
+        Raises:
+            MapperStoppedError: the thread has ended.
+        """
+        future: Future[ResultT] = Future()
+
+        def run() -> None:
+            try:
+                future.set_result(command(self._mapper))
+            except BaseException as error:
+                future.set_exception(error)
+
+        self._commands.put(run)
+        self._wake.set()
+        while not future.done() and not self._ended.is_set():
+            _wait(future)
+        if not future.done():
+            raise MapperStoppedError("the mapper has stopped")
+        return future.result()
+
+    def _run(self) -> None:
+        be_patient(PATIENCE)
+        try:
+            while not self._stopping.is_set():
+                self._turn()
+            self._run_commands()
+            self._publish()
+        except Exception:
+            _log.exception("the mapper stopped by a defect")
+            self._failed()
+        finally:
+            self._ended.set()
+
+    def _turn(self) -> None:
+        """One round: commands, a scan, a slice of training, an epoch where one is due."""
+        self._wake.clear()
+        self._run_commands()
+        if self._resting.is_set():
+            self._wake.wait()
+            return
+        took_scan = self._ingest_next()
+        if not self._mapper.settled:
+            # However many ask, training waits a third of its time at most.
+            self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
+            started = time.monotonic()
+            self._mapper.train()
+            self._step_s = time.monotonic() - started
+            self._unpublished = True
+        if self._publish_soon.is_set() or self._publish_due():
+            self._publish_soon.clear()
+            self._publish()
+        self._note_progress()
+        if self._mapper.settled and not took_scan:
+            self._wake.wait(self._rest_s())
+
+    def _run_commands(self) -> None:
+        while True:
+            try:
+                command = self._commands.get_nowait()
+            except queue.Empty:
+                return
+            command()
+            self._publish()
+
+    def _ingest_next(self) -> bool:
+        """Take in the oldest waiting scan; False where none waits."""
+        scan = self._inputs.scans.take()
+        if scan is None:
+            return False
+        try:
+            report = self._mapper.ingest(
+                scan.points, scan.world_from_sensor, scan.stamp_ns // 1_000_000_000
+            )
+        except ScanRefusedError as error:
+            self._inputs.scans_dropped.add(error.reason)
+            self._inputs.ledger.refuse(scan, str(error))
+            _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
+        except Exception as error:  # bad input, whatever it is, must not stop the server
+            self._inputs.scans_dropped.add("internal")
+            self._inputs.ledger.refuse(scan, f"a defect of the server: {error!r}")
+            _log.exception("scan %d of %s could not be taken in", scan.sequence, scan.source)
+        else:
+            for reason, count in report.points_dropped.items():
+                self._inputs.points_dropped.add(reason, count)
+            self._scans_taken += 1
+            self._unpublished = True
+            self._inputs.ledger.take(scan)
+        return True
+
+    def _publish_due(self) -> bool:
+        return self._unpublished and time.monotonic() >= self._next_publish
+
+    def _publish(self) -> None:
+        started = time.monotonic()
+        epoch = self._mapper.publish()
+        if epoch is not self.epochs.newest:
+            self.epochs.add(epoch)
+        self._loss = self._mapper.loss
+        self._unpublished = False
+        now = time.monotonic()
+        self._next_publish = now + max(self._period_s, _MIN_PUBLISH_SHARE * (now - started))
+        self._inputs.ledger.publish()
+
+    def _rest_s(self) -> float | None:
+        """How long there is nothing to do; None: until woken."""
+        return max(0.0, self._next_publish - time.monotonic()) if self._unpublished else None
+
+    def _note_progress(self) -> None:
+        self.progress = Progress(
+            self._mapper.settled and not self._unpublished,
+            self._scans_taken,
+            self._mapper.samples_trained,
+            self._mapper.segments_kept,
+            self._loss,
+        )
+
+
+def _wait(future: Future[Any]) -> None:
+    """Wait a while for a result, not for ever: the thread that makes it may end."""
+    try:
+        future.exception(timeout=0.2)
+    except TimeoutError:
+        return

@@ -1,0 +1,275 @@
+"""Surface normals from the scans so far: moments of the end points in two sparse grids.
+
+Points in one cell share a normal, that of all points in the 27 cells around. A scan alone cannot
+tell the normal of far ground, where it is a few lines of points; the moments of many scans can. The
+fine grid serves where it has a plane, the coarse one where it has not.
+"""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from triquad_map.compiled.rows import with_room
+from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
+
+from triquad_server.threads import MAPPING
+
+_MIN_POINTS = 6
+_MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
+_MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
+_FULL = 65_536  # points of a cell, above which older ones count for less
+_RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
+
+Moments = NDArray[np.float32]
+Normals = NDArray[np.float32]
+Rows = NDArray[np.int32]
+Counts = NDArray[np.float32]
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(
+    points: NDArray[np.float64],
+    start: int,
+    cell_m: float,
+    index: Index,
+    moments: Moments,
+    rows: Rows,
+    count: int,
+) -> tuple[int, int]:
+    """Add points to the moments [cells, 10] of their cells, relative to the cells' centres."""
+    for i in range(start, len(points)):
+        x = int(np.floor(points[i, 0] / cell_m))
+        y = int(np.floor(points[i, 1] / cell_m))
+        z = int(np.floor(points[i, 2] / cell_m))
+        row = make_row(index, count, pack(x, y, z))
+        if row < 0:
+            return i, count
+        count = max(count, row + 1)
+        rows[i] = row
+        m = moments[row]
+        a = points[i, 0] - (x + 0.5) * cell_m
+        b = points[i, 1] - (y + 0.5) * cell_m
+        c = points[i, 2] - (z + 0.5) * cell_m
+        m[0] += 1
+        m[1] += a
+        m[2] += b
+        m[3] += c
+        m[4] += a * a
+        m[5] += a * b
+        m[6] += a * c
+        m[7] += b * b
+        m[8] += b * c
+        m[9] += c * c
+        if m[0] > _FULL:
+            m *= np.float32(0.5)
+    return len(points), count
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(
+    row: int,
+    cell_m: float,
+    index: Index,
+    moments: Moments,
+    total: NDArray[np.float64],
+) -> None:
+    """Sum the moments of the 27 cells around that of a row, relative to its centre."""
+    total[:] = 0
+    x, y, z = unpack(index.row_keys[row])
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                near = find_row(index, pack(x + i, y + j, z + k))
+                if near < 0:
+                    continue
+                m = moments[near]
+                a, b, c = i * cell_m, j * cell_m, k * cell_m
+                n = m[0]
+                total[0] += n
+                total[1] += m[1] + n * a
+                total[2] += m[2] + n * b
+                total[3] += m[3] + n * c
+                total[4] += m[4] + 2 * a * m[1] + n * a * a
+                total[5] += m[5] + a * m[2] + b * m[1] + n * a * b
+                total[6] += m[6] + a * m[3] + c * m[1] + n * a * c
+                total[7] += m[7] + 2 * b * m[2] + n * b * b
+                total[8] += m[8] + b * m[3] + c * m[2] + n * b * c
+                total[9] += m[9] + 2 * c * m[3] + n * c * c
+
+
+@numba.njit(cache=True, nogil=True)
+def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
+    """Normal of the plane through points with the moments ``m``; False where there is none."""
+    n = m[0]
+    if n < _MIN_POINTS:
+        return False
+    mx, my, mz = m[1] / n, m[2] / n, m[3] / n
+    xx, xy, xz = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - mx * mz
+    yy, yz, zz = m[7] / n - my * my, m[8] / n - my * mz, m[9] / n - mz * mz
+    # Eigenvalues of a symmetric 3 x 3 matrix (Smith 1961).
+    mean = (xx + yy + zz) / 3
+    off = xy * xy + xz * xz + yz * yz
+    spread = np.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off) / 6)
+    if spread <= 1e-12:
+        return False
+    a, b, c = (xx - mean) / spread, (yy - mean) / spread, (zz - mean) / spread
+    d, e, f = xy / spread, xz / spread, yz / spread
+    half_det = (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)) / 2
+    angle = np.arccos(min(1.0, max(-1.0, half_det))) / 3
+    greatest = mean + 2 * spread * np.cos(angle)
+    least = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
+    middle = 3 * mean - greatest - least
+    if least > _MAX_THICKNESS**2 * middle or middle < _MIN_WIDTH**2 * greatest:
+        return False
+    # The eigenvector is orthogonal to the rows of (A - least I): take their longest cross product.
+    rows = np.array([[xx - least, xy, xz], [xy, yy - least, yz], [xz, yz, zz - least]])
+    longest = 0.0
+    for i in range(3):
+        cross = np.cross(rows[i], rows[(i + 1) % 3])
+        length = (cross * cross).sum()
+        if length > longest:
+            longest = length
+            normal[:] = cross
+    if longest == 0.0:
+        return False
+    normal /= np.sqrt(longest)
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _outdated(rows: Rows, normals: NDArray[np.float64], moments: Moments, basis: Counts) -> Rows:
+    """Cells of points without a normal whose own is of far fewer points than there are.
+
+    Their ``basis`` is brought up to date.
+    """
+    outdated = np.empty(len(rows), np.int32)
+    count = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        if np.isnan(normals[i, 0]) and moments[row, 0] >= _RENEWAL * basis[row]:
+            basis[row] = moments[row, 0]
+            outdated[count] = row
+            count += 1
+    return outdated[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _estimate(rows: Rows, cell_m: float, index: Index, moments: Moments, normals: Normals) -> None:
+    """Set the normals [cells, 3] of cells; NaN where there is no plane."""
+    total, normal = np.empty(10), np.empty(3)
+    for row in rows:
+        _gather(row, cell_m, index, moments, total)
+        if not _plane_normal(total, normal):
+            normal[:] = np.nan
+        normals[row] = normal
+
+
+@numba.njit(cache=True, nogil=True)
+def _adopt(rows: Rows, of_cells: Normals, normals: NDArray[np.float64]) -> None:
+    """Replace those of ``normals`` that are NaN by those of their cells."""
+    for i in range(len(rows)):
+        if np.isnan(normals[i, 0]):
+            for axis in range(3):
+                normals[i, axis] = of_cells[rows[i], axis]
+
+
+class MomentGrid:
+    """Moments of points in the cells of a sparse lattice."""
+
+    def __init__(self, cell_m: float) -> None:
+        self._cell_m = cell_m
+        self._cells = VoxelIndex(1024)
+        self._moments = np.zeros((1024, 10), np.float32)
+        self._normals = np.zeros((1024, 3), np.float32)
+        # Points in each cell when its normal was estimated.
+        self._basis = np.zeros(1024, np.float32)
+
+    def add(self, points: NDArray[np.float64]) -> Rows:
+        """Add points [N, 3], metres, map frame; returns the row of each one's cell."""
+        rows = np.empty(len(points), np.int32)
+        done = 0
+        while done < len(points):
+            index, count = self._cells.arrays, self._cells.count
+            done, self._cells.count = _add(
+                points,
+                done,
+                self._cell_m,
+                index,
+                self._moments,
+                rows,
+                count,
+            )
+            if done < len(points):
+                self._cells.grow()
+                self._refit(slice(None))
+        return rows
+
+    def fill(self, normals: NDArray[np.float64], rows: Rows) -> None:
+        """Replace those of ``normals`` [N, 3] that are NaN by those of the cells ``rows`` [N]."""
+        outdated = _outdated(rows, normals, self._moments, self._basis)
+
+        def work(first: int, last: int) -> None:
+            part = outdated[first:last]
+            _estimate(part, self._cell_m, self._cells.arrays, self._moments, self._normals)
+
+        MAPPING.split(len(outdated), work)
+        _adopt(rows, self._normals, normals)
+
+    def keep_nearest(self, place: NDArray[np.float64], cells: int) -> None:
+        """Keep the moments of the ``cells`` nearest to a ``place`` [3] only."""
+        distance = np.linalg.norm(self._centres() - place, axis=1)
+        self._keep(np.sort(np.argpartition(distance, cells)[:cells]))
+
+    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Drop the moments of cells between the corners ``low`` and ``high`` [3]."""
+        centres = self._centres()
+        self._keep(np.flatnonzero(((centres < low) | (centres > high)).any(axis=1)))
+
+    @property
+    def cells(self) -> int:
+        """Cells in use."""
+        return self._cells.count
+
+    def _centres(self) -> NDArray[np.float64]:
+        return np.asarray((self._cells.cells() + 0.5) * self._cell_m, np.float64)
+
+    def _keep(self, rows: NDArray[np.int64]) -> None:
+        self._cells = VoxelIndex.of_cells(self._cells.cells()[rows])
+        self._refit(rows)
+
+    def _refit(self, rows: NDArray[np.int64] | slice) -> None:
+        """Keep some rows, with as much room as the cells have."""
+        capacity = self._cells.capacity
+        self._moments = with_room(self._moments[rows], capacity)
+        self._normals = with_room(self._normals[rows], capacity)
+        self._basis = with_room(self._basis[rows], capacity)
+
+
+class SurfaceNormals:
+    """Normals of the surfaces around the sensor; those farthest from it go first."""
+
+    def __init__(
+        self,
+        fine_m: float = 0.15,
+        coarse_m: float = 0.5,
+        max_cells: int = 150_000,  # of each grid, at some 100 bytes
+    ) -> None:
+        self._grids = (MomentGrid(fine_m), MomentGrid(coarse_m))
+        self._max_cells = max_cells
+
+    def add(self, points: NDArray[np.float64], sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Add the end points [N, 3] of a scan from ``sensor`` [3], metres, map frame.
+
+        Returns:
+            Unit normals [N, 3] of either sign at the points; NaN where no plane is known.
+        """
+        normals = np.full(points.shape, np.nan)
+        for grid in self._grids:
+            grid.fill(normals, grid.add(points))
+            if grid.cells > self._max_cells:
+                grid.keep_nearest(sensor, self._max_cells // 2)
+        return normals
+
+    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Forget the surfaces between the corners ``low`` and ``high`` [3]."""
+        for grid in self._grids:
+            grid.forget(low, high)

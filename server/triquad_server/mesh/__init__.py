@@ -1,0 +1,1 @@
+"""Mesh tiles: meshing, cache and change feed."""

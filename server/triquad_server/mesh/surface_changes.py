@@ -1,0 +1,170 @@
+"""Where the surface of a map changed: what mesh tiles have to follow."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import RegionIndex
+from triquad_map.compiled.surfels.surfel_index import surfel_voxels
+from triquad_map.compiled.team import Team
+
+from triquad_server.epochs.epoch import FrozenRegion
+
+_KEY_BITS = 20  # of each coordinate of a voxel, or of a group, in its region
+
+
+_LEFT_SHARE = 0.02
+_LEFT_VOXELS = 4
+"""Where the surface left so many voxels of a group, and that share of them, something is gone; of
+fewer, training is the cause, which never leaves all voxels alone."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Where the surface changed. Positions are metres in the map frame."""
+
+    places: NDArray[np.float64]  # [N, 3] centres of voxels whose surface is new or gone
+    drifted: NDArray[np.float64]  # [G, 3] centres of groups whose surface moved as a whole
+
+
+@dataclass(frozen=True)
+class _Voxels:
+    """The voxels of a region with seen surface."""
+
+    keys: NDArray[np.int64]  # [V] increasing
+    centres: NDArray[np.float64]  # [V, 3] metres, map frame
+    groups: NDArray[np.float64]  # [G, 3] centres of the groups
+    group: NDArray[np.intp]  # [V] of each voxel
+
+
+@dataclass(frozen=True)
+class _Noted:
+    """The surface of a region when its changes were last told."""
+
+    region: FrozenRegion
+    voxels: _Voxels
+    offsets: NDArray[np.float32]  # [V] metres from each voxel's centre to the surface
+
+
+class SurfaceChanges:
+    """Compares each epoch with what was told before, in groups of voxels: cubes of ``group_m``.
+
+    Where the surface crosses a voxel is told by the field at the voxel's centre, along its
+    gradient. While a field is trained, single voxels are never at rest; so a group changes where
+
+    * a voxel with seen surface is new, or forgotten;
+    * the surface left some voxels (moved by more than half their side);
+    * it moved by more than the tolerance in more than half of the group's voxels, since the group
+      was told of last: small movements add up.
+    """
+
+    def __init__(
+        self, settings: FieldSettings, tolerance_m: float, group_m: float, team: Team
+    ) -> None:
+        self._settings = settings
+        self._tolerance_m = tolerance_m
+        self._group_m = group_m
+        self._team = team
+        self._noted: dict[RegionIndex, _Noted] = {}
+
+    def since_last(self, regions: tuple[FrozenRegion, ...]) -> Changes:
+        """What changed since the last call."""
+        before, self._noted = self._noted, {}
+        nothing = np.zeros((0, 3))
+        found = [Changes(nothing, nothing)]
+        for region in regions:
+            old = before.pop(region.index, None)
+            if old is None:
+                new = self._look(region, None)
+                found.append(Changes(new.voxels.centres, nothing))
+            elif old.region is region:
+                new = old
+            else:
+                new, changes = self._compare(old, self._look(region, old))
+                found.append(changes)
+            self._noted[region.index] = new
+        found += [Changes(gone.voxels.centres, nothing) for gone in before.values()]
+        return Changes(
+            np.concatenate([changes.places for changes in found]),
+            np.concatenate([changes.drifted for changes in found]),
+        )
+
+    def _compare(self, old: _Noted, new: _Noted) -> tuple[_Noted, Changes]:
+        """What is to be noted, and what changed."""
+        voxels = new.voxels
+        before = old.offsets
+        gone = np.zeros((0, 3))
+        if voxels is not old.voxels:
+            before = np.full(len(voxels.keys), np.nan, np.float32)
+            rows, found = _find(voxels.keys, old.voxels.keys)
+            before[found] = old.offsets[rows[found]]
+            _, kept = _find(old.voxels.keys, voxels.keys)
+            gone = old.voxels.centres[~kept]
+        moved = np.abs(new.offsets - before)
+        is_new = np.isnan(before)
+
+        def count(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+            return np.bincount(voxels.group[chosen], minlength=len(voxels.groups))
+
+        size = np.bincount(voxels.group, minlength=len(voxels.groups))
+        left = moved > self._settings.leaf_m / 2
+        many_left = count(left) >= np.maximum(_LEFT_VOXELS, _LEFT_SHARE * size)
+        drifted = 2 * count(moved > self._tolerance_m) > size
+        told = drifted | many_left | (count(is_new) > 0)
+        noted = np.where(told[voxels.group], new.offsets, before)
+        places = is_new | (left & many_left[voxels.group])
+        return _Noted(new.region, voxels, noted), Changes(
+            np.concatenate([gone, voxels.centres[places]]), voxels.groups[drifted]
+        )
+
+    def _look(self, region: FrozenRegion, old: _Noted | None) -> _Noted:
+        if old is not None and old.region.evidence is region.evidence:
+            voxels = old.voxels
+        else:
+            voxels = self._voxels(region)
+        return _Noted(region, voxels, self._offsets(region, voxels.centres))
+
+    def _voxels(self, region: FrozenRegion) -> _Voxels:
+        evidence = region.evidence
+        voxels = surfel_voxels(evidence.cells, evidence.surface, len(region.surfels))
+        keys = _key(voxels)
+        order = np.argsort(keys)
+        corner = region.centre - self._settings.region_side_m / 2
+        centres = corner + (voxels[order] + 0.5) * self._settings.leaf_m
+        cells = np.floor(centres / self._group_m).astype(np.int64)
+        low = cells.min(axis=0, initial=0)
+        _, first, group = np.unique(_key(cells - low), return_index=True, return_inverse=True)
+        groups = ((cells[first] + 0.5) * self._group_m).astype(np.float64)
+        return _Voxels(keys[order], centres, groups, group.ravel())
+
+    def _offsets(self, region: FrozenRegion, centres: NDArray[np.float64]) -> NDArray[np.float32]:
+        """How far [V] the surface is from the centres; at most a voxel: beyond are others."""
+        offsets = np.empty(len(centres), np.float32)
+        leaf_m = self._settings.leaf_m
+
+        def work(first: int, last: int) -> None:
+            part = slice(first, last)
+            local = (centres[part] - region.centre).astype(np.float32)
+            values = region.engine.evaluate(local, True)
+            slope = np.maximum(np.linalg.norm(values.gradient, axis=1), 0.1)
+            offsets[part] = np.clip(values.sdf / slope, -leaf_m, leaf_m)
+
+        self._team.split(len(centres), work)
+        return offsets
+
+
+def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each of cells [N, 3], none of them negative."""
+    return (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
+
+
+def _find(
+    keys: NDArray[np.int64], among: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Where increasing keys [N] are among others, and whether they are there at all."""
+    rows = np.searchsorted(among, keys)
+    if len(among) == 0:
+        return rows, np.zeros(len(keys), np.bool_)
+    rows = np.minimum(rows, len(among) - 1)
+    return rows, among[rows] == keys

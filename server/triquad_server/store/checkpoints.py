@@ -1,0 +1,152 @@
+"""When checkpoints are written: now and then, on request, and at the end."""
+
+import logging
+import queue
+import threading
+import time
+from concurrent.futures import Future
+
+from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
+from triquad_map.compiled.team import be_patient
+
+from triquad_server.errors import RequestError, StoreBaseError, StoreError
+from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.store.store import Store
+from triquad_server.threads import PATIENCE
+
+_log = logging.getLogger(__name__)
+
+_NO_STORE = "the server was started without --store: the map is not kept"
+
+
+class Checkpoints:
+    """Writes the map to its store, on a thread of its own that gives way to those that answer.
+
+    A store that fails never stops the mapping.
+    """
+
+    def __init__(
+        self,
+        mapper: MapperThread,
+        store: Store | None,
+        period_s: float,
+        last: CheckpointInfo | None,
+    ) -> None:
+        """``last`` is the checkpoint that the map was restored from."""
+        self._mapper = mapper
+        self._store = store
+        self._period_s = period_s
+        self._asked: queue.SimpleQueue[Future[CheckpointInfo]] = queue.SimpleQueue()
+        self._stopping = threading.Event()
+        self._wake = threading.Event()
+        self.last = last
+        self.error = None if store else _NO_STORE
+        self._thread = threading.Thread(target=self._run, name="checkpoints")
+
+    def start(self) -> None:
+        """Begin to write checkpoints, while the map changes and on request."""
+        if self._store is not None:
+            self._thread.start()
+
+    def close(self) -> None:
+        """Write a last checkpoint, if the map changed since the one before."""
+        self._stopping.set()
+        self._wake.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        if self._store is not None:
+            self._write_if_changed()
+
+    def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
+        """A checkpoint of the map as it is now; the last one where nothing changed."""
+        if self._store is None:
+            raise RequestError("store", _NO_STORE)
+        asked: Future[CheckpointInfo] = Future()
+        self._asked.put(asked)
+        self._wake.set()
+        try:
+            return asked.result()
+        except StoreError as error:
+            raise RequestError("store", str(error)) from error
+
+    def _run(self) -> None:
+        be_patient(2 * PATIENCE)  # mapping comes first, too
+        due = time.monotonic() + self._period_s
+        while not self._stopping.is_set():
+            self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)
+            self._wake.clear()
+            self._write_as_asked()
+            if self._period_s > 0 and time.monotonic() >= due:
+                self._write_if_changed()
+                due = time.monotonic() + self._period_s
+            self._fold()
+
+    def _write_as_asked(self) -> None:
+        while not self._asked.empty():
+            asked = self._asked.get()
+            try:
+                asked.set_result(self._write())
+            except Exception as error:
+                asked.set_exception(error)
+
+    def _write_if_changed(self) -> None:
+        try:
+            self._write()
+        except StoreError:
+            return  # noted in the status and in the log
+        except Exception:
+            self.error = "a defect of the server; its log has the details"
+            _log.exception("a checkpoint met a defect")
+
+    def _write(self) -> CheckpointInfo:
+        assert self._store is not None
+        epoch = self._mapper.call(lambda mapper: mapper.publish().number)
+        last = self.last
+        # The base is the last checkpoint, as long as its files are as they were written.
+        if last is not None and last.epoch == epoch == self._store.base_epoch:
+            return last
+        try:
+            info = self._write_changes(self._store)
+        except StoreError as error:
+            self.error = str(error)
+            _log.error("%s", error)
+            raise
+        self.last, self.error = info, None
+        _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
+        return info
+
+    def _write_changes(self, store: Store) -> CheckpointInfo:
+        """What changed since the last checkpoint; all of the map where that was damaged since."""
+        base = store.base_epoch
+        try:
+            return store.write(self._mapper.call(lambda mapper: mapper.changes_since(base)))
+        except StoreBaseError as error:
+            _log.warning("%s; all of the map is written instead", error)
+            return store.write(self._mapper.call(lambda mapper: mapper.changes_since(None)))
+
+    def _fold(self) -> None:
+        """Put old checkpoints together, where there are many."""
+        assert self._store is not None
+        try:
+            info = self._store.fold(self._interrupted)
+        except StoreBaseError as error:
+            _log.warning("%s; all of the map is written instead", error)
+            self.last = None
+            self._write_if_changed()
+            return
+        except StoreError as error:
+            self.error = str(error)
+            _log.error("%s", error)
+            return
+        except Exception:
+            _log.exception("folding checkpoints met a defect")
+            return
+        if info is None:
+            return
+        _log.info("folded %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
+        if self.last is not None and self.last.epoch == info.epoch:
+            self.last = info
+
+    def _interrupted(self) -> bool:
+        """Whether something is more urgent than folding, which can be begun again."""
+        return self._stopping.is_set() or not self._asked.empty()

@@ -1,0 +1,71 @@
+"""Map files that clients fetch in chunks."""
+
+import io
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from triquad_format.mapfile.mapfile import write_map
+from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
+
+from triquad_server.errors import RequestError
+from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.store.stamp import stamp_now_ns
+
+CHUNK_BYTES = 2**20
+FILES_KEPT = 2
+
+
+@dataclass(frozen=True)
+class _MapBytes:
+    """A map file in memory."""
+
+    info: MapInfo
+    training: bool
+    data: bytes
+
+
+class MapDownloads:
+    """Serialises epochs on request; the files asked for last are kept."""
+
+    def __init__(self, mapper: MapperThread) -> None:
+        self._mapper = mapper
+        self._lock = threading.Lock()
+        self._files: OrderedDict[str, _MapBytes] = OrderedDict()
+
+    def info(self, request: MapInfoRequest) -> MapInfo:
+        """Make the newest epoch's file, unless it is there."""
+        newest = self._mapper.epochs.newest
+        with self._lock:
+            for file in self._files.values():
+                if file.info.epoch == newest.number and file.training == request.training:
+                    self._files.move_to_end(file.info.sha256)
+                    return file.info
+        if request.training:
+            changes = self._mapper.call(lambda mapper: mapper.changes_since(None))
+            record, newest = changes.record, changes.epoch
+        else:
+            record = newest.record()
+        buffer = io.BytesIO()
+        written = write_map(record, buffer, stamp_ns=stamp_now_ns(), distances=newest.distances)
+        info = MapInfo(written.epoch, written.bytes, written.sha256, CHUNK_BYTES)
+        with self._lock:
+            self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())
+            while len(self._files) > FILES_KEPT:
+                self._files.popitem(last=False)
+        return info
+
+    def chunk(self, request: MapChunkRequest) -> MapChunk:
+        """Bytes of a file that is kept."""
+        with self._lock:
+            file = self._files.get(request.sha256)
+        if file is None:
+            raise RequestError("chunk_gone", "this map file is not kept; ask for its info again")
+        if not 0 <= request.offset < len(file.data) or request.length < 1:
+            raise RequestError(
+                "bad_request",
+                f"{request.length} bytes from {request.offset} on are not in the file of "
+                f"{len(file.data)} bytes",
+            )
+        end = request.offset + min(request.length, CHUNK_BYTES)
+        return MapChunk(request.offset, file.data[request.offset : end])

@@ -1,0 +1,325 @@
+"""The mesh followed in an event loop: as by the blocking watch, cancelled and closed meanwhile."""
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+import pytest
+import triquad_client
+import zenoh
+from support import servers
+from triquad_client import (
+    AsyncClient,
+    AsyncMeshWatch,
+    Client,
+    ClosedError,
+    HeldTiles,
+    InvalidInputError,
+    MeshWatch,
+    RequestTimeoutError,
+)
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
+from triquad_server.settings import MeshSettings
+
+SETTINGS = replace(servers.SMALL, mesh=MeshSettings(tile_cells=16, tolerance_m=0.1))
+
+ResultT = TypeVar("ResultT")
+
+
+def half(side: int) -> np.ndarray:
+    """The half of the ball at x > 0, or at x < 0."""
+    points = servers.sphere(12_000)
+    return points[np.sign(points[:, 0]) == side]
+
+
+def learn(client: Client, points: np.ndarray) -> None:
+    for _ in range(3):
+        client.publish_scan(points, np.eye(4))
+    client.flush(servers.WAIT_S)
+    client.settle(servers.WAIT_S)
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    """A service that has learnt half of a ball."""
+    with servers.running_service(SETTINGS) as endpoint:
+        with triquad_client.connect(endpoint) as client:
+            learn(client, half(1))
+        yield endpoint
+
+
+def connected(
+    endpoint: str, use: Callable[[AsyncClient], Awaitable[ResultT]], timeout_s: float = 10.0
+) -> ResultT:
+    """What ``use`` returns of a client in an event loop of its own."""
+
+    async def main() -> ResultT:
+        async with triquad_client.connect_async(endpoint, timeout_s=timeout_s) as client:
+            return await asyncio.wait_for(use(client), servers.WAIT_S)
+
+    return asyncio.run(main())
+
+
+def digests(watch: MeshWatch | AsyncMeshWatch) -> dict[tuple[int, int, int], str]:
+    return {index: tile.digest for index, tile in watch.tiles.items()}
+
+
+def test_what_changes_is_told_while_the_loop_goes_on() -> None:
+    with (
+        servers.running_service(SETTINGS) as endpoint,
+        triquad_client.connect(endpoint) as other,
+    ):
+        learn(other, half(1))
+
+        async def use(client: AsyncClient) -> None:
+            async with client.watch_mesh() as watch:
+                await watch.catch_up(servers.WAIT_S)
+                first = await watch.mesh()
+                assert first.vertices[:, 0].min() > -1
+                before = watch.tiles
+                waiting = asyncio.ensure_future(watch.next(servers.WAIT_S))
+                points = servers.sphere(50).astype(np.float64)
+                assert len((await client.query_sdf(points)).sdf) == 50
+                await asyncio.to_thread(learn, other, half(-1))
+                update = await waiting
+                assert update is not None
+                assert update.changed
+                await watch.catch_up(servers.WAIT_S)
+                assert watch.complete
+                assert min(x for x, _, _ in before) >= -1, "what was read does not change"
+                mesh = await watch.mesh()
+                assert mesh.vertices[:, 0].min() < -3
+                assert await watch.next(0.0) is None
+                with other.watch_mesh() as blocking:
+                    blocking.catch_up(servers.WAIT_S)
+                    assert digests(watch) == digests(blocking)
+                    expected = blocking.mesh()
+                assert (mesh.epoch, len(mesh.faces)) == (expected.epoch, len(expected.faces))
+
+        connected(endpoint, use)
+
+
+def test_held_tiles_go_from_one_kind_of_watch_to_the_other(endpoint: str) -> None:
+    async def use(client: AsyncClient) -> HeldTiles:
+        async with client.watch_mesh(level=1) as watch:
+            assert watch.level == 1
+            await watch.catch_up(servers.WAIT_S)
+            held = watch.held()
+        async with client.watch_mesh(level=1, held=held) as watch:
+            assert watch.tiles.keys() == held.tiles.keys()
+            assert await watch.next(0.0) is None
+            assert watch.complete
+        return held
+
+    held = connected(endpoint, use)
+    assert held.tiles
+    with (
+        triquad_client.connect(endpoint) as client,
+        client.watch_mesh(level=1, held=held) as watch,
+    ):
+        assert watch.next(0.0) is None
+
+
+def test_iteration_ends_with_the_watch(endpoint: str) -> None:
+    async def use(client: AsyncClient) -> None:
+        watch = client.watch_mesh()
+        seen = asyncio.Event()
+
+        async def follow() -> int:
+            count = 0
+            async for update in watch:
+                count += len(update.changed)
+                seen.set()
+            return count
+
+        following = asyncio.ensure_future(follow())
+        await seen.wait()
+        await watch.close()
+        assert await following > 0
+        await watch.close()
+        assert await watch.next() is None
+        with pytest.raises(ClosedError, match="the watch is closed"):
+            await watch.catch_up()
+        assert len((await watch.mesh()).faces), "what is held stays"
+
+    connected(endpoint, use)
+
+
+def test_a_cancelled_wait_leaves_the_watch_in_order(endpoint: str) -> None:
+    async def use(client: AsyncClient) -> None:
+        async with client.watch_mesh() as watch:
+            for steps in range(1, 12):  # cut off in the midst of what comes first
+                waiting = asyncio.ensure_future(watch.next())
+                for _ in range(steps):
+                    await asyncio.sleep(0)
+                waiting.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await waiting
+            await watch.catch_up(servers.WAIT_S)
+            waiting = asyncio.ensure_future(watch.next())
+            await asyncio.sleep(0)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            async with client.watch_mesh() as fresh:
+                await fresh.catch_up(servers.WAIT_S)
+                assert digests(fresh) == digests(watch)
+
+    connected(endpoint, use)
+
+
+def test_what_is_awaited_when_the_client_is_closed_says_so(endpoint: str) -> None:
+    async def use(client: AsyncClient) -> None:
+        watch = client.watch_mesh()
+        await watch.catch_up(servers.WAIT_S)
+        waiting = asyncio.ensure_future(watch.next())
+        await client.status()  # by then it waits at the server
+        await client.close()
+        with pytest.raises(ClosedError):
+            await waiting
+        with pytest.raises(ClosedError):
+            await watch.next(0.0)
+
+    connected(endpoint, use)
+
+
+def test_a_watch_is_caught_up_while_another_task_waits_for_changes(endpoint: str) -> None:
+    async def use(client: AsyncClient) -> None:
+        async with client.watch_mesh() as watch:
+            await watch.catch_up(servers.WAIT_S)
+            waiting = asyncio.ensure_future(watch.next())
+            await client.status()
+            await watch.catch_up(servers.WAIT_S)
+            assert not waiting.done()
+            async with client.watch_mesh() as fresh:
+                await fresh.catch_up(servers.WAIT_S)
+                assert digests(fresh) == digests(watch)
+            await watch.close()
+            assert await waiting is None
+
+    connected(endpoint, use)
+
+
+def removed(index: int, revision: int) -> bytes:
+    """A reply without tiles, after which the tile ``(index, 0, 0)`` is gone."""
+    side_m, none = 1.6, np.zeros(0, np.int64)
+    return codec.encode(
+        TileUpdates(
+            "s", revision, revision, True, False, side_m, 0.1, np.zeros((0, 3), np.int32), none,
+            none.astype(np.uint8), none, b"", np.array([[index, 0, 0]], np.int32),
+        )
+    )  # fmt: skip
+
+
+def held_tiles(endpoint: str) -> HeldTiles:
+    with triquad_client.connect(endpoint) as client, client.watch_mesh() as watch:
+        watch.catch_up(servers.WAIT_S)
+        return watch.held()
+
+
+def test_an_old_reply_does_not_undo_what_a_later_one_told(endpoint: str) -> None:
+    """Two tasks ask at the same time; the reply to the one that asked first comes last."""
+    tile = next(iter(held_tiles(endpoint).tiles.values()))
+    tiles = {(x, 0, 0): replace(tile, index=(x, 0, 0)) for x in range(2)}
+    held = HeldTiles("s", 0, 1.6, tiles)
+    first: list[zenoh.Query] = []
+    came = threading.Event()
+
+    def answer(query: zenoh.Query, key: str) -> None:
+        asks = codec.decode(TileUpdatesRequest, query.payload.to_bytes())
+        if not first:
+            first.append(query)
+            came.set()
+            return
+        with query:
+            query.reply(key, removed(1 if asks.revision == 0 else 5, 2))
+
+    with servers.answering({keys.TILE_UPDATES: answer}) as endpoint:
+
+        async def use(client: AsyncClient) -> None:
+            async with client.watch_mesh(held=held) as watch:
+                early = asyncio.ensure_future(watch.next(0.0))
+                assert await asyncio.to_thread(came.wait, servers.WAIT_S)
+                late = await watch.next(0.0)
+                assert late is not None
+                assert late.removed == ((1, 0, 0),)
+                with first[0] as query:
+                    key = keys.operation_key(servers.MAP, keys.TILE_UPDATES)
+                    query.reply(key, removed(0, 1))
+                assert await early is None
+                assert set(watch.tiles) == {(0, 0, 0)}
+
+        connected(endpoint, use)
+
+
+def test_a_server_that_does_not_answer_is_an_error_and_what_is_held_stays(endpoint: str) -> None:
+    held = held_tiles(endpoint)
+    silent: list[zenoh.Query] = []
+    answers = {keys.TILE_UPDATES: lambda query, key: silent.append(query)}
+    with servers.answering(answers) as endpoint:
+
+        async def use(client: AsyncClient) -> None:
+            async with client.watch_mesh(held=held) as watch:
+                with pytest.raises(RequestTimeoutError):
+                    await watch.next(0.0)
+                assert watch.tiles.keys() == held.tiles.keys()
+
+        connected(endpoint, use, timeout_s=0.5)
+        for query in silent:
+            query.drop()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"level": 3},
+        {"max_bytes_per_s": 0},
+        {"bounds": ((np.nan, 0, 0), (1, 1, 1))},
+        {"held": HeldTiles("s", 1, 6.4)},
+    ],
+)
+def test_bad_arguments_are_refused(endpoint: str, arguments: dict[str, object]) -> None:
+    async def use(client: AsyncClient) -> None:
+        with pytest.raises(InvalidInputError):
+            client.watch_mesh(**arguments)  # type: ignore[arg-type]
+
+    connected(endpoint, use)
+
+
+def test_both_clients_fetch_all_levels(endpoint: str) -> None:
+    bounds = ((0.2, 0.2, -9), (9, 9, 9))
+
+    async def use(client: AsyncClient) -> None:
+        with triquad_client.connect(endpoint) as other:
+            faces = []
+            for level in range(3):
+                mesh, expected = await client.mesh(bounds, level), other.mesh(bounds, level=level)
+                np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+                np.testing.assert_array_equal(mesh.faces, expected.faces)
+                assert (mesh.vertices[mesh.faces].mean(axis=1)[:, :2] >= 0.2).all()
+                error_m = np.abs(np.linalg.norm(mesh.vertices, axis=1) - servers.RADIUS_M)
+                assert error_m.mean() < 0.2
+                faces.append(len(mesh.faces))
+                listed = await client.tiles(bounds, level)
+                np.testing.assert_array_equal(listed.tiles, other.tiles(bounds, level).tiles)
+                assert listed.tile_side_m == pytest.approx(1.6 * 2**level)
+                x, y, z = listed.tiles[0].tolist()
+                tile = await client.mesh_tile(x, y, z, level)
+                np.testing.assert_array_equal(
+                    tile.vertices, other.mesh_tile(x, y, z, level=level).vertices
+                )
+                corner = np.array((x, y, z)) * listed.tile_side_m
+                assert (tile.vertices >= corner - 1e-4).all()
+                assert (tile.vertices <= corner + listed.tile_side_m + 1e-4).all()
+            assert faces[0] > 2 * faces[1] > 4 * faces[2] > 0
+            for call in (other.mesh, other.tiles):
+                with pytest.raises(InvalidInputError, match="level = 3: use 0 to 2"):
+                    call(level=3)
+            with pytest.raises(InvalidInputError, match=r"level = 1\.0"):
+                await client.mesh_tile(0, 0, 0, 1.0)  # type: ignore[arg-type]
+
+    connected(endpoint, use)

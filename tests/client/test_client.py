@@ -1,0 +1,357 @@
+"""The client where things go wrong, and what it refuses to send."""
+
+import hashlib
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+import triquad_client
+import zenoh
+from support import servers
+from triquad_client import (
+    BadReplyError,
+    ClosedError,
+    ConnectError,
+    DownloadError,
+    InvalidInputError,
+    InvalidScanError,
+    NoReplyError,
+    RefusedError,
+    RequestTimeoutError,
+    TriquadError,
+    UnknownMapError,
+)
+from triquad_client.net.call import Call, retried
+from triquad_client.net.connection import open_connection
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import (
+    ErrorReply,
+    MapChunk,
+    MapChunkRequest,
+    MapInfo,
+    SdfReply,
+    SdfRequest,
+)
+
+POSE = np.eye(4)
+CLOUD = np.ones((10, 3), np.float32)
+
+
+@pytest.fixture(scope="module")
+def endpoint():
+    with servers.running_service() as endpoint:
+        yield endpoint
+
+
+@pytest.fixture(scope="module")
+def client(endpoint):
+    with triquad_client.connect(endpoint) as client:
+        yield client
+
+
+def test_where_nothing_listens_the_error_names_the_endpoint_and_the_remedy():
+    endpoint = servers.free_endpoint()
+    with pytest.raises(ConnectError, match="Start triquad-server") as caught:
+        triquad_client.connect(endpoint)
+    assert endpoint in str(caught.value)
+
+
+def test_something_else_that_listens_is_a_connect_error():
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        with pytest.raises(ConnectError, match="cannot connect"):
+            triquad_client.connect(endpoint, timeout_s=0.3)
+
+
+@pytest.mark.parametrize("endpoint", ["", "nonsense", "tcp/", "carrier-pigeon/1"])
+def test_an_endpoint_that_is_none_is_a_connect_error(endpoint):
+    with pytest.raises(ConnectError):
+        triquad_client.connect(endpoint, timeout_s=1.0)
+
+
+def test_an_unknown_map_lists_the_maps_there_are(endpoint):
+    with pytest.raises(UnknownMapError, match="available: default") as caught:
+        triquad_client.connect(endpoint, "kitchen")
+    assert caught.value.available == ["default"]
+
+
+def test_a_router_without_maps_is_told_apart():
+    endpoint = servers.free_endpoint()
+    with (
+        servers.raw_session("router", listen=endpoint),
+        pytest.raises(UnknownMapError, match="available: none"),
+    ):
+        triquad_client.connect(endpoint)
+
+
+def test_a_map_name_that_cannot_be_is_refused(endpoint):
+    with pytest.raises(InvalidInputError, match="map name"):
+        triquad_client.connect(endpoint, "a/b")
+
+
+def test_two_maps_on_one_network_do_not_disturb_each_other():
+    with (
+        servers.running_service(map_name="ground") as ground,
+        servers.running_service(map_name="cellar", connect=(ground,)),
+        triquad_client.connect(ground, "ground") as upstairs,
+    ):
+        wait_for_maps(upstairs, ["cellar", "ground"])
+        with triquad_client.connect(ground, "cellar") as downstairs:
+            downstairs.publish_scan(servers.sphere(), POSE)
+            assert downstairs.flush(servers.WAIT_S).taken == 1
+            assert downstairs.status().scans_taken == 1
+        assert upstairs.status().scans_taken == 0
+        assert upstairs.status().regions == 0
+
+
+def wait_for_maps(client: triquad_client.Client, names: list[str]) -> None:
+    """Two routers exchange what they know some time after they are up."""
+    pause = threading.Event()
+    deadline = time.monotonic() + servers.WAIT_S
+    while (found := client.maps()) != names:
+        assert time.monotonic() < deadline, f"found {found}, not {names}"
+        pause.wait(0.05)
+
+
+def test_a_map_that_goes_away_is_noticed():
+    with servers.running_service() as endpoint:
+        client = triquad_client.connect(endpoint, timeout_s=5.0)
+    with client, pytest.raises(TriquadError):
+        client.status()
+
+
+def test_a_closed_client_says_so(endpoint):
+    client = triquad_client.connect(endpoint)
+    client.close()
+    client.close()
+    for call in (client.status, client.maps, lambda: client.publish_scan(CLOUD, POSE)):
+        with pytest.raises(ClosedError):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("points", "text"),
+    [
+        (np.zeros((0, 3)), "no points"),
+        (np.zeros((5, 2)), r"\[5, 2\], not \[N, 3\]"),
+        (np.zeros(3), r"\[3\], not"),
+        (np.zeros((2, 3), complex), "complex128"),
+        (np.full((2, 3), "x"), "dtype"),
+        ([[1, 2, 3], [4, 5]], "points are not"),
+        (None, "points are not"),
+    ],
+)
+def test_points_that_are_no_scan_are_refused_here(client, points, text):
+    with pytest.raises(InvalidScanError, match=text):
+        client.publish_scan(points, POSE)
+
+
+@pytest.mark.parametrize(
+    ("pose", "text"),
+    [
+        (np.eye(3), r"\[3, 3\], not \[4, 4\]"),
+        (np.full((4, 4), np.nan), "not finite"),
+        (np.diag([2.0, 2, 2, 1]), "not rigid"),
+        (np.diag([1.0, 1, -1, 1]), "not rigid"),
+        (np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1.0]]), "transposed"),
+        ("pose", "not a matrix"),
+    ],
+)
+def test_poses_that_are_not_rigid_are_refused_here(client, pose, text):
+    with pytest.raises(InvalidScanError, match=text):
+        client.publish_scan(CLOUD, pose)
+
+
+@pytest.mark.parametrize("stamp", [np.nan, np.inf, -1.0, 1e30])
+def test_stamps_that_are_no_time_are_refused_here(client, stamp):
+    with pytest.raises(InvalidScanError, match="stamp"):
+        client.publish_scan(CLOUD, POSE, stamp)
+
+
+def test_time_that_runs_backwards_is_refused_here_per_source(client):
+    client.publish_scan(servers.sphere(10), POSE, 1000.5, "a")
+    client.publish_scan(servers.sphere(10), POSE, 1000.5, "a")
+    client.publish_scan(servers.sphere(10), POSE, 10.0, "b")
+    with pytest.raises(InvalidScanError, match="in order"):
+        client.publish_scan(CLOUD, POSE, 1000.4, "a")
+
+
+def test_sources_that_are_no_names_are_refused_here(client):
+    with pytest.raises(InvalidScanError, match="source name 'a/b'"):
+        client.publish_scan(CLOUD, POSE, source="a/b")
+
+
+def test_lists_and_other_numbers_are_taken(client):
+    taken = client.flush(servers.WAIT_S).taken
+    client.publish_scan(servers.sphere(100).tolist(), np.eye(4, dtype=int).tolist())
+    client.publish_scan(np.asfortranarray(servers.sphere(100).astype(np.float64))[::-1], POSE)
+    client.publish_scan((100 * servers.sphere(100)).astype(np.int16) // 100, POSE)
+    report = client.flush(servers.WAIT_S)
+    assert (report.taken - taken, report.lost) == (3, 0)
+    assert client.query_sdf([[0, 0, 0], [1, 2, 3]]).sdf.shape == (2,)
+
+
+def test_points_that_are_not_finite_are_refused_by_index(client):
+    points = np.zeros((5, 3))
+    points[3, 1] = np.nan
+    with pytest.raises(InvalidInputError, match="point 3 is not finite"):
+        client.query_sdf(points)
+    with pytest.raises(InvalidInputError, match="point 1 is .* metres of the map frame"):
+        client.query_sdf([[0, 0, 0], [0, 2e9, 0]])
+    with pytest.raises(ValueError, match="not finite"):
+        client.query_gradient([[np.inf, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [((0, 0), (1, 1)), ((1, 0, 0), (0, 1, 1)), ((np.nan, 0, 0), (1, 1, 1)), (1, 2, 3), 5],
+)
+def test_bounds_that_are_no_box_are_refused_here(client, bounds):
+    with pytest.raises(InvalidInputError, match="bounds"):
+        client.mesh(bounds)
+
+
+@pytest.mark.parametrize("arguments", [(-1.0, 0), (1.0, -1)])
+def test_a_flush_of_negative_length_is_refused_here(client, arguments):
+    with pytest.raises(InvalidInputError):
+        client.flush(*arguments)
+
+
+def test_far_coordinates_keep_their_precision(client):
+    """Offsets travel in single precision from an origin in double precision."""
+    far = np.array([[50_000.0, 0, 0]]) + servers.sphere(20)
+    pose = np.eye(4)
+    pose[0, 3] = 50_000.0
+    client.publish_scan(servers.sphere(), pose, source="far")
+    client.flush(servers.WAIT_S)
+    assert (client.query_sdf(far).status == triquad_client.Status.SURFACE).all()
+
+
+def test_silence_though_the_map_is_there_is_told_apart():
+    with (
+        servers.answering({}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+        pytest.raises(NoReplyError, match="access control"),
+    ):
+        client.status()
+
+
+def test_a_reply_that_never_comes_is_a_timeout():
+    held = []
+    with (
+        servers.answering({keys.SDF: lambda query, _: held.append(query)}) as endpoint,
+        triquad_client.connect(endpoint, timeout_s=0.2) as client,
+    ):
+        with pytest.raises(RequestTimeoutError, match=r"query/sdf within 0\.2 s"):
+            client.query_sdf(CLOUD)
+        held[0].drop()
+
+
+def test_a_reply_of_other_bytes_is_told_apart():
+    def answer(query: zenoh.Query, key: str) -> None:
+        with query:
+            query.reply(key, b"\xff\x00")
+
+    with (
+        servers.answering({keys.SDF: answer}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+        pytest.raises(BadReplyError, match="query/sdf"),
+    ):
+        client.query_sdf(CLOUD)
+
+
+def test_a_refusal_carries_its_code():
+    def answer(query: zenoh.Query, _: str) -> None:
+        with query:
+            query.reply_err(codec.encode(ErrorReply("busy", "try later")))
+
+    with (
+        servers.answering({keys.SDF: answer}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+    ):
+        with pytest.raises(RefusedError, match="busy: try later") as caught:
+            client.query_sdf(CLOUD)
+        assert caught.value.code == "busy"
+
+
+def test_a_query_whose_epoch_goes_starts_again_and_gives_up_after_three_tries():
+    first_parts = []
+
+    def answer(query: zenoh.Query, key: str) -> None:
+        request = codec.decode(SdfRequest, query.payload.to_bytes())
+        with query:
+            if request.epoch:
+                query.reply_err(codec.encode(ErrorReply("epoch_gone", "")))
+                return
+            first_parts.append(request)
+            count = len(request.points)
+            reply = SdfReply(3, np.zeros(count, np.float32), np.zeros(count, np.uint8), None)
+            query.reply(key, codec.encode(reply))
+
+    with (
+        servers.answering({keys.SDF: answer}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+        pytest.raises(RefusedError, match="epoch_gone"),
+    ):
+        client.query_sdf(np.zeros((150_000, 3)))
+    assert len(first_parts) == 3
+
+
+def test_a_download_with_wrong_bytes_leaves_nothing(tmp_path):
+    data = b"x" * 100
+
+    def info(query: zenoh.Query, key: str) -> None:
+        with query:
+            digest = hashlib.sha256(b"y" * 100).hexdigest()
+            query.reply(key, codec.encode(MapInfo(1, len(data), digest, 60)))
+
+    def chunk(query: zenoh.Query, key: str) -> None:
+        with query:
+            asked = codec.decode(MapChunkRequest, query.payload.to_bytes())
+            part = data[asked.offset : asked.offset + asked.length]
+            query.reply(key, codec.encode(MapChunk(asked.offset, part)))
+
+    path = tmp_path / "map.triquad"
+    path.write_text("older")
+    with (
+        servers.answering({keys.MAP_INFO: info, keys.MAP_CHUNK: chunk}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+        pytest.raises(DownloadError, match="SHA-256"),
+    ):
+        client.download_map(path)
+    assert path.read_text() == "older"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_zenoh_configuration_file_is_used(endpoint, tmp_path):
+    file = tmp_path / "client.json5"
+    file.write_text('{ mode: "client", scouting: { multicast: { enabled: false } } }')
+    with triquad_client.connect(endpoint, config=file) as client:
+        assert client.status().map_name == servers.MAP
+    file.write_text("{ mode: 'submarine' }")
+    with pytest.raises(ConnectError):
+        triquad_client.connect(endpoint, config=file)
+    with pytest.raises(ConnectError):
+        open_connection(endpoint, servers.MAP, 1.0, tmp_path / "missing.json5")
+
+
+def test_only_the_expected_refusal_is_asked_again_and_not_for_ever():
+    asked = []
+
+    def refuse(code: str, times: int) -> Call[int]:
+        yield from ()
+        asked.append(code)
+        if len(asked) <= times:
+            raise RefusedError(code, "")
+        return len(asked)
+
+    with pytest.raises(StopIteration) as end:
+        next(retried("epoch_gone", lambda: refuse("epoch_gone", 2)))
+    assert end.value.value == 3
+    for code, attempts in (("epoch_gone", 3), ("busy", 1)):
+        asked.clear()
+        with pytest.raises(RefusedError):
+            next(retried("epoch_gone", lambda code=code: refuse(code, 100)))
+        assert len(asked) == attempts

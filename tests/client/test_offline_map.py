@@ -1,0 +1,233 @@
+"""A map file answers as the server that it came from, without one."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import servers
+from support.checkpoint_folder import map_at, write_checkpoints
+from support.exact_maps import exact_map, flat
+from triquad_client import (
+    Client,
+    ClosedError,
+    InvalidInputError,
+    RefusedError,
+    UnknownSpaceError,
+    open_map,
+)
+from triquad_client.calls.queries import MapQueries
+from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.mapfile.mapfile import write_map
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+POSE = np.eye(4)
+BOX = ((-5.0, -5.0, -1.0), (5.0, 5.0, 1.0))
+POINTS = np.random.default_rng(0).uniform(-6, 6, (2000, 3))
+ENDS = np.random.default_rng(1).uniform(-6, 6, (200, 3))
+
+Question = Callable[[MapQueries], Any]
+
+QUESTIONS: dict[str, Question] = {
+    "query_sdf": lambda view: view.query_sdf(POINTS),
+    "query_gradient": lambda view: view.query_gradient(POINTS),
+    "query_distance": lambda view: view.query_distance(
+        POINTS, 3.0, unknown="obstacle", surface_point=True, unknown_distance=True
+    ),
+    "query_spheres": lambda view: view.query_spheres(POINTS, 0.3),
+    "query_segments": lambda view: view.query_segments(POINTS[:200], ENDS, radius=0.1),
+    "query_polyline": lambda view: view.query_polyline(0.3 * ENDS[:40], radius=0.1),
+    "query_rays": lambda view: view.query_rays([0, 0, 0], ENDS),
+    "query_grid": lambda view: view.query_grid(BOX, cell=0.5),
+    "align": lambda view: view.align(servers.sphere(3000), moved(0.2)),
+}
+"""One of each kind."""
+
+
+def moved(x_m: float) -> np.ndarray:
+    """A pose [4, 4] off by that."""
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    return pose
+
+
+@dataclass(frozen=True)
+class Twins:
+    """A server that has learnt a sphere, and its map as a file."""
+
+    client: Client
+    path: Path
+
+
+@pytest.fixture(scope="module")
+def twins(tmp_path_factory):
+    path = tmp_path_factory.mktemp("twin") / "map.triquad"
+    with servers.service_and_client() as client:
+        for _ in range(3):
+            client.publish_scan(servers.sphere(20_000), POSE, stamp=1.7e9)
+        client.flush(servers.WAIT_S)
+        client.settle(servers.WAIT_S)
+        client.download_map(path)
+        yield Twins(client, path)
+
+
+@pytest.fixture(scope="module")
+def offline(twins):
+    with open_map(twins.path) as offline:
+        yield offline
+
+
+def assert_close(have: Any, want: Any, name: str) -> None:
+    """Fail unless 99 % of all numbers are within a millimetre, and of all states equal."""
+    assert type(have) is type(want), name
+    if hasattr(want, "__dataclass_fields__"):
+        for field in want.__dataclass_fields__:
+            assert_close(getattr(have, field), getattr(want, field), f"{name}.{field}")
+    elif isinstance(want, np.ndarray):
+        assert (have.dtype, have.shape) == (want.dtype, want.shape), name
+        if want.dtype.kind == "f":
+            np.testing.assert_array_equal(np.isnan(have), np.isnan(want), err_msg=name)
+            apart = np.abs(have - want)[~np.isnan(want)]
+            # Directions turn by more where two surfaces are as near; what a ball does not tell of
+            # a pose has a variance of half a turn.
+            largest = max(1.0, np.abs(want).max(initial=0.0)) if "covariance" in name else 1.0
+            assert np.quantile(apart, 0.99) < (0.02 if "gradient" in name else 1e-3 * largest), name
+        else:
+            assert np.mean(have == want) > 0.99, name
+    elif isinstance(want, float):
+        assert have == pytest.approx(want, abs=1e-2), name
+    elif want is not None and not isinstance(want, tuple):
+        assert have == want, name
+
+
+def test_every_query_of_a_client_is_compared():
+    assert set(QUESTIONS) == {name for name in vars(MapQueries) if not name.startswith("_")}
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_the_file_answers_as_the_server(twins, offline, name):
+    assert offline.compiled
+    assert_close(QUESTIONS[name](offline), QUESTIONS[name](twins.client), name)
+
+
+def test_it_tells_what_it_is(twins, offline):
+    status = twins.client.status()
+    assert (offline.name, offline.epoch) == (status.map_name, status.epoch)
+    assert offline.stamp_ns > 1.7e18
+    assert offline.query_distance(POINTS).epoch == offline.epoch
+
+
+def test_large_questions_are_one_call(offline):
+    many = np.tile(POINTS, (60, 1))  # more than go into one request
+    answer = offline.query_distance(many)
+    np.testing.assert_array_equal(answer.distance[: len(POINTS)], answer.distance[-len(POINTS) :])
+    assert len(offline.query_sdf(many).sdf) == len(many)
+
+
+def test_only_its_own_epoch_can_be_asked_for(offline):
+    here = offline.query_sdf(POINTS, at_epoch=offline.epoch)
+    np.testing.assert_array_equal(here.sdf, offline.query_sdf(POINTS).sdf)
+    for question in (offline.query_sdf, offline.query_distance):
+        with pytest.raises(RefusedError, match=rf"kept is \[{offline.epoch}\]") as refusal:
+            question(POINTS, at_epoch=offline.epoch + 1)
+        assert refusal.value.code == "epoch_gone"
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda view: view.query_sdf([[0, 0]]),
+        lambda view: view.query_sdf([[0, 0, np.nan]]),
+        lambda view: view.query_distance(POINTS, -1.0),
+        lambda view: view.query_distance(POINTS, 1e3),
+        lambda view: view.query_distance(POINTS, unknown="maybe"),
+        lambda view: view.query_spheres(POINTS, -1.0),
+        lambda view: view.query_segments(POINTS, ENDS),
+        lambda view: view.query_rays([0, 0, 0], [[0, 0, 0]]),
+        lambda view: view.query_grid(BOX, cell=0.0),
+        lambda view: view.query_sdf(POINTS, at_epoch=0),
+        lambda view: view.query_distance([[9.0, 9, 9]], unknown="error"),
+    ],
+)
+def test_what_the_server_does_not_answer_the_file_does_not_either(twins, offline, ask):
+    errors = (InvalidInputError, RefusedError, UnknownSpaceError)
+    with pytest.raises(errors) as online:
+        ask(twins.client)
+    with pytest.raises(type(online.value)) as refusal:
+        ask(offline)
+    assert str(refusal.value) == str(online.value)
+
+
+def test_a_closed_map_says_so(twins):
+    offline = open_map(twins.path)
+    offline.close()
+    with pytest.raises(ClosedError):
+        offline.query_sdf(POINTS)
+
+
+def test_of_a_store_the_newest_checkpoint_is_opened(tmp_path):
+    folder = tmp_path / "store" / "site"
+    folder.mkdir(parents=True)
+    write_checkpoints(folder, (3, 5, 8))
+    for path in (folder, folder.parent):
+        assert open_map(path).epoch == 8
+    want = write_map(map_at(8), tmp_path / "whole.triquad")
+    whole, delta = open_map(tmp_path / "whole.triquad"), open_map(folder)
+    assert whole.epoch == want.epoch
+    np.testing.assert_array_equal(whole.query_sdf(POINTS).sdf, delta.query_sdf(POINTS).sdf)
+
+
+def test_files_of_version_1_are_opened():
+    offline = open_map(GOLDEN / "map_v1.triquad")
+    assert np.isfinite(offline.query_sdf([[0.0, 0, 0]]).sdf).all()
+    assert offline.stamp_ns == 0
+
+
+def test_damaged_and_foreign_files_are_refused_by_name(tmp_path):
+    path = tmp_path / "map.triquad"
+    write_map(exact_map(flat(0.0)), path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])
+    with pytest.raises(DamagedMapFileError, match=r"map\.triquad is damaged"):
+        open_map(path)
+    path.write_bytes(b"not a map at all")
+    with pytest.raises(MapFileError, match=r"map\.triquad"):
+        open_map(path)
+    with pytest.raises(FileNotFoundError):
+        open_map(tmp_path / "nowhere.triquad")
+    with pytest.raises(MapFileError, match="not a folder of checkpoints"):
+        open_map(tmp_path)
+
+
+PLAIN = """
+import sys
+for name in ("numba", "llvmlite", "torch", "skimage"):
+    sys.modules[name] = None  # as if it were not installed
+import triquad_client
+with triquad_client.open_map(sys.argv[1]) as offline:
+    assert not offline.compiled
+    above = offline.query_distance([[0.0, 0.0, 1.0]], surface_point=True)
+    print(above.distance[0], above.surface_point[0, 2], offline.query_sdf([[0, 0, 0.1]]).sdf[0])
+loaded = {"zenoh", "triquad_server"} & {n for n, m in sys.modules.items() if m is not None}
+assert loaded <= {"zenoh"}, loaded
+"""
+
+
+def test_without_numba_and_torch_it_answers_the_same(tmp_path):
+    path = tmp_path / "map.triquad"
+    write_map(exact_map(flat(0.07)), path)
+    done = subprocess.run(
+        [sys.executable, "-c", PLAIN, str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    plain = [float(number) for number in done.stdout.split()]
+    with open_map(path) as offline:
+        above = offline.query_distance([[0.0, 0.0, 1.0]], surface_point=True)
+        sdf = offline.query_sdf([[0, 0, 0.1]]).sdf
+    compiled = [above.distance[0], above.surface_point[0, 2], sdf[0]]
+    np.testing.assert_allclose(plain, compiled, atol=1e-5)
+    np.testing.assert_allclose(plain, [0.93, 0.07, 0.03], atol=5e-3)

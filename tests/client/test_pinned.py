@@ -1,0 +1,98 @@
+"""Queries that are answered from one epoch, however the map goes on meanwhile."""
+
+import asyncio
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import Client, InvalidInputError, RefusedError
+
+POSE = np.eye(4)
+POINTS = servers.sphere(300).astype(np.float64)
+LIMITS = replace(servers.SMALL.service, epochs_kept=1, epochs_pinned=2)
+
+
+@pytest.fixture
+def client() -> Iterator[Client]:
+    """Of a service that keeps the newest epoch, and two that are asked for."""
+    with servers.service_and_client(replace(servers.SMALL, service=LIMITS)) as client:
+        learn_more(client)
+        yield client
+
+
+def learn_more(client: Client) -> None:
+    """Have the map change, and settle."""
+    client.publish_scan(servers.sphere() * np.float32(1.1), POSE)
+    client.flush(servers.WAIT_S)
+    client.settle(servers.WAIT_S)
+
+
+def test_a_pinned_map_stays_as_it_was(client):
+    view = client.pinned()
+    before = view.query_gradient(POINTS)
+    assert before.epoch == view.epoch == client.status().epoch
+    for _ in range(3):
+        learn_more(client)
+        after = view.query_gradient(POINTS)
+        assert after.epoch == view.epoch
+        np.testing.assert_array_equal(after.sdf, before.sdf)
+        np.testing.assert_array_equal(after.gradient, before.gradient)
+    newest = client.query_sdf(POINTS)
+    assert newest.epoch > view.epoch
+    assert (newest.sdf != before.sdf).any()
+    assert client.pinned().epoch == newest.epoch
+
+
+def test_all_parts_of_a_big_query_come_from_the_epoch_that_is_asked_for(client):
+    view = client.pinned()
+    learn_more(client)
+    big = client.query_sdf(np.tile(POINTS, (1000, 1)), at_epoch=view.epoch)
+    assert big.epoch == view.epoch
+    expected = view.query_sdf(POINTS).sdf
+    np.testing.assert_allclose(big.sdf, np.tile(expected, 1000), atol=1e-6)
+
+
+def test_an_epoch_that_is_gone_is_refused_and_no_other_answers(client):
+    view = client.pinned()
+    for _ in range(2):  # two others are asked for since
+        learn_more(client)
+        client.pinned()
+    learn_more(client)
+    for points in (POINTS, np.tile(POINTS, (1000, 1))):
+        with pytest.raises(RefusedError, match=f"epoch {view.epoch} is not kept") as caught:
+            view.query_sdf(points)
+        assert caught.value.code == "epoch_gone"
+    assert client.query_sdf(POINTS).epoch > view.epoch
+
+
+@pytest.mark.parametrize("epoch", [0, -1, 2**63, 1.5, "newest"])
+def test_what_is_no_epoch_is_refused_here(client, epoch):
+    with pytest.raises(InvalidInputError, match="at_epoch"):
+        client.query_sdf(POINTS, at_epoch=epoch)
+
+
+def test_an_epoch_may_be_any_integer(client):
+    epoch = client.query_sdf(POINTS).epoch
+    assert client.query_gradient(POINTS, at_epoch=np.int64(epoch)).epoch == epoch
+
+
+def test_the_other_client_pins_alike():
+    with servers.running_service(replace(servers.SMALL, service=LIMITS)) as endpoint:
+        asyncio.run(asyncio.wait_for(pin_with(endpoint), servers.WAIT_S))
+
+
+async def pin_with(endpoint: str) -> None:
+    with triquad_client.connect(endpoint) as learner:
+        await asyncio.to_thread(learn_more, learner)
+        async with triquad_client.connect_async(endpoint) as client:
+            view = await client.pinned()
+            before = await view.query_sdf(POINTS)
+            await asyncio.to_thread(learn_more, learner)
+            after = await asyncio.gather(*(view.query_gradient(POINTS) for _ in range(50)))
+            assert {result.epoch for result in after} == {view.epoch}
+            np.testing.assert_array_equal(after[0].sdf, before.sdf)
+            assert (await client.query_sdf(POINTS)).epoch > view.epoch
+            assert (await client.query_sdf(POINTS, at_epoch=view.epoch)).epoch == view.epoch

@@ -1,0 +1,272 @@
+"""Copies of a server's map that stay current, and answer when the link drops."""
+
+import asyncio
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import (
+    Client,
+    ClosedError,
+    ConnectError,
+    DownloadError,
+    InvalidInputError,
+    RefusedError,
+    SyncedMap,
+    SyncReport,
+)
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo
+
+FAR_M = 60.0  # from the first room to the second: in another region
+WHOLE = ((-10, -10, -10), (FAR_M + 10, 10, 10))
+FIRST = ((-10, -10, -10), (10, 10, 10))
+POINTS = np.random.default_rng(0).uniform(-6, 6, (3000, 3))
+
+
+@pytest.fixture
+def endpoint():
+    """Of a server that has learnt two rooms."""
+    with servers.running_service() as endpoint:
+        with triquad_client.connect(endpoint) as client:
+            learn(client, 0.0)
+            learn(client, FAR_M)
+        yield endpoint
+
+
+@pytest.fixture
+def client(endpoint):
+    with triquad_client.connect(endpoint) as client:
+        yield client
+
+
+def learn(client: Client, x_m: float, radius_m: float = 4.0) -> None:
+    """Have the server learn a room, and settle."""
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    client.publish_scan(servers.sphere(radius_m=radius_m), pose)
+    client.flush(servers.WAIT_S)
+    client.settle(servers.WAIT_S)
+
+
+def assert_same_answers(local, client, points=POINTS):
+    have, want = local.query_distance(points), client.query_distance(points)
+    assert have.epoch == want.epoch
+    np.testing.assert_array_equal(have.status, want.status)
+    assert np.quantile(np.abs(have.distance - want.distance), 0.99) < 1e-3
+
+
+def test_a_copy_answers_as_the_server(client, tmp_path):
+    path = tmp_path / "copy.triquad"
+    local = client.sync(WHOLE, path)
+    assert local.epoch == client.status().epoch
+    assert_same_answers(local, client)
+    assert_same_answers(local, client, POINTS + (FAR_M, 0, 0))
+    with triquad_client.open_map(path) as offline:
+        again = offline.query_distance(POINTS)
+    np.testing.assert_array_equal(again.distance, local.query_distance(POINTS).distance)
+
+
+def test_a_copy_holds_what_its_box_needs_and_no_more(client, tmp_path):
+    whole, first = (client.sync(box, tmp_path / "copy.triquad") for box in (WHOLE, FIRST))
+    assert_same_answers(first, client)
+    assert 0 < first.report.parts < whole.report.parts
+    assert not first.query_distance(POINTS + (FAR_M, 0, 0)).found.any()
+
+
+def test_only_what_changed_travels(client, tmp_path):
+    local = client.sync(WHOLE, tmp_path / "copy.triquad")
+    everything = local.report
+    assert everything.parts_kept == 0
+    unchanged = local.refresh()
+    assert (unchanged.bytes_received, unchanged.parts_received) == (0, 0)
+    learn(client, FAR_M, radius_m=3.0)
+    changed = local.refresh()
+    assert changed == local.report
+    assert changed.epoch == client.status().epoch
+    assert 0 < changed.parts_received < everything.parts
+    assert changed.parts_kept + changed.parts_received >= everything.parts
+    assert changed.bytes_received < 0.75 * everything.bytes_received
+    assert_same_answers(local, client, POINTS + (FAR_M, 0, 0))
+
+
+def test_the_copy_of_an_earlier_run_is_taken_up(client, tmp_path):
+    path = tmp_path / "copy.triquad"
+    before = client.sync(WHOLE, path).report
+    again = client.sync(WHOLE, path)
+    assert again.report.parts_received == 0
+    assert again.report.parts_kept == before.parts
+    assert again.report.bytes_received < 0.2 * before.bytes_received
+    assert_same_answers(again, client)
+
+
+def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(client, tmp_path):
+    path = tmp_path / "copy.triquad"
+    parts = client.sync(WHOLE, path).report.parts
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(data)
+    mended = client.sync(WHOLE, path)
+    assert mended.report.parts_received >= 1
+    assert mended.report.parts_kept + mended.report.parts_received == parts
+    assert_same_answers(mended, client)
+    for content in (b"", b"something else", bytes(data[:-50])):
+        path.write_bytes(content)
+        assert client.sync(WHOLE, path).report.parts_received == parts
+        assert triquad_client.open_map(path).epoch == client.status().epoch
+
+
+def test_it_goes_on_answering_while_the_server_is_gone(tmp_path):
+    path, store = tmp_path / "copy.triquad", tmp_path / "store"
+    settings = tmp_path / "settings.toml"
+    settings.write_text(servers.SMALL_TOML)
+    options = ["--settings", settings, "--store", store]
+    with servers.server_process(options) as server:
+        client = triquad_client.connect(server.endpoint, timeout_s=5.0)
+        learn(client, 0.0)
+        client.checkpoint()
+        local = client.sync(FIRST, path)
+        before = local.query_distance(POINTS)
+        age_s = local.age_s
+        server.process.kill()
+        server.wait()
+    with pytest.raises(ConnectError, match="down"):
+        local.refresh()
+    assert local.age_s > age_s
+    np.testing.assert_array_equal(local.query_distance(POINTS).distance, before.distance)
+    assert triquad_client.open_map(path).epoch == before.epoch
+    with client, servers.server_process(options, endpoint=server.endpoint):
+        assert refreshed_once_linked(local).parts_kept > 0
+        assert_same_answers(local, client)
+    with pytest.raises(ClosedError):
+        local.refresh()
+    assert local.query_distance(POINTS).epoch == local.epoch
+
+
+def refreshed_once_linked(local: SyncedMap) -> SyncReport:
+    """What the copy's refresh reports; the link is set up again some time after it was lost."""
+    deadline = time.monotonic() + servers.WAIT_S
+    while True:
+        try:
+            return local.refresh()
+        except ConnectError:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+
+
+def test_its_age_counts_from_when_the_server_had_nothing_newer(client, tmp_path):
+    local = client.sync(FIRST, tmp_path / "copy.triquad")
+    age_s = local.age_s
+    assert local.age_s > age_s >= 0
+    started = time.monotonic()
+    local.refresh()
+    assert local.age_s <= time.monotonic() - started
+
+
+def test_a_copy_has_one_epoch(client, tmp_path):
+    local = client.sync(FIRST, tmp_path / "copy.triquad")
+    before = local.epoch
+    local.query_sdf(POINTS, at_epoch=before)
+    learn(client, 0.0, radius_m=3.5)
+    assert local.query_sdf(POINTS).epoch == before
+    local.refresh()
+    assert local.query_sdf(POINTS).epoch == local.epoch > before
+    with pytest.raises(RefusedError) as refusal:
+        local.query_sdf(POINTS, at_epoch=before)
+    assert refusal.value.code == "epoch_gone"
+
+
+def test_of_an_unknown_place_nothing_is_known_until_it_is(tmp_path):
+    with servers.service_and_client() as client:
+        local = client.sync(FIRST, tmp_path / "copy.triquad")
+        assert not local.query_distance(POINTS).status.any()
+        learn(client, 0.0)
+        local.refresh()
+        assert_same_answers(local, client)
+        client.reset(FIRST)
+        local.refresh()
+        assert not local.query_distance(POINTS).status.any()
+
+
+def test_bounds_that_hold_nothing_are_refused(client, tmp_path):
+    with pytest.raises(InvalidInputError, match="hold nothing"):
+        client.sync(((0, 0, 0), (0, 1, 1)), tmp_path / "copy.triquad")
+    with pytest.raises(OSError, match="nowhere"):
+        client.sync(FIRST, tmp_path / "nowhere" / "copy.triquad")
+
+
+def test_what_arrives_damaged_replaces_nothing(client, tmp_path):
+    path, whole = tmp_path / "copy.triquad", tmp_path / "whole.triquad"
+    client.sync(FIRST, path)
+    client.download_map(whole)
+    before, sent = path.read_bytes(), bytearray(whole.read_bytes())
+    for place in range(100, len(sent) // 2, 5000):
+        sent[place] ^= 0xFF
+
+    def info(query, key):
+        message = MapInfo(99, len(sent), "0" * 64, 2**20)
+        with query:
+            query.reply(key, codec.encode(message))
+
+    def chunk(query, key):
+        request = codec.decode(MapChunkRequest, query.payload.to_bytes())
+        data = bytes(sent[request.offset : request.offset + request.length])
+        with query:
+            query.reply(key, codec.encode(MapChunk(request.offset, data)))
+
+    path.unlink()
+    path.write_bytes(before[:1000])  # so that all of it is asked for
+    answers = {keys.MAP_INFO: info, keys.MAP_CHUNK: chunk}
+    with (
+        servers.answering(answers) as endpoint,
+        triquad_client.connect(endpoint) as liar,
+        pytest.raises(DownloadError),
+    ):
+        liar.sync(FIRST, path)
+    assert path.read_bytes() == before[:1000]
+    assert [file.name for file in tmp_path.iterdir() if ".tmp" in file.name] == []
+
+
+SYNCING = """
+import sys, triquad_client
+with triquad_client.connect(sys.argv[1]) as client:
+    while True:
+        client.sync(((-10, -10, -10), (70, 10, 10)), sys.argv[2])
+        print("synced", flush=True)
+"""
+
+
+def test_a_process_that_is_killed_leaves_a_whole_copy(tmp_path):
+    path = tmp_path / "copy.triquad"
+    with servers.running_service() as endpoint, triquad_client.connect(endpoint) as client:
+        learn(client, 0.0)
+        epoch = client.status().epoch
+        for rounds in (1, 4, 9):
+            command = [sys.executable, "-c", SYNCING, endpoint, str(path)]
+            with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+                assert process.stdout is not None
+                for _ in range(rounds):
+                    assert process.stdout.readline() == "synced\n"
+                process.kill()
+            assert triquad_client.open_map(path).epoch == epoch
+
+
+def test_copies_for_event_loops(endpoint, client, tmp_path):
+    async def follow() -> None:
+        async with triquad_client.connect_async(endpoint) as awaited:
+            local = await awaited.sync(WHOLE, tmp_path / "copy.triquad")
+            answers = await asyncio.gather(*(local.query_distance(POINTS) for _ in range(4)))
+            want = client.query_distance(POINTS)
+            for answer in answers:
+                assert np.quantile(np.abs(answer.distance - want.distance), 0.99) < 1e-3
+            assert (await local.refresh()).bytes_received == 0
+            assert local.age_s >= 0
+        with pytest.raises(ClosedError):
+            await local.refresh()
+        assert (await local.query_sdf(POINTS)).epoch == local.epoch
+
+    asyncio.run(follow())

@@ -1,0 +1,273 @@
+"""Whatever arrives, the server counts it, tells why, and goes on."""
+
+import dataclasses
+import zlib
+
+import msgpack
+import numpy as np
+import pytest
+import triquad_client
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support import servers
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import (
+    ResetRequest,
+    Scan,
+    SdfRequest,
+    StatusRequest,
+    TileListRequest,
+    TileRequest,
+)
+from triquad_format.wire.query_messages import RaysRequest, SegmentsRequest
+
+ORIGIN = np.zeros(3)
+ONE_POINT = np.zeros((1, 3), np.float32)
+
+
+def segments(count: int, length_m: float) -> SegmentsRequest:
+    starts = np.zeros((count, 3), np.float32)
+    ends = starts + np.array([length_m, 0, 0], np.float32)
+    return SegmentsRequest(ORIGIN, starts, ends, 0.1, 5.0, 0)
+
+
+def rays(count: int, range_m: float) -> RaysRequest:
+    ways = np.tile(np.array([1, 0, 0], np.float32), (count, 1))
+    return RaysRequest(ORIGIN, np.zeros_like(ways), ways, range_m, False, 0)
+
+
+@pytest.fixture(scope="module")
+def server():
+    """A raw peer and a client of one server; sessions and counts tell the tests apart."""
+    with (
+        servers.running_service() as endpoint,
+        servers.raw_session(connect=endpoint) as session,
+        triquad_client.connect(endpoint) as client,
+    ):
+        yield servers.RawPeer(session), client
+
+
+@pytest.fixture
+def peer(server):
+    return server[0]
+
+
+@pytest.fixture
+def client(server):
+    return server[1]
+
+
+@pytest.fixture
+def scan(request):
+    """Makes good scans, but for changes, of a session of this test alone."""
+    session = zlib.crc32(request.node.name.encode())
+    source = f"lidar{session}"
+
+    def make(sequence: int = 0, **changes: object) -> Scan:
+        return servers.scan(sequence, **({"session": session, "source": source} | changes))
+
+    return make
+
+
+def changed(message: codec.Message, **changes: object) -> bytes:
+    return msgpack.packb(msgpack.unpackb(codec.encode(message)) | changes)
+
+
+def packed(array: np.ndarray) -> dict[str, object]:
+    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": array.tobytes()}
+
+
+def added(before: dict[str, int], after: dict[str, int]) -> dict[str, int]:
+    """The counts that rose, and by how much."""
+    rises = {reason: count - before.get(reason, 0) for reason, count in after.items()}
+    return {reason: rise for reason, rise in rises.items() if rise}
+
+
+GOOD = codec.encode(servers.scan())
+POSE = np.eye(4)
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", "decode"),
+        (b"\x93\x01\x02", "decode"),
+        (np.random.default_rng(0).bytes(10_000), "decode"),
+        (GOOD[:-1], "decode"),
+        (GOOD[: len(GOOD) // 2], "decode"),
+        (GOOD + b"\x00", "decode"),
+        (codec.encode(StatusRequest()), "decode"),
+        (changed(servers.scan(), triquad=2), "bad_version"),
+        (changed(servers.scan(), points=packed(np.zeros((5, 2), np.float32))), "decode"),
+        (changed(servers.scan(), points=packed(np.zeros(3, np.float32))), "decode"),
+        (changed(servers.scan(), points=packed(np.zeros((5, 3)))), "decode"),
+        (changed(servers.scan(), world_from_sensor=packed(np.eye(3))), "decode"),
+        (changed(servers.scan(), source="radar"), "key_source_mismatch"),
+        (changed(servers.scan(), sequence=-1), "bad_sequence"),
+        (changed(servers.scan(), sequence=2**62), "bad_sequence"),
+        (codec.encode(servers.scan(points=np.zeros((2_001_000, 3), np.float32))), "too_large"),
+    ],
+)
+def test_scans_that_cannot_be_read_are_counted_by_reason(peer, client, scan, payload, reason):
+    before = client.status()
+    peer.put("lidar", payload)
+    # What one session sends stays in order: once this one is in, the bad one was looked at.
+    peer.put(scan().source, codec.encode(scan()))
+    assert peer.flush(scan()).taken == 1
+    after = client.status()
+    assert added(before.scans_dropped, after.scans_dropped) == {reason: 1}
+    assert after.scans_taken == before.scans_taken + 1
+    assert after.scans_lost == before.scans_lost
+    result = client.query_sdf(servers.sphere(20))
+    assert (result.status == triquad_client.Status.SURFACE).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"points": np.zeros((0, 3), np.float32)}, "empty"),
+        ({"points": np.full((100, 3), np.nan, np.float32)}, "empty"),
+        ({"points": np.full((100, 3), 3e38, np.float32)}, "empty"),
+        ({"points": np.zeros((500_001, 3), np.float32)}, "too_many_points"),
+        ({"world_from_sensor": np.full((4, 4), np.inf)}, "pose_not_finite"),
+        ({"world_from_sensor": np.diag([2.0, 1, 1, 1])}, "pose_not_rigid"),
+        ({"world_from_sensor": np.diag([1.0, 1, -1, 1])}, "pose_not_rigid"),
+        ({"world_from_sensor": np.zeros((4, 4))}, "pose_not_rigid"),
+        ({"world_from_sensor": np.eye(4) + np.eye(4, k=3) * 1e9}, "outside_world"),
+        ({"stamp_ns": -5}, "time_backwards"),
+    ],
+)
+def test_scans_that_cannot_be_used_are_refused_with_the_cause(peer, client, scan, changes, reason):
+    before = client.status()
+    source = scan().source
+    peer.put(source, codec.encode(scan(0)))
+    peer.put(source, codec.encode(scan(1, **changes)))
+    reply = peer.flush(scan(1))
+    assert (reply.taken, reply.refused, reply.lost) == (1, 1, 0)
+    assert "scan 1: " in reply.last_refusal
+    assert added(before.scans_dropped, client.status().scans_dropped) == {reason: 1}
+    peer.put(source, codec.encode(scan(2)))
+    assert peer.flush(scan(2)).taken == 2
+
+
+def test_bad_points_among_good_ones_are_left_out_and_counted(peer, client, scan):
+    before = client.status()
+    points = servers.sphere(500)
+    points[:10] = np.nan
+    points[10:15] = np.inf
+    points[15:18] *= 1000
+    points[18:20] *= 0.01
+    peer.put(scan().source, codec.encode(scan(0, points=points)))
+    assert peer.flush(scan(0)).taken == 1
+    dropped = added(before.points_dropped, client.status().points_dropped)
+    assert dropped == {"not_finite": 15, "too_far": 3, "too_near": 2}
+    assert np.isfinite(client.query_sdf(servers.sphere(50)).sdf).all()
+
+
+def test_a_source_whose_name_cannot_stand_in_a_key_is_refused(peer, client, scan):
+    before = client.status()
+    name = "a" * 65
+    peer.session.put(f"triquad/{peer.map_name}/scan/{name}", codec.encode(scan(source=name)))
+    peer.put(scan().source, codec.encode(scan()))
+    peer.flush(scan())
+    after = client.status()
+    assert added(before.scans_dropped, after.scans_dropped) == {"bad_source": 1}
+    assert name not in after.scans_lost
+
+
+def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
+    before = client.status()
+    source = scan().source
+    for sequence in (0, 2, 2, 1):
+        peer.put(source, codec.encode(scan(sequence)))
+    reply = peer.flush(scan(2))
+    assert (reply.taken, reply.lost) == (2, 1)
+    peer.put(source, codec.encode(scan(3)))
+    peer.flush(scan(3))
+    status = client.status()
+    assert added(before.scans_dropped, status.scans_dropped) == {"sequence_backwards": 2}
+    assert status.scans_lost[source] == 1
+
+
+@pytest.mark.parametrize(
+    ("operation", "request_", "code"),
+    [
+        (keys.SDF, b"", "bad_request"),
+        (keys.SDF, b"\xc1\xff", "bad_request"),
+        (keys.SDF, codec.encode(StatusRequest()), "bad_request"),
+        (keys.SDF, changed(StatusRequest(), triquad=9), "bad_version"),
+        (keys.SDF, SdfRequest(ORIGIN, ONE_POINT * np.nan, False, 0), "bad_request"),
+        (keys.SDF, SdfRequest(ORIGIN + np.inf, ONE_POINT, False, 0), "bad_request"),
+        (keys.SDF, SdfRequest(ORIGIN, ONE_POINT, False, -1), "epoch_gone"),
+        (
+            keys.SDF,
+            SdfRequest(ORIGIN, np.zeros((10_000_000, 3), np.float32), False, 0),
+            "too_large",
+        ),
+        *((operation, bytes(12_010_000), "too_large") for operation in keys.OPERATIONS),
+        (keys.SEGMENTS, segments(2_000, 900.0), "too_large"),
+        (keys.SEGMENTS, segments(1, 1_001.0), "bad_request"),
+        (keys.RAYS, rays(100_000, 1_000.0), "too_large"),
+        (keys.TILE, TileRequest(2**62, 0, 0, 0), "bad_request"),
+        (keys.TILE, TileRequest(0, -(2**63), 0, 0), "bad_request"),
+        (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),
+        (keys.TILE_LIST, TileListRequest(ORIGIN * np.nan, ORIGIN, 0), "bad_request"),
+        (keys.RESET, ResetRequest(ORIGIN, ORIGIN * np.nan), "bad_request"),
+        (keys.RESET, ResetRequest(ORIGIN, ORIGIN - 1), "bad_request"),
+        *((operation, b"\x00", "bad_request") for operation in keys.OPERATIONS),
+    ],
+)
+def test_bad_requests_are_refused_with_a_code(peer, client, operation, request_, code):
+    before = client.status().requests_refused.get(code, 0)
+    assert peer.refusal(operation, request_) == code
+    assert client.status().requests_refused[code] == before + 1
+    assert len(client.query_sdf(ONE_POINT).status) == 1
+
+
+def test_a_request_without_payload_is_refused(peer):
+    for operation in keys.OPERATIONS:
+        assert peer.ask(operation, None).code == "bad_request"
+
+
+def test_a_request_for_another_map_gets_no_reply(peer):
+    stranger = dataclasses.replace(peer, map_name="kitchen")
+    assert stranger.ask(keys.STATUS, codec.encode(StatusRequest())) is None
+
+
+def test_far_tiles_and_far_points_are_empty(client):
+    tile = client.mesh_tile(1_000_000, -1_000_000, 0)
+    assert len(tile.faces) == 0
+    result = client.query_gradient([[1e9, 0, 0], [-1e9, 1e9, 1e9]])
+    assert (result.status == triquad_client.Status.UNKNOWN).all()
+    assert np.isnan(result.sdf).all()
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    st.sampled_from(keys.OPERATIONS),
+    st.one_of(
+        st.binary(max_size=100),
+        st.dictionaries(
+            st.sampled_from(["triquad", "kind", "points", "origin", "epoch", "x", "timeout_s"]),
+            st.one_of(st.none(), st.integers(-5, 5), st.text(max_size=5), st.booleans()),
+        ).map(msgpack.packb),
+    ),
+)
+def test_random_requests_are_always_refused(peer, operation, payload):
+    assert peer.refusal(operation, payload) in ("bad_request", "bad_version")
+
+
+def test_random_scans_are_dropped_or_taken_but_never_do_harm(peer, client, scan):
+    before = client.status()
+    rng = np.random.default_rng(3)
+    count = 30
+    for _ in range(count):
+        payload = bytearray(GOOD)
+        for position in rng.integers(0, 200, 20):
+            payload[position] = rng.integers(0, 256)
+        peer.put("lidar", bytes(payload))
+    peer.put(scan().source, codec.encode(scan()))
+    assert peer.flush(scan()).taken == 1
+    after = client.status()
+    dropped = sum(added(before.scans_dropped, after.scans_dropped).values())
+    assert dropped + after.scans_taken - before.scans_taken == count + 1

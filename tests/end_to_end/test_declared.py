@@ -1,0 +1,67 @@
+"""What the packages import is what ``pyproject.toml`` declares."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DISTRIBUTIONS = {
+    "zenoh": "eclipse-zenoh",
+    "PIL": "pillow",
+    "google": "protobuf",
+    "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
+}
+
+
+def declared(*extras: str) -> set[str]:
+    """Names of the distributions that the base and some extras need."""
+    listed = [*PROJECT["dependencies"]]
+    for extra in extras:
+        listed += PROJECT["optional-dependencies"][extra]
+    names = [entry.split(";")[0].split("[")[0].split("<")[0].split(">")[0] for entry in listed]
+    return {name.strip() for name in names} - {"triquad"}
+
+
+def imported(folder: str) -> set[str]:
+    """Names of the distributions that the modules of a folder import."""
+    modules = set()
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                modules |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                modules.add(node.module.split(".")[0])
+    foreign = {
+        name
+        for name in modules - sys.stdlib_module_names - {"tomllib"}
+        if not name.startswith("triquad_")
+    }
+    return {DISTRIBUTIONS.get(name, name) for name in foreign}
+
+
+@pytest.mark.parametrize(
+    ("folder", "extras"),
+    [
+        ("format", ("draco",)),
+        ("client", ()),
+        ("map", ("fast",)),
+        ("server", ("fast", "server")),
+        ("tools", ("fast", "server", "tools")),
+    ],
+)
+def test_what_is_imported_is_declared(folder, extras):
+    assert imported(folder) <= declared(*extras)
+
+
+def test_what_is_declared_is_imported():
+    folders = ("format", "map", "client", "server", "tools")
+    used = set().union(*(imported(folder) for folder in folders))
+    assert declared("fast", "server", "tools", "draco") <= used

@@ -1,0 +1,166 @@
+import dataclasses
+import json
+import signal
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import servers
+from triquad_client import RequestTimeoutError, SdfResult
+from triquad_format.mapfile.mapfile import read_map
+from triquad_tools.demo import demo, demo_steps
+from triquad_tools.demo.demo_probe import Probe, ProbeError, ProbeReport, ask_until
+from triquad_tools.demo.demo_results import (
+    DemoResults,
+    Intake,
+    MapSize,
+    Restart,
+    broken_promises,
+    table_rows,
+)
+from triquad_tools.demo.demo_server import DemoServer, DemoServerError, ServerOptions
+from triquad_tools.evaluation.map_scores import StreetScores
+from triquad_tools.evaluation.meshfile import read_mesh
+from triquad_tools.evaluation.metrics import MeshScores
+
+GOOD = DemoResults(
+    seed=1,
+    cpus=2,
+    intake=Intake(60, 60, 0, 0, 2_400_000, 6.0, 30.0, True, 15_000_000),
+    queries=ProbeReport(500, 0, None, 60, 0, 1000, 2.0, 3.0, 4.0, 5.0),
+    street=StreetScores(0.012, 0.006, 0.03, 4.0, 0.99, 100_000, 0.999, 10_000),
+    mesh=MeshScores(0.011, 0.007, 0.98, 0.04, 0.96, 0.97, 0.01, 1000, 1000),
+    restart=Restart(50_000, 0.0001, 0),
+    size=MapSize(2_000_000, 20_000_000, 1_000_000),
+    phases_s={"simulate": 1.0, "learn": 30.0},
+)
+
+QUALITY = ("SDF error", "gradient angle", "mesh F-score", "houses UNKNOWN")
+
+
+def test_a_few_scans_leave_all_results(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(demo_steps, "_SETTLE_LIMIT_S", 1.0)
+    monkeypatch.setattr(demo_steps, "_MESH_SAMPLES", 100_000)
+    out = tmp_path / "out"
+    before = signal.getsignal(signal.SIGTERM)
+    code = demo.main(["--out", str(out), "--scans", "2"])
+    assert signal.getsignal(signal.SIGTERM) is before
+    output = capsys.readouterr()
+    for name in ("scans taken in", "training", "SDF error", "mesh F-score", "after a restart"):
+        assert name in output.out
+    assert "compiles kernels" in output.err
+    # Two scans and a second do not make a good map; everything else is promised of them too.
+    broken = [line for line in output.err.splitlines() if "; promised is at" in line]
+    assert all(any(name in line for name in QUALITY) for line in broken), broken
+    assert code == (1 if broken else 0)
+    results = json.loads((out / "results.json").read_text())
+    assert (results["intake"]["taken"], results["intake"]["lost"]) == (2, 0)
+    assert results["queries"]["queries"] > 0
+    assert results["queries"]["errors"] == results["queries"]["epochs_backwards"] == 0
+    assert results["restart"]["points"] == results["street"]["near_points"]
+    assert results["size"]["bytes"] == (out / "map.triquad").stat().st_size
+    assert results["size"]["bytes"] < results["size"]["bytes_with_training"]
+    assert all(region.training is None for region in read_map(out / "map.triquad").regions)
+    faces = [len(read_mesh(out / name).faces) for name in ("street.ply", "street.glb")]
+    assert faces[0] == faces[1] > 1000
+    assert (out / "street.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "server.log").read_text().count("stopped\n") == 2
+
+
+def test_results_as_promised_break_nothing() -> None:
+    assert broken_promises(GOOD) == []
+    values = {row.name: row.value for row in table_rows(GOOD)}
+    assert values["scans taken in"] == "10.0 /s"
+    assert values["training"] == "0.50 M samples/s"
+    assert values["SDF error"] == "1.20 cm"
+    assert values["mesh F-score"] == "97.00 %"
+    assert values["map file"] == "2.00 MB"
+    assert values["after a restart"] == "0.100 mm"
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "words"),
+    [
+        ("street", {"sdf_error_m": 0.021}, "SDF error (m) is 0.021; promised is at most 0.02"),
+        ("street", {"sdf_error_m": float("nan")}, "SDF error (m) is nan"),
+        ("street", {"gradient_angle_deg": 12.5}, "gradient angle (deg) is 12.5"),
+        ("street", {"houses_unknown_ratio": 0.97}, "houses UNKNOWN is 0.97; promised is at least"),
+        ("mesh", {"f_score": 0.949}, "mesh F-score is 0.949; promised is at least 0.95"),
+        ("restart", {"sdf_difference_max_m": 0.003}, "restart difference (m) is 0.003"),
+        ("restart", {"statuses_changed": 1}, "statuses changed by the restart is 1"),
+        ("intake", {"lost": 2}, "scans lost or refused is 2; promised is at most 0"),
+        ("queries", {"errors": 3}, "query errors is 3"),
+        ("queries", {"epochs_backwards": 1}, "answers from an older epoch is 1"),
+    ],
+)
+def test_a_broken_promise_is_named_with_its_value(part, changes, words) -> None:
+    changed = dataclasses.replace(getattr(GOOD, part), **changes)
+    broken = broken_promises(dataclasses.replace(GOOD, **{part: changed}))
+    assert len(broken) == 1
+    assert words in broken[0]
+
+
+def test_a_map_that_still_learns_may_change_over_a_restart() -> None:
+    learning = dataclasses.replace(
+        GOOD,
+        intake=dataclasses.replace(GOOD.intake, settled=False),
+        restart=Restart(50_000, 0.1, 3),
+    )
+    assert broken_promises(learning) == []
+    notes = {row.name: row.note for row in table_rows(learning)}
+    assert "still learning" in notes["training"]
+    assert "went on learning" in notes["after a restart"]
+
+
+def test_a_server_that_cannot_start_is_reported_with_its_last_line(tmp_path) -> None:
+    (tmp_path / "store").write_text("a file")
+    log = tmp_path / "server.log"
+    options = ServerOptions(servers.free_endpoint(), "demo", tmp_path / "store", log)
+    with pytest.raises(DemoServerError, match="the server did not start: .*store") as caught:
+        DemoServer(options)
+    assert str(log) in str(caught.value)
+    assert str(tmp_path / "store") in log.read_text()
+
+
+class _Planned:
+    """A client whose answers are planned: epochs, or an error; then it stops the queries."""
+
+    def __init__(self, epochs: list[int | None], stop: threading.Event) -> None:
+        self._epochs = epochs
+        self._stop = stop
+
+    def query_sdf(self, points: np.ndarray, gradient: bool = False) -> SdfResult:
+        epoch = self._epochs.pop(0)
+        if not self._epochs:
+            self._stop.set()
+        if epoch is None:
+            raise RequestTimeoutError("too late")
+        return SdfResult(np.zeros(len(points), np.float32), np.zeros(len(points)), None, epoch)
+
+
+def test_queries_are_counted_with_their_errors_and_epochs() -> None:
+    stop = threading.Event()
+    client = _Planned([1, 2, None, 1, 5], stop)
+    report = ask_until(stop, client, np.zeros((7, 3)))  # type: ignore[arg-type]
+    assert (report.queries, report.errors, report.points) == (5, 1, 7)
+    assert report.last_error == "RequestTimeoutError: too late"
+    assert (report.epochs, report.epochs_backwards) == (3, 1)
+    assert 0.0 < report.latency_p50_ms <= report.latency_p99_ms <= report.latency_max_ms
+
+
+def test_queries_without_a_server_fail(tmp_path: Path) -> None:
+    np.save(tmp_path / "points.npy", np.zeros((1, 3)))
+    endpoint = servers.free_endpoint()
+    with (
+        Probe(endpoint, "demo", tmp_path / "points.npy") as probe,
+        pytest.raises(ProbeError, match="exit code 1"),
+    ):
+        probe.finish()
+
+
+@pytest.mark.parametrize("arguments", [("--scans", "0"), ("--seed", "x"), ("street",)])
+def test_wrong_usage_ends_with_code_2(arguments) -> None:
+    with pytest.raises(SystemExit) as caught:
+        demo.main(arguments)
+    assert caught.value.code == 2

@@ -1,0 +1,176 @@
+"""The guides' examples, run as their readers do, against a server that has seen the street."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import triquad_client
+from numpy.typing import NDArray
+from PIL import Image
+from support import servers
+from triquad_tools.plots.slice_view import main as draw_slice
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
+from triquad_tools.simulation.street import street
+
+DOCS = Path(__file__).parents[2] / "docs"
+EXAMPLES = DOCS / "examples"
+SETTINGS = "[training]\nbatch = 4096\nvisits = 15.0\n"
+SCENE = street(1)  # of triquad-demo, which the guides begin with
+DRIVE = SimulatedDrive(SCENE, Lidar(columns=360), drive(SCENE, 20, 1.5), seed=1)
+RADIUS_M = 0.4  # of what the planners move
+TRUE_POSE = np.eye(4)
+TRUE_POSE[:3, 3] = 12.0, -1.6, 1.8
+
+Run = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Of a server with a map like that of triquad-demo: fewer scans, trained for less time."""
+    settings = tmp_path_factory.mktemp("settings") / "settings.toml"
+    settings.write_text(SETTINGS)
+    with servers.server_process(["--map", "demo", "--settings", settings]) as server:
+        with triquad_client.connect(server.endpoint, "demo") as client:
+            for scan in DRIVE:
+                client.publish_scan(scan.points, scan.world_from_sensor)
+                client.flush(servers.WAIT_S, pending=2)
+            client.flush(servers.WAIT_S)
+            client.settle(servers.WAIT_S)
+        yield server.endpoint
+
+
+@pytest.fixture(scope="module")
+def run(endpoint: str) -> Run:
+    def run_example(name: str, *arguments: object) -> str:
+        command = [sys.executable, EXAMPLES / name, "--connect", endpoint, *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=servers.WAIT_S)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run_example
+
+
+def test_every_example_is_tested_and_explained() -> None:
+    tests = Path(__file__).read_text(encoding="utf-8")
+    guides = "".join(path.read_text(encoding="utf-8") for path in (DOCS / "guides").glob("*.md"))
+    for example in EXAMPLES.glob("*.py"):
+        assert f'"{example.name}"' in tests
+        assert f"../examples/{example.name}" in guides
+
+
+def printed_places(output: str) -> NDArray[np.float64]:
+    """The rows [N, 3] of the array that an example prints."""
+    rows = re.findall(r"^ ?\[+\s*(-?[\d.]+)\s+(-?[\d.]+)\s+(-?[\d.]+)\s*\]+$", output, re.M)
+    return np.array(rows, np.float64)
+
+
+def clearance(path: NDArray[np.float64]) -> float:
+    """The least true distance to a surface along a path [N, 3]."""
+    along = np.arange(0, len(path) - 1, 0.005)
+    places = [np.interp(along, np.arange(len(path)), axis) for axis in path.T]
+    return float(SCENE.sdf(np.stack(places, axis=1)).min())
+
+
+def test_the_planned_path_is_free(run: Run) -> None:
+    output = run("plan_path.py")
+    path = printed_places(output)
+    np.testing.assert_allclose(path[0], (2, -6.5, 1.2))
+    np.testing.assert_allclose(path[-1], (24, 10.5, 1.2))
+    assert "free True" in output
+    assert clearance(path) > RADIUS_M - 0.1
+
+
+def test_a_planner_does_not_begin_in_a_wall(endpoint: str) -> None:
+    command = [sys.executable, EXAMPLES / "plan_path.py", "--connect", endpoint]
+    command += ["--goal", "18", "10.5", "1.2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=servers.WAIT_S)
+    assert done.returncode == 1
+    assert "the goal is not free: UNKNOWN" in done.stderr
+
+
+def test_paths_bend_away_from_what_blocks_the_straight_one(run: Run) -> None:
+    output = run("optimise_path.py")
+    ends = np.array([[2, -6, 1.2], [26, -6, 1.2]])
+    assert clearance(ends) < RADIUS_M - 0.1
+    rows = re.findall(r"bow (..) m: ([\d.]+) m, clearance ([\d.]+) m, (not )?free", output)
+    assert len(rows) == 4
+    best = re.search(r"best: bow (..) m", output)[1]
+    chosen = next(row for row in rows if row[0] == best)
+    assert not chosen[3]
+    assert 24 < float(chosen[1]) < 26
+    assert float(chosen[2]) > RADIUS_M
+    path = printed_places(output)
+    assert len(path) > 5
+    assert SCENE.sdf(path).min() > RADIUS_M - 0.05
+
+
+def read_costmap(path: Path) -> tuple[NDArray[np.int8], NDArray[np.float64], float]:
+    """Costs [x, y], the corner [2] and the cell, read as map_server reads them."""
+    lines = path.with_suffix(".yaml").read_text().splitlines()
+    entries = dict(line.split(": ", 1) for line in lines)
+    assert (entries["mode"], entries["negate"]) == ("raw", "0")
+    with Image.open(path.parent / entries["image"]) as image:
+        pixels = np.asarray(image)
+    costs = np.where(pixels <= 100, pixels, -1).astype(np.int8)
+    origin = [float(number) for number in entries["origin"].strip("[]").split(",")]
+    return costs[::-1].T, np.array(origin[:2]), float(entries["resolution"])
+
+
+def test_a_costmap_keeps_the_robot_off_what_it_would_touch(run: Run, tmp_path: Path) -> None:
+    output = run("costmap.py", tmp_path / "street")
+    cost, corner, cell = read_costmap(tmp_path / "street")
+    assert cost.shape == (280, 160)
+    assert "280 x 160 cells" in output
+    np.testing.assert_allclose(corner, (0, -8))
+    x, y = np.meshgrid(*[np.arange(count) for count in cost.shape], indexing="ij")
+    middles = corner + (np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) * cell
+    least = np.full(len(middles), np.inf)
+    for height in np.arange(0.45, 1.05, 0.1):  # of the robot's balls
+        balls = np.column_stack([middles, np.full(len(middles), height)])
+        least = np.minimum(least, SCENE.sdf(balls))
+    cost = cost.reshape(-1)
+    touched = (least < 0.35 - 0.05) & (least > -0.1)
+    assert ((cost[touched] >= 99) | (cost[touched] == -1)).mean() > 0.99
+    clear = least > 0.35 + 0.05
+    assert (cost[clear] < 99).mean() > 0.99
+    road = np.abs(middles[:, 1]) < 2
+    assert ((cost[road] >= 0) & (cost[road] < 50)).mean() > 0.99
+    inside = least < -0.3  # of cars and houses
+    assert ((cost[inside] == -1) | (cost[inside] >= 99)).mean() > 0.99
+    assert (cost[inside] == -1).any()
+
+
+def test_a_scan_finds_its_place(run: Run, tmp_path: Path) -> None:
+    scan = DRIVE.lidar.scan(SCENE, TRUE_POSE, np.random.default_rng(5))
+    np.save(tmp_path / "scan.npy", scan.points)
+    for arguments in ([], ["--scan", tmp_path / "scan.npy"]):
+        output = run("localise.py", *arguments)
+        found = re.search(r"x (.+) m, y (.+) m, z (.+) m, yaw (.+) deg", output)
+        x, y, z, yaw_deg = map(float, found.groups())
+        np.testing.assert_allclose([x, y, z], TRUE_POSE[:3, 3], atol=0.05)
+        assert abs(yaw_deg) < 0.3
+        assert "\nbelieve it" in output
+
+
+def test_a_scan_of_another_place_is_doubted(run: Run, tmp_path: Path) -> None:
+    np.save(tmp_path / "scan.npy", servers.sphere())
+    assert "do not use it" in run("localise.py", "--scan", tmp_path / "scan.npy")
+
+
+def test_a_scan_finds_its_place_in_a_file(endpoint: str, run: Run, tmp_path: Path) -> None:
+    with triquad_client.connect(endpoint, "demo") as client:
+        client.download_map(tmp_path / "demo.triquad")
+    assert "\nbelieve it" in run("localise.py", "--file", tmp_path / "demo.triquad")
+
+
+def test_a_slice_shows_what_is_known(endpoint: str, tmp_path: Path) -> None:
+    box = ("--box", "0", "-10", "20", "10")
+    out = tmp_path / "slice.png"
+    assert draw_slice([str(out), "--connect", endpoint, *box]) == 0
+    with Image.open(out) as picture:
+        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
+    assert {(0x7D, 0x87, 0x94), (0xF4, 0xF1, 0xE8), (0xA3, 0x34, 0x1F)} <= colours

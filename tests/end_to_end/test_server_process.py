@@ -1,0 +1,205 @@
+"""``triquad-server`` as a process: signals, exit codes, restarts."""
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import SdfResult
+from triquad_format.mapfile.mapfile import read_map
+
+PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
+POSE = np.eye(4)
+
+
+@pytest.fixture
+def settings(tmp_path) -> Path:
+    path = tmp_path / "server.toml"
+    path.write_text(servers.SMALL_TOML)
+    return path
+
+
+@pytest.fixture
+def arguments(tmp_path, settings) -> list[str | Path]:
+    return ["--settings", settings, "--store", tmp_path / "store"]
+
+
+def checkpoints(tmp_path: Path) -> list[Path]:
+    return sorted((tmp_path / "store" / servers.MAP).glob("*.triquad"))
+
+
+def learn(endpoint: str) -> SdfResult:
+    with triquad_client.connect(endpoint) as client:
+        for _ in range(2):
+            client.publish_scan(servers.sphere(), POSE)
+        assert client.flush(servers.WAIT_S).taken == 2
+        client.settle(servers.WAIT_S)
+        return client.query_gradient(PROBES)
+
+
+def ask(endpoint: str) -> SdfResult:
+    with triquad_client.connect(endpoint) as client:
+        return client.query_gradient(PROBES)
+
+
+def assert_same_map(before: SdfResult, after: SdfResult) -> None:
+    assert after.epoch >= before.epoch
+    assert np.array_equal(after.status, before.status)
+    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features in half precision
+
+
+def run(arguments: list[str | Path], endpoint: str | None = None) -> servers.ServerProcess:
+    """A server that ends by itself."""
+    with servers.server_process(arguments, endpoint, ready=False) as server:
+        server.wait()
+    return server
+
+
+def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(tmp_path, arguments):
+    with servers.server_process(arguments) as server:
+        before = learn(server.endpoint)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    assert f"ready: map 'default' on {server.endpoint}, epoch 1" in server.log
+    assert "stopped" in server.log
+    newest = checkpoints(tmp_path)[-1]
+    assert read_map(newest).epoch == before.epoch
+    with servers.server_process(arguments) as server:
+        assert f"restoring epoch {before.epoch} from {newest}" in server.log
+        assert_same_map(before, ask(server.endpoint))
+
+
+def test_sigint_and_a_second_signal_stop_it_cleanly(tmp_path, arguments):
+    with servers.server_process(arguments) as server:
+        before = learn(server.endpoint)
+        server.process.send_signal(signal.SIGINT)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    assert "Traceback" not in server.log
+    assert read_map(checkpoints(tmp_path)[-1]).epoch == before.epoch
+
+
+def test_sigterm_amid_a_stream_of_scans(tmp_path, arguments):
+    with (
+        servers.server_process(arguments) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        for _ in range(40):
+            client.publish_scan(servers.sphere(20_000), POSE)
+        client.flush(servers.WAIT_S, pending=39)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    assert "Traceback" not in server.log
+    assert len(read_map(checkpoints(tmp_path)[-1]).regions) == 1
+
+
+def test_after_sigkill_the_last_checkpoint_counts(tmp_path, arguments):
+    with servers.server_process(arguments) as server:
+        before = learn(server.endpoint)
+        with triquad_client.connect(server.endpoint) as client:
+            client.checkpoint()
+            client.publish_scan(servers.sphere(2000, 6.0), POSE)
+            client.flush(servers.WAIT_S)
+        server.process.kill()
+        server.wait()
+    with servers.server_process(arguments) as server:
+        assert_same_map(before, ask(server.endpoint))
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(tmp_path, arguments):
+    with servers.server_process(arguments) as server:
+        with triquad_client.connect(server.endpoint) as client:
+            before = learn(server.endpoint)
+            good = Path(client.checkpoint().path)
+            client.publish_scan(servers.sphere(2000, 6.0), POSE)
+            client.flush(servers.WAIT_S)
+            client.settle(servers.WAIT_S)
+            bad = Path(client.checkpoint().path)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    payload = bytearray(bad.read_bytes())
+    payload[len(payload) // 2] ^= 0xFF
+    bad.write_bytes(payload)
+    with servers.server_process(arguments) as server:
+        assert f"checkpoint {bad} is damaged" in server.log
+        assert f"the older checkpoint {good} is used instead" in server.log
+        assert_same_map(before, ask(server.endpoint))
+
+
+def test_all_checkpoints_damaged_is_no_reason_to_start_empty(tmp_path, arguments):
+    folder = tmp_path / "store" / servers.MAP
+    folder.mkdir(parents=True)
+    (folder / "epoch-000000007.triquad").write_bytes(b"not a map")
+    server = run(arguments)
+    assert server.process.returncode == 4
+    assert "all 1 checkpoints" in server.log
+
+
+def test_without_a_store_it_says_that_the_map_is_not_kept(settings):
+    with servers.server_process(["--settings", settings, "--map", "lab"]) as server:
+        assert "the map is not kept" in server.log
+        with triquad_client.connect(server.endpoint, "lab") as client:
+            assert client.maps() == ["lab"]
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+
+
+def test_a_port_in_use_is_exit_code_3():
+    endpoint = servers.free_endpoint()
+    with servers.raw_session("router", listen=endpoint):
+        server = run([], endpoint)
+    assert server.process.returncode == 3
+    assert "is another server running there?" in server.log
+    assert "Traceback" not in server.log
+
+
+def test_a_store_that_cannot_be_written_is_exit_code_4(tmp_path):
+    (tmp_path / "file").write_text("")
+    server = run(["--store", tmp_path / "file" / "store"])
+    assert server.process.returncode == 4
+    assert "cannot be written" in server.log
+
+
+def test_a_store_in_use_is_exit_code_4(tmp_path, arguments):
+    with servers.server_process(arguments):
+        server = run(arguments)
+    assert server.process.returncode == 4
+    assert "in use by another server" in server.log
+
+
+@pytest.mark.parametrize(
+    ("toml", "text"),
+    [
+        ("[service]\nscan_que = 3\n", "unknown key 'scan_que'"),
+        ("[service]\nscan_queue = -3\n", "scan_queue = -3 is out of range"),
+        ("[service\n", "settings file"),
+    ],
+)
+def test_settings_that_are_wrong_are_exit_code_2(settings, toml, text):
+    settings.write_text(toml)
+    server = run(["--settings", settings])
+    assert server.process.returncode == 2
+    assert text in server.log
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--map", "a/b"], ["--mode", "boat"], ["--config", "missing.json5"], ["--no-such-option"]],
+)
+def test_wrong_usage_is_exit_code_2(arguments):
+    server = run(arguments)
+    assert server.process.returncode == 2
+    assert "Traceback" not in server.log
+
+
+def test_a_zenoh_configuration_file_is_used(tmp_path, settings):
+    file = tmp_path / "zenoh.json5"
+    endpoint = servers.free_endpoint()
+    file.write_text(f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }} }}')
+    with (
+        servers.server_process(["--settings", settings, "--config", file]) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        assert client.status().map_name == servers.MAP

@@ -1,0 +1,363 @@
+"""The service with a real map, asked by the real client over the loopback."""
+
+import dataclasses
+import math
+import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import DownloadError, InvalidInputError, RefusedError, Status
+from triquad_format.mapfile.mapfile import read_map
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import (
+    ErrorReply,
+    FlushRequest,
+    MapChunk,
+    MapChunkRequest,
+    ResetRequest,
+    SdfRequest,
+    ServerStatus,
+    TileRequest,
+)
+from triquad_map.questions.answers import Answers
+from triquad_map.reference.evaluator import MapEvaluator
+from triquad_server.store.store import Store
+
+POSE = np.eye(4)
+PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
+
+
+@pytest.fixture
+def endpoint():
+    with servers.running_service() as endpoint:
+        yield endpoint
+
+
+@pytest.fixture
+def client(endpoint):
+    with triquad_client.connect(endpoint) as client:
+        yield client
+
+
+def learn(client, scans=2):
+    for _ in range(scans):
+        client.publish_scan(servers.sphere(), POSE)
+    return client.flush(servers.WAIT_S)
+
+
+def test_an_empty_map_answers_that_it_knows_nothing(client):
+    result = client.query_gradient(PROBES)
+    assert np.isnan(result.sdf).all()
+    assert np.isnan(result.gradient).all()
+    assert (result.status == Status.UNKNOWN).all()
+    assert len(client.mesh().faces) == 0
+    assert len(client.tiles().tiles) == 0
+
+
+def test_what_was_flushed_shows_in_the_next_answer(client):
+    before = client.query_sdf(PROBES).epoch
+    report = learn(client)
+    assert (report.taken, report.refused, report.lost) == (2, 0, 0)
+    result = client.query_sdf(servers.sphere(100))
+    assert result.epoch > before
+    assert (result.status == Status.SURFACE).all()
+    assert (client.query_sdf(servers.sphere(100, 2.0)).status == Status.FREE).all()
+
+
+def test_a_settled_map_has_learnt_the_surface(client):
+    learn(client)
+    status = client.settle(servers.WAIT_S)
+    assert status.scans_taken == 2
+    assert status.samples_trained > 0
+    assert status.regions == 1
+    result = client.query_gradient(servers.sphere(200))
+    assert np.abs(result.sdf).mean() < 0.05
+    assert np.isfinite(result.gradient).all()
+    assert client.query_sdf(servers.sphere(200, 2.0)).sdf.mean() > 0.1
+    assert client.query_sdf(PROBES).epoch == result.epoch == status.epoch
+
+
+def test_flush_with_nothing_published_returns_at_once(client):
+    report = client.flush()
+    assert (report.taken, report.refused, report.lost, report.last_refusal) == (0, 0, 0, None)
+
+
+def test_flush_lets_a_publisher_run_ahead(client):
+    for _ in range(6):
+        client.publish_scan(servers.sphere(), POSE)
+        assert client.flush(servers.WAIT_S, pending=3).lost == 0
+    assert client.flush(servers.WAIT_S).taken == 6
+
+
+def test_sources_of_one_client_are_flushed_together(client):
+    for source in ("front", "rear", "front"):
+        client.publish_scan(servers.sphere(), POSE, source=source)
+    assert client.flush(servers.WAIT_S).taken == 3
+
+
+def test_flush_of_a_scan_that_never_arrives_counts_it_as_lost(endpoint):
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        peer.put("lidar", codec.encode(servers.scan(1)))
+        reply = peer.flush(servers.scan(2))
+        assert (reply.taken, reply.lost) == (1, 2)
+
+
+def test_flush_ends_when_its_time_is_over(endpoint):
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        assert peer.refusal(keys.FLUSH, FlushRequest("lidar", 1, 0, 0.0)) == "timeout"
+        assert peer.refusal(keys.FLUSH, FlushRequest("lidar", 1, 0, math.nan)) == "bad_request"
+        assert peer.refusal(keys.FLUSH, FlushRequest("lidar", 1, 0, 1e9)) == "bad_request"
+
+
+def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client, endpoint):
+    learn(client)
+    probes = np.tile(PROBES, (1500, 1))  # 300 000 points: several requests
+    stop = threading.Event()
+
+    def publish() -> None:
+        with triquad_client.connect(endpoint) as publisher:
+            while not stop.is_set():
+                learn(publisher, 1)
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        epochs = set()
+        for _ in range(5):
+            learn(client, 1)  # returns once a new epoch is out
+            result = client.query_sdf(probes)
+            rows = result.sdf.reshape(1500, -1)
+            # The part of a request in which a point travels moves its origin, by less than 1 um.
+            assert np.allclose(rows, rows[0], rtol=0, atol=1e-4)
+            assert (result.status.reshape(1500, -1) == result.status[: len(PROBES)]).all()
+            epochs.add(result.epoch)
+    finally:
+        stop.set()
+        thread.join()
+    assert len(epochs) == 5
+
+
+def test_many_threads_may_ask_at_once(client):
+    learn(client)
+    expected = client.query_sdf(PROBES, gradient=True)
+    epoch = client.settle(servers.WAIT_S).epoch
+    expected = client.query_gradient(PROBES)
+    with ThreadPoolExecutor(8) as pool:
+        results = list(pool.map(client.query_gradient, [PROBES] * 64))
+    for result in results:
+        assert result.epoch == epoch
+        assert np.array_equal(result.sdf, expected.sdf)
+        assert np.array_equal(result.gradient, expected.gradient)
+
+
+def test_a_query_of_no_points_tells_the_epoch(client):
+    result = client.query_gradient(np.zeros((0, 3)))
+    assert result.sdf.shape == (0,)
+    assert result.gradient.shape == (0, 3)
+    assert result.epoch == client.status().epoch
+
+
+def test_an_epoch_that_is_gone_is_told_apart(endpoint):
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        request = SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), False, 999)
+        assert peer.refusal(keys.SDF, request) == "epoch_gone"
+        assert peer.refusal(keys.TILE, TileRequest(0, 0, 0, 999)) == "epoch_gone"
+
+
+def test_tiles_make_one_mesh(client):
+    learn(client)
+    client.settle(servers.WAIT_S)
+    listed = client.tiles()
+    assert len(listed.tiles) == len(listed.changed) > 1
+    mesh = client.mesh()
+    distance = np.linalg.norm(mesh.vertices, axis=1)
+    assert np.abs(distance - servers.RADIUS_M).mean() < 0.2  # after little training
+    parts = [client.mesh_tile(*map(int, index)) for index in listed.tiles]
+    assert sum(len(part.faces) for part in parts) >= len(mesh.faces)
+    assert sum(len(part.vertices) for part in parts) > len(mesh.vertices)
+    steps = mesh.vertices / listed.tile_side_m
+    border = mesh.vertices[(np.abs(steps - np.round(steps)) < 1e-6).any(axis=1)]
+    assert len(border) > 100
+    assert len(np.unique(np.round(border, 5), axis=0)) == len(border)
+    assert mesh.epoch == listed.epoch
+
+
+def test_meshes_are_cropped_to_bounds(client):
+    learn(client)
+    client.settle(servers.WAIT_S)
+    whole = client.mesh()
+    upper = client.mesh(((-10, -10, 0), (10, 10, np.inf)))
+    assert 0 < len(upper.faces) < len(whole.faces)
+    assert (upper.vertices[upper.faces].mean(axis=1)[:, 2] >= 0).all()
+    assert len(client.mesh(((50, 50, 50), (60, 60, 60))).faces) == 0
+
+
+def test_reset_forgets_a_box_or_everything(client):
+    learn(client)
+    epoch = client.reset(((0, -10, -10), (10, 10, 10)))
+    points = servers.sphere(400)
+    result = client.query_sdf(points)
+    assert result.epoch >= epoch
+    assert (result.status[points[:, 0] > 0.2] == Status.UNKNOWN).all()
+    assert (result.status[points[:, 0] < -0.2] == Status.SURFACE).all()
+    epoch = client.reset()
+    assert client.status().regions == 0
+    assert client.query_sdf(points).epoch >= epoch
+    assert learn(client, 1).taken == 3
+
+
+def test_a_downloaded_map_is_the_map(client, tmp_path):
+    learn(client)
+    client.settle(servers.WAIT_S)
+    path = tmp_path / "map.triquad"
+    info = client.download_map(path)
+    assert path.stat().st_size == info.bytes
+    record = read_map(path)
+    assert record.epoch == info.epoch == client.status().epoch
+    assert len(record.regions) == 1
+    assert record.regions[0].training is None
+    assert client.download_map(path) == info
+    client.download_map(path, training=True)
+    assert read_map(path).regions[0].training is not None
+    assert [entry.name for entry in tmp_path.iterdir()] == ["map.triquad"]
+
+
+def test_chunks_of_other_files_or_beyond_the_end_are_refused(client, endpoint, tmp_path):
+    info = client.download_map(tmp_path / "map.triquad")
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        assert peer.refusal(keys.MAP_CHUNK, MapChunkRequest("00" * 32, 0, 10)) == "chunk_gone"
+        for offset, length in ((-1, 10), (info.bytes, 10), (2**62, 10), (0, 0), (0, -1)):
+            request = MapChunkRequest(info.sha256, offset, length)
+            assert peer.refusal(keys.MAP_CHUNK, request) == "bad_request"
+        data = (tmp_path / "map.triquad").read_bytes()
+        for length, end in ((5, 8), (2**62, None)):
+            answer = peer.ask(keys.MAP_CHUNK, codec.encode(MapChunkRequest(info.sha256, 3, length)))
+            assert codec.decode(MapChunk, answer).data == data[3:end]
+
+
+def test_without_a_store_checkpoints_are_refused_and_the_status_says_so(client):
+    with pytest.raises(RefusedError, match="without --store") as caught:
+        client.checkpoint()
+    assert caught.value.code == "store"
+    assert "not kept" in client.status().store_error
+
+
+def test_a_checkpoint_restores_the_same_answers(tmp_path):
+    with servers.service_and_client(store=tmp_path) as client:
+        learn(client)
+        client.settle(servers.WAIT_S)
+        info = client.checkpoint()
+        assert client.checkpoint() == info
+        assert client.status().last_checkpoint == info
+        before = client.query_gradient(PROBES)
+    with servers.service_and_client(store=tmp_path) as client:
+        after = client.query_gradient(PROBES)
+        assert client.status().last_checkpoint.epoch == info.epoch
+    assert after.epoch == before.epoch
+    assert np.array_equal(after.status, before.status)
+    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features are half precision
+
+
+def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_path, monkeypatch):
+    replies = []
+    write = Store.write
+
+    def reset_meanwhile(store, record):
+        with servers.raw_session(connect=endpoint) as session:
+            request = ResetRequest(np.full(3, -np.inf), np.full(3, np.inf))
+            replies.append(servers.RawPeer(session).ask(keys.RESET, codec.encode(request)))
+        return write(store, record)
+
+    with servers.running_service(store=tmp_path) as endpoint:
+        with triquad_client.connect(endpoint) as client:
+            learn(client)
+        monkeypatch.setattr(Store, "write", reset_meanwhile)
+    assert replies == [None]
+
+
+def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
+    with servers.service_and_client(store=tmp_path) as client:
+        learn(client)
+        shutil.rmtree(tmp_path / servers.MAP)
+        (tmp_path / servers.MAP).write_text("in the way")
+        with pytest.raises(RefusedError, match="cannot be written"):
+            client.checkpoint()
+        assert "cannot be written" in client.status().store_error
+        assert learn(client, 1).taken == 3
+        (tmp_path / servers.MAP).unlink()
+        (tmp_path / servers.MAP).mkdir()
+        assert client.checkpoint().epoch > 0
+        assert client.status().store_error is None
+
+
+def test_the_status_is_published(endpoint):
+    with servers.raw_session(connect=endpoint) as session:
+        subscriber = session.declare_subscriber(keys.status_key(servers.MAP))
+        sample = subscriber.recv()
+        status = codec.decode(ServerStatus, sample.payload.to_bytes())
+    assert status.map_name == servers.MAP
+    assert status.memory_bytes > 2**20
+    assert str(sample.encoding) == keys.encoding(ServerStatus)
+
+
+def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
+    begun, go_on = threading.Event(), threading.Event()
+    answer = Answers.sdf
+
+    def answer_later(queries, request):
+        begun.set()
+        assert go_on.wait(servers.WAIT_S)
+        return answer(queries, request)
+
+    monkeypatch.setattr(Answers, "sdf", answer_later)
+    limits = dataclasses.replace(servers.SMALL.service, request_queue=1, query_workers=1)
+    settings = dataclasses.replace(servers.SMALL, service=limits)
+    key = keys.operation_key(servers.MAP, keys.SDF)
+    payload = codec.encode(SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), True, 0))
+    with (
+        servers.running_service(settings) as endpoint,
+        servers.raw_session(connect=endpoint) as session,
+    ):
+        answered = [session.get(key, payload=payload, timeout=servers.WAIT_S)]
+        assert begun.wait(servers.WAIT_S)  # the only worker is at it: one more can wait
+        answered.append(session.get(key, payload=payload, timeout=servers.WAIT_S))
+        for _ in range(5):
+            (reply,) = session.get(key, payload=payload, timeout=servers.WAIT_S)
+            assert codec.decode(ErrorReply, reply.err.payload.to_bytes()).code == "busy"
+        go_on.set()
+        assert [reply.ok is not None for replies in answered for reply in replies] == [True, True]
+
+
+def test_a_box_of_the_map_is_downloaded_without_the_rest(client, tmp_path):
+    learn(client)
+    client.settle(servers.WAIT_S)
+    whole = client.download_map(tmp_path / "whole.triquad")
+    low, high = (1.0, -4.5, -4.5), (4.5, 4.5, 4.5)
+    box = client.download_box(tmp_path / "box.triquad", (low, high))
+    assert box.epoch == whole.epoch
+    assert box.bytes < whole.bytes
+    points = np.random.default_rng(0).uniform(low, high, (500, 3))
+    here = MapEvaluator(read_map(tmp_path / "box.triquad")).query(points, gradient=True)
+    there = MapEvaluator(read_map(tmp_path / "whole.triquad")).query(points, gradient=True)
+    assert np.array_equal(here.sdf, there.sdf)
+    assert np.array_equal(here.status, there.status)
+    everything = client.download_box(tmp_path / "all.triquad", ((-math.inf,) * 3, (math.inf,) * 3))
+    assert read_map(tmp_path / "all.triquad").regions[0].parameters > 0
+    assert everything.epoch == whole.epoch
+    with pytest.raises(InvalidInputError, match="hold nothing"):
+        client.download_box(tmp_path / "none.triquad", (low, low))
+    with pytest.raises(DownloadError, match="nothing of the map lies between"):
+        client.download_box(tmp_path / "none.triquad", ((500, 0, 0), (501, 1, 1)))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "all.triquad",
+        "box.triquad",
+        "whole.triquad",
+    ]

@@ -1,0 +1,310 @@
+import dataclasses
+import hashlib
+import io
+from collections import Counter
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from support.map_records import SMALL, assert_same, random_record, with_integers, with_levels
+from support.mapfile_surgery import (
+    edited,
+    file_bytes,
+    manifest_of,
+    metadata_of,
+    parts_of,
+    read_bytes,
+    rebuild,
+    stored,
+    write_pair,
+)
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.mapfile import MapFileInfo, read_map, read_map_file, write_map
+from triquad_format.mapfile.parts.shuffle import (
+    join_integers,
+    shuffle,
+    shuffle_codes,
+    split_integers,
+    unshuffle,
+    unshuffle_codes,
+)
+from triquad_format.records import morton
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+GOLDEN_NAMES = ("map_v2.triquad", "map_v2_next.triquad")
+GOLDEN_LEVELS = "map_v2_levels.triquad"
+GOLDEN_PRODUCER = "0.1.0"
+GOLDEN_ZSTD = (1, 5, 7)
+"""The release of zstd that compressed the golden files: others may give other bytes."""
+
+
+def golden_records():
+    """The records of the golden files, and what follows; change them only with the version."""
+    record = random_record(
+        2024, indices=((0, 0, 0), (-1, 2, 0)), points=12, name="golden", epoch=42
+    )
+    one, other = record.regions
+    (changed,) = with_integers(dataclasses.replace(record, regions=(other,)), 300).regions
+    return record, dataclasses.replace(record, epoch=43, regions=(one, changed))
+
+
+def golden_levels():
+    """The record of the golden file with levels and times."""
+    wide = dataclasses.replace(SMALL, depth=9)
+    record = random_record(2025, settings=wide, points=40, training=False, name="golden", epoch=44)
+    return with_levels(record)
+
+
+def write_golden(folder):
+    """The golden files: a complete one, and what changed after it."""
+    stamps = (1_700_000_000 * 10**9, 1_700_000_060 * 10**9)
+    write_pair(folder, *golden_records(), names=GOLDEN_NAMES, stamps=stamps)
+    write_map(golden_levels(), folder / GOLDEN_LEVELS, stamp_ns=stamps[0], preview=False)
+
+
+# Round trips
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("dtype", ["<f2", "<f4"])
+def test_round_trip(tmp_path, training, dtype):
+    record = random_record(
+        1, indices=((0, 0, 0), (3, -1, 2)), training=training, feature_dtype=dtype
+    )
+    path = tmp_path / "map.triquad"
+    info = write_map(record, path, feature_dtype=dtype)
+    assert_same(read_map(path), record)
+    assert_same(read_map(str(path)), record)
+    with path.open("rb") as stream:
+        assert_same(read_map(stream), record)
+    data = path.read_bytes()
+    assert info == MapFileInfo(len(data), hashlib.sha256(data).hexdigest(), record.epoch)
+
+
+@pytest.mark.parametrize(("limit", "planes"), [(1, 1), (127, 1), (128, 2), (MAX_INTEGER, 2)])
+def test_integer_features(limit, planes):
+    record = with_integers(random_record(2), limit)
+    data = file_bytes(record)
+    assert_same(read_bytes(data), record)
+    bodies = [msgpack.unpackb(p.payload) for p in parts_of(data) if p.topic == "/triquad/vertices"]
+    levels = [level for body in bodies for level in body["levels"]]
+    assert {level["integers"]["shape"][0] for level in levels} == {planes}
+    assert not any("features" in level for level in levels)
+
+
+def test_regions_may_differ_in_their_features():
+    base, record = golden_records()
+    assert {table.scale is None for r in record.regions for table in r.tables} == {True, False}
+    assert_same(read_bytes(file_bytes(record)), record)
+    assert_same(read_bytes(file_bytes(base)), base)
+
+
+def test_empty_map():
+    record = MapRecord("default", 0, SMALL, ())
+    assert_same(read_bytes(file_bytes(record)), record)
+    assert_same(stored(file_bytes(record)).record(), record)
+
+
+@pytest.mark.parametrize("preview", [True, False])
+def test_regions_that_saw_nothing(preview):
+    record = random_record(0, points=0)
+    assert_same(read_bytes(file_bytes(record, preview=preview)), record)
+    integers = with_integers(record)
+    assert_same(read_bytes(file_bytes(integers, preview=preview)), integers)
+
+
+@pytest.mark.parametrize("integers", [True, False])
+def test_regions_are_split_into_squares_and_cubes(integers):
+    record = random_record(2, settings=FieldSettings(), points=350)
+    record = with_integers(record) if integers else record
+    (region,) = record.regions
+    places = {
+        (table.plane, *cell)
+        for table in region.tables
+        for cell in (morton.decode(table.codes, 2) << (12 - table.level) >> 8).tolist()
+    }
+    cubes = np.unique(morton.decode(region.evidence.codes, 3) >> 5, axis=0)
+    data = file_bytes(record)
+    found = Counter(part.topic for part in parts_of(data))
+    assert found["/triquad/vertices"] == found["/triquad/moments"] == len(places) > len(AXES)
+    assert found["/triquad/evidence"] == len(cubes) > 1
+    assert_same(read_bytes(data), record)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    points=st.integers(0, 30),
+    encoding=st.sampled_from(["both", "features", "fourier"]),
+    depth=st.integers(6, 15),
+    levels=st.integers(1, 4),
+    size=st.integers(1, 9),
+    training=st.booleans(),
+    limit=st.none() | st.integers(1, MAX_INTEGER),
+    epoch=st.integers(0, 2**63 - 1),
+)
+def test_round_trip_of_any_record(
+    seed, points, encoding, depth, levels, size, training, limit, epoch
+):
+    chosen = dataclasses.replace(
+        SMALL, encoding=encoding, depth=depth, feature_levels=levels, feature_size=size
+    )
+    record = random_record(seed, settings=chosen, points=points, training=training, epoch=epoch)
+    record = record if limit is None else with_integers(record, limit, seed)
+    data = file_bytes(record)
+    assert_same(read_bytes(data), record)
+    assert_same(stored(data).record(), record)
+
+
+def test_features_are_rounded_to_the_file_dtype():
+    record = random_record(3, feature_dtype="<f4")
+    table = read_bytes(file_bytes(record)).regions[0].tables[0]
+    assert table.features.dtype == np.float16
+    np.testing.assert_array_equal(
+        table.features, record.regions[0].tables[0].features.astype(np.float16)
+    )
+
+
+def test_same_record_same_bytes():
+    assert file_bytes(random_record(4), preview=True) == file_bytes(random_record(4), preview=True)
+    assert "created" not in metadata_of(file_bytes(random_record(4)))["triquad"]
+
+
+def test_stamp():
+    stamp_ns = 1_700_000_000_123_456_789
+    stamped = file_bytes(random_record(4), stamp_ns=stamp_ns)
+    assert metadata_of(stamped)["triquad"]["created"] == "2023-11-14T22:13:20Z"
+    manifest = manifest_of(stamped)
+    assert manifest.stamp_ns == stamp_ns
+    assert {(entry.epoch, entry.stamp_ns) for entry in manifest.entries} == {(7, stamp_ns)}
+    messages = make_reader(io.BytesIO(stamped)).iter_messages()
+    assert {message.log_time for _, _, message in messages} == {stamp_ns}
+    assert manifest_of(file_bytes(random_record(4))).stamp_ns == 0
+    for bad in (-1, 2**63):
+        with pytest.raises(FormatError, match="stamp_ns"):
+            file_bytes(random_record(4), stamp_ns=bad)
+
+
+def test_info_of_parts():
+    record = random_record(5)
+    data = file_bytes(record)
+    file = read_map_file(io.BytesIO(data))
+    assert file.size == len(data)
+    assert file.metadata["frame_id"] == "map"
+    assert [(p.topic, p.size) for p in file.parts] == [
+        (p.topic, len(p.payload)) for p in parts_of(data)[:-1]
+    ]
+    assert 0 < sum(part.stored_size for part in file.parts) < len(data)
+    assert file.manifest == manifest_of(data)
+
+
+# Columns
+
+
+@given(st.lists(st.integers(0, 2**47), unique=True))
+def test_codes_round_trip(codes):
+    array = np.array(sorted(codes), np.int64)
+    np.testing.assert_array_equal(unshuffle_codes(shuffle_codes(array)), array)
+
+
+@given(st.lists(st.integers(-MAX_INTEGER, MAX_INTEGER), min_size=1))
+def test_integers_round_trip(integers):
+    array = np.array(integers, np.int16)[:, None]
+    np.testing.assert_array_equal(join_integers(split_integers(array)), array)
+
+
+def test_literal_bytes_of_columns():
+    assert shuffle_codes(np.array([1, 3, 300])).tolist() == [[1, 2, 41], [0, 0, 1]]
+    assert shuffle_codes(np.array([], np.int64)).shape == (1, 0)
+    halves = np.array([[1.0, -2.0]], "<f2")  # 0x3c00, 0xc000
+    assert shuffle(halves).tolist() == [[[0x00, 0x00]], [[0x3C, 0xC0]]]
+    np.testing.assert_array_equal(unshuffle(shuffle(halves), "<f2"), halves)
+    assert split_integers(np.array([[1, -128], [2, 127]])).tolist() == [[[1, 2], [-128, 127]]]
+    wide = np.array([[128, -300, MAX_INTEGER]])
+    assert split_integers(wide).tolist() == [[[-128], [-44], [127]], [[1], [-1], [127]]]
+
+
+# The golden files
+
+
+def test_golden_files_read_back():
+    base, record = golden_records()
+    assert sum((GOLDEN / name).stat().st_size for name in GOLDEN_NAMES) <= 80_000
+    assert_same(read_map(GOLDEN / GOLDEN_NAMES[0]), base)
+    assert_same(read_map(GOLDEN / GOLDEN_NAMES[1]), record)
+    assert_same(read_map(GOLDEN / GOLDEN_LEVELS), golden_levels())
+
+
+@pytest.fixture
+def golden_pairs(monkeypatch, tmp_path):
+    """The golden files, and what the writer writes now, under the name that it had then."""
+    monkeypatch.setattr("triquad_format.mapfile.writer.__version__", GOLDEN_PRODUCER)
+    write_golden(tmp_path)
+    names = (*GOLDEN_NAMES, GOLDEN_LEVELS)
+    return [((GOLDEN / name).read_bytes(), (tmp_path / name).read_bytes()) for name in names]
+
+
+@pytest.mark.skipif(zstandard.ZSTD_VERSION != GOLDEN_ZSTD, reason="made with another zstd")
+def test_golden_bytes_are_what_the_writer_writes(golden_pairs):
+    for golden, now in golden_pairs:
+        assert now == golden
+
+
+def test_golden_parts_are_what_the_writer_writes(golden_pairs):
+    """Compared before compression."""
+    for golden, now in golden_pairs:
+        assert parts_of(now) == parts_of(golden)
+        assert metadata_of(now) == metadata_of(golden)
+
+
+def test_a_delta_holds_only_what_changed(golden_pairs):
+    base, following, _ = (parts_of(golden) for golden, _ in golden_pairs)
+    changed = {part.topic for part in following}
+    assert changed == {"/triquad/map", "/triquad/region", "/triquad/vertices", "/triquad/manifest"}
+    assert not {part.payload for part in base} & {part.payload for part in following}
+
+
+# Other tools
+
+
+def test_stock_reader_sees_an_ordinary_file():
+    data = file_bytes(random_record(6), preview=True)
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
+    assert reader.get_header().profile == ""
+    assert reader.get_header().library.startswith("triquad ")
+    summary = reader.get_summary()
+    assert summary.statistics.message_count == len(parts_of(data)) == len(summary.chunk_indexes)
+    encodings = {c.topic: c.message_encoding for c in summary.channels.values()}
+    assert encodings.pop("/preview/mesh") == "protobuf"
+    assert set(encodings.values()) == {"msgpack"}
+    assert {chunk.compression for chunk in summary.chunk_indexes} <= {"zstd", ""}
+    assert parts_of(data)[-1].topic == "/triquad/manifest"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": CompressionType.NONE},
+        {"chunk_size": 1 << 20},
+        {"use_chunking": False},
+        {"enable_crcs": False},
+        {"use_summary_offsets": False},
+    ],
+)
+def test_files_rewritten_by_other_tools_are_read(options):
+    record = random_record(6)
+    data = file_bytes(record, preview=True)
+    assert_same(read_bytes(rebuild(parts_of(data), metadata_of(data), **options)), record)
+
+
+def test_unknown_fields_are_skipped():
+    data = edited(file_bytes(random_record(7)), "/triquad/region", lambda b: b.update(more=[1]))
+    assert_same(read_bytes(data), random_record(7))

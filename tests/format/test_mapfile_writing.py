@@ -1,0 +1,189 @@
+import dataclasses
+import os
+
+import numpy as np
+import pytest
+from support.map_records import SMALL, assert_same, random_record, with_integers
+from support.mapfile_surgery import write_pair, write_record
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.records import morton
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import MAX_INTEGER, MAX_SEEN_S
+
+
+def with_table(record, **changes):
+    """The record with changes to the first table of its first region."""
+    region = record.regions[0]
+    table = dataclasses.replace(region.tables[0], **changes)
+    region = dataclasses.replace(region, tables=(table, *region.tables[1:]))
+    return dataclasses.replace(record, regions=(region, *record.regions[1:]))
+
+
+UNSOUND = {
+    "epoch": lambda r: dataclasses.replace(r, epoch=-1),
+    "name": lambda r: dataclasses.replace(r, name="a/b"),
+    "a region twice": lambda r: dataclasses.replace(r, regions=r.regions * 2),
+    "shapes": lambda r: dataclasses.replace(r, settings=dataclasses.replace(SMALL, hidden=9)),
+    "levels": lambda r: dataclasses.replace(r, settings=dataclasses.replace(SMALL, depth=9)),
+    "a scale without integers": lambda r: with_table(r, scale=0.5),
+    "integers in one table alone": lambda r: with_table(with_integers(r), scale=None),
+    "integers beyond two bytes": lambda r: with_table(
+        with_integers(r), features=with_integers(r, MAX_INTEGER).regions[0].tables[0].features + 1
+    ),
+    "no scale": lambda r: with_table(with_integers(r), scale=0.0),
+    "a scale that is no number": lambda r: with_table(with_integers(r), scale=float("nan")),
+    "a scale below single precision": lambda r: with_table(with_integers(r), scale=1e-60),
+    "a scale above single precision": lambda r: with_table(with_integers(r), scale=1e60),
+    "a scale of double precision": lambda r: with_table(with_integers(r), scale=0.1),
+}
+
+
+@pytest.mark.parametrize("case", UNSOUND)
+def test_unsound_records_are_not_written(tmp_path, case):
+    path = tmp_path / "map.triquad"
+    with pytest.raises(FormatError):
+        write_map(UNSOUND[case](random_record(15)), path)
+    assert not list(tmp_path.iterdir())
+
+
+UNSOUND_EVIDENCE = {
+    "a level less": ("levels", np.zeros(39, np.uint8), r"levels: expected an array \[40\]"),
+    "wide levels": ("levels", np.zeros(40, np.int64), r"levels: expected .* of \|u1"),
+    "a level too high": ("levels", np.full(40, 8, np.uint8), "levels: one exceeds 7"),
+    "a time for each voxel": ("seen_s", np.zeros(40, np.int64), r"seen_s: expected .* \[38\]"),
+    "half seconds": ("seen_s", np.full(38, 0.5), "seen_s: expected .* of <i8"),
+    "a time before 1970": ("seen_s", np.full(38, -1), "seen_s: a time lies outside"),
+    "a time beyond stamps": ("seen_s", np.full(38, MAX_SEEN_S + 1), "seen_s: a time lies outside"),
+}
+
+
+def with_evidence(record, **changes):
+    """The record with changes to the evidence of its only region."""
+    region = record.regions[0]
+    region = dataclasses.replace(region, evidence=dataclasses.replace(region.evidence, **changes))
+    return dataclasses.replace(record, regions=(region,))
+
+
+@pytest.mark.parametrize("case", UNSOUND_EVIDENCE)
+def test_unsound_evidence_is_not_written(tmp_path, case):
+    field, array, message = UNSOUND_EVIDENCE[case]
+    with pytest.raises(FormatError, match=message):
+        write_map(with_evidence(random_record(15), **{field: array}), tmp_path / "map.triquad")
+    assert not list(tmp_path.iterdir())
+
+
+def test_blocks_without_surface_have_no_time(tmp_path):
+    record = random_record(15)
+    surface = record.regions[0].evidence.surface.copy()
+    surface[5] = 0
+    record = with_evidence(record, surface=surface, seen_s=np.ones(38, np.int64))
+    with pytest.raises(FormatError, match="seen_s: a block without surface has a time"):
+        write_map(record, tmp_path / "map.triquad")
+
+
+def test_features_beyond_half_precision(tmp_path):
+    record = random_record(16, feature_dtype="<f4")
+    record.regions[0].tables[1].features[0, 0] = 1e6
+    with pytest.raises(FormatError, match="1e\\+06|1000000"):
+        write_map(record, tmp_path / "map.triquad")
+    assert not list(tmp_path.iterdir())
+    write_map(record, tmp_path / "map.triquad", feature_dtype="<f4")
+    with pytest.raises(FormatError, match="feature_dtype"):
+        write_map(record, tmp_path / "map.triquad", feature_dtype="<f8")
+
+
+def test_total_limit_holds_while_writing(monkeypatch, tmp_path):
+    path = tmp_path / "map.triquad"
+    write_map(random_record(17), path)
+    size = path.stat().st_size
+    for limit in (2000, size - 1):
+        monkeypatch.setattr("triquad_format.mapfile.writer.MAX_MAP_BYTES", limit)
+        with pytest.raises(FormatError, match=f"at most {limit}"):
+            write_map(random_record(18), path)
+    assert_same(read_map(path), random_record(17))
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_part_limit(monkeypatch, tmp_path):
+    monkeypatch.setattr("triquad_format.mapfile.writer.MAX_PART_BYTES", 200)
+    with pytest.raises(FormatError, match="at most 200"):
+        write_map(random_record(17), tmp_path / "map.triquad")
+
+
+@pytest.mark.parametrize("limit", ["MAX_ENTRIES", "MAX_FILES"])
+def test_manifest_limits(monkeypatch, tmp_path, limit):
+    monkeypatch.setattr(f"triquad_format.mapfile.manifest.{limit}", 0)
+    with pytest.raises(FormatError, match="at most"):
+        write_pair(tmp_path, random_record(17), random_record(17, epoch=8))
+    assert not (tmp_path / "next.triquad").exists()
+
+
+@pytest.mark.parametrize("step", ["write", "fsync", "replace"])
+def test_interrupted_write_leaves_the_old_file(monkeypatch, tmp_path, step):
+    path = tmp_path / "map.triquad"
+    write_map(random_record(18), path)
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    if step == "write":
+        monkeypatch.setattr("triquad_format.mapfile.writer.pack_manifest", fail)
+    else:
+        monkeypatch.setattr(os, step, fail)
+    with pytest.raises(OSError, match="No space"):
+        write_map(random_record(19), path)
+    monkeypatch.undo()
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["map.triquad"]
+    write_map(random_record(19), path)
+    assert_same(read_map(path), random_record(19))
+
+
+def test_file_is_synced_before_and_folder_after_the_rename(monkeypatch, tmp_path):
+    calls = []
+    real_sync, real_replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda fd: (calls.append("fsync"), real_sync(fd))[1])
+    monkeypatch.setattr(
+        os, "replace", lambda *names: (calls.append("replace"), real_replace(*names))[1]
+    )
+    write_map(random_record(20), tmp_path / "map.triquad")
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+def test_an_unchanged_part_keeps_its_epoch_and_time(tmp_path):
+    """Also in a complete file, which stores it anew."""
+    base = random_record(21, indices=((0, 0, 0), (1, 0, 0)), epoch=3)
+    one, other = base.regions
+    tables = [np.negative(table.features) for table in other.tables]
+    changed = dataclasses.replace(
+        other,
+        tables=tuple(
+            dataclasses.replace(table, features=features)
+            for table, features in zip(other.tables, tables, strict=True)
+        ),
+    )
+    record = dataclasses.replace(base, epoch=5, regions=(one, changed))
+    first = write_record(tmp_path / "first.triquad", base, 10**9, {})
+    known = {entry.key: entry for entry in first.manifest.entries}
+    written = write_record(tmp_path / "second.triquad", record, 2 * 10**9, known)
+    assert_same(read_map(tmp_path / "second.triquad"), record)
+    assert not written.manifest.files
+    for entry in written.manifest.entries:
+        is_new = entry.key.topic == "/triquad/map" or (
+            entry.key.topic == "/triquad/vertices" and entry.key.region == (1, 0, 0)
+        )
+        assert (entry.epoch, entry.stamp_ns) == ((5, 2 * 10**9) if is_new else (3, 10**9))
+
+
+def test_what_shrinks_more_than_readers_believe_is_stored_as_it_is(tmp_path):
+    wide = FieldSettings(depth=8, feature_levels=1, feature_size=64)
+    record = random_record(0, settings=wide, training=False, feature_dtype="<f4")
+    cells = np.stack(np.meshgrid(np.arange(256), np.arange(256)), axis=-1).reshape(-1, 2)
+    codes = np.sort(morton.encode(cells))
+    zeros = np.zeros((len(codes), 64), np.float32)
+    record = with_table(record, codes=codes, features=zeros)
+    path = tmp_path / "map.triquad"
+    write_map(record, path, feature_dtype="<f4", preview=False)
+    assert_same(read_map(path), record)

@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from triquad_format.records import morton
+
+
+def slow_code(cell):
+    code = 0
+    for axis, coordinate in enumerate(cell):
+        for bit in range(int(coordinate).bit_length()):
+            code |= (int(coordinate) >> bit & 1) << (bit * len(cell) + axis)
+    return code
+
+
+@pytest.mark.parametrize(("dimensions", "bits"), [(2, morton.BITS_2D), (3, morton.BITS_3D)])
+def test_known_codes(dimensions, bits):
+    units = np.eye(dimensions, dtype=np.int64)
+    assert morton.encode(units).tolist() == [1 << axis for axis in range(dimensions)]
+    top = np.full(dimensions, (1 << bits) - 1)
+    assert int(morton.encode(top)) == (1 << bits * dimensions) - 1
+    assert morton.decode(morton.encode(top), dimensions).tolist() == top.tolist()
+
+
+@pytest.mark.parametrize(("dimensions", "side"), [(2, 64), (3, 16)])
+def test_codes_number_a_cube_without_gaps(dimensions, side):
+    cells = np.stack(np.meshgrid(*[np.arange(side)] * dimensions), axis=-1)
+    codes = morton.encode(cells)
+    assert np.array_equal(np.sort(codes, axis=None), np.arange(side**dimensions))
+    assert np.array_equal(morton.decode(codes, dimensions), cells)
+
+
+@given(st.lists(st.integers(0, 2**31 - 1), min_size=2, max_size=2))
+def test_2d_against_slow_code(cell):
+    code = int(morton.encode(np.array(cell)))
+    assert code == slow_code(cell)
+    assert morton.decode(np.array(code), 2).tolist() == cell
+
+
+@given(st.lists(st.integers(0, 2**20 - 1), min_size=3, max_size=3))
+def test_3d_against_slow_code(cell):
+    code = int(morton.encode(np.array(cell)))
+    assert code == slow_code(cell)
+    assert morton.decode(np.array(code), 3).tolist() == cell
+
+
+def test_integers_of_any_width():
+    cells = np.array([[3, 5], [7, 1]])
+    for dtype in (np.int32, np.uint16, np.uint8):
+        assert np.array_equal(morton.encode(cells.astype(dtype)), morton.encode(cells))
+    assert morton.encode(np.zeros((0, 2), np.int64)).shape == (0,)

@@ -1,0 +1,137 @@
+"""The mesh that MCAP viewers show, read back as they read it."""
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from support.map_records import SMALL, random_record
+from support.mapfile_surgery import RawPart, file_bytes, metadata_of, parts_of, read_bytes, rebuild
+from triquad_format.errors import DamagedMapFileError
+from triquad_format.mapfile.preview import CLUSTER_CELLS, NET_LEAVES
+from triquad_format.records import morton
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, Evidence
+
+SETTINGS = FieldSettings()
+GROUND_M = 1.3
+
+
+def ground(points):
+    """Signed distance to a level ground."""
+    return points[:, 2] - GROUND_M
+
+
+def seen_ground(record):
+    """The record with evidence of the ground in a square of 40 m around each region's centre."""
+    return dataclasses.replace(
+        record,
+        regions=tuple(
+            dataclasses.replace(region, evidence=evidence_of(record.settings))
+            for region in record.regions
+        ),
+    )
+
+
+def evidence_of(settings):
+    side = np.arange(-20, 20, settings.leaf_m)
+    x, y = np.meshgrid(side, side)
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, GROUND_M)], axis=1)
+    leaves = np.floor(points / settings.leaf_m).astype(np.int64) + (1 << (settings.depth - 1))
+    blocks = morton.encode(leaves // BLOCK_VOXELS)
+    codes = np.unique(blocks)
+    surface = np.zeros((len(codes), BLOCK_BYTES), np.uint8)
+    a, b, c = (leaves % BLOCK_VOXELS).T
+    rows = np.searchsorted(codes, blocks)
+    np.bitwise_or.at(surface, (rows, a * BLOCK_VOXELS + b), (1 << c).astype(np.uint8))
+    return Evidence(codes, surface, np.zeros_like(surface))
+
+
+def scenes(data):
+    """The scene updates of a file by the stock reader and decoder."""
+    reader = make_reader(io.BytesIO(data), decoder_factories=[DecoderFactory()])
+    messages = reader.iter_decoded_messages(topics=["/preview/mesh"])
+    return [(schema.name, scene) for schema, _, _, scene in messages]
+
+
+def mesh_of(scene):
+    """Vertices [V, 3] and faces [F, 3] of the one entity in a scene."""
+    (entity,) = scene.entities
+    (triangles,) = entity.triangles
+    vertices = np.array([(p.x, p.y, p.z) for p in triangles.points]).reshape(-1, 3)
+    return vertices, np.array(triangles.indices).reshape(-1, 3)
+
+
+@pytest.fixture(scope="module")
+def ground_file():
+    indices = ((0, 0, 0), (1, 0, 0))
+    record = seen_ground(random_record(60, settings=SETTINGS, indices=indices, points=50))
+    return file_bytes(record, preview=True, distances=ground, stamp_ns=1_700_000_000_000_000_005)
+
+
+def test_viewers_see_the_surface(ground_file):
+    cell = SETTINGS.leaf_m * NET_LEAVES * CLUSTER_CELLS
+    found = scenes(ground_file)
+    assert len(found) == 2
+    for (name, scene), x in zip(found, (0.0, SETTINGS.region_pitch_m), strict=True):
+        assert name == "foxglove.SceneUpdate"
+        vertices, faces = mesh_of(scene)
+        assert len(faces) > 1000
+        assert faces.max() < len(vertices)
+        np.testing.assert_allclose(vertices[:, 2], GROUND_M, atol=0.04)
+        extent = np.abs(vertices[:, :2] - (x, 0)).max(axis=0)
+        assert (extent > 20 - 2 * cell).all()
+        assert (extent < 20 + cell).all()
+        a, b, c = (vertices[faces[:, i]] for i in range(3))
+        normals = np.cross(b - a, c - a)
+        assert (normals[:, 2] > 0).all()  # towards free space
+        assert normals[:, 2].sum() / 2 > 0.85 * 40**2  # its area: no holes but the rim
+
+
+def test_each_entity_tells_region_frame_and_time(ground_file):
+    entities = [entity for _, scene in scenes(ground_file) for entity in scene.entities]
+    assert [entity.id for entity in entities] == ["region 0 0 0", "region 1 0 0"]
+    for entity in entities:
+        assert entity.frame_id == "map"
+        assert entity.timestamp.ToNanoseconds() == 1_700_000_000_000_000_005
+        assert entity.triangles[0].color.a == 1.0
+
+
+def test_schema_is_complete():
+    """A viewer that knows no schema by heart can decode it: dependencies are in the file."""
+    reader = make_reader(io.BytesIO(file_bytes(random_record(61), preview=True)))
+    (schema,) = reader.get_summary().schemas.values()
+    assert (schema.name, schema.encoding) == ("foxglove.SceneUpdate", "protobuf")
+    assert b"foxglove/TriangleListPrimitive.proto" in schema.data
+    assert b"google/protobuf/timestamp.proto" in schema.data
+
+
+def test_the_field_of_the_map_is_shown_where_no_other_is_given():
+    """Also at the border of all regions, where cells reach to where the field says nothing."""
+    record = random_record(62, points=400, training=False)
+    full = np.full((8**3, BLOCK_BYTES), 255, np.uint8)
+    seen = Evidence(np.arange(8**3), full, full)
+    everywhere = dataclasses.replace(record.regions[0], evidence=seen)
+    record = dataclasses.replace(record, regions=(everywhere,))
+    ((_, scene),) = scenes(file_bytes(record, preview=True))
+    vertices, faces = mesh_of(scene)
+    assert len(faces)
+    assert np.isfinite(vertices).all()
+    assert (np.abs(vertices) <= SMALL.region_side_m / 2).all()
+
+
+def test_nothing_seen_is_an_empty_mesh():
+    ((_, scene),) = scenes(file_bytes(random_record(64, points=0), preview=True))
+    vertices, faces = mesh_of(scene)
+    assert len(vertices) == len(faces) == 0
+
+
+def test_readers_mind_a_preview_that_is_not_the_listed_one(ground_file):
+    parts = [
+        RawPart(part.topic, part.payload + b" ") if part.topic == "/preview/mesh" else part
+        for part in parts_of(ground_file)
+    ]
+    with pytest.raises(DamagedMapFileError, match="preview"):
+        read_bytes(rebuild(parts, metadata_of(ground_file)))

@@ -1,0 +1,373 @@
+"""Files cut, overwritten and torn: what is intact comes back, and answers as before."""
+
+import dataclasses
+import io
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from support.checkpoint_folder import FIRST, SECOND, map_at, write_checkpoints
+from support.map_records import SMALL, assert_same, random_record
+from support.mapfile_surgery import file_bytes, manifest_of, rebuild, with_metadata
+from triquad_format.errors import MapFileError, UnsupportedMapFileError
+from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.parts.part import (
+    EVIDENCE,
+    FIELD_TOPICS,
+    MANIFEST,
+    MAP,
+    MOMENTS,
+    PREVIEW,
+    REGION,
+    SAMPLES,
+    TOPICS,
+    TRAINING,
+    VERTICES,
+)
+from triquad_format.records import morton
+from triquad_format.records.crop import without_training
+from triquad_format.records.evidence_voxels import seen_voxels
+from triquad_format.records.region import region_centre, region_corner
+from triquad_format.records.status import Status
+from triquad_format.recovery.recover import recover
+from triquad_map.reference.evaluator import MapEvaluator
+from triquad_tools.commands.pack import main
+
+GOLDEN_V1 = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
+SQUARES = dataclasses.replace(SMALL, depth=9)
+"""A region of 128 m, of 2 x 2 squares."""
+
+INDICES = ((0, 0, 0), (1, 0, 0))
+RECORD = random_record(5, settings=SQUARES, indices=INDICES, points=600)
+DATA = file_bytes(RECORD, preview=True, stamp_ns=10**18)
+
+
+@dataclasses.dataclass(frozen=True)
+class Chunk:
+    """Where a part lies in a file."""
+
+    topic: str
+    start: int
+    end: int
+
+
+def chunks(data):
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    return [
+        Chunk(
+            summary.channels[next(iter(index.message_index_offsets))].topic,
+            index.chunk_start_offset,
+            index.chunk_start_offset + index.chunk_length,
+        )
+        for index in summary.chunk_indexes
+    ]
+
+
+def flipped(data, *places):
+    spoilt = bytearray(data)
+    for place in places:
+        spoilt[place] ^= 0x10
+    return bytes(spoilt)
+
+
+def zeroed(data, first, last):
+    return data[:first] + bytes(len(data[first:last])) + data[last:]
+
+
+@pytest.fixture
+def recovered(tmp_path):
+    def recover_bytes(data):
+        path = tmp_path / "broken.triquad"
+        path.write_bytes(data)
+        return recover(path)
+
+    return recover_bytes
+
+
+@cache
+def places():
+    """Points all over the regions, most of them where rays have been."""
+    rng = np.random.default_rng(0)
+    points = [rng.uniform(-1, 1.5, (1000, 3)) * SQUARES.region_side_m]
+    for region in RECORD.regions:
+        evidence = region.evidence
+        voxels = seen_voxels(evidence, evidence.surface | evidence.free)
+        voxels = voxels[rng.integers(len(voxels), size=2000)] + rng.uniform(size=(2000, 3))
+        points.append(region_corner(SQUARES, region.index) + voxels * SQUARES.leaf_m)
+    return np.concatenate(points)
+
+
+@cache
+def whole_answer():
+    return MapEvaluator(RECORD).query(places())
+
+
+def in_lost_regions(points, recovery):
+    """Where the distance was blended with that of a region that is gone."""
+    kept = {region.index for region in recovery.record.regions}
+    inside = np.zeros(len(points), bool)
+    for index in set(INDICES) - kept:
+        offset = points - region_centre(SQUARES, index)
+        inside |= (np.abs(offset) <= SQUARES.region_side_m / 2).all(axis=1)
+    return inside
+
+
+def assert_answers(recovery):
+    """Where no loss reaches all is as before, and nothing that is known is wrong."""
+    points, before = places(), whole_answer()
+    after = MapEvaluator(recovery.record).query(points)
+    known = after.status != Status.UNKNOWN
+    known &= ~in_lost_regions(points, recovery)
+    np.testing.assert_array_equal(after.sdf[known], before.sdf[known])
+    # At the fringe of lost evidence SURFACE may become FREE.
+    assert (after.status[known] <= before.status[known]).all()
+    if recovery.parts_listed is None:
+        return  # not all losses are known
+    spared = np.ones(len(points), bool)
+    margin = 2 * SQUARES.leaf_m
+    for loss in recovery.losses:
+        if loss.key.topic != TRAINING:
+            low, high = loss.minimum - margin, loss.maximum + margin
+            spared &= ~((points >= low) & (points <= high)).all(axis=1)
+    np.testing.assert_array_equal(after.sdf[spared], before.sdf[spared])
+    np.testing.assert_array_equal(after.status[spared], before.status[spared])
+
+
+def test_an_intact_file_loses_nothing(recovered):
+    recovery = recovered(DATA)
+    assert recovery.complete
+    assert recovery.losses == ()
+    assert recovery.stamp_ns == 10**18
+    assert_same(recovery.record, RECORD)
+
+
+@pytest.mark.parametrize("topic", [VERTICES, EVIDENCE, REGION])
+def test_a_lost_part_is_named_and_all_else_is_there(recovered, topic):
+    listed = manifest_of(DATA).own
+    for number, chunk in enumerate(chunks(DATA)):
+        if chunk.topic != topic:
+            continue
+        recovery = recovered(flipped(DATA, (chunk.start + chunk.end) // 2))
+        field = [loss.key for loss in recovery.losses if loss.key.topic in FIELD_TOPICS]
+        assert field == [listed[number].key]
+        assert not recovery.complete
+        assert recovery.parts_intact == recovery.parts_listed - 1
+        assert_answers(recovery)
+
+
+def test_what_a_loss_says_of_its_place(recovered):
+    for chunk in chunks(DATA):
+        if chunk.topic == VERTICES:
+            break
+    loss = recovered(flipped(DATA, chunk.end - 20)).losses[-1]
+    assert loss.key.plane == 0
+    np.testing.assert_allclose(loss.minimum, [-65, -65, -64.5])
+    np.testing.assert_allclose(loss.maximum, [0.5, 0.5, 64.5])
+
+
+def test_outside_of_the_boxes_that_are_told_nothing_changes(recovered):
+    """Also where surface was seen across the border of the box, and right beside it."""
+    rng = np.random.default_rng(0)
+    leaves = np.concatenate([np.full((300, 1), 255.0), rng.uniform(0, 512, (300, 2))], axis=1)
+    seen = random_record(6, settings=SQUARES, points=4000).regions[0].evidence
+    region = dataclasses.replace(RECORD.regions[0], evidence=seen, training=None)
+    record = dataclasses.replace(RECORD, regions=(region,))
+    data = file_bytes(record)
+    chunk = next(chunk for chunk in chunks(data) if chunk.topic == VERTICES)
+    recovery = recovered(flipped(data, chunk.end - 20))
+    (loss,) = recovery.losses
+    blocks = morton.decode(seen.codes, 3)
+    corner = region_corner(SQUARES, region.index)
+    places = np.concatenate([blocks * 8.0, blocks * 8.0 + 7, leaves])
+    points = np.concatenate(
+        [corner + (places + rng.uniform(-1, 2, places.shape)) * SQUARES.leaf_m for _ in range(10)]
+    )
+    outside = ((points < loss.minimum) | (points > loss.maximum)).any(axis=1)
+    assert outside.sum() > 1000
+    before = MapEvaluator(record).query(points[outside])
+    after = MapEvaluator(recovery.record).query(points[outside])
+    assert np.array_equal(before.sdf, after.sdf, equal_nan=True)
+    assert np.array_equal(before.status, after.status)
+
+
+@pytest.mark.parametrize("topic", [TRAINING, MOMENTS, SAMPLES])
+def test_training_state_goes_where_it_is_not_complete(recovered, topic):
+    chunk = next(chunk for chunk in chunks(DATA) if chunk.topic == topic)
+    recovery = recovered(flipped(DATA, chunk.end - 20))
+    assert [loss.key.topic for loss in recovery.losses] == [TRAINING]
+    hurt, spared = recovery.record.regions
+    assert hurt.training is None
+    assert_same(spared, RECORD.regions[1])
+    assert_same(without_training(recovery.record), without_training(RECORD))
+
+
+@pytest.mark.parametrize("topic", [MAP, PREVIEW])
+def test_parts_that_can_be_made_anew_are_no_loss(recovered, topic):
+    chunk = next(chunk for chunk in chunks(DATA) if chunk.topic == topic)
+    recovery = recovered(flipped(DATA, chunk.end - 20))
+    assert recovery.complete
+    assert_same(recovery.record, RECORD)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.4, 0.55, 0.7, 0.85, 0.95])
+def test_truncated_files(recovered, share):
+    recovery = recovered(DATA[: int(len(DATA) * share)])
+    assert not recovery.complete
+    assert recovery.parts_listed is None
+    assert recovery.parts_intact > 0
+    assert_answers(recovery)
+
+
+def test_a_file_cut_within_its_index_loses_nothing(recovered):
+    end = chunks(DATA)[-1].end
+    for cut in (end, end + 10, len(DATA) - 1):
+        assert_same(recovered(DATA[:cut]).record, RECORD)
+
+
+def test_blocks_of_zeros(recovered):
+    for first in range(0, len(DATA), len(DATA) // 24):
+        assert_answers(recovered(zeroed(DATA, first, first + 4096)))
+
+
+def test_without_its_front(recovered):
+    first = next(chunk for chunk in chunks(DATA) if chunk.topic == REGION)
+    assert_same(recovered(zeroed(DATA, 0, first.start)).record, RECORD)
+    assert_same(recovered(DATA[first.start :]).record, RECORD)
+
+
+def test_without_its_manifest(recovered):
+    manifest = chunks(DATA)[-1]
+    spoilt = zeroed(DATA, manifest.start, manifest.end)
+    recovery = recovered(spoilt)
+    assert not recovery.complete
+    assert recovery.losses == ()
+    assert_same(recovery.record, RECORD)
+    # Neither channels at the front nor in the summary:
+    first = next(chunk for chunk in chunks(DATA) if chunk.topic == MAP)
+    assert_same(recovered(zeroed(spoilt, 0, first.start)[: manifest.end]).record, RECORD)
+
+
+def test_lost_vertices_are_missed_without_a_manifest(recovered):
+    *parts, manifest = chunks(DATA)
+    for chunk in [chunk for chunk in parts if chunk.topic == VERTICES]:
+        spoilt = zeroed(DATA[: manifest.start], chunk.start, chunk.end)
+        recovery = recovered(spoilt)
+        assert [loss.key.topic for loss in recovery.losses].count(VERTICES) == 1
+        assert_answers(recovery)
+
+
+def test_without_front_and_manifest_nothing_tells_what_map_it_is(recovered):
+    first, last = chunks(DATA)[1], chunks(DATA)[-1]
+    with pytest.raises(MapFileError, match="nothing can be saved"):
+        recovered(DATA[first.start : last.start])
+    with pytest.raises(MapFileError, match="nothing can be saved"):
+        recovered(b"")
+    with pytest.raises(MapFileError, match="nothing can be saved"):
+        recovered(np.random.default_rng(0).bytes(100_000))
+
+
+def test_bytes_inserted_and_removed(recovered):
+    middle = len(DATA) // 2
+    assert_answers(recovered(DATA[:middle] + b"\x06" * 999 + DATA[middle:]))
+    assert_answers(recovered(DATA[:middle] + DATA[middle + 999 :]))
+
+
+def test_flipped_bytes_anywhere(recovered):
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        recovery = recovered(flipped(DATA, *rng.integers(0, len(DATA), 3).tolist()))
+        assert_answers(recovery)
+
+
+def test_a_file_rewritten_by_other_tools(recovered):
+    parts = [(topic, data) for topic, data in _messages(DATA) if topic in TOPICS]
+    one_chunk = rebuild([_Part(*part) for part in parts], {}, chunk_size=10**9)
+    assert_same(recovered(one_chunk).record, RECORD)
+
+
+_Part = dataclasses.make_dataclass("_Part", ["topic", "payload"])
+
+
+def _messages(data):
+    reader = make_reader(io.BytesIO(data))
+    return [(c.topic, m.data) for _, c, m in reader.iter_messages(log_time_order=False)]
+
+
+def test_a_newer_file_is_refused(recovered):
+    newer = with_metadata(file_bytes(RECORD), {"min_reader_version": "3", "format_version": "3"})
+    with pytest.raises(UnsupportedMapFileError, match="version 3"):
+        recovered(newer[:-100])
+    needs = with_metadata(file_bytes(RECORD), {"required_features": "holograms"})
+    with pytest.raises(UnsupportedMapFileError, match="holograms"):
+        recovered(needs[:-100])
+
+
+def test_a_delta_without_its_base(tmp_path):
+    base, delta = write_checkpoints(tmp_path, (3, 5))
+    assert_same(recover(delta).record, map_at(5))
+    third = base.stat().st_size // 3
+    base.write_bytes(base.read_bytes()[:third])  # its index is gone, not all of its parts
+    torn = recover(delta)
+    assert_same(torn.record.regions[-1], map_at(5).regions[1])
+    base.unlink()
+    recovery = recover(delta)
+    assert [region.index for region in recovery.record.regions] == [SECOND]
+    assert (REGION, FIRST) in [(loss.key.topic, loss.key.region) for loss in recovery.losses]
+    assert 0 < recovery.parts_intact < torn.parts_intact < recovery.parts_listed
+
+
+def test_version_1(recovered):
+    data, whole = GOLDEN_V1.read_bytes(), read_map(GOLDEN_V1)
+    intact = recovered(data)
+    assert intact.complete
+    assert_same(intact.record, whole)
+    places = chunks(data)
+    second = [chunk.start for chunk in places if chunk.topic == REGION][1]
+    cut = recovered(data[: second + 10])
+    assert not cut.complete
+    assert_same(cut.record.regions, whole.regions[:1])
+
+    def without(topic):
+        chunk = next(chunk for chunk in places if chunk.topic == topic)
+        return recovered(flipped(data, chunk.end - 20))
+
+    lost = without(VERTICES)
+    assert [(loss.key.topic, loss.key.region) for loss in lost.losses] == [(REGION, (0, 0, 0))]
+    assert_same(lost.record.regions, whole.regions[1:])
+    unseen = without(EVIDENCE)
+    assert [loss.key.topic for loss in unseen.losses] == [EVIDENCE]
+    assert_same(unseen.record.regions[0].tables, whole.regions[0].tables)
+    assert_same(unseen.record.regions[0].training, whole.regions[0].training)
+    untaught = without(MOMENTS)
+    assert [loss.key.topic for loss in untaught.losses] == [TRAINING]
+    assert_same(without_training(untaught.record).regions, without_training(whole).regions)
+    assert without(MANIFEST).parts_listed is None
+
+
+def test_tool(tmp_path, capsys):
+    broken, out = tmp_path / "broken.triquad", tmp_path / "out.triquad"
+    broken.write_bytes(DATA[:-100])
+    assert main([str(broken), str(out)]) == 1
+    assert "triquad-pack --recover" in capsys.readouterr().err
+    assert not out.exists()
+    assert main(["--recover", str(broken), str(out)]) == 0
+    assert "saved all" in capsys.readouterr().out
+    assert_same(read_map(out), RECORD)
+    chunk = next(chunk for chunk in chunks(DATA) if chunk.topic == VERTICES)
+    broken.write_bytes(flipped(DATA, chunk.end - 20))
+    assert main(["--recover", "--force", str(broken), str(out)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("lost: training state of region 0 0 0")
+    assert lines[1] == (
+        "lost: vertices of plane XY of region 0 0 0: now UNKNOWN, "
+        "x -65.0 to 0.5 m, y -65.0 to 0.5 m, z -64.5 to 64.5 m"
+    )
+    assert lines[2].startswith("saved ")
+    assert_same(read_map(out), recover(broken).record)
+    before = out.read_bytes()
+    broken.write_bytes(DATA[:100])
+    assert main(["--recover", "--force", str(broken), str(out)]) == 2
+    assert "nothing can be saved" in capsys.readouterr().err
+    assert out.read_bytes() == before

@@ -1,0 +1,307 @@
+"""docs/map-file.md is complete: a reader written from it alone answers as the project's does."""
+
+import dataclasses
+import io
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support import map_records, spec_reader
+from support.map_records import SMALL
+from support.spec_parts import Map, RefusedError
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.records import morton
+from triquad_format.records.region import MapRecord
+from triquad_map.reference.evaluator import MapEvaluator
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+NEIGHBOURS = ((0, 0, 0), (1, 0, 0), (0, -1, 0), (1, -1, 0), (0, 0, 1))
+WIDE = dataclasses.replace(SMALL, depth=10)
+"""Four squares to a side."""
+
+
+def with_step(record: MapRecord, step: float) -> MapRecord:
+    """The record with another scale of its integers, which is no power of two."""
+    scale = float(np.float32(step))
+    regions = []
+    for region in record.regions:
+        tables = tuple(dataclasses.replace(table, scale=scale) for table in region.tables)
+        regions.append(dataclasses.replace(region, tables=tables))
+    return dataclasses.replace(record, regions=tuple(regions))
+
+
+VARIANTS = {
+    "a training state": map_records.random_record(1, points=400),
+    "overlapping regions": map_records.random_record(2, indices=NEIGHBOURS, points=200),
+    "single-precision features": map_records.random_record(3, feature_dtype="<f4", points=400),
+    "integers of a byte": map_records.with_integers(map_records.random_record(4, points=400)),
+    "integers of two bytes": with_step(
+        map_records.with_integers(map_records.random_record(5, points=400), limit=32_000), 1e-4
+    ),
+    "features alone": map_records.random_record(
+        6,
+        settings=dataclasses.replace(SMALL, encoding="features", feature_levels=4, leaf_m=0.2),
+        points=400,
+    ),
+    "no features": map_records.random_record(
+        7, settings=dataclasses.replace(SMALL, encoding="fourier", depth=7), points=2000
+    ),
+    "many squares": map_records.random_record(
+        8, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000
+    ),
+    "levels": map_records.with_levels(
+        map_records.random_record(10, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
+    ),
+    "no vertices": map_records.random_record(9, points=0),
+}
+
+
+def probes(answers: Map, count: int = 4000) -> NDArray[np.float64]:
+    """Points in, around and far outside a map's regions, borders of cells and voxels among them.
+
+    Half of them lie near the rows of the evidence, where a status other than unknown is likely.
+    """
+    rng = np.random.default_rng(0)
+    settings = answers.settings
+    centres = np.array([region.centre for region in answers.regions.values()])
+    anywhere = rng.uniform(-0.6, 0.6, (count, 3)) * settings.side + rng.choice(centres, count)
+    on_borders = np.round(anywhere[::4] / (settings.leaf / 2)) * (settings.leaf / 2)
+    voxels = np.concatenate([surface_voxels(region) for region in answers.regions.values()])
+    if len(voxels):
+        near = rng.choice(voxels, count) + rng.uniform(-2, 2, (count, 3)) * settings.leaf
+        anywhere = np.concatenate([anywhere, near])
+    return np.concatenate([anywhere, on_borders, centres + 100 * settings.side])
+
+
+def surface_voxels(region: object) -> NDArray[np.float64]:
+    """Middles of the voxels whose surface bit is set."""
+    table, settings = region.surface, region.settings
+    bits = np.unpackbits(table.values[:-1].reshape(-1, 8, 8, 1), axis=-1, bitorder="little")
+    row, *inner = np.nonzero(bits)
+    blocks = np.stack([table.places[:-1] >> 20 * axis & (1 << 20) - 1 for axis in range(3)], -1)
+    voxels = 8 * blocks[row] + np.stack(inner, -1)
+    return (voxels + 0.5 - 2 ** (settings.depth - 1)) * settings.leaf + region.centre
+
+
+def assert_agree(answers: Map, record: MapRecord, points: NDArray[np.float64]) -> None:
+    have_sdf, have_gradient = answers.distance(points)
+    want = MapEvaluator(record).query(points, gradient=True)
+    np.testing.assert_array_equal(answers.status(points), want.status)
+    np.testing.assert_allclose(have_sdf, want.sdf, rtol=1e-5, atol=1e-5)
+    assert np.isfinite(have_sdf).any()
+    apart = ~np.isclose(have_gradient, want.gradient, rtol=1e-3, atol=1e-3, equal_nan=True)
+    assert apart.any(1).mean() < 1e-3  # a sum that rounds to the other side of max(y, 0)
+
+
+def assert_same_support(answers: Map, record: MapRecord) -> None:
+    """Levels and times are those of the record, voxel by voxel; 0 where it has none."""
+    for region in record.regions:
+        evidence, have = region.evidence, answers.regions[region.index]
+        blocks = morton.decode(evidence.codes, 3)
+        bits = np.unpackbits(evidence.surface, axis=1, bitorder="little").astype(bool)
+        levels = have.levels(blocks)
+        assert not levels[~bits].any()
+        seen_s = have.seen(blocks)[:, 0]
+        np.testing.assert_array_equal(levels[bits], or_zeros(evidence.levels, bits.sum()))
+        np.testing.assert_array_equal(seen_s, or_zeros(evidence.seen_s, len(blocks)))
+
+
+def or_zeros(column: NDArray | None, count: int) -> NDArray:
+    return np.zeros(count) if column is None else column
+
+
+def write_variant(path: Path, name: str) -> Path:
+    dtype = "<f4" if name.startswith("single") else "<f2"
+    write_map(VARIANTS[name], path, feature_dtype=dtype)
+    return path
+
+
+@pytest.mark.parametrize("name", ["map_v2.triquad", "map_v2_next.triquad", "map_v2_levels.triquad"])
+def test_the_samples(name: str) -> None:
+    answers = spec_reader.load(GOLDEN / name)
+    points = probes(answers)
+    assert {0, 2} <= set(answers.status(points))
+    record = read_map(GOLDEN / name)
+    assert_agree(answers, record, points)
+    assert_same_support(answers, record)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_maps_of_every_kind(tmp_path: Path, name: str) -> None:
+    path = write_variant(tmp_path / "map.triquad", name)
+    answers = spec_reader.load(path)
+    points = probes(answers)
+    if name != "no vertices":
+        assert set(answers.status(points)) == {0, 1, 2}
+    record = read_map(path)
+    assert_agree(answers, record, points)
+    assert_same_support(answers, record)
+    assert (record.regions[0].evidence.levels is not None) == (name == "levels")
+
+
+# Section 9
+
+
+def test_one_place_is_read_by_the_index(tmp_path: Path) -> None:
+    path = write_variant(tmp_path / "map.triquad", "many squares")
+    record = read_map(path)
+    points = probes(spec_reader.load(path), 8)
+    assert np.isfinite(MapEvaluator(record).query(points).sdf).sum() > 8
+    for point in points:
+        file, parts = spec_reader.read_near(path, point[None])
+        near = Map(file.manifest.values, parts)
+        have, want = near.distance(point[None])[0], MapEvaluator(record).query(point[None])
+        np.testing.assert_allclose(have, want.sdf, rtol=1e-5, atol=1e-5)
+        assert near.status(point[None]) == want.status
+        assert file.bytes_read < path.stat().st_size / 4
+
+
+def test_one_place_of_a_map_in_two_files() -> None:
+    path = GOLDEN / "map_v2_next.triquad"
+    points = probes(spec_reader.load(path), 500)
+    file, parts = spec_reader.read_near(path, points)
+    assert file.bases[1].bytes_read > 0
+    assert_agree(Map(file.manifest.values, parts), read_map(path), points)
+
+
+def test_a_damaged_part_is_refused_by_the_index(tmp_path: Path) -> None:
+    path = write_variant(tmp_path / "map.triquad", "a training state")
+    file = spec_reader.IndexedFile(path)
+    row = next(row for row in file.manifest.own if row.key[0] == "/triquad/region")
+    assert file.read(row)
+    start, size = file.chunks[file.manifest.own.index(row)]
+    flip(path, start + size - 1)
+    with pytest.raises((RefusedError, spec_reader.zstandard.ZstdError)):
+        spec_reader.IndexedFile(path).read(row)
+
+
+# What must be refused
+
+
+def flip(path: Path, at: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[at] ^= 0x10
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("at", range(0, (GOLDEN / "map_v2.triquad").stat().st_size, 2003))
+def test_a_flipped_bit_is_refused(tmp_path: Path, at: int) -> None:
+    path = tmp_path / "map.triquad"
+    shutil.copyfile(GOLDEN / "map_v2.triquad", path)
+    flip(path, at)
+    assert_both_refuse(path)
+
+
+def test_a_file_without_its_base_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "next.triquad"
+    shutil.copyfile(GOLDEN / "map_v2_next.triquad", path)
+    with pytest.raises(FileNotFoundError):
+        spec_reader.load(path)
+    with pytest.raises(FormatError):
+        read_map(path)
+
+
+def test_another_base_with_the_same_parts_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "next.triquad"
+    shutil.copyfile(GOLDEN / "map_v2_next.triquad", path)
+    base = spec_reader.read_whole(GOLDEN / "map_v2.triquad")[0]
+    record = read_map(GOLDEN / "map_v2.triquad")
+    later = dataclasses.replace(record, epoch=record.epoch + 1)
+    stamp_ns = base.values["created_ns"]
+    write_map(later, tmp_path / "map_v2.triquad", stamp_ns=stamp_ns, preview=False)
+    same = spec_reader.read_whole(tmp_path / "map_v2.triquad")[0]
+    assert [row.digest for row in same.rows[1:]] == [row.digest for row in base.rows[1:]]
+    assert_both_refuse(path)
+
+
+def assert_both_refuse(path: Path) -> None:
+    with pytest.raises((RefusedError, spec_reader.zstandard.ZstdError)):
+        spec_reader.load(path)
+    with pytest.raises(FormatError):
+        read_map(path)
+
+
+# Files as another MCAP tool may write them
+
+
+def unchunked_copy(
+    metadata: dict[str, str], parts: list[tuple[str, bytes]], extra: dict[str, str] | None = None
+) -> bytes:
+    """A map file without chunks, checksums and indexes."""
+    out = io.BytesIO()
+    out.write(spec_reader.MAGIC + record(1, text("") + text("a copy")))
+    topics = sorted({topic for topic, _ in parts})
+    for i, topic in enumerate(topics):
+        encoding = "protobuf" if topic == "/preview/mesh" else "msgpack"
+        channel = struct.pack("<HH", i, 0) + text(topic) + text(encoding) + bytes(4)
+        out.write(record(spec_reader.CHANNEL, channel))
+    pairs = b"".join(text(k) + text(v) for k, v in (metadata | (extra or {})).items())
+    body = text("triquad") + struct.pack("<I", len(pairs)) + pairs
+    out.write(record(spec_reader.METADATA, body))
+    for topic, payload in parts:
+        head = struct.pack("<HIQQ", topics.index(topic), 0, 0, 0)
+        out.write(record(spec_reader.MESSAGE, head + payload))
+    out.write(record(spec_reader.DATA_END, bytes(4)) + record(spec_reader.FOOTER, bytes(20)))
+    return out.getvalue() + spec_reader.MAGIC
+
+
+def record(code: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", code, len(content)) + content
+
+
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+@pytest.fixture
+def sample() -> tuple[dict[str, str], list[tuple[str, bytes]]]:
+    return spec_reader.scan((GOLDEN / "map_v2.triquad").read_bytes())
+
+
+def test_a_copy_without_chunks(tmp_path: Path, sample: tuple) -> None:
+    path = tmp_path / "map.triquad"
+    later = {"format_version": "9", "weather": "fine"}
+    path.write_bytes(unchunked_copy(*sample, extra=later))
+    answers = spec_reader.load(path)
+    assert_agree(answers, read_map(GOLDEN / "map_v2.triquad"), probes(answers))
+    assert_agree(answers, read_map(path), probes(answers))
+
+
+def test_digests_stand_alone(tmp_path: Path, sample: tuple) -> None:
+    metadata, parts = sample
+    for i, (topic, payload) in enumerate(parts[:-1]):
+        path = tmp_path / f"{i}.triquad"
+        altered = (topic, payload[:-1] + bytes([payload[-1] ^ 1]))
+        path.write_bytes(unchunked_copy(metadata, [*parts[:i], altered, *parts[i + 1 :]]))
+        assert_both_refuse(path)
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {"min_reader_version": "3"},
+        {"required_features": "holograms"},
+        {"required_features": "base-files,holograms"},
+        {"epoch": "999"},
+        {"map": "another"},
+        {"units": "ft"},
+    ],
+)
+def test_facts_that_must_be_refused(tmp_path: Path, sample: tuple, extra: dict[str, str]) -> None:
+    path = tmp_path / "map.triquad"
+    path.write_bytes(unchunked_copy(*sample, extra=extra))
+    assert_both_refuse(path)
+
+
+def test_parts_that_are_missing_doubled_or_moved(tmp_path: Path, sample: tuple) -> None:
+    metadata, parts = sample
+    *own, manifest = parts
+    wrong = [own[:-1], [*own, own[-1]], own[::-1], [*own[:2], own[0], *own[3:]]]
+    for i, some in enumerate(wrong):
+        path = tmp_path / f"{i}.triquad"
+        path.write_bytes(unchunked_copy(metadata, [*some, manifest]))
+        assert_both_refuse(path)

@@ -1,0 +1,62 @@
+import contextlib
+
+import msgpack
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from triquad_format.errors import WireError
+from triquad_format.wire import codec
+from triquad_format.wire.messages import StatusRequest
+from triquad_format.wire.structure import check_structure
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.binary(max_size=300)
+    | st.text(max_size=300),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(), inner, max_size=5),
+    max_leaves=12,
+)
+
+
+@given(VALUES)
+def test_ordinary_values_pass(value):
+    packed = msgpack.packb(value)
+    check_structure(packed)
+    with pytest.raises(WireError):
+        check_structure(packed[:-1])
+
+
+@given(st.binary(max_size=200))
+def test_what_passes_can_be_unpacked_and_what_does_not_is_named(payload):
+    try:
+        check_structure(payload)
+    except WireError:
+        return
+    with contextlib.suppress(ValueError, TypeError):  # text that is not UTF-8, or a map as a key
+        msgpack.unpackb(payload, strict_map_key=False)
+    with pytest.raises(WireError):
+        check_structure(payload + b"\xc0")
+
+
+@pytest.mark.parametrize(
+    ("payload", "words"),
+    [
+        (
+            b"\x81\xa1a\xdd" + (9).to_bytes(4, "big") + (b"\xdc\xff\xff" + b"\x90" * 65535) * 9,
+            "objects",
+        ),
+        (b"\xdd\xff\xff\xff\xff", "objects"),
+        (b"\x91" * 5000 + b"\x01", "deep"),
+        (b"\x82\xa7triquad\x01\xa4kind" + b"\x91" * 1000 + b"\x01", "deep"),
+        (msgpack.packb({"a": 1}) + b"\x00", "follows"),
+        (msgpack.packb({"a": b"123456"})[:-1], "incomplete"),
+        (msgpack.packb(msgpack.ExtType(3, b"x")), "type"),
+        (b"", "incomplete"),
+    ],
+)
+def test_bombs_are_refused_before_anything_is_built(payload, words):
+    with pytest.raises(WireError, match=words):
+        codec.decode(StatusRequest, payload)

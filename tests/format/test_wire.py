@@ -1,0 +1,238 @@
+import dataclasses
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.wire import codec, messages
+from triquad_format.wire.codec import Message
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    FlushReply,
+    MapChunk,
+    Scan,
+    SdfReply,
+    SdfRequest,
+    ServerStatus,
+    StatusRequest,
+    TileList,
+    TileRequest,
+)
+
+POSE = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], np.float64)
+POINTS = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
+SCAN = Scan(POINTS, POSE, 123, "lidar", 2**62, 4)
+STATUS = ServerStatus(
+    map_name="lab",
+    server="s",
+    version="1",
+    device="cpu",
+    epoch=3,
+    settled=True,
+    scans_taken=1,
+    scans_dropped={"decode": 2},
+    scans_lost={},
+    scans_waiting=0,
+    points_dropped={},
+    requests_refused={},
+    samples_trained=9,
+    segments_kept=9,
+    loss=0.5,
+    regions=1,
+    vertices=2,
+    parameters=3,
+    memory_bytes=4,
+    uptime_s=1.5,
+    last_checkpoint=CheckpointInfo("p", 1, 2, "ab", 3),
+    store_error=None,
+)
+EXAMPLES = [
+    SCAN,
+    SdfRequest(np.array([1e6, 2e6, 3.0]), POINTS, True, 0),
+    SdfReply(5, np.array([0.5, np.nan], np.float32), np.array([1, 0], np.uint8), None),
+    SdfReply(5, np.zeros(0, np.float32), np.zeros(0, np.uint8), np.zeros((0, 3), np.float32)),
+    TileList(2, 6.4, np.array([[-1, 0, 1]], np.int32), np.array([7], np.int64)),
+    StatusRequest(),
+    STATUS,
+    FlushReply(1, 2, 3, None),
+    MapChunk(0, b"\x00\xff"),
+]
+
+
+def all_messages() -> list[type[Message]]:
+    return [
+        kind
+        for kind in vars(messages).values()
+        if isinstance(kind, type) and issubclass(kind, Message) and kind is not Message
+    ]
+
+
+def same(left: object, right: object) -> bool:
+    if isinstance(left, np.ndarray):
+        return left.dtype == right.dtype and np.array_equal(left, right, equal_nan=True)
+    return left == right
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_round_trip(message):
+    copy = codec.decode(type(message), codec.encode(message))
+    for part in dataclasses.fields(message):
+        assert same(getattr(message, part.name), getattr(copy, part.name)), part.name
+
+
+def test_all_messages_are_frozen_records_with_known_fields():
+    kinds = all_messages()
+    assert len(kinds) == 22
+    for kind in kinds:
+        assert kind.__dataclass_params__.frozen, kind
+        assert list(kind.annotations()) == [part.name for part in dataclasses.fields(kind)]
+
+
+def test_golden_bytes_of_a_request_without_fields():
+    assert codec.encode(StatusRequest()) == b"\x82\xa7triquad\x01\xa4kind\xadStatusRequest"
+
+
+def test_golden_bytes_of_a_query():
+    request = SdfRequest(np.array([1.0, 0.0, -2.0]), np.array([[0.5, 0, 0]], np.float32), False, 0)
+    assert codec.encode(request) == (
+        b"\x86\xa7triquad\x01\xa4kind\xaaSdfRequest"
+        b"\xa6origin\x83\xa5dtype\xa3<f8\xa5shape\x91\x03\xa4data\xc4\x18"
+        b"\x00\x00\x00\x00\x00\x00\xf0\x3f" + bytes(8) + b"\x00\x00\x00\x00\x00\x00\x00\xc0"
+        b"\xa6points\x83\xa5dtype\xa3<f4\xa5shape\x92\x01\x03\xa4data\xc4\x0c"
+        b"\x00\x00\x00\x3f" + bytes(8) + b"\xa8gradient\xc2\xa5epoch\x00"
+    )
+
+
+def test_big_endian_and_strided_arrays_travel_as_little_endian():
+    points = np.array([[1, 2, 3], [4, 5, 6]], np.float32)[::-1]
+    request = SdfRequest(np.zeros(3), points, False, 0)
+    assert np.array_equal(codec.decode(SdfRequest, codec.encode(request)).points, points)
+
+
+def test_fields_of_a_later_revision_are_ignored():
+    body = msgpack.unpackb(codec.encode(StatusRequest()))
+    assert codec.decode(StatusRequest, msgpack.packb(body | {"later": 1})) == StatusRequest()
+
+
+def test_fields_with_a_default_may_be_missing():
+    body = msgpack.unpackb(codec.encode(TileRequest(1, 2, 3, 4, 1)))
+    assert codec.decode(TileRequest, msgpack.packb(body)).level == 1
+    del body["level"]
+    assert codec.decode(TileRequest, msgpack.packb(body)) == TileRequest(1, 2, 3, 4, 0)
+    del body["x"]
+    with pytest.raises(WireError, match="TileRequest.x: missing"):
+        codec.decode(TileRequest, msgpack.packb(body))
+
+
+def changed(message: Message, **changes: object) -> bytes:
+    return msgpack.packb(msgpack.unpackb(codec.encode(message)) | changes)
+
+
+def array(dtype: object = "<f4", shape: object = (2, 3), data: object = bytes(24)) -> object:
+    return {"dtype": dtype, "shape": list(shape) if isinstance(shape, tuple) else shape} | {
+        "data": data
+    }
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        array("<f8", (2, 3), bytes(48)),
+        array("|O", (2, 3)),
+        array([], (2, 3)),
+        array("<f4", (3, 2)),
+        array("<f4", (6,)),
+        array("<f4", (2, 3), bytes(23)),
+        array("<f4", (2, 3), "text"),
+        array("<f4", (2**39, 3), b""),
+        array("<f4", (2**63, 3), b""),
+        array("<f4", (-1, 3), b""),
+        array("<f4", (True, 3), bytes(12)),
+        array("<f4", (2.0, 3)),
+        array("<f4", None),
+        array("<f4", (1,) * 99, bytes(4)),
+        {"dtype": "<f4"},
+        [1, 2, 3],
+        None,
+    ],
+)
+def test_arrays_that_lie_are_refused(points):
+    with pytest.raises(WireError, match=r"Scan\.points"):
+        codec.decode(Scan, changed(SCAN, points=points))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("stamp_ns", 1.5), ("stamp_ns", True), ("source", 1), ("session", 2**64 - 1), ("source", b"")],
+)
+def test_fields_of_another_type_are_refused_by_name(name, value):
+    with pytest.raises(WireError, match=f"Scan.{name}"):
+        codec.decode(Scan, changed(SCAN, **{name: value}))
+
+
+def test_missing_field_is_named():
+    body = msgpack.unpackb(codec.encode(SCAN))
+    del body["session"]
+    with pytest.raises(WireError, match=r"Scan\.session: missing"):
+        codec.decode(Scan, msgpack.packb(body))
+
+
+def test_another_version_is_told_apart():
+    with pytest.raises(ProtocolVersionError, match="version 2"):
+        codec.decode(Scan, changed(SCAN, triquad=2))
+
+
+def test_another_kind_is_refused():
+    with pytest.raises(WireError, match="expected a Scan, got 'StatusRequest'"):
+        codec.decode(Scan, codec.encode(StatusRequest()))
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"\xc1", b"\x01", b"\x80", b"\xdf\xff\xff\xff\xff", b"\x91" * 5000, b"\x81\x90\x01"],
+)
+def test_other_bytes_are_refused(payload):
+    with pytest.raises(WireError):
+        codec.decode(Scan, payload)
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_never_do_more_than_refuse(payload):
+    with pytest.raises(WireError):
+        codec.decode(Scan, payload)
+
+
+@given(st.sampled_from(EXAMPLES), st.data())
+def test_cut_messages_are_refused(message, data):
+    payload = codec.encode(message)
+    length = data.draw(st.integers(0, len(payload) - 1))
+    with pytest.raises(WireError):
+        codec.decode(type(message), payload[:length])
+
+
+@given(st.sampled_from(EXAMPLES), st.data())
+def test_messages_with_a_changed_byte_are_read_or_refused(message, data):
+    payload = bytearray(codec.encode(message))
+    payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        read = codec.decode(type(message), bytes(payload))
+    except WireError:
+        return
+    assert type(read) is type(message)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        dataclasses.replace(SCAN, points=POINTS.astype(np.float64)),
+        dataclasses.replace(SCAN, points=POINTS.T),
+        dataclasses.replace(SCAN, source=3),
+        dataclasses.replace(SCAN, session=2**63),
+        dataclasses.replace(STATUS, scans_dropped={"a": "b"}),
+    ],
+)
+def test_values_that_do_not_fit_are_not_encoded(message):
+    with pytest.raises(WireError):
+        codec.encode(message)

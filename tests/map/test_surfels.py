@@ -1,0 +1,124 @@
+"""Surfels follow the field and the evidence, as if they were always made anew."""
+
+import numpy as np
+import pytest
+from support import small_world
+from triquad_map.compiled.compiled_view import field_samples, in_one
+from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.surfels.surfel_map import SurfelMap, SurfelTask, first_surfels
+from triquad_map.nearest import NearestSurfels, no_surfels
+from triquad_map.surface.surfels import FieldSample, SurfelKind, fit_surfels
+from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.mapping.mapper import Mapper
+
+SIDE = 64
+
+
+def plane(normal: np.ndarray, height: float):
+    """The exact field of a half space, in voxels."""
+
+    def sample(points: np.ndarray) -> FieldSample:
+        values = points @ normal - height
+        return FieldSample(values.astype(np.float32), np.tile(normal, (len(points), 1)))
+
+    return sample
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0.6, 0, 0.8), (0.267, 0.535, 0.802)])
+def test_a_disc_lies_where_the_field_is_zero(normal):
+    normal = np.array(normal) / np.linalg.norm(normal)
+    voxels = np.array([[30, 30, 30]])
+    field = plane(normal, float(voxels[0] @ normal) + 0.6 * normal.sum())
+    surfels = fit_surfels(voxels, field, lambda asked: np.zeros(len(asked), bool))
+    assert surfels.kinds[0] == SurfelKind.DISC
+    point = voxels[0] + 0.5 + surfels.offsets[0]
+    assert abs(field(point[None]).values[0]) < 1e-4
+    np.testing.assert_allclose(surfels.normals[0], normal, atol=1e-5)
+
+
+def test_of_two_voxels_on_one_surface_one_counts():
+    field = plane(np.array([0.0, 0, 1]), 30.7)  # in the lower voxel
+    voxels = np.array([[30, 30, 30], [30, 30, 31]])
+    seen = {tuple(voxel) for voxel in voxels.tolist()}
+
+    def ended_in(asked: np.ndarray) -> np.ndarray:
+        return np.array([tuple(voxel) in seen for voxel in asked.tolist()], bool)
+
+    surfels = fit_surfels(voxels, field, ended_in)
+    assert surfels.kinds.tolist() == [SurfelKind.DISC, SurfelKind.NONE]
+
+
+def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
+    def flat(points: np.ndarray) -> FieldSample:
+        return FieldSample(np.full(len(points), 2.0, np.float32), np.zeros((len(points), 3)))
+
+    surfels = fit_surfels(np.array([[5, 6, 7]]), flat, lambda asked: np.zeros(len(asked), bool))
+    assert surfels.kinds[0] == SurfelKind.POINT
+    np.testing.assert_array_equal(surfels.offsets[0], 0)
+
+
+def nearest(surfels: SurfelMap, points: np.ndarray) -> NearestSurfels:
+    found = no_surfels(np.full(len(points), 40.0))
+    surfels.find_nearest(points, found)
+    return found
+
+
+def random_evidence(rng: np.random.Generator, count: int) -> Evidence:
+    evidence = Evidence(SIDE)
+    evidence.mark_surface(rng.uniform((0, 0, 28), (SIDE, SIDE, 33), (count, 3)))
+    return evidence
+
+
+def test_surfels_kept_up_to_date_are_those_made_anew():
+    rng = np.random.default_rng(0)
+    evidence = random_evidence(rng, 300)
+    before, after = (plane(np.array([0.6, 0, 0.8]), height) for height in (43.0, 43.3))
+    surfels = first_surfels(evidence.copy(), before, SurfelTask(1, None))
+    evidence.mark_surface(rng.uniform((0, 0, 25), (SIDE, SIDE, 35), (200, 3)))
+    evidence.clear(np.array([0.0, 0, 0]), np.array([20.0, 20, 64]))
+    kept = surfels.updated(evidence.copy(), after, SurfelTask(2, None))
+    anew = first_surfels(evidence.copy(), after, SurfelTask(2, None))
+    assert len(kept) == len(anew) > 300
+    points = rng.uniform(0, SIDE, (500, 3))
+    for mine, wanted in zip(nearest(kept, points), nearest(anew, points), strict=True):
+        np.testing.assert_array_equal(mine, wanted)
+
+
+def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
+    rng = np.random.default_rng(1)
+    evidence = random_evidence(rng, 400)
+    low, high = (plane(np.array([0.0, 0, 1]), height) for height in (29.5, 31.5))
+    surfels = first_surfels(evidence.copy(), low, SurfelTask(1, None))
+    new = np.array([[10.5, 10.5, 50.5]])
+    evidence.mark_surface(new)
+    points = np.concatenate([new + (0, 0, 3.0), rng.uniform((0, 0, 36), (SIDE, SIDE, 40), (50, 3))])
+    wanted = first_surfels(evidence.copy(), high, SurfelTask(1, None))
+    rounds = 0
+    while not np.array_equal(nearest(surfels, points).feet, nearest(wanted, points).feet):
+        surfels = surfels.updated(evidence.copy(), high, SurfelTask(2 + rounds, 100))
+        rounds += 1
+        np.testing.assert_allclose(nearest(surfels, points[:1]).distances, 3.0)
+        assert rounds < 10
+    assert rounds > 1
+
+
+def surfels_of(region: FrozenRegion, mapper_settings: object) -> SurfelMap:
+    samples = field_samples(region.engine, mapper_settings, in_one)  # type: ignore[arg-type]
+    return first_surfels(region.evidence, samples, SurfelTask(1, None))
+
+
+def test_a_settled_map_answers_from_the_field_as_it_is():
+    chosen = small_world.settings()
+    drive = small_world.world(3)
+    mapper = Mapper("test", chosen, "cpu")
+    for scan in drive.scans:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+        mapper.train()
+        mapper.publish()
+    small_world.settle(mapper)
+    epoch = mapper.publish()
+    rng = np.random.default_rng(3)
+    for region in epoch.frozen_regions:
+        points = rng.uniform(0, 1 << chosen.field.depth, (200, 3))
+        expected = nearest(surfels_of(region, chosen.field), points)
+        np.testing.assert_array_equal(nearest(region.surfels, points).feet, expected.feet)

@@ -1,0 +1,149 @@
+"""Compiled code against tensors: values, gradients and training."""
+
+import numpy as np
+import pytest
+import torch
+from support import small_world
+from triquad_format.records.field_settings import FieldSettings
+from triquad_map.compiled.field.batch import load, new_tile
+from triquad_map.compiled.field.encoding import locate
+from triquad_server.engine.adam import Betas, Parameter
+from triquad_server.engine.engine import CompiledEngine, GradientSums, TorchEngine, make_engine
+from triquad_server.engine.field import Field
+from triquad_server.mapping.sampling import Batch
+
+CPU = torch.device("cpu")
+CASES = [
+    FieldSettings(depth=8, frequencies=4),
+    FieldSettings(depth=12),
+    FieldSettings(depth=9, feature_size=5, feature_levels=2, hidden=17),
+    FieldSettings(depth=8, encoding="features"),
+    FieldSettings(depth=8, encoding="fourier"),
+]
+
+
+def trained(settings: FieldSettings) -> Field:
+    field = Field(settings, CPU, 3)
+    batch = samples(settings, 4000)
+    field.grow(leaves(settings, batch))
+    for _ in range(3):
+        field.train(batch.points, batch.labels, 0.01, Betas(0.9, 0.99))
+    return field
+
+
+def leaves(settings: FieldSettings, batch: Batch) -> np.ndarray:
+    """The leaves of the batch's points, which lie inside the cube."""
+    points = batch.points.numpy()
+    return np.floor(points / settings.leaf_m).astype(np.int64) + 2 ** (settings.depth - 1)
+
+
+def samples(settings: FieldSettings, count: int, seed: int = 0) -> Batch:
+    generator = torch.Generator().manual_seed(seed)
+    half = min(12.0, settings.region_side_m * 0.49)
+    points = (torch.rand((count, 3), generator=generator) * 2 - 1) * half
+    return Batch(points, 0.3 * torch.sin(points).sum(1))
+
+
+@pytest.mark.parametrize("settings", CASES)
+def test_values_and_gradients_are_equal(settings: FieldSettings) -> None:
+    field = trained(settings)
+    points = samples(settings, 3000, seed=1).points.numpy()
+    slow = TorchEngine(field).evaluate(points, gradient=True)
+    fast = CompiledEngine(field).evaluate(points, gradient=True)
+    np.testing.assert_allclose(fast.sdf, slow.sdf, atol=2e-6)
+    # At a kink, rounding may choose the other side: all but a few must agree.
+    error = np.abs(fast.gradient - slow.gradient).max(axis=1)
+    assert np.quantile(error, 0.99) < 1e-4 * np.abs(slow.gradient).max()
+    values_only = CompiledEngine(field).evaluate(points, gradient=False)
+    np.testing.assert_array_equal(values_only.sdf, fast.sdf)
+    assert len(values_only.gradient) == 0
+
+
+@pytest.mark.parametrize("settings", CASES)
+def test_a_training_step_is_equal(settings: FieldSettings) -> None:
+    slow, fast = trained(settings), trained(settings)
+    batch = samples(settings, 4096, seed=2)
+    engine = CompiledEngine(fast, GradientSums())
+    for step in range(3):
+        loss = float(TorchEngine(slow).train(batch, 0.01, Betas(0.9, 0.99)))
+        assert engine.train(batch, 0.01, Betas(0.9, 0.99)) == pytest.approx(loss, rel=1e-4), step
+    assert torch.equal(slow.features.steps, fast.features.steps)
+    # The gradient's moments are what the step is made of.
+    scale = float(slow.features.means.abs().max())
+    torch.testing.assert_close(fast.features.means, slow.features.means, atol=1e-3 * scale, rtol=0)
+    for part, other in zip(fast.mlp, slow.mlp, strict=True):
+        torch.testing.assert_close(part.means, other.means, atol=1e-4, rtol=1e-3)
+        torch.testing.assert_close(part.values, other.values, atol=1e-3, rtol=0)
+
+
+def test_training_goes_on_after_growth() -> None:
+    settings = FieldSettings(depth=8, frequencies=4)
+    field = trained(settings)
+    engine = make_engine(field, GradientSums())
+    batch = samples(settings, 2048, seed=5)
+    before = len(field.features)
+    field.grow(leaves(settings, batch))
+    assert len(field.features) > before
+    losses = [engine.train(batch, 0.01, Betas(0.9, 0.99)) for _ in range(60)]
+    assert losses[-1] < losses[0]
+    assert field.features.steps[before:].min() > 0
+
+
+def test_points_outside_the_cube_get_values_without_features() -> None:
+    settings = FieldSettings(depth=8, frequencies=4)
+    field = trained(settings)
+    points = np.array([[100.0, 0, 0], [0, -26.0, 1], [25.6, 25.6, 25.6]], np.float32)
+    slow = TorchEngine(field).evaluate(points, gradient=False)
+    np.testing.assert_allclose(
+        CompiledEngine(field).evaluate(points, gradient=False).sdf,
+        slow.sdf,
+        atol=2e-6,
+    )
+
+
+@pytest.mark.parametrize("levels", [1, 3, 4])
+def test_the_faces_of_the_cube_are_no_trap(levels: int) -> None:
+    """Where rounding takes a point just outside, no vertex is looked for beyond its block."""
+    for leaf_m in np.linspace(0.1, 0.5, 201):
+        settings = FieldSettings(leaf_m=float(leaf_m), depth=6, feature_levels=levels, hidden=4)
+        field = Field(settings, CPU, 3)
+        compiled = CompiledEngine(field)._compiled()
+        face = np.float32(-settings.region_side_m / 2)
+        points = np.array([[face, face, face], [0, face, face], [face, 0, 0]], np.float32)
+        near = np.concatenate([points, np.nextafter(points, np.float32(-1e9)), -points])
+        tile = new_tile(levels, settings.feature_size, settings.input_size, settings.hidden)
+        load(tile, near, 0)
+        locate(tile, compiled.geometry, compiled.vertices, compiled.features)
+        sides = np.array([(1 << (at % levels)) + 1 for at in range(3 * levels)])
+        ends = np.cumsum([(1 << h) ** 2 + 2 * (1 << h) + 1 for h in range(levels)])
+        last = ends[np.arange(3 * levels) % levels]
+        assert (tile.corners.max(axis=1) + sides + 1 < last).all()
+
+
+def test_no_points_give_no_values() -> None:
+    field = trained(CASES[0])
+    none = np.zeros((0, 3), np.float32)
+    assert CompiledEngine(field).evaluate(none, gradient=True).gradient.shape == (0, 3)
+
+
+def test_a_step_over_all_rows_is_that_of_the_chosen() -> None:
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn((50, 8), generator=generator)
+    chosen, masked = Parameter(values), Parameter(values)
+    for _ in range(5):
+        mask = torch.rand(50, generator=generator) < 0.4
+        gradient = torch.randn((50, 8), generator=generator)
+        rows = mask.nonzero()[:, 0]
+        chosen.step(rows, gradient[rows], 0.01, Betas(0.9, 0.99))
+        masked.step_where(mask, gradient, 0.01, Betas(0.9, 0.99))
+    assert torch.equal(chosen.steps, masked.steps)
+    for name in ("values", "means", "variances"):
+        torch.testing.assert_close(getattr(masked, name), getattr(chosen, name))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_a_mapper_learns_on_the_gpu() -> None:
+    world = small_world.world(3)
+    mapper = small_world.settled_mapper(small_world.settings(), world, "cuda")
+    assert small_world.surface_error(mapper.publish(), world) < 0.02

@@ -1,0 +1,97 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_world import settings, settled_mapper, world
+from triquad_format.records.status import Status
+from triquad_map.reference.evaluator import MapEvaluator
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import MeshSettings
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def epoch() -> Epoch:
+    return settled_mapper(settings(visits=3.0), world(3)).publish()
+
+
+def test_the_numpy_evaluator_gives_the_same_answers(epoch: Epoch) -> None:
+    hits = world(3).hits
+    near = hits[RNG.choice(len(hits), 5000)] + RNG.normal(0, 0.1, (5000, 3))
+    anywhere = RNG.uniform(hits.min(axis=0) - 30, hits.max(axis=0) + 30, (5000, 3))
+    points = np.concatenate([near, anywhere])
+    live = epoch.query(points, gradient=True)
+    offline = MapEvaluator(epoch.record()).query(points, gradient=True)
+    np.testing.assert_array_equal(offline.status, live.status)
+    np.testing.assert_allclose(offline.sdf, live.sdf, atol=1e-5)
+    assert live.gradient is not None
+    assert offline.gradient is not None
+    known = np.isfinite(live.sdf)
+    error = np.abs(offline.gradient - live.gradient)[known].max(axis=1)
+    assert np.quantile(error, 0.99) < 1e-3, "all but points on a kink"
+    np.testing.assert_array_equal(np.isnan(offline.sdf), np.isnan(live.sdf))
+
+
+def test_gradients_are_those_of_the_blended_field(epoch: Epoch) -> None:
+    border = settings().field.region_pitch_m / 2
+    points = RNG.uniform([border - 1.6, -6, -0.1], [border + 1.6, 6, 0.3], (2000, 3))
+    answer = epoch.query(points, gradient=True)
+    assert answer.gradient is not None
+    step = 2e-3
+    for axis in range(3):
+        offset = np.eye(3)[axis] * step
+        ahead, behind = epoch.query(points + offset, False), epoch.query(points - offset, False)
+        error = np.abs((ahead.sdf - behind.sdf) / (2 * step) - answer.gradient[:, axis])
+        assert np.median(error) < 0.02
+
+
+def test_where_no_region_is_there_is_no_distance(epoch: Epoch) -> None:
+    answer = epoch.query(np.array([[5000.0, 0, 0], [0, 0, -9e6]]), gradient=True)
+    assert np.isnan(answer.sdf).all()
+    assert answer.gradient is not None
+    assert np.isnan(answer.gradient).all()
+    assert (answer.status == Status.UNKNOWN).all()
+
+
+def test_no_points_give_an_empty_answer(epoch: Epoch) -> None:
+    answer = epoch.query(np.zeros((0, 3)), gradient=True)
+    assert answer.sdf.shape == (0,)
+    assert answer.gradient is not None
+    assert answer.gradient.shape == (0, 3)
+
+
+def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
+    chosen = settings(visits=1.2)
+    small = replace(chosen, mesh=MeshSettings(cell_m=0.05, tile_cells=16, reach_m=0.2))
+    mapper = Mapper("test", small, "cpu")
+    scan = world(1).scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    epoch = mapper.publish()
+    low, high = np.array([3.0, -2.0, -1.0]), np.array([5.0, 2.0, 1.0])
+    listed = {tuple(tile) for tile in epoch.tiles(low, high).tolist()}
+    side = small.mesh.tile_side_m
+    for offset in np.ndindex(3, 6, 3):
+        x, y, z = (np.floor(low / side).astype(int) + offset).tolist()
+        if len(epoch.mesh((x, y, z)).faces):
+            assert (x, y, z) in listed
+
+
+def test_an_empty_map_knows_nothing() -> None:
+    epoch = Mapper("test", settings(), "cpu").publish()
+    answer = epoch.query(np.zeros((3, 3)), gradient=False)
+    assert (answer.status == Status.UNKNOWN).all()
+    assert len(epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf))) == 0
+    assert len(epoch.mesh((0, 0, 0)).vertices) == 0
+
+
+def test_tiles_are_those_that_meet_the_bounds(epoch: Epoch) -> None:
+    everything = epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf))
+    side = settings().mesh.tile_side_m
+    tiles = {tuple(tile) for tile in everything.tolist()}
+    seen = {tuple(tile) for tile in np.floor(world(3).hits / side).astype(int).tolist()}
+    assert seen <= tiles
+    low, high = np.array([0.1, 0.1, -1.0]), np.array([side + 0.1, side - 0.1, 1.0])
+    some = epoch.tiles(low, high)
+    assert {tuple(tile) for tile in some[:, :2].tolist()} == {(0, 0), (1, 0)}

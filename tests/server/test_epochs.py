@@ -1,0 +1,142 @@
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from triquad_format.records.field_settings import FieldSettings
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs.epochs import EpochShelf, ShelfLimits
+from triquad_server.errors import RequestError
+from triquad_server.settings import MeshSettings
+
+
+@dataclass
+class Clock:
+    now: float = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def epoch(number: int) -> Epoch:
+    return Epoch("lab", number, FieldSettings(), MeshSettings(), ())
+
+
+def shelf(
+    kept: int, pinned: int = 0, pin_s: float = 30.0, clock: Clock | None = None
+) -> EpochShelf:
+    return EpochShelf(epoch(1), ShelfLimits(kept, pinned, pin_s), clock or Clock())
+
+
+def is_gone(shelf: EpochShelf, number: int) -> bool:
+    try:
+        found = shelf.get(number)
+    except RequestError as error:
+        return error.code == "epoch_gone"
+    assert found.number == number  # never another one
+    return False
+
+
+def test_zero_asks_for_the_newest():
+    epochs = shelf(kept=2)
+    epochs.add(epoch(2))
+    assert epochs.get(0).number == epochs.newest.number == 2
+    assert epochs.get(1).number == 1
+
+
+def test_older_epochs_that_nobody_asked_for_go():
+    epochs = shelf(kept=2, pinned=8)
+    for number in (2, 3):
+        epochs.get(0)
+        epochs.add(epoch(number))
+    with pytest.raises(RequestError, match=r"epoch 1 is not kept; kept are \[2, 3\]") as caught:
+        epochs.get(1)
+    assert caught.value.code == "epoch_gone"
+
+
+def test_an_epoch_that_is_asked_for_stays_for_its_time_and_each_time_renews_it():
+    clock = Clock()
+    epochs = shelf(kept=1, pinned=1, pin_s=30.0, clock=clock)
+    for number in range(2, 20):
+        assert not is_gone(epochs, 1)
+        clock.now += 30.0
+        epochs.add(epoch(number))
+        assert epochs.get(0).number == number
+    clock.now += 0.1
+    epochs.add(epoch(20))
+    assert is_gone(epochs, 1)
+
+
+def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
+    clock = Clock()
+    epochs = shelf(kept=1, pinned=1, pin_s=30.0, clock=clock)
+    epochs.get(1)
+    epochs.add(epoch(2))
+    clock.now = 31.0
+    epochs.get(0)
+    assert is_gone(epochs, 1)
+
+
+def test_of_too_many_pinned_ones_that_which_was_asked_longest_ago_goes():
+    clock = Clock()
+    epochs = shelf(kept=1, pinned=2, clock=clock)
+    for number in range(1, 4):
+        epochs.add(epoch(number))
+        epochs.get(number)
+    epochs.get(1)
+    epochs.add(epoch(4))
+    assert [is_gone(epochs, number) for number in (1, 2, 3, 4)] == [False, True, False, False]
+
+
+def test_the_newest_never_goes():
+    epochs = shelf(kept=1)
+    epochs.add(epoch(2))
+    assert epochs.get(0).number == epochs.get(2).number == 2
+    assert is_gone(epochs, 1)
+
+
+DEEDS = st.one_of(
+    st.just("publish"),
+    st.tuples(st.just("ask"), st.integers(0, 12)),  # so many epochs back
+    st.tuples(st.just("wait"), st.sampled_from([0.5, 7.0, 10.0, 11.0])),
+)
+
+
+@given(st.integers(1, 4), st.integers(0, 4), st.lists(DEEDS, max_size=60))
+def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, deeds):
+    pin_s = 10.0
+    clock = Clock()
+    epochs = shelf(kept, pinned, pin_s, clock)
+    newest = 1
+    asked: dict[int, float] = {}  # in the order of asking
+    for deed in deeds:
+        if deed == "publish":
+            newest += 1
+            epochs.add(epoch(newest))
+        elif deed[0] == "wait":
+            clock.now += deed[1]
+        else:
+            number = max(1, newest - deed[1])
+            if is_gone(epochs, number):
+                assert number <= newest - kept
+                expired = clock.now - asked.get(number, -1e9) > pin_s
+                order = [other for other in asked if other <= newest - kept]
+                assert expired or len(order) - order.index(number) > pinned
+            else:
+                asked.pop(number, None)
+                asked[number] = clock.now
+        assert epochs.get(0) is epochs.newest
+        assert epochs.newest.number == newest
+
+
+@given(st.integers(1, 4), st.integers(0, 4), st.integers(5, 30), st.data())
+def test_no_more_stay_than_may(kept, pinned, count, data):
+    epochs = shelf(kept, pinned)
+    for number in range(2, count):
+        epochs.get(number - 1)
+        epochs.add(epoch(number))
+        back = data.draw(st.integers(0, 6))
+        is_gone(epochs, max(1, number - back))
+    there = [number for number in range(1, count) if not is_gone(epochs, number)]
+    assert len(there) == min(count - 1, kept + pinned)
+    assert there[-kept:] == list(range(count - kept, count))

@@ -1,0 +1,92 @@
+import math
+import queue
+from contextlib import closing
+
+import pytest
+from support import servers
+from triquad_format.wire.messages import FlushReply, FlushRequest
+from triquad_server.errors import RequestError
+from triquad_server.intake import flush, sources
+from triquad_server.intake.flush import FlushDesk
+from triquad_server.intake.sources import SourceLedger
+
+
+class HeldRequest:
+    """Stands for a Zenoh query; notes its one answer."""
+
+    def __init__(self, defect: Exception | None = None) -> None:
+        self._defect = defect
+        self._replies: queue.SimpleQueue[object] = queue.SimpleQueue()
+
+    def answer(self, message: object) -> None:
+        if self._defect:
+            raise self._defect
+        self._replies.put(message)
+
+    def refuse(self, code: str, text: str) -> None:
+        self._replies.put(code)
+
+    @property
+    def reply(self) -> object:
+        return self._replies.get(timeout=servers.WAIT_S)
+
+
+@pytest.fixture
+def ledger():
+    return SourceLedger()
+
+
+@pytest.fixture
+def desk(ledger, monkeypatch):
+    monkeypatch.setattr(flush, "ARRIVAL_GRACE_S", 0.0)
+    with closing(FlushDesk(ledger, lambda: None, 600.0, 8)) as desk:
+        desk.start()
+        yield desk
+
+
+def asks(sequence: int = 0, **changes: object) -> FlushRequest:
+    return FlushRequest(
+        **({"source": "lidar", "session": 7, "timeout_s": 60.0} | changes), sequence=sequence
+    )
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        asks(-1),
+        asks(sources.MAX_SEQUENCE),
+        asks(2**63 - 1),
+        asks(source=""),
+        asks(source="a/b"),
+        asks(source="a" * 65),
+        asks(timeout_s=math.nan),
+        asks(timeout_s=math.inf),
+        asks(timeout_s=-1.0),
+    ],
+)
+def test_requests_out_of_range_are_refused_and_the_desk_goes_on(desk, request_):
+    with pytest.raises(RequestError) as caught:
+        desk.hold(HeldRequest(), request_)
+    assert caught.value.code == "bad_request"
+    good = HeldRequest()
+    desk.hold(good, asks(2))
+    assert good.reply == FlushReply(0, 0, 3, None)
+
+
+def test_a_defect_ends_one_request_and_not_the_desk(desk):
+    bad, good = HeldRequest(RuntimeError("a defect")), HeldRequest()
+    desk.hold(bad, asks())
+    assert bad.reply == "internal"
+    desk.hold(good, asks())
+    assert good.reply == FlushReply(0, 0, 1, None)
+
+
+def test_questions_about_strangers_push_nobody_out(desk, ledger, monkeypatch):
+    monkeypatch.setattr(sources, "MAX_SESSIONS", 2)
+    ledger.arrive(servers.scan(0))
+    for session in range(100, 110):
+        stranger = HeldRequest()
+        desk.hold(stranger, asks(4, session=session))
+        assert stranger.reply == FlushReply(0, 0, 5, None)
+    assert ledger.arrived("lidar", 7, 0)
+    assert ledger.lost() == {}

@@ -1,0 +1,213 @@
+"""Levels of surface voxels and times of their blocks, wherever evidence goes."""
+
+import dataclasses
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.map_records import SMALL, assert_same, random_record, with_levels
+from support.mapfile_surgery import (
+    edited,
+    file_bytes,
+    manifest_of,
+    parts_of,
+    read_bytes,
+    stored,
+    write_pair,
+)
+from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.parts.part import EVIDENCE
+from triquad_format.records.crop import crop_record
+from triquad_format.records.evidence_voxels import masked, seen_voxels, surface_counts
+from triquad_format.records.region import MAX_SEEN_S, Evidence
+from triquad_format.recovery.recover import recover
+from triquad_tools.mapfiles.seen_space import owned_evidence
+
+CUBES = dataclasses.replace(SMALL, depth=9)
+"""Two cubes to a side."""
+
+RECORD = with_levels(random_record(21, settings=CUBES, indices=((0, 0, 0), (1, 0, 0)), points=500))
+
+
+def level_of(evidence: Evidence) -> dict[tuple[int, ...], int]:
+    """The level of each surface voxel."""
+    voxels = seen_voxels(evidence, evidence.surface).tolist()
+    return dict(zip(map(tuple, voxels), evidence.levels.tolist(), strict=True))
+
+
+def time_of(evidence: Evidence) -> dict[int, int]:
+    """The time of each block that holds surface."""
+    times = zip(evidence.codes.tolist(), evidence.seen_s.tolist(), strict=True)
+    touched = evidence.surface.any(axis=1)
+    return {code: s for (code, s), seen in zip(times, touched, strict=True) if seen}
+
+
+def assert_part_of(some: Evidence, whole: Evidence) -> None:
+    """Voxels and blocks kept what they had; blocks without surface have no time."""
+    assert level_of(some).items() <= level_of(whole).items()
+    assert time_of(some).items() <= time_of(whole).items()
+    assert not some.seen_s[~some.surface.any(axis=1)].any()
+
+
+def blocks(seed: int, count: int) -> Evidence:
+    """Blocks with many voxels each, some without surface, all in one cube."""
+    rng = np.random.default_rng(seed)
+    surface, free = rng.integers(0, 256, (2, count, 64)).astype(np.uint8)
+    surface[rng.random(count) < 0.3] = 0
+    return Evidence(np.sort(rng.permutation(200)[:count]).astype(np.int64), surface, free)
+
+
+def record_of(evidence: Evidence):
+    record = random_record(3, training=False)
+    region = dataclasses.replace(record.regions[0], evidence=evidence)
+    return dataclasses.replace(record, regions=(region,))
+
+
+def test_files_hold_levels_and_times():
+    evidence = RECORD.regions[0].evidence
+    assert set(evidence.levels) == set(range(8))
+    assert (evidence.seen_s[evidence.surface.any(axis=1)] == 0).any()
+    data = file_bytes(RECORD)
+    assert len([part for part in parts_of(data) if part.topic == EVIDENCE]) == 16
+    assert_same(read_bytes(data), RECORD)
+    with stored(data) as map_file:
+        assert_same(map_file.record(), RECORD)
+
+
+TIMES = st.sampled_from([0, 1, 2, 255, 256, 257, 1_700_000_000, 1_700_000_300, MAX_SEEN_S])
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 99), count=st.integers(1, 12), draw=st.data())
+def test_any_levels_and_times_come_back(seed, count, draw):
+    evidence = blocks(seed, count)
+    counts = surface_counts(evidence.surface)
+    size = int(counts.sum())
+    levels = np.frombuffer(draw.draw(st.binary(min_size=size, max_size=size)), np.uint8) & 7
+    seen_s = np.array(draw.draw(st.lists(TIMES, min_size=count, max_size=count)), np.int64)
+    evidence = dataclasses.replace(
+        evidence,
+        levels=draw.draw(st.sampled_from([levels, None])),
+        seen_s=draw.draw(st.sampled_from([np.where(counts > 0, seen_s, 0), None])),
+    )
+    (region,) = read_bytes(file_bytes(record_of(evidence))).regions
+    assert_same(region.evidence, evidence)
+
+
+def test_literal_bytes():
+    """The examples of the specification."""
+    surface = np.zeros((3, 64), np.uint8)
+    surface[0, 0], surface[2, 63] = 0b1011, 0b1
+    levels = np.array([0, 3, 4, 6], np.uint8)
+    seen_s = np.array([1_700_000_300, 0, 1_700_000_000], np.int64)
+    evidence = Evidence(np.arange(3), surface, surface, levels, seen_s)
+    data = file_bytes(record_of(evidence))
+    (part,) = (part for part in parts_of(data) if part.topic == EVIDENCE)
+    body = msgpack.unpackb(part.payload)
+    assert body["levels"] == {"dtype": "|u1", "shape": [3, 1], "data": b"\x0c\x06\x08"}
+    assert body["seen_from_s"] == 1_699_999_999
+    assert body["seen_s"] == {"dtype": "|u1", "shape": [2, 2], "data": b"\x2d\x01\x01\x00"}
+
+
+def test_a_file_without_them_reads_as_not_known():
+    record = random_record(21)
+    data = file_bytes(record)
+    (part,) = (part for part in parts_of(data) if part.topic == EVIDENCE)
+    fields = {"region", "plane", "cell", "codes", "surface", "free"}
+    assert msgpack.unpackb(part.payload).keys() == fields
+    evidence = read_bytes(data).regions[0].evidence
+    assert evidence.levels is None
+    assert evidence.seen_s is None
+
+
+def test_cubes_without_them_read_as_zero():
+    """As where an older release went on with a map."""
+
+    def older(body):
+        for key in ("levels", "seen_s", "seen_from_s"):
+            del body[key]
+
+    data = edited(file_bytes(RECORD), EVIDENCE, older, number=3)
+    entry = [e for e in manifest_of(data).entries if e.key.topic == EVIDENCE][3]
+    want, other = (region.evidence for region in RECORD.regions)
+    have, same = (region.evidence for region in read_bytes(data).regions)
+    assert entry.key.region == (0, 0, 0)
+    assert_same(same, other)
+    lost = want.codes >> 15 == entry.key.cell
+    voxels = np.repeat(lost, surface_counts(want.surface))
+    assert want.levels[voxels].any()
+    np.testing.assert_array_equal(have.levels, np.where(voxels, 0, want.levels))
+    np.testing.assert_array_equal(have.seen_s, np.where(lost, 0, want.seen_s))
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 999))
+def test_masked_voxels_take_their_levels_with_them(seed):
+    evidence = with_levels(record_of(blocks(seed, 8)), seed).regions[0].evidence
+    rng = np.random.default_rng(seed)
+    mask = rng.integers(0, 256, evidence.surface.shape).astype(np.uint8)
+    mask[rng.random(len(mask)) < 0.5] = 0
+    kept = masked(evidence, mask)
+    assert_part_of(kept, evidence)
+    left = dataclasses.replace(evidence, surface=evidence.surface & mask)
+    want = set(map(tuple, seen_voxels(left, left.surface).tolist()))
+    assert level_of(kept).keys() == want
+
+
+def test_a_crop_keeps_the_levels_of_what_it_keeps():
+    cropped = crop_record(RECORD, (-20, -30, -25), (100, 30, 20))
+    for some, whole in zip(cropped.regions, RECORD.regions, strict=True):
+        assert 0 < len(some.evidence.levels) < len(whole.evidence.levels)
+        assert_part_of(some.evidence, whole.evidence)
+    assert_same(read_bytes(file_bytes(cropped)), cropped)
+    with stored(file_bytes(RECORD)) as map_file:
+        near = map_file.box((-20, -30, -25), (100, 30, 20))
+    again = crop_record(near, (-20, -30, -25), (100, 30, 20))
+    for one, other in zip(again.regions, cropped.regions, strict=True):
+        assert_same(one.evidence, other.evidence)
+
+
+def test_what_a_region_owns_keeps_its_levels():
+    whole = random_record(4, points=4000)
+    region = with_levels(whole).regions[0]
+    owned = owned_evidence(whole.settings, region)
+    assert 0 < len(owned.levels) < len(region.evidence.levels)
+    assert_part_of(owned, region.evidence)
+
+
+def test_a_delta_holds_the_cubes_whose_levels_changed(tmp_path):
+    first, second = RECORD.regions
+    levels = first.evidence.levels.copy()
+    levels[0] ^= 1
+    changed = dataclasses.replace(
+        first, evidence=dataclasses.replace(first.evidence, levels=levels)
+    )
+    following = dataclasses.replace(RECORD, epoch=8, regions=(changed, second))
+    write_pair(tmp_path, RECORD, following)
+    data = (tmp_path / "next.triquad").read_bytes()
+    assert [p.topic for p in parts_of(data)] == ["/triquad/map", EVIDENCE, "/triquad/manifest"]
+    assert_same(read_map(tmp_path / "next.triquad"), following)
+
+
+def test_what_is_recovered_has_its_levels(tmp_path):
+    data = bytearray(file_bytes(RECORD))
+    chunk = len(data) // 2
+    data[chunk : chunk + 200] = bytes(200)
+    path = tmp_path / "broken.triquad"
+    path.write_bytes(data)
+    recovery = recover(path)
+    assert recovery.losses
+    whole = {region.index: region.evidence for region in RECORD.regions}
+    assert any(len(region.evidence.levels) for region in recovery.record.regions)
+    for region in recovery.record.regions:
+        assert_part_of(region.evidence, whole[region.index])
+
+
+@pytest.mark.parametrize("field", ["levels", "seen_s"])
+def test_one_may_be_known_without_the_other(field):
+    evidence = dataclasses.replace(RECORD.regions[0].evidence, **{field: None})
+    region = dataclasses.replace(RECORD.regions[0], evidence=evidence)
+    record = dataclasses.replace(RECORD, regions=(region, RECORD.regions[1]))
+    assert_same(read_bytes(file_bytes(record)), record)

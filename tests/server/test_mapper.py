@@ -1,0 +1,290 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_world import settings, settle, settled_mapper, surface_error, world
+from triquad_format.records.status import Status
+from triquad_server.intake.scan import ScanRefusedError
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import parse_settings
+
+EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
+
+
+@pytest.fixture(scope="module")
+def mapped() -> Mapper:
+    return settled_mapper(settings(), world())
+
+
+def test_the_map_is_right_near_surfaces(mapped: Mapper) -> None:
+    assert surface_error(mapped.publish(), world()) < 0.02
+
+
+def test_gradients_point_away_from_surfaces(mapped: Mapper) -> None:
+    scene, hits = world().scene, world().hits[::50]
+    normals = scene.gradient(hits)
+    answer = mapped.publish().query(hits + 0.03 * normals, gradient=True)
+    assert answer.gradient is not None
+    unit = answer.gradient / np.linalg.norm(answer.gradient, axis=1, keepdims=True)
+    angles = np.degrees(np.arccos(np.clip((unit * normals).sum(axis=1), -1, 1)))
+    assert np.median(angles) < 12
+
+
+def test_what_was_seen_is_told_from_what_was_not(mapped: Mapper) -> None:
+    epoch, scene = mapped.publish(), world().scene
+    hits = world().hits
+    assert (epoch.status(hits) == Status.SURFACE).mean() > 0.99
+    between = [
+        scan.world_from_sensor[:3, 3] + 0.5 * (hit - scan.world_from_sensor[:3, 3])
+        for scan in world().scans
+        for hit in scan.true_hits[::500]
+    ]
+    assert (epoch.status(np.array(between)) != Status.UNKNOWN).mean() > 0.95
+    rng = np.random.default_rng(0)
+    inside = rng.uniform(hits.min(axis=0), hits.max(axis=0), (200_000, 3))
+    inside = inside[scene.is_inside_house(inside, 0.5)]
+    assert len(inside) > 1000
+    assert (epoch.status(inside) == Status.UNKNOWN).mean() > 0.98
+
+
+def test_ghost_cells_are_unknown(mapped: Mapper) -> None:
+    """Points all of whose projections are occupied, but that no ray has seen."""
+    epoch = mapped.publish()
+    hits = world().hits
+    occupied = [
+        {tuple(cell) for cell in np.floor(hits[:, axes] / 0.2).astype(int).tolist()}
+        for axes in ([0, 1], [0, 2], [1, 2])
+    ]
+    rng = np.random.default_rng(1)
+    cells = np.floor(rng.uniform(hits.min(axis=0), hits.max(axis=0), (400_000, 3)) / 0.2)
+    ghosts = np.array(
+        [
+            (x, y, z)
+            for x, y, z in cells.astype(int).tolist()
+            if (x, y) in occupied[0] and (x, z) in occupied[1] and (y, z) in occupied[2]
+        ],
+    )
+    centres = (ghosts + 0.5) * 0.2
+    hidden = centres[world().scene.is_inside_house(centres, 0.5)]
+    assert len(hidden) > 20, "the scene has ghosts"
+    assert (epoch.status(hidden) == Status.UNKNOWN).mean() > 0.98
+
+
+def test_regions_meet_without_hole_or_step() -> None:
+    """The sensor drives over the border of two regions; the ground must go on."""
+    chosen = parse_settings({"field": {"depth": 7}, "training": {"batch": 4096, "visits": 18.0}})
+    border = chosen.field.region_pitch_m / 2
+    drive_through = world(8)
+    moved = np.eye(4)
+    moved[0, 3] = border - np.mean([scan.world_from_sensor[0, 3] for scan in drive_through.scans])
+    mapper = Mapper("test", chosen, "cpu")
+    for scan in drive_through.scans:
+        mapper.ingest(scan.points, moved @ scan.world_from_sensor)
+    settle(mapper)
+    epoch = mapper.publish()
+    assert epoch.regions >= 2
+    along = np.linspace(-4.0, 4.0, 801)
+    for y in (1.0, 2.0, 3.0):
+        ground = np.stack([border + along, np.full(801, y), np.zeros(801)], 1)
+        answer = epoch.query(ground, gradient=False)
+        assert np.abs(answer.sdf).max() < 0.1
+        assert np.abs(np.diff(answer.sdf)).max() < 0.01, "samples are 1 cm apart"
+        assert (answer.status == Status.SURFACE).all(), "no hole"
+
+
+def test_free_space_is_seen_in_all_regions_that_rays_pass() -> None:
+    """A wall beyond the border of two regions, seen from this side of it."""
+    chosen = parse_settings({"field": {"depth": 8}})
+    half = chosen.field.region_side_m / 2
+    mapper = Mapper("test", chosen, "cpu")
+    across = np.mgrid[-2:2:0.1, -2:2:0.1].reshape(2, -1).T
+    wall = np.column_stack([np.full(len(across), 12.0), across]).astype(np.float32)
+    pose = np.eye(4)
+    pose[0, 3] = half - 8.0
+    mapper.ingest(wall, pose)
+    along = np.linspace(half - 7.5, half + 3.5, 200)
+    points = np.column_stack([along, np.full(200, 0.05), np.full(200, 0.05)])
+    answer = mapper.publish().query(points)
+    assert (answer.status == Status.FREE).all()
+    assert np.isfinite(answer.sdf).all()
+
+
+def test_it_settles_and_then_changes_no_more(mapped: Mapper) -> None:
+    assert mapped.settled
+    first, trained = mapped.publish(), mapped.samples_trained
+    mapped.train()
+    assert mapped.samples_trained == trained
+    assert mapped.publish() is first
+
+
+def test_an_epoch_does_not_change_while_training_goes_on() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    first, *others = world().scans
+    mapper.ingest(first.points, first.world_from_sensor)
+    mapper.train()
+    epoch = mapper.publish()
+    points = first.true_hits[::20]
+    before = epoch.query(points, gradient=False)
+    for scan in others:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+        mapper.train()
+    after = epoch.query(points, gradient=False)
+    np.testing.assert_array_equal(after.sdf, before.sdf)
+    np.testing.assert_array_equal(after.status, before.status)
+    later = mapper.publish()
+    assert later.number > epoch.number
+    assert later.vertices > epoch.vertices
+
+
+def test_epochs_share_what_did_not_change_between_them() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    first, second = world().scans[:2]
+    mapper.ingest(first.points, first.world_from_sensor)
+    mapper.train()
+    before = mapper.publish()
+    mapper.train()
+    after = mapper.publish()
+    changed = [
+        (old, new)
+        for old, new in zip(before.frozen_regions, after.frozen_regions, strict=True)
+        if old is not new
+    ]
+    assert len(changed) == 1, "only the region that was trained"
+    old, new = changed[0]
+    assert new.evidence is old.evidence
+    assert new.field.tree is old.field.tree
+    mapper.ingest(second.points, second.world_from_sensor)
+    assert all(region.evidence is not new.evidence for region in mapper.publish().frozen_regions), (
+        "a scan was taken in since"
+    )
+
+
+def test_the_number_of_regions_is_bounded() -> None:
+    mapper = Mapper("test", settings(max_regions=2), "cpu")
+    scan = world().scans[0]
+    with pytest.raises(ScanRefusedError) as refusal:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    assert refusal.value.reason == "too_many_regions"
+    assert mapper.publish().regions == 0
+
+
+def test_a_refused_scan_changes_nothing() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    epoch = mapper.publish()
+    with pytest.raises(ScanRefusedError):
+        mapper.ingest(np.zeros((5, 3), np.float32), np.eye(4) * 2)
+    assert mapper.publish() is epoch
+    assert mapper.settled
+
+
+def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
+    epoch = mapped.publish()
+    twin = Mapper("test", settings(), "cpu", mapped.changes_since(None).record)
+    restored = twin.publish()
+    assert restored.number == epoch.number
+    points = world().hits[::40] + [0, 0, 0.02]
+    np.testing.assert_allclose(
+        restored.query(points, gradient=False).sdf,
+        epoch.query(points, gradient=False).sdf,
+        atol=1e-5,
+    )
+    np.testing.assert_array_equal(restored.status(points), epoch.status(points))
+    assert twin.segments_kept > 0
+    scan = world().scans[0]
+    before = surface_error(restored, world())
+    twin.ingest(scan.points, scan.world_from_sensor)
+    twin.train()
+    during = surface_error(twin.publish(), world())
+    settle(twin)
+    after = surface_error(twin.publish(), world())
+    assert during < before + 0.005, "the optimiser goes on where it was"
+    assert after < before + 0.002, "what the scan did not see is not forgotten"
+
+
+def test_a_record_without_samples_owes_nothing() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    scan = world().scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    record = mapper.changes_since(None).record
+    emptied = []
+    for region in record.regions:
+        state = region.training
+        assert state is not None
+        state = replace(
+            state,
+            sample_points=state.sample_points[:0],
+            sample_labels=state.sample_labels[:0],
+        )
+        emptied.append(replace(region, training=state))
+    twin = Mapper("test", settings(), "cpu", replace(record, regions=tuple(emptied)))
+    assert twin.settled
+    twin.ingest(scan.points, scan.world_from_sensor)
+    twin.train()
+    assert twin.samples_trained > 0
+
+
+def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    for scan in world(2).scans:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    record = mapper.changes_since(None).record
+    assert len(record.regions) > 1
+    bounded = settings(pool_segments=4000)
+    twin = Mapper("test", bounded, "cpu", record)
+    assert twin.segments_kept <= 4000
+    twin.reset(np.array([5.0, -np.inf, -np.inf]), np.full(3, np.inf))
+    for scan in world(2).scans:
+        twin.ingest(scan.points, scan.world_from_sensor)
+    assert 1000 < twin.segments_kept <= 4000
+
+
+def test_what_is_owed_survives_a_restart() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    scan = world().scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    twin = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
+    assert not twin.settled
+
+
+def test_a_place_left_behind_is_not_forgotten() -> None:
+    chosen = settings(pool_segments=75_000)
+    here = world(3)
+    mapper = settled_mapper(chosen, here)
+    before = surface_error(mapper.publish(), here)
+    for scan in world(14, 1.5).scans[6:]:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+        for _ in range(10):
+            mapper.train()
+    settle(mapper)
+    assert mapper.segments_kept <= 75_000
+    assert surface_error(mapper.publish(), here) < before + 0.004
+
+
+def test_reset_forgets_a_box_and_everything() -> None:
+    mapper = settled_mapper(settings(visits=3.0), world(2))
+    hits = world(2).hits
+    low, high = np.array([-5.0, -50, -5]), np.array([0.0, 50, 50])
+    mapper.reset(low, high)
+    status = mapper.publish().status(hits)
+    inside = ((hits > low + 0.3) & (hits < high - 0.3)).all(axis=1)
+    outside = ((hits < low - 0.3) | (hits > high + 0.3)).any(axis=1)
+    assert inside.any()
+    assert (status[inside] == Status.UNKNOWN).all()
+    assert (status[outside] == Status.SURFACE).mean() > 0.99
+    mapper.reset(*EVERYWHERE)
+    assert mapper.publish().regions == 0
+    assert mapper.segments_kept == 0
+    scan = world(2).scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    assert mapper.publish().regions > 0
+
+
+@pytest.mark.parametrize("encoding", ["features", "fourier"])
+def test_the_parts_of_the_field_can_be_switched(encoding: str) -> None:
+    chosen = settings(visits=3.0)
+    field = type(chosen.field)(depth=8, encoding=encoding)
+    mapper = Mapper("test", type(chosen)(field=field, training=chosen.training), "cpu")
+    scan = world().scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    settle(mapper)
+    assert np.isfinite(mapper.publish().query(scan.true_hits[::100], gradient=True).sdf).all()

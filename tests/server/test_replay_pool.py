@@ -1,0 +1,108 @@
+import numpy as np
+import torch
+from triquad_server.mapping.ray_labels import sample_segments
+from triquad_server.mapping.replay_pool import ReplayPool
+from triquad_server.mapping.sampling import Placement
+
+CPU = torch.device("cpu")
+PLACEMENT = Placement(surface_share=0.5, spread_m=0.08, truncation_m=0.3, half_side_m=400.0)
+RNG = np.random.default_rng(0)
+
+
+def new_pool(capacity: int) -> ReplayPool:
+    return ReplayPool(capacity, PLACEMENT, CPU, 0)
+
+
+def place(x: float, count: int) -> np.ndarray:
+    return (RNG.random((count, 3)) * 4 + [x, 0.0, 0.0]).astype(np.float32)
+
+
+def labelled(points: np.ndarray, label: float = 0.0) -> np.ndarray:
+    return sample_segments(points, np.full(len(points), label, np.float32))
+
+
+def test_it_is_bounded() -> None:
+    pool = new_pool(1000)
+    for i in range(30):
+        pool.add(labelled(place(i, 300)))
+        assert len(pool) == min(1000, 300 * (i + 1))
+    pool.add(labelled(place(0, 5000)))
+    assert len(pool) == 1000
+
+
+def test_samples_come_back_as_they_were() -> None:
+    pool = new_pool(10_000)
+    points = place(0, 8000)
+    pool.add(sample_segments(points, points[:, 0] * 3))
+    batch = pool.draw(500, 0)
+    torch.testing.assert_close(batch.labels, batch.points[:, 0] * 3)
+    assert len(torch.unique(batch.points[:, 0])) > 400
+
+
+def test_a_place_left_long_ago_keeps_its_share() -> None:
+    pool = new_pool(20_000)
+    pool.add(labelled(place(-50, 5000), -1))
+    for _ in range(100):
+        pool.add(labelled(place(50, 5000), 1))
+    old = (pool.sample(20_000).labels < 0).sum()
+    assert old > 3000, "a hundred scans elsewhere must not push it out"
+
+
+def test_of_a_scan_that_is_too_large_any_part_is_kept() -> None:
+    pool = new_pool(3000)
+    for _ in range(5):
+        points = place(0, 6000)
+        pool.add(sample_segments(points, np.arange(6000, dtype=np.float32)))
+    labels = pool.sample(3000).labels.numpy()
+    shares = np.histogram(labels, bins=6, range=(0, 6000))[0] / len(labels)
+    assert shares.min() > 0.1
+
+
+def test_the_newest_can_be_drawn_apart() -> None:
+    pool = new_pool(100_000)
+    pool.add(labelled(place(0, 50_000)))
+    pool.add(labelled(place(0, 100), 1))
+    labels = pool.draw(1000, 400).labels
+    assert 400 <= labels.sum() < 450
+    assert pool.draw(1000, 0).labels.sum() < 50
+
+
+def test_forgetting_a_box() -> None:
+    pool = new_pool(10_000)
+    points = place(0, 6000)
+    pool.add(labelled(points))
+    low, high = np.array([1.0, 0.0, 0.0]), np.array([2.0, 4.0, 4.0])
+    pool.forget(low, high)
+    inside = ((points >= low) & (points <= high)).all(axis=1).sum()
+    assert len(pool) == 6000 - inside
+    left = pool.sample(10_000).points.numpy()
+    assert not ((left >= low) & (left <= high)).all(axis=1).any()
+    pool.add(labelled(place(1, 3000)))
+    assert len(pool) == 9000 - inside
+
+
+def test_the_smallest_pools_work() -> None:
+    for capacity in (1, 2, 3):
+        pool = new_pool(capacity)
+        for count in (1, 1, 5):
+            pool.add(labelled(place(0, count)))
+        assert len(pool) == capacity
+        assert len(pool.draw(10, 5).labels) == 10
+
+
+def test_a_lower_limit_takes_effect_at_once() -> None:
+    pool = new_pool(10_000)
+    pool.add(labelled(place(0, 9000)))
+    pool.limit(2000)
+    assert len(pool) == 2000
+    pool.add(labelled(place(0, 9000)))
+    assert len(pool) == 2000
+    assert np.isfinite(pool.draw(100, 50).points.numpy()).all()
+
+
+def test_neighbours_in_a_batch_are_neighbours_on_the_ground() -> None:
+    pool = new_pool(100_000)
+    pool.add(labelled((RNG.random((50_000, 3)) * 100).astype(np.float32)))
+    points = pool.draw(8192, 0).points[:, :2]
+    apart = (points[1:] - points[:-1]).norm(dim=1).median()
+    assert apart < 5, "in any order they are some 50 m apart"

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+import torch
+from triquad_server.intake.scan import IngestReport, Rays
+from triquad_server.mapping.ray_labels import ray_segments
+from triquad_server.mapping.sampling import Batch, Placement, draw_ordered_samples, draw_samples
+from triquad_server.settings import ScanSettings
+
+HALF_SIDE_M = 400.0
+CENTRE = np.array([10.0, -20.0, 3.0])
+
+
+def rays_to_ground(count: int = 500, height_m: float = 2.0) -> Rays:
+    rng = np.random.default_rng(0)
+    ends = np.column_stack([rng.uniform(2, 30, (count, 1)), rng.uniform(-9, 9, (count, 1))])
+    ends = np.column_stack([ends, np.zeros(count)])
+    return Rays(np.array([0, 0, height_m]), ends, IngestReport(count, {}))
+
+
+def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placement:
+    return Placement(settings.surface_share, settings.spread_m, settings.truncation_m, half_side_m)
+
+
+def draw(engine: str, segments: np.ndarray, chosen: np.ndarray, placement: Placement) -> Batch:
+    if engine == "compiled":
+        return draw_ordered_samples(segments, chosen, placement, np.random.default_rng(1))
+    generator = torch.Generator().manual_seed(1)
+    return draw_samples(torch.from_numpy(segments[chosen]), placement, generator)
+
+
+ENGINES = pytest.mark.parametrize("engine", ["compiled", "tensors"])
+
+
+@ENGINES
+def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> None:
+    settings = ScanSettings()
+    rays = rays_to_ground()
+    down = np.tile([0.0, 0.0, -1.0], (500, 1))
+    segments = ray_segments(rays, down, CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, segments, np.arange(500).repeat(20), placed(settings))
+    heights = batch.points[:, 2].numpy() + CENTRE[2]
+    labels = batch.labels.numpy()
+    assert abs(labels - heights).max() < 0.05, "up to the least cosine"
+    far = np.abs(labels) > 1e-3
+    assert (np.sign(labels) == np.sign(heights))[far].all(), "positive above the ground"
+
+
+@ENGINES
+def test_without_normals_the_label_is_the_distance_along_the_ray(engine: str) -> None:
+    settings = ScanSettings()
+    rays = rays_to_ground(1)
+    segments = ray_segments(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, segments, np.zeros(3000, np.int64), placed(settings))
+    points = batch.points.numpy() + CENTRE
+    distance = np.linalg.norm(points - rays.ends[0], axis=1)
+    np.testing.assert_allclose(np.abs(batch.labels.numpy()), distance, atol=1e-4)
+    assert (np.sign(batch.labels.numpy()) == np.sign(points[:, 2]))[distance > 1e-3].all()
+
+
+@ENGINES
+def test_samples_lie_where_the_settings_say(engine: str) -> None:
+    settings = ScanSettings(surface_share=0.7, spread_m=0.1)
+    rays = rays_to_ground(1)
+    range_m = np.linalg.norm(rays.ends[0] - rays.origin)
+    segments = ray_segments(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, segments, np.zeros(20_000, np.int64), placed(settings))
+    reach = np.linalg.norm(batch.points.numpy() + CENTRE - rays.origin, axis=1)
+    assert reach.min() >= 0.3 * range_m - 1e-4
+    assert reach.max() <= range_m + 0.8 + 1e-4
+    near = np.abs(reach - range_m) <= 0.3
+    free_near = 0.6 / (0.7 * range_m + 0.8)  # of the free samples that lie there by chance
+    assert near.mean() == pytest.approx(0.7 + 0.3 * free_near, abs=0.02)
+    assert np.std(reach[near] - range_m) == pytest.approx(0.1, abs=0.02)
+
+
+@ENGINES
+def test_samples_stay_inside_the_cube(engine: str) -> None:
+    settings = ScanSettings()
+    half = 8.0
+    rays = rays_to_ground()
+    segments = ray_segments(rays, np.full((500, 3), np.nan), np.zeros(3), half, settings)
+    ending = (np.abs(rays.ends) < half).all(axis=1).sum()
+    assert len(segments) > ending, "rays that only pass through teach free space"
+    batch = draw(engine, segments, np.arange(len(segments)).repeat(10), placed(settings, half))
+    assert np.abs(batch.points.numpy()).max() <= half + 1e-4
+
+
+def test_rays_that_miss_the_cube_teach_nothing() -> None:
+    far = np.array([0.0, 500.0, 0.0])
+    rays = rays_to_ground()
+    segments = ray_segments(rays, np.full((500, 3), np.nan), far, 20.0, ScanSettings())
+    assert len(segments) == 0

@@ -1,0 +1,147 @@
+import threading
+
+from support import servers
+from triquad_server.counter import Tally
+from triquad_server.intake import sources
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.sources import SourceLedger
+
+SCAN = servers.scan()
+SOURCE = (SCAN.source, SCAN.session)
+
+
+def arrive_and_take(ledger: SourceLedger, sequence: int) -> None:
+    assert ledger.arrive(servers.scan(sequence)) is None
+    ledger.take(servers.scan(sequence))
+
+
+def test_a_taken_scan_is_settled_at_once_but_done_only_when_published():
+    ledger = SourceLedger()
+    assert ledger.arrive(SCAN) is None
+    assert not ledger.settled(*SOURCE, 0)
+    ledger.take(SCAN)
+    assert ledger.settled(*SOURCE, 0)
+    assert ledger.outcome(*SOURCE, 0) is None
+    ledger.publish()
+    reply = ledger.outcome(*SOURCE, 0)
+    assert (reply.taken, reply.refused, reply.lost) == (1, 0, 0)
+
+
+def test_gaps_count_as_lost_also_before_the_first_scan():
+    ledger = SourceLedger()
+    arrive_and_take(ledger, 3)
+    arrive_and_take(ledger, 5)
+    ledger.publish()
+    reply = ledger.outcome(*SOURCE, 5)
+    assert (reply.taken, reply.lost) == (2, 4)
+    assert ledger.lost() == {"lidar": 4}
+
+
+def test_a_scan_is_not_settled_while_an_earlier_one_waits():
+    ledger = SourceLedger()
+    ledger.arrive(servers.scan(0))
+    ledger.arrive(servers.scan(1))
+    ledger.arrive(servers.scan(2, stamp_ns=0))
+    assert not ledger.settled(*SOURCE, 2)
+    ledger.take(servers.scan(0))
+    assert not ledger.settled(*SOURCE, 1)
+    ledger.refuse(servers.scan(1), "no points")
+    assert ledger.settled(*SOURCE, 2)
+    ledger.publish()
+    assert ledger.outcome(*SOURCE, 2).last_refusal == "scan 1: no points"
+
+
+def test_later_scans_do_not_hold_up_a_published_one():
+    ledger = SourceLedger()
+    arrive_and_take(ledger, 0)
+    ledger.publish()
+    arrive_and_take(ledger, 1)
+    assert ledger.outcome(*SOURCE, 0) is not None
+    assert ledger.outcome(*SOURCE, 1) is None
+
+
+def test_time_that_runs_backwards_is_refused_per_session():
+    ledger = SourceLedger()
+    arrive_and_take(ledger, 0)
+    assert ledger.arrive(servers.scan(1, stamp_ns=999)) == "time_backwards"
+    assert ledger.arrive(servers.scan(2, stamp_ns=1000)) is None
+    assert ledger.arrive(servers.scan(0, stamp_ns=1, session=8)) is None
+
+
+def test_sequences_out_of_range_or_order_are_refused_and_change_nothing():
+    ledger = SourceLedger()
+    for sequence in (-1, 2**48, 2**63 - 1):
+        assert ledger.arrive(servers.scan(sequence, stamp_ns=0)) == "bad_sequence"
+    arrive_and_take(ledger, 4)
+    assert ledger.arrive(servers.scan(4)) == "sequence_backwards"
+    assert ledger.arrive(servers.scan(2)) == "sequence_backwards"
+    ledger.publish()
+    reply = ledger.outcome(*SOURCE, 4)
+    assert (reply.taken, reply.refused, reply.lost) == (1, 0, 4)
+
+
+def test_what_is_given_up_counts_as_lost():
+    ledger = SourceLedger()
+    arrive_and_take(ledger, 0)
+    ledger.publish()
+    ledger.give_up(*SOURCE, 2)
+    assert ledger.outcome(*SOURCE, 2).lost == 2
+    assert ledger.arrive(servers.scan(2)) == "sequence_backwards"
+
+
+def test_sessions_remembered_are_bounded_and_losses_are_not_forgotten(monkeypatch):
+    monkeypatch.setattr(sources, "MAX_SESSIONS", 3)
+    ledger = SourceLedger()
+    for session in range(10):
+        ledger.arrive(servers.scan(1, session=session))
+    assert ledger.lost() == {"*": 7, "lidar": 3}
+    assert not ledger.arrived("lidar", 0, 1)
+
+
+def test_losses_of_a_hostile_publisher_still_fit_a_message():
+    ledger = SourceLedger()
+    for session in range(40_000):
+        ledger.arrive(servers.scan(2**48 - 1, session=session))
+    assert sum(ledger.lost().values()) <= 2 * (2**63 - 1)
+    assert max(ledger.lost().values()) < 2**63
+
+
+def test_a_full_queue_pushes_out_the_oldest_scan_and_counts_it():
+    ledger = SourceLedger()
+    queue = ScanQueue(2, ledger, Tally())
+    for sequence in range(3):
+        queue.put(servers.scan(sequence))
+    assert ledger.lost() == {"lidar": 1}
+    assert ledger.settled(*SOURCE, 0)
+    assert queue.take().sequence == 1
+    assert len(queue) == 2  # the one in hand is not in the map yet
+    assert queue.take().sequence == 2
+    assert queue.take() is None
+    assert len(queue) == 0
+
+
+def test_waiting_for_an_outcome_ends_with_the_publication():
+    ledger = SourceLedger()
+    arrive_and_take(ledger, 0)
+    publisher = threading.Timer(0.01, ledger.publish)
+    publisher.start()
+    with ledger.changed:
+        assert ledger.changed.wait_for(
+            lambda: ledger.outcome(*SOURCE, 0) is not None, servers.WAIT_S
+        )
+    publisher.join()
+
+
+def test_a_scan_turned_away_says_nothing_of_those_that_wait() -> None:
+    ledger = SourceLedger()
+    first, second = servers.scan(sequence=0), servers.scan(sequence=1)
+    ledger.arrive(first)
+    ledger.arrive(second)
+    ledger.turn_away(second, "too many points")
+    asked = (first.source, first.session, 1)
+    assert ledger.outcome(*asked) is None, "the first still waits"
+    ledger.take(first)
+    ledger.publish()
+    outcome = ledger.outcome(*asked)
+    assert outcome is not None
+    assert (outcome.taken, outcome.refused, outcome.lost) == (1, 1, 0)

@@ -1,0 +1,189 @@
+import errno
+import logging
+from contextlib import closing
+
+import pytest
+from support import servers
+from triquad_format.errors import MapFileError, TooLargeMapFileError
+from triquad_format.mapfile.mapfile import read_map
+from triquad_format.records.region import MapRecord
+from triquad_server.errors import StoreError
+from triquad_server.mapping.mapper import MapChanges, Mapper
+from triquad_server.store import store as store_module
+from triquad_server.store.retention import Retention
+from triquad_server.store.store import Store
+
+EMPTY = Mapper("lab", servers.SMALL, "cpu").publish()
+
+
+def record(epoch: int) -> MapChanges:
+    return MapChanges(MapRecord("lab", epoch, servers.SMALL.field, ()), (), EMPTY)
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path, "lab", Retention(2))
+    yield store
+    store.close()
+
+
+def names(store: Store) -> list[str]:
+    return sorted(path.name for path in store.folder.iterdir() if path.name != "lock")
+
+
+def test_an_empty_store_has_nothing(store):
+    assert store.newest() is None
+
+
+def test_the_newest_checkpoints_are_kept_and_described(store):
+    for epoch in (1, 2, 10):
+        info = store.write(record(epoch))
+    assert names(store) == ["epoch-000000002.triquad", "epoch-000000010.triquad"]
+    restored = store.newest()
+    assert restored.record.epoch == restored.info.epoch == 10
+    assert restored.info == info
+    assert info.bytes == (store.folder / "epoch-000000010.triquad").stat().st_size
+    assert len(info.sha256) == 64
+
+
+def test_a_damaged_checkpoint_is_left_out_by_name_and_kept_aside(store, caplog):
+    store.write(record(1))
+    bad = store.folder / "epoch-000000002.triquad"
+    bad.write_bytes(b"not a map")
+    with caplog.at_level(logging.WARNING):
+        assert store.newest().record.epoch == 1
+    assert "epoch-000000002.triquad is damaged" in caplog.text
+    assert "epoch-000000001.triquad is used instead" in caplog.text
+    assert names(store) == ["epoch-000000001.triquad", "epoch-000000002.triquad.damaged"]
+    store.write(record(2))
+    store.write(record(3))
+    assert store.newest().record.epoch == 3
+
+
+def test_a_truncated_checkpoint_is_damaged(store):
+    store.write(record(1))
+    path = store.folder / "epoch-000000002.triquad"
+    store.write(record(2))
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(MapFileError):
+        read_map(path)
+    assert store.newest().record.epoch == 1
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.EIO, "Input/output error"),
+        OSError(errno.EMFILE, "Too many open files"),
+        PermissionError(errno.EACCES, "Permission denied"),
+        TooLargeMapFileError("it is larger than the limit"),
+    ],
+)
+def test_a_sound_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkeypatch, error):
+    for epoch in (1, 2):
+        store.write(record(epoch))
+    before = names(store)
+
+    def fail(path):
+        raise error
+
+    monkeypatch.setattr(store_module, "read_map_file", fail)
+    with pytest.raises(StoreError, match="000000002.triquad cannot be read"):
+        store.newest()
+    assert names(store) == before
+
+
+def test_a_folder_that_cannot_be_listed_is_an_error_of_the_store(store, monkeypatch):
+    monkeypatch.setattr(store, "folder", store.folder / "gone")
+    with pytest.raises(StoreError, match="cannot be read"):
+        store.newest()
+    with pytest.raises(StoreError):
+        store.write(record(1))
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(errno.ENOSPC, "No space left")])
+def test_what_keeps_a_checkpoint_from_being_written_is_an_error_of_the_store(
+    store, monkeypatch, error
+):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(store_module, "write_parts", fail)
+    with pytest.raises(StoreError, match="cannot be written"):
+        store.write(record(1))
+
+
+def test_a_damaged_file_of_a_higher_number_does_not_push_out_a_sound_one(store):
+    store.write(record(1))
+    for epoch in (8, 9):
+        (store.folder / f"epoch-00000000{epoch}.triquad").write_bytes(b"damaged")
+    store.write(record(2))
+    assert names(store)[:2] == ["epoch-000000001.triquad", "epoch-000000002.triquad"]
+    store.write(record(3))
+    assert names(store)[:2] == ["epoch-000000002.triquad", "epoch-000000003.triquad"]
+    assert store.newest().record.epoch == 3
+
+
+def test_it_does_not_start_empty_where_all_checkpoints_are_damaged(store):
+    for epoch in (1, 2):
+        (store.folder / f"epoch-00000000{epoch}.triquad").write_bytes(b"")
+    with pytest.raises(StoreError, match="all 2 checkpoints"):
+        store.newest()
+    assert len(names(store)) == 2
+
+
+def test_other_files_are_left_alone(store):
+    (store.folder / "notes.txt").write_text("mine")
+    for epoch in range(5):
+        store.write(record(epoch))
+    assert "notes.txt" in names(store)
+    assert len(names(store)) == 3
+
+
+def test_two_servers_do_not_share_a_folder(store, tmp_path):
+    with pytest.raises(StoreError, match="in use"):
+        Store(tmp_path, "lab", Retention(2))
+    Store(tmp_path, "other", Retention(2)).close()
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot be written"):
+        Store(tmp_path / "file", "lab", Retention(2))
+
+
+def test_what_a_killed_server_left_unfinished_goes(store, tmp_path):
+    store.write(record(1))
+    store.close()
+    (store.folder / ".epoch-000000002.triquad.0a1b2c3d.tmp").write_bytes(b"half")
+    with closing(Store(tmp_path, "lab", Retention(2))) as again:
+        assert names(again) == ["epoch-000000001.triquad"]
+        assert again.newest().record.epoch == 1
+
+
+def test_a_failed_write_leaves_the_older_checkpoints(store):
+    store.write(record(1))
+    (store.folder / "epoch-000000002.triquad").mkdir()
+    with pytest.raises(StoreError, match="epoch-000000002"):
+        store.write(record(2))
+    (store.folder / "epoch-000000002.triquad").rmdir()
+    assert store.newest().record.epoch == 1
+
+
+def test_a_checkpoint_under_a_wrong_number_does_not_pass_for_a_later_one(store, caplog):
+    store.write(record(3))
+    sound = store.folder / "epoch-000000003.triquad"
+    (store.folder / "epoch-000000009.triquad").write_bytes(sound.read_bytes())
+    with caplog.at_level(logging.WARNING):
+        restored = store.newest()
+    assert restored.info.epoch == restored.record.epoch == 3
+    assert "epoch-000000009.triquad holds epoch 3" in caplog.text
+    store.write(record(4))
+    assert store.newest().record.epoch == 4
+
+
+def test_a_number_of_more_than_64_bits_is_not_a_checkpoint(store):
+    store.write(record(3))
+    sound = store.folder / "epoch-000000003.triquad"
+    (store.folder / "epoch-9999999999999999999.triquad").write_bytes(sound.read_bytes())
+    assert store.newest().info.epoch == 3

@@ -1,0 +1,37 @@
+"""Folders of checkpoints of a map of two regions, as a server leaves them."""
+
+import dataclasses
+from pathlib import Path
+
+from support.map_records import random_record
+from triquad_format.mapfile.history import checkpoint_name
+from triquad_format.mapfile.manifest import FileRef
+from triquad_format.mapfile.map_facts import MapFacts
+from triquad_format.mapfile.writer import record_parts, write_parts
+from triquad_format.records.region import MapRecord
+
+START_NS = 1_769_860_800 * 10**9  # 2026-01-31T12:00:00Z
+HOUR_NS = 3600 * 10**9
+FIRST, SECOND = (0, 0, 0), (-1, 0, 0)
+
+
+def map_at(epoch: int) -> MapRecord:
+    """The map, of which only the second region changes from epoch to epoch."""
+    still = random_record(1, indices=(FIRST,)).regions
+    changing = random_record(epoch, indices=(SECOND,)).regions
+    return dataclasses.replace(random_record(1), epoch=epoch, regions=(*still, *changing))
+
+
+def write_checkpoints(folder: Path, epochs: tuple[int, ...]) -> list[Path]:
+    """A complete checkpoint, then deltas, an hour apart; their files."""
+    known, paths = {}, []
+    for hours, epoch in enumerate(epochs):
+        record = map_at(epoch)
+        stamp_ns = START_NS + hours * HOUR_NS
+        path = folder / checkpoint_name(epoch, complete=not known)
+        facts = MapFacts(record.name, epoch, record.settings)
+        parts = record_parts(record, "<f2", None, stamp_ns)
+        written = write_parts(path, facts, stamp_ns, parts, known)
+        known = written.manifest.elsewhere(FileRef(path.name, written.manifest_sha256))
+        paths.append(path)
+    return paths

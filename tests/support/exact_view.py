@@ -1,0 +1,54 @@
+"""A map whose answers are exact: those of a scene, wherever it lies in the map frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.status import Status
+from triquad_map.nearest import NearestSurface, NearestUnknown
+from triquad_map.reference.evaluator import Answer
+from triquad_tools.simulation.scene import Scene
+
+
+@dataclass(frozen=True)
+class ExactView:
+    """A :class:`MapView` of a scene, of which a box is seen; all else is unknown."""
+
+    scene: Scene
+    map_from_scene: NDArray[np.float64]  # [4, 4]
+    seen_low: NDArray[np.float64]  # [3] corner of the box, scene frame
+    seen_high: NDArray[np.float64]  # [3]
+    number: int = 7
+    voxel_m: float = 0.2
+
+    def query(self, points: NDArray[np.float64], gradient: bool = False) -> Answer:
+        local = self._local(points)
+        sdf = self.scene.sdf(local).astype(np.float32)
+        slopes = self.scene.gradient(local) @ self.map_from_scene[:3, :3].T
+        return Answer(sdf, self.status(points), slopes.astype(np.float32) if gradient else None)
+
+    def status(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
+        local = self._local(points)
+        sdf = self.scene.sdf(local)
+        status = np.where(sdf > 0, Status.FREE, Status.UNKNOWN)
+        status = np.where(np.abs(sdf) < self.voxel_m, Status.SURFACE, status)
+        return np.where(self._seen(local), status, Status.UNKNOWN).astype(np.uint8)
+
+    def nearest_surface(self, points: NDArray[np.float64], max_distance_m: float) -> NearestSurface:
+        local = self._local(points)
+        sdf = self.scene.sdf(local)
+        feet = local - sdf[:, None] * self.scene.gradient(local)
+        found = (np.abs(sdf) <= max_distance_m) & self._seen(feet)
+        world = feet @ self.map_from_scene[:3, :3].T + self.map_from_scene[:3, 3]
+        world[~found] = 0.0
+        distance = np.where(found, np.abs(sdf), max_distance_m)
+        return NearestSurface(found, distance, world, world, found.astype(np.float32))
+
+    def nearest_unknown(self, points: NDArray[np.float64], max_distance_m: float) -> NearestUnknown:
+        raise NotImplementedError("no test asks for it")
+
+    def _local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (points - self.map_from_scene[:3, 3]) @ self.map_from_scene[:3, :3]
+
+    def _seen(self, local: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return ((local >= self.seen_low) & (local <= self.seen_high)).all(axis=1)

@@ -1,0 +1,180 @@
+"""Map files taken apart and put together again, so that tests can spoil them anywhere."""
+
+import dataclasses
+import hashlib
+import io
+from typing import NamedTuple
+
+import msgpack
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from triquad_format.errors import MapFileError
+from triquad_format.mapfile.manifest import FileRef, pack_manifest, unpack_manifest
+from triquad_format.mapfile.map_facts import MapFacts
+from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.parts.part import MANIFEST
+from triquad_format.mapfile.random_access import MemoryBytes
+from triquad_format.mapfile.writer import record_parts, write_parts
+from triquad_format.records.record_check import check_record
+from triquad_format.wire.array import pack_array, unpack_array
+from triquad_map.stored_map import StoredMap
+
+
+class RawPart(NamedTuple):
+    """A message of a map file."""
+
+    topic: str
+    payload: bytes
+
+
+def file_bytes(record, *, preview=False, **options):
+    """A complete map file."""
+    stream = io.BytesIO()
+    write_map(record, stream, preview=preview, **options)
+    return stream.getvalue()
+
+
+def read_bytes(data):
+    return read_map(io.BytesIO(data))
+
+
+def stored(data):
+    """The map of a file's bytes, by random access."""
+    return StoredMap(MemoryBytes(data))
+
+
+def parts_of(data):
+    """The messages of a file by the stock reader, which also checks the CRCs it knows."""
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
+    return [
+        RawPart(channel.topic, message.data)
+        for _, channel, message in reader.iter_messages(log_time_order=False)
+    ]
+
+
+def metadata_of(data):
+    return {m.name: m.metadata for m in make_reader(io.BytesIO(data)).iter_metadata()}
+
+
+def manifest_of(data):
+    return unpack_manifest(parts_of(data)[-1].payload, len(data))
+
+
+def rebuild(parts, metadata, *, encoding="msgpack", chunk_size=1, **options):
+    """An MCAP file with right CRCs around whatever parts are given, each in its own chunk."""
+    stream = io.BytesIO()
+    writer = Writer(stream, enable_data_crcs=True, chunk_size=chunk_size, **options)
+    writer.start()
+    for name, entries in metadata.items():
+        writer.add_metadata(name, entries)
+    channels = {}
+    for part in parts:
+        if part.topic not in channels:
+            channels[part.topic] = writer.register_channel(part.topic, encoding, 0)
+        writer.add_message(channels[part.topic], 0, part.payload, 0)
+    writer.finish()
+    return stream.getvalue()
+
+
+def listed(parts, manifest):
+    """Parts and a manifest with their sizes and digests; keys are those of ``manifest``."""
+    own = tuple(
+        dataclasses.replace(
+            entry, size=len(part.payload), sha256=hashlib.sha256(part.payload).digest()
+        )
+        for entry, part in zip(manifest.own, parts, strict=True)
+    )
+    others = tuple(entry for entry in manifest.entries if entry.file is not None)
+    packed = pack_manifest(dataclasses.replace(manifest, entries=own + others))
+    return [*parts, RawPart(MANIFEST, packed.payload)]
+
+
+def edited(data, topic, edit, number=0):
+    """The file with the body of the ``number``-th part of a topic edited; digests fit."""
+    parts = parts_of(data)
+    at = [i for i, part in enumerate(parts) if part.topic == topic][number]
+    body = msgpack.unpackb(parts[at].payload)
+    edit(body)
+    parts[at] = RawPart(topic, msgpack.packb(body))
+    whole = parts if topic == MANIFEST else listed(parts[:-1], manifest_of(data))
+    return rebuild(whole, metadata_of(data))
+
+
+def with_manifest(data, edit):
+    """The file with another manifest, which ``edit`` makes of its own."""
+    parts = parts_of(data)
+    parts[-1] = RawPart(MANIFEST, pack_manifest(edit(manifest_of(data))).payload)
+    return rebuild(parts, metadata_of(data))
+
+
+def with_metadata(data, changes):
+    """The file with other values in its metadata; ``None`` takes one out."""
+    metadata = metadata_of(data)
+    metadata["triquad"].update(changes)
+    metadata["triquad"] = {k: v for k, v in metadata["triquad"].items() if v is not None}
+    return rebuild(parts_of(data), metadata)
+
+
+def set_field(key, value):
+    return lambda body: body.__setitem__(key, value)
+
+
+def set_array(key, array):
+    return set_field(key, pack_array(array))
+
+
+def shorten(key, axis):
+    """Cut the last row off one column of a part."""
+
+    def edit(body):
+        planes = unpack_array(key, body[key])
+        body[key] = pack_array(np.ascontiguousarray(np.delete(planes, -1, axis)))
+
+    return edit
+
+
+def all_of(*edits):
+    return lambda body: [edit(body) for edit in edits]
+
+
+def in_level(number, edit):
+    """Edit the rows of one level of a part."""
+    return lambda body: edit(body["levels"][number])
+
+
+def altered(parts, count, rng):
+    """``count`` times the parts, with some bits of one flipped."""
+    for _ in range(count):
+        at = int(rng.integers(len(parts)))
+        payload = bytearray(parts[at].payload)
+        # Most flips hit the heads, where lengths, shapes and keys are.
+        for _ in range(int(rng.integers(1, 4))):
+            payload[int(len(payload) * rng.random() ** 3)] ^= 1 << int(rng.integers(8))
+        yield [*parts[:at], RawPart(parts[at].topic, bytes(payload)), *parts[at + 1 :]]
+
+
+def sound_or_refused(read, data):
+    """The record of a hostile file, which must be sound; ``None`` where the file is refused."""
+    try:
+        record = read(data)
+    except MapFileError:
+        return None
+    check_record(record)
+    return record
+
+
+def write_pair(
+    folder, base, record, *, names=("base.triquad", "next.triquad"), stamps=(None, None)
+):
+    """A complete file of ``base``, and one of what ``record`` changes of it."""
+    first = write_record(folder / names[0], base, stamps[0], {})
+    known = first.manifest.elsewhere(FileRef(names[0], first.manifest_sha256))
+    return first, write_record(folder / names[1], record, stamps[1], known)
+
+
+def write_record(path, record, stamp_ns, known):
+    """A file of all parts of a record that no file of ``known`` holds."""
+    facts = MapFacts(record.name, record.epoch, record.settings)
+    parts = record_parts(record, "<f2", None, stamp_ns or 0)
+    return write_parts(path, facts, stamp_ns, parts, known)

@@ -1,0 +1,70 @@
+"""A short drive through the exact street, shared by the tests of the server's core."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings, parse_settings
+from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.street import street
+
+
+@dataclass(frozen=True)
+class World:
+    """A scene and what a lidar saw of it."""
+
+    scene: Scene
+    scans: tuple[SimulatedScan, ...]
+
+    @property
+    def hits(self) -> NDArray[np.float64]:
+        """True hits [N, 3] of all scans."""
+        return np.concatenate([scan.true_hits for scan in self.scans])
+
+
+@cache
+def world(scans: int = 6, step_m: float = 1.5) -> World:
+    """A drive of a few scans."""
+    scene = street(3)
+    rng = np.random.default_rng(0)
+    lidar = Lidar(columns=360)
+    poses = drive(scene, scans, step_m)
+    return World(scene, tuple(lidar.scan(scene, pose, rng) for pose in poses))
+
+
+def settings(**training: object) -> Settings:
+    """Small regions, so that a street has several."""
+    return parse_settings(
+        {"field": {"depth": 8}, "training": {"batch": 4096, "visits": 18.0, **training}}
+    )
+
+
+def settled_mapper(chosen: Settings, drive_through: World, device: str = "cpu") -> Mapper:
+    """A mapper that learnt all it can of a world."""
+    mapper = Mapper("test", chosen, device)
+    for scan in drive_through.scans:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    settle(mapper)
+    return mapper
+
+
+def settle(mapper: Mapper) -> None:
+    """Train until nothing is left to learn."""
+    while not mapper.settled:
+        mapper.train()
+
+
+def surface_error(epoch: Epoch, drive_through: World, count: int = 20_000) -> float:
+    """Mean |SDF error| in metres at points within 0.1 m of the seen surface."""
+    rng = np.random.default_rng(9)
+    hits = drive_through.hits
+    hits = hits[rng.choice(len(hits), count)]
+    normals = drive_through.scene.gradient(hits)
+    points = hits + normals * rng.uniform(-0.1, 0.1, (count, 1))
+    points = points[drive_through.scene.is_exact(points)]
+    error = epoch.query(points, gradient=False).sdf - drive_through.scene.sdf(points)
+    return float(np.abs(error).mean())

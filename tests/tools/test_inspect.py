@@ -1,0 +1,257 @@
+import dataclasses
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.checkpoint_folder import write_checkpoints
+from support.exact_maps import SEEN_M, exact_map, flat
+from support.map_records import random_record, with_integers
+from triquad_format.mapfile.mapfile import write_map
+from triquad_tools.commands.inspect import main
+
+VERSION_1 = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    path = tmp_path / "map.triquad"
+    write_map(random_record(1, indices=((0, 0, 0), (-1, 0, 0))), path)
+    return path
+
+
+@pytest.fixture
+def delta(tmp_path):
+    return write_checkpoints(tmp_path, (9, 12))[1]
+
+
+def summary_of(path, capsys):
+    assert main([str(path), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_text(map_file, capsys):
+    assert main([str(map_file)]) == 0
+    out = capsys.readouterr().out
+    for text in (
+        "epoch 7",
+        "format version  2",
+        "other files     none needed",
+        "/triquad/vertices",
+        "(float16)",
+        "leaf_m 0.25",
+        "training state  yes",
+    ):
+        assert text in out
+    assert "ok:" not in out
+
+
+def test_json(map_file, capsys):
+    assert main([str(map_file), "--json", "--verify"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    record = random_record(1, indices=((0, 0, 0), (-1, 0, 0)))
+    tables = [table for region in record.regions for table in region.tables]
+    assert report["bytes"] == map_file.stat().st_size
+    assert report["vertices"] == sum(len(table.codes) for table in tables)
+    mlp = record.regions[0].mlp
+    dense = 2 * sum(array.size for array in (*mlp.weights, *mlp.biases))
+    assert report["parameters"] == dense + sum(table.features.size for table in tables)
+    assert report["settings"]["depth"] == 6
+    assert report["regions"][1]["index"] == [-1, 0, 0]
+    assert report["regions"][1]["centre_m"] == [-12.0, 0.0, 0.0]
+    assert report["regions"][0]["samples"] == 40
+    assert report["other_files"] == []
+    parts = report["parts"]
+    assert parts["/triquad/vertices"]["parts"] == parts["/triquad/vertices"]["stored_parts"] == 6
+    training = sum(
+        parts[f"/triquad/{k}"]["stored_bytes"] for k in ("training", "moments", "samples")
+    )
+    assert report["bytes_per_parameter"] == (report["bytes"] - training) / report["parameters"]
+    assert any("mcap library" in check for check in report["checks"])
+
+
+def test_volume_is_that_of_the_voxels_that_a_region_answers_for(tmp_path, capsys):
+    path = tmp_path / "ground.triquad"
+    write_map(exact_map(flat(0.1)), path)
+    report = summary_of(path, capsys)
+    layer_m3 = (2 * SEEN_M) ** 2 * 0.2
+    assert report["surface_m3"] == pytest.approx(layer_m3)
+    assert report["free_m3"] == pytest.approx(10 * layer_m3)
+
+    overlapping = tmp_path / "overlapping.triquad"
+    write_map(random_record(1, indices=((0, 0, 0), (1, 0, 0)), points=4000), overlapping)
+    both = summary_of(overlapping, capsys)
+    voxels = both["surface_m3"] / 0.25**3
+    assert voxels == round(voxels)
+    # Of cubes of 64 voxels, 48 along each side are a region's own.
+    assert voxels == pytest.approx(2 * 4000 * (48 / 64) ** 3, rel=0.1)
+
+
+def test_precision_of_integers(tmp_path, capsys):
+    path = tmp_path / "integers.triquad"
+    record = with_integers(random_record(2))
+    write_map(record, path)
+    region = summary_of(path, capsys)["regions"][0]
+    assert region["precision"] == ["int16"]
+    scales = region["scales"]
+    assert scales == sorted(table.scale for table in record.regions[0].tables)
+    assert main([str(path)]) == 0
+    text = f"(integers, in steps of {scales[0]:.3g} to {scales[-1]:.3g})"
+    assert text in capsys.readouterr().out
+
+
+def test_surface_by_level_of_support(tmp_path, capsys):
+    path = tmp_path / "levels.triquad"
+    record = random_record(2)
+    write_map(record, path)
+    assert summary_of(path, capsys)["regions"][0]["surface_levels"] is None
+    evidence = record.regions[0].evidence
+    levels = np.full(int(np.unpackbits(evidence.surface).sum()), 7, np.uint8)
+    region = dataclasses.replace(
+        record.regions[0], evidence=dataclasses.replace(evidence, levels=levels)
+    )
+    write_map(dataclasses.replace(record, regions=(region,)), path)
+    summary = summary_of(path, capsys)["regions"][0]
+    voxels = round(summary["surface_m3"] / record.settings.leaf_m**3)
+    assert summary["surface_levels"] == [0] * 7 + [voxels]
+    assert main([str(path)]) == 0
+    assert "surface by level of support: 0: 0%, 1: 0%," in capsys.readouterr().out
+
+
+def test_a_delta_names_the_files_it_needs(delta, capsys):
+    assert main([str(delta)]) == 0
+    assert "other files     epoch-000000009.triquad: needed, and there" in capsys.readouterr().out
+    report = summary_of(delta, capsys)
+    assert report["other_files"] == ["epoch-000000009.triquad"]
+    assert report["epoch"] == 12
+    assert report["bytes_per_parameter"] is None
+    evidence = report["parts"]["/triquad/evidence"]
+    assert (evidence["parts"], evidence["stored_parts"]) == (2, 1)
+    assert evidence["bytes"] > evidence["stored_bytes"]
+
+
+def test_a_delta_without_its_base_is_damaged(delta, capsys):
+    (delta.parent / "epoch-000000009.triquad").unlink()
+    for options in ([], ["--verify"], ["--diff", str(delta)]):
+        assert main([str(delta), *options]) == 1
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.count("\n") == 1
+        assert "needs epoch-000000009.triquad" in captured.err
+
+
+def test_version_1(capsys):
+    assert main([str(VERSION_1), "--verify"]) == 0
+    out = capsys.readouterr().out
+    assert "format version  1" in out
+    assert out.count("  ok: ") == 6
+
+
+def test_verify(map_file, delta, capsys):
+    assert main([str(map_file), "--verify"]) == 0
+    assert capsys.readouterr().out.count("  ok: ") == 6
+    assert main([str(delta), "--verify"]) == 0
+    assert "ok: 10 parts in other files" in capsys.readouterr().out
+
+
+def test_verify_finds_a_field_that_is_not_finite(tmp_path, capsys):
+    path = tmp_path / "map.triquad"
+    record = random_record(1)
+    for table in record.regions[0].tables:
+        table.features[:] = np.finfo(np.float16).max
+    for weight in record.regions[0].mlp.weights:
+        weight[:] = 1e30
+    write_map(record, path, preview=False)
+    assert main([str(path)]) == 0
+    assert main([str(path), "--verify"]) == 1
+    assert "is not finite" in capsys.readouterr().err
+
+
+def test_map_without_regions(tmp_path, capsys):
+    path = tmp_path / "empty.triquad"
+    write_map(random_record(indices=()), path)
+    assert main([str(path), "--verify"]) == 0
+    assert "training state  no" in capsys.readouterr().out
+
+
+def test_faults_are_one_line(map_file, tmp_path, capsys):
+    data = map_file.read_bytes()
+    for status, content in (
+        (1, data[:-9]),
+        (1, data[:500] + b"\xff" + data[501:]),
+        (1, b""),
+        (2, b"another file"),
+    ):
+        map_file.write_bytes(content)
+        assert main([str(map_file), "--verify"]) == status
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.count("\n") == 1
+        assert "map.triquad" in captured.err
+    assert main([str(tmp_path / "none.triquad")]) == 2
+    assert "none.triquad" in capsys.readouterr().err
+    assert main([str(tmp_path)]) == 2
+    assert "is a folder: --log" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main([])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["FILE", "FILE"], "only --diff takes more than one file: 2 given"),
+        (["FILE", "--diff"], "--diff compares two map files: 1 given"),
+        (["FILE", "--log", "--diff", "FILE"], "exclude each other"),
+        (["FILE", "FILE", "--diff", "--verify"], "--verify is for one map file"),
+        (["FILE", "--tile", "2"], "--tile and --limit go with --diff"),
+        (["FILE", "--log", "--plot", "a.png"], "--plot is for map files"),
+        (["FILE", "--plot", "a.jpg"], "--plot a.jpg: its name must end in .png"),
+        (["FILE", "--plot", "none/a.png"], "--plot none/a.png: its folder does not exist"),
+        (["FILE", "--log"], "is a file: --log lists the checkpoints in a folder"),
+    ],
+)
+def test_wrong_usage_is_one_line(map_file, arguments, complaint, capsys):
+    assert main([argument.replace("FILE", str(map_file)) for argument in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert complaint in captured.err
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(map_file, tmp_path, capsys):
+    (tmp_path / "taken.png").mkdir()
+    assert main([str(map_file), "--plot", str(tmp_path / "taken.png")]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert "taken.png" in captured.err
+
+
+def test_no_state_left_on_streams():
+    stream = io.BytesIO(b"before")
+    stream.seek(6)
+    write_map(random_record(2), stream)
+    assert stream.getvalue().startswith(b"before\x89MCAP")
+
+
+def test_format_needs_neither_server_nor_torch():
+    code = (
+        "import sys, triquad_format.mapfile.mapfile, triquad_map.reference.evaluator\n"
+        "import triquad_format.records.crop\n"
+        "bad = {'torch', 'numba', 'zenoh', 'skimage', 'triquad_server'} & set(sys.modules)\n"
+        "assert not bad, bad"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_inspecting_needs_neither_server_nor_pictures(map_file):
+    code = (
+        "import sys; from triquad_tools.commands.inspect import main; main([sys.argv[1]])\n"
+        "bad = {'torch', 'numba', 'zenoh', 'PIL', 'scipy', 'triquad_server'} & set(sys.modules)\n"
+        "assert not bad, bad"
+    )
+    command = [sys.executable, "-c", code, str(map_file)]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")

@@ -1,0 +1,150 @@
+"""Meshes and grids that ``triquad-pack`` writes, opened by the libraries that people use."""
+
+import numpy as np
+import pytest
+import trimesh
+from support.map_records import random_record
+from support.mapfile_surgery import file_bytes
+from support.small_world import settings, settled_mapper, world
+from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.records.crop import crop_record
+from triquad_format.records.status import Status
+from triquad_map.reference.evaluator import MapEvaluator
+from triquad_tools.commands.pack import main
+from triquad_tools.evaluation.meshfile import read_mesh
+from triquad_tools.mapfiles.seen_space import surface_voxels
+
+BOX = ["0.1", "-4.7", "-2", "12.3", "4.1", "3"]
+LOW, HIGH = np.array([0.1, -4.7, -2]), np.array([12.3, 4.1, 3])
+
+
+@pytest.fixture(scope="module")
+def map_file(tmp_path_factory):
+    """A street; its regions are learnt, and a part of them is kept."""
+    record = settled_mapper(settings(), world(4)).publish().record()
+    path = tmp_path_factory.mktemp("street") / "street.triquad"
+    path.write_bytes(file_bytes(crop_record(record, [-5, -10, -3], [40, 10, 5])))
+    return path
+
+
+def export(map_file, tmp_path, name, *options):
+    out = tmp_path / name
+    assert main([str(map_file), str(out), *options]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    return out
+
+
+def test_meshes_lie_on_the_surface(map_file, tmp_path):
+    ply = read_mesh(export(map_file, tmp_path, "mesh.ply"))
+    (tmp_path / "mesh.ply").unlink()
+    glb = read_mesh(export(map_file, tmp_path, "mesh.glb"))
+    assert len(ply.faces) > 10_000
+    np.testing.assert_array_equal(ply.faces, glb.faces)
+    np.testing.assert_allclose(ply.vertices, glb.vertices, atol=1e-4)
+    answer = MapEvaluator(read_map(map_file)).query(ply.vertices)
+    assert np.quantile(np.abs(answer.sdf), 0.95) < 0.01
+    mesh = trimesh.Trimesh(ply.vertices, ply.faces, process=False)
+    assert len(mesh.edges_unique) < 2 * len(ply.faces)  # tiles are joined
+
+
+def test_a_mesh_within_a_box(map_file, tmp_path):
+    whole = read_mesh(export(map_file, tmp_path, "mesh.ply", "--cell", "0.2"))
+    (tmp_path / "mesh.ply").unlink()
+    part = read_mesh(export(map_file, tmp_path, "mesh.ply", "--cell", "0.2", "--crop", *BOX))
+    middles = whole.vertices[whole.faces].mean(axis=1)
+    inside = ((middles >= LOW) & (middles <= HIGH)).all(axis=1)
+    assert 0 < len(part.faces) == inside.sum() < len(whole.faces)
+
+
+def test_dense_grid(map_file, tmp_path):
+    grid = np.load(export(map_file, tmp_path, "grid.npz", "--crop", *BOX))
+    assert grid["sdf"].dtype == np.float32
+    assert grid["status"].dtype == np.uint8
+    assert grid["sdf"].shape == grid["status"].shape == (61, 44, 26)
+    np.testing.assert_allclose(grid["origin_m"], [0.2, -4.6, -2])
+    assert grid["cell_m"] == 0.2
+    cells = np.indices(grid["sdf"].shape).reshape(3, -1).T
+    answer = MapEvaluator(read_map(map_file)).query(grid["origin_m"] + cells * grid["cell_m"])
+    np.testing.assert_allclose(grid["sdf"].ravel(), answer.sdf, atol=1e-4)
+    assert (grid["status"].ravel() != answer.status).mean() < 1e-3  # on borders of voxels
+    assert (answer.status == Status.SURFACE).any()
+
+
+def test_a_grid_without_a_box_holds_all_evidence_and_nan_where_no_region_is(tmp_path):
+    source, out = tmp_path / "in.triquad", tmp_path / "out.npz"
+    record = random_record(1)
+    source.write_bytes(file_bytes(record))
+    assert main([str(source), str(out), "--cell", "0.5"]) == 0
+    grid = np.load(out)
+    np.testing.assert_allclose(grid["origin_m"], [-8, -8, -8])
+    assert grid["sdf"].shape == (33, 33, 33)
+    assert grid["epoch"] == record.epoch
+    wide = ["--crop", "-12", "-1", "-1", "0", "1", "1"]
+    assert main([str(source), str(out), "--cell", "0.5", "--force", *wide]) == 0
+    grid = np.load(out)
+    outside = grid["origin_m"][0] + 0.5 * np.arange(len(grid["sdf"])) <= -8
+    assert np.isnan(grid["sdf"][outside]).all()
+    assert (grid["status"][outside] == Status.UNKNOWN).all()
+    assert np.isfinite(grid["sdf"][~outside]).all()
+
+
+def test_sparse_grid(map_file, tmp_path):
+    grid = np.load(export(map_file, tmp_path, "grid.npz", "--sparse", "--cell", "0.25"))
+    indices, sdf, status = grid["indices"], grid["sdf"], grid["status"]
+    assert indices.dtype == np.int32
+    assert sdf.shape == status.shape == (len(indices), 8, 8, 8)
+    assert len(np.unique(indices, axis=0)) == len(indices)
+    record = read_map(map_file)
+    points = (indices[:, None] * 8 + np.indices((8, 8, 8)).reshape(3, -1).T) * grid["cell_m"]
+    answer = MapEvaluator(record).query(points.reshape(-1, 3))
+    np.testing.assert_allclose(sdf.ravel(), answer.sdf, atol=1e-4)
+    # Around every voxel with seen surface there is a margin for interpolation.
+    held = {tuple(index) for index in indices.tolist()}
+    for offset in (-0.75, 0.0, 0.75):
+        near = np.round((surface_voxels(record) + offset) / 0.25).astype(int) // 8
+        assert {tuple(block) for block in np.unique(near, axis=0).tolist()} <= held
+
+
+def test_a_sparse_grid_within_a_box(map_file, tmp_path):
+    grid = np.load(export(map_file, tmp_path, "grid.npz", "--sparse", "--crop", *BOX))
+    corners = grid["indices"] * 8 * grid["cell_m"]
+    assert len(corners)
+    assert (corners + 1.4 >= LOW - 0.8).all()
+    assert (corners <= HIGH + 0.8).all()
+    points = corners[:, None] + np.indices((8, 8, 8)).reshape(3, -1).T * grid["cell_m"]
+    answer = MapEvaluator(read_map(map_file)).query(points.reshape(-1, 3))
+    np.testing.assert_allclose(grid["sdf"].ravel(), answer.sdf, atol=1e-4)
+
+
+def test_a_map_that_has_seen_nothing(tmp_path, capsys):
+    source = tmp_path / "in.triquad"
+    source.write_bytes(file_bytes(crop_record(random_record(1), [7.9] * 3, [7.95] * 3)))
+    assert main([str(source), str(tmp_path / "out.ply")]) == 0
+    assert " 0 faces" in capsys.readouterr().out
+    assert main([str(source), str(tmp_path / "out.npz")]) == 2
+    assert "no ray has shown anything" in capsys.readouterr().err
+
+
+def test_refusals(map_file, tmp_path, capsys):
+    def refused(text, name, *options):
+        out = tmp_path / name
+        assert main([str(map_file), str(out), *options]) == 2
+        assert text in capsys.readouterr().err.splitlines()[-1]
+        assert list(tmp_path.iterdir()) == []
+
+    wide = ["--crop", "-400", "-400", "-400", "400", "400", "400"]
+    refused("4000 x 4000 x 4000 = 6.4e+10 points", "grid.npz", *wide)
+    refused("--crop, --sparse or a larger --cell", "grid.npz", *wide)
+    refused("--cell = 0.001 is out of range: use 0.01 to 10", "mesh.ply", "--cell", "0.001")
+    refused(".triquad, .ply, .glb, .npz", "mesh.obj")
+    refused("--sparse is of .npz", "mesh.ply", "--sparse")
+    refused("of map files", "mesh.ply", "--max-error", "2mm")
+    refused("nowhere is not a folder", "nowhere/mesh.ply")
+
+
+def test_regions_too_far_for_a_mesh_are_told(tmp_path, capsys):
+    record = random_record(0, indices=((2**31 - 1, 0, 0),))
+    write_map(record, tmp_path / "far.triquad", preview=False)
+    assert main([str(tmp_path / "far.triquad"), str(tmp_path / "far.ply")]) == 2
+    assert "too far from the origin" in capsys.readouterr().err
+    assert not (tmp_path / "far.ply").exists()

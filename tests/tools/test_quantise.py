@@ -1,0 +1,140 @@
+"""Integer features: files shrink, and distances move by no more than was allowed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from support.map_records import SMALL, assert_same, random_record
+from support.mapfile_surgery import file_bytes, read_bytes
+from support.small_world import settings, settled_mapper, world
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.mapfile import read_map
+from triquad_format.records.crop import crop_record
+from triquad_map.reference.evaluator import MapEvaluator
+from triquad_tools.commands.pack import main
+from triquad_tools.mapfiles.field_change import draw_probes, field_change
+from triquad_tools.mapfiles.map_packing import INTEGER_ERROR_M
+from triquad_tools.mapfiles.quantise import dequantised, quantise
+from triquad_tools.mapfiles.region_probes import RegionProbes
+
+OTHER_SEED = 77
+
+
+@pytest.fixture(scope="module")
+def street():
+    """A piece of a trained map, as its file has it."""
+    record = settled_mapper(settings(), world(2)).publish().record()
+    return read_bytes(file_bytes(crop_record(record, [0, -8, -3], [16, 8, 5])))
+
+
+@pytest.fixture(scope="module")
+def fine(street):
+    return quantise(street, INTEGER_ERROR_M)
+
+
+@pytest.fixture(scope="module")
+def coarse(street):
+    return quantise(street, 0.005)
+
+
+@pytest.mark.parametrize("encoding", ["both", "features", "fourier"])
+def test_random_maps_keep_to_the_limit(encoding):
+    shape = dataclasses.replace(SMALL, encoding=encoding)
+    record = random_record(2, settings=shape, indices=((0, 0, 0), (1, 0, 0)), points=60)
+    packed = quantise(record, 0.01)
+    assert field_change(record, packed.record, OTHER_SEED).quantile_m <= 0.01
+    assert packed.change.quantile_m <= 0.01
+    for region in packed.record.regions:
+        assert region.training is None
+        assert all(table.features.dtype == np.int16 for table in region.tables)
+
+
+@pytest.mark.parametrize(("name", "limit_m"), [("fine", INTEGER_ERROR_M), ("coarse", 0.005)])
+def test_a_trained_map_keeps_to_the_limit_and_shrinks(street, name, limit_m, request):
+    packed = request.getfixturevalue(name)
+    fresh = field_change(street, packed.record, OTHER_SEED)
+    assert 0.5 * limit_m < fresh.quantile_m <= limit_m  # and does not waste it
+    assert packed.change.largest_m < 4 * limit_m
+    assert len(file_bytes(packed.record)) < 0.7 * len(file_bytes(street))
+
+
+def test_statuses_stay(street, coarse):
+    region = street.regions[0]
+    points = draw_probes(street.settings, region, np.random.default_rng(5), 2000).points
+    before, after = (MapEvaluator(record).query(points) for record in (street, coarse.record))
+    np.testing.assert_array_equal(before.status, after.status)
+
+
+def test_probes_agree_with_the_evaluator(street):
+    region = street.regions[0]
+    moved = tuple(dataclasses.replace(t, features=t.features * 1.01) for t in region.tables)
+    change = RegionProbes(street.settings, region, np.random.default_rng(0)).change(
+        [table.vectors() for table in moved]
+    )
+    alone = dataclasses.replace(street, regions=(dataclasses.replace(region, index=(0, 0, 0)),))
+    after = dataclasses.replace(
+        alone, regions=(dataclasses.replace(alone.regions[0], tables=moved),)
+    )
+    probes = draw_probes(street.settings, region, np.random.default_rng(0))
+    before, now = (MapEvaluator(record).query(probes.points).sdf for record in (alone, after))
+    inside = np.isfinite(before)
+    expected = probes.change(np.where(inside, now - before, 0))
+    assert change.near_m == pytest.approx(expected.near_m, rel=0.02)
+
+
+def test_the_error_is_from_the_map_that_was_packed(street, fine):
+    again = quantise(fine.record, 0.004)
+    assert field_change(fine.record, again.record, OTHER_SEED).quantile_m <= 0.004
+    assert field_change(street, again.record, OTHER_SEED).quantile_m <= 0.005
+
+
+def test_integers_survive_the_file_and_become_floats_again(coarse, tmp_path):
+    packed = coarse.record
+    (tmp_path / "map.triquad").write_bytes(file_bytes(packed))
+    assert_same(read_map(tmp_path / "map.triquad"), packed)
+    floats = dequantised(packed)
+    points = np.random.default_rng(0).uniform(-20, 20, (2000, 3))
+    before, after = (MapEvaluator(record).query(points).sdf for record in (packed, floats))
+    np.testing.assert_array_equal(before, after)
+
+
+def test_a_map_without_evidence():
+    nothing_seen = crop_record(random_record(1), [7.9, 7.9, 7.9], [7.95, 7.95, 7.95])
+    assert quantise(nothing_seen, 0.001).change.largest_m == 0
+    assert quantise(dataclasses.replace(nothing_seen, regions=()), 0.001).record.regions == ()
+
+
+def test_a_limit_that_integers_cannot_keep(street):
+    with pytest.raises(FormatError, match="allow a larger error"):
+        quantise(street, 1e-9)
+
+
+def test_tool(street, fine, coarse, tmp_path, capsys):
+    source, out = tmp_path / "in.triquad", tmp_path / "out.triquad"
+    source.write_bytes(file_bytes(street, preview=True))
+    assert main([str(source), str(out), "--max-error", "5mm"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "bytes per learnable parameter" in lines[1]
+    assert "99 % of distances moved by less than" in lines[2]
+    assert "training state" in lines[3]
+    assert_same(read_map(out), coarse.record)
+    finer = tmp_path / "finer.triquad"
+    assert main([str(source), str(finer), "--precision", "int8"]) == 0
+    assert_same(read_map(finer), fine.record)
+    assert out.stat().st_size < finer.stat().st_size < 0.7 * source.stat().st_size
+    # Integers stay what they are unless floats are asked for.
+    copy, floats = tmp_path / "copy.triquad", tmp_path / "floats.triquad"
+    assert main([str(out), str(copy)]) == 0
+    assert_same(read_map(copy), read_map(out))
+    assert main([str(out), str(floats), "--precision", "fp32"]) == 0
+    assert_same(read_map(floats), dequantised(read_map(out)))
+    capsys.readouterr()
+    assert main([str(out), str(copy), "--max-error", "0.5cm", "--force"]) == 0
+    assert "both errors add up" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("length", ["2", "2km", "-2mm", "mm", "nanmm", "0mm", "1m", "1e3mm", ""])
+def test_lengths_that_are_none(tmp_path, capsys, length):
+    with pytest.raises(SystemExit, match="2"):
+        main([str(tmp_path / "in"), str(tmp_path / "out.triquad"), f"--max-error={length}"])
+    assert "mm" in capsys.readouterr().err

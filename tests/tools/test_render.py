@@ -1,0 +1,128 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from triquad_tools.plots.camera import Camera, birds_eye
+from triquad_tools.plots.raster import rasterise, vertex_normals
+from triquad_tools.plots.render import height_colours, render_mesh, write_png
+
+SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
+FROM_ABOVE = Camera(np.array([0.0, 0.0, 10.0]), np.array([0.0, 0.0, 0.0]))
+FROM_BELOW = Camera(np.array([0.0, 0.0, -10.0]), np.array([0.0, 0.0, 0.0]))
+RED, GREEN = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+
+
+def _two_squares(first_z: float, second_z: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A red square, then a green one, at two heights."""
+    up = np.array([0.0, 0.0, 1.0])
+    vertices = np.vstack([SQUARE + first_z * up, SQUARE + second_z * up])
+    colours = np.vstack([np.repeat(RED, 4, axis=0), np.repeat(GREEN, 4, axis=0)])
+    return vertices, np.vstack([SQUARE_FACES, SQUARE_FACES + 4]), colours
+
+
+@pytest.mark.parametrize(("heights", "nearest"), [((0.0, 1.0), 1), ((1.0, 0.0), 0)])
+def test_nearer_things_hide_farther_ones(heights: tuple[float, float], nearest: int) -> None:
+    vertices, faces, colours = _two_squares(*heights)
+    picture = render_mesh(vertices, faces, 64, 48, FROM_ABOVE, colours)
+    assert np.argmax(picture[24, 32]) == nearest
+    from_below = render_mesh(vertices, faces, 64, 48, FROM_BELOW, colours)
+    assert np.argmax(from_below[24, 32]) == 1 - nearest
+
+
+def test_faces_seen_from_inside_are_darker() -> None:
+    front = render_mesh(SQUARE, SQUARE_FACES, 64, 48, FROM_ABOVE)[24, 32]
+    back = render_mesh(SQUARE, SQUARE_FACES[:, ::-1], 64, 48, FROM_ABOVE)[24, 32]
+    assert np.all(back < 0.8 * front)
+
+
+def test_a_roof_throws_a_shadow() -> None:
+    floor = SQUARE * np.array([10.0, 10.0, 1.0])
+    vertices = np.vstack([floor, SQUARE + np.array([0.0, 0.0, 3.0])])
+    faces = np.vstack([SQUARE_FACES, SQUARE_FACES + 4])
+    camera = Camera(np.array([0.0, 0.0, 40.0]), np.array([0.0, 0.0, 0.0]))
+    bare = render_mesh(floor, SQUARE_FACES, 96, 96, camera).astype(int)
+    shaded = render_mesh(vertices, faces, 96, 96, camera).astype(int)
+    darker = np.any(bare - shaded > 40, axis=2)
+    square_m2 = 4.0 * (37.0 / 40.0) ** -2
+    metres = 2.0 * 40.0 * np.tan(np.radians(0.5 * camera.view_deg)) / 96
+    assert 0.3 < np.sum(darker) * metres**2 / square_m2 < 1.5
+
+
+def test_an_empty_mesh_is_all_sky() -> None:
+    picture = render_mesh(np.empty((0, 3)), np.empty((0, 3), np.int64), 32, 16)
+    assert picture.shape == (16, 32, 3)
+    assert picture.dtype == np.uint8
+    assert np.all(picture == picture[:, :1])
+    assert picture[-1, 0].sum() > picture[0, 0].sum()
+
+
+def test_things_behind_the_eye_are_not_drawn() -> None:
+    away = Camera(np.array([0.0, 0.0, 10.0]), np.array([0.0, 0.0, 20.0]))
+    sky = render_mesh(np.empty((0, 3)), np.empty((0, 3), np.int64), 32, 16)
+    np.testing.assert_array_equal(render_mesh(SQUARE, SQUARE_FACES, 32, 16, away), sky)
+
+
+def test_birds_eye_view_holds_the_whole_mesh_and_fills_the_picture() -> None:
+    rng = np.random.default_rng(0)
+    for size in ([100.0, 40.0, 10.0], [10.0, 60.0, 5.0], [1.0, 1.0, 30.0]):
+        points = rng.uniform(-0.5, 0.5, (5_000, 3)) * size + [1e3, -2e3, 50.0]
+        seen = birds_eye(points, 16 / 9).project(points, 1600, 900)
+        assert np.isfinite(seen).all()
+        inside = (seen[:, :2] > 0.0) & (seen[:, :2] < [1600.0, 900.0])
+        assert np.mean(np.all(inside, axis=1)) > 0.985
+        spread = (seen[:, :2].max(axis=0) - seen[:, :2].min(axis=0)) / [1600.0, 900.0]
+        assert spread.max() > 0.8
+
+
+def test_projection_and_its_inverse_agree() -> None:
+    camera = Camera(np.array([3.0, -8.0, 6.0]), np.array([0.5, 0.2, 0.0]))
+    nearness = np.random.default_rng(0).uniform(0.05, 0.5, (9, 16))
+    places = camera.unproject(nearness)
+    seen = camera.project(places.reshape(-1, 3), 16, 9).reshape(9, 16, 3)
+    np.testing.assert_allclose(seen[..., 2], nearness)
+    np.testing.assert_allclose(seen[4, :, 0], np.arange(16) + 0.5)
+    np.testing.assert_allclose(seen[:, 7, 1], np.arange(9) + 0.5)
+
+
+def test_right_and_up_in_the_picture_are_right_and_up_in_the_world() -> None:
+    camera = Camera(np.array([0.0, -10.0, 0.0]), np.array([0.0, 0.0, 0.0]))
+    column, row, _ = camera.project(np.array([[1.0, 0.0, 1.0]]), 100, 100)[0]
+    assert column > 50.0  # looking along +y, +x is to the right
+    assert row < 50.0
+
+
+def test_rasteriser_covers_each_pixel_of_a_square_once() -> None:
+    corners = np.array([[2.0, 1.0, 1.0], [6.0, 1.0, 1.0], [6.0, 4.0, 1.0], [2.0, 4.0, 1.0]])
+    for faces in (SQUARE_FACES, SQUARE_FACES[:, ::-1]):
+        raster = rasterise(corners, faces, 8, 6)
+        covered = np.zeros((6, 8), bool)
+        covered[1:4, 2:6] = True
+        np.testing.assert_array_equal(raster.faces >= 0, covered)
+        np.testing.assert_allclose(raster.weights[covered].sum(axis=1), 1.0, atol=1e-6)
+
+
+def test_faces_that_are_not_finite_are_left_out() -> None:
+    corners = np.array([[0.0, 0.0, 1.0], [np.nan, 0.0, 1.0], [8.0, 8.0, 1.0]])
+    assert np.all(rasterise(corners, np.array([[0, 1, 2]]), 8, 8).faces == -1)
+
+
+def test_normals_of_vertices_are_those_around_them() -> None:
+    normals = vertex_normals(SQUARE, SQUARE_FACES.astype(np.int32))
+    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (4, 1)))
+
+
+def test_height_colours_rise_from_blue_to_red() -> None:
+    heights = np.column_stack([np.zeros((101, 2)), np.linspace(0.0, 5.0, 101)])
+    colours = height_colours(heights)
+    assert colours.shape == (101, 3)
+    assert colours[0, 2] > colours[0, 0]
+    assert colours[-1, 0] > colours[-1, 2]
+
+
+def test_png_round_trip(tmp_path: Path) -> None:
+    from PIL import Image
+
+    picture = np.random.default_rng(0).integers(0, 255, (12, 20, 3)).astype(np.uint8)
+    write_png(tmp_path / "a.png", picture)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), picture)

@@ -1,0 +1,125 @@
+"""``triquad-bench`` of the map file: how small, how true, how quickly opened."""
+
+import dataclasses
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.records.region import MapRecord
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
+
+from triquad_tools.benchmarks.bench_figures import Figure
+from triquad_tools.benchmarks.bench_street import BenchStreet
+from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.meshfile import Mesh
+from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
+from triquad_tools.mapfiles.field_change import field_change
+from triquad_tools.mapfiles.map_packing import INTEGER_ERROR_M
+from triquad_tools.mapfiles.quantise import quantise
+from triquad_tools.mapfiles.surface_mesh import surface_mesh
+
+_LARGE_BYTES = 100_000_000
+_MESH_SAMPLES = 3_000_000
+_SEED = 2  # of the points at which the file is compared with the live map
+
+_OPEN = """
+import sys, time
+import numpy
+from triquad_map.stored_map import StoredMap
+started = time.perf_counter()
+with StoredMap.open(sys.argv[1]) as stored:
+    stored.query(numpy.array([[10.0, 0.0, 0.5]]), gradient=True)
+print(time.perf_counter() - started)
+"""
+
+
+def measure_file(made: BenchStreet) -> list[Figure]:
+    """Figures of the street's map as a file."""
+    mapper = settled_mapper(made)
+    epoch = mapper.publish()
+    record = epoch.record()
+    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
+        folder = Path(name)
+        figures = _sizes(epoch, record, made, folder)
+        return figures + _opening(record, folder)
+
+
+def settled_mapper(made: BenchStreet) -> Mapper:
+    """A mapper that has learnt the street."""
+    settings = Settings()
+    warm_up(settings, "cpu")
+    mapper = Mapper("bench", settings, "cpu")
+    with progress("mapping the street", len(made.scans) + 1) as report:
+        for number, scan in enumerate(made.scans):
+            mapper.ingest(scan.points, scan.world_from_sensor)
+            report(number, f"scan {number}")
+        while not mapper.settled:
+            mapper.train()
+        report(len(made.scans) + 1, "settled")
+    return mapper
+
+
+def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> list[Figure]:
+    plain = write_map(record, folder / "fp16.triquad", distances=epoch.distances)
+    stored = read_map(folder / "fp16.triquad")
+    eighth, tight = quantise(stored, INTEGER_ERROR_M), quantise(stored, 0.002)
+    small = write_map(eighth.record, folder / "int8.triquad", distances=epoch.distances)
+    least = write_map(tight.record, folder / "2mm.triquad", distances=epoch.distances)
+    live = field_change(record, stored, _SEED)
+    count = epoch.parameters
+    scores = [_f_score(one, made) for one in (stored, tight.record)]
+    return [
+        Figure("parameters of the map", count / 1e6, "M"),
+        Figure("fp16 file", plain.bytes / 1e6, "MB", at_most=4),
+        Figure("fp16, everything included", plain.bytes / count, "bytes/parameter", at_most=1.9),
+        Figure("fp16 against the live map, 99 %", 1e3 * live.quantile_m, "mm", at_most=1),
+        Figure("int8 file", small.bytes / 1e6, "MB"),
+        Figure("int8, everything included", small.bytes / count, "bytes/parameter", at_most=1.0),
+        Figure("int8 against fp16, 99 %", 1e3 * eighth.change.quantile_m, "mm", at_most=2),
+        Figure("file within 2 mm", least.bytes / 1e6, "MB", at_most=2),
+        Figure("within 2 mm, everything included", least.bytes / count, "bytes/parameter"),
+        Figure("the same against fp16, 99 %", 1e3 * tight.change.quantile_m, "mm", at_most=2),
+        Figure("the same, largest of all points", 1e3 * tight.change.largest_m, "mm"),
+        Figure("F-score, fp16", scores[0], "%"),
+        Figure("F-score within 2 mm, change", abs(scores[1] - scores[0]), "points", at_most=0.2),
+    ]
+
+
+def _f_score(record: MapRecord, made: BenchStreet) -> float:
+    settings = Settings()
+    epoch = Mapper("bench", settings, "cpu", record).publish()
+    mesh = surface_mesh(epoch, made.drive.scene.bounds, settings.mesh.tile_side_m, lambda *_: None)
+    scoring = ScoreSettings(samples_max=_MESH_SAMPLES)
+    scene, rng = made.drive.scene, np.random.default_rng(0)
+    scores = score_against_scene(Mesh(mesh.vertices, mesh.faces), scene, made.visible, scoring, rng)
+    return 100 * scores.f_score
+
+
+def _opening(record: MapRecord, folder: Path) -> list[Figure]:
+    """The street's region, side by side until the file is large."""
+    path = folder / "large.triquad"
+    first = record.regions[0]
+    bytes_each = write_map(record, folder / "one.triquad", preview=False).bytes
+    copies = -(-_LARGE_BYTES // bytes_each)
+    row = tuple(dataclasses.replace(first, index=(number, 0, 0)) for number in range(copies))
+    size = write_map(dataclasses.replace(record, regions=row), path, preview=False).bytes
+    started = time.perf_counter()
+    answered = subprocess.run(
+        [sys.executable, "-c", _OPEN, str(path)], stdout=subprocess.PIPE, text=True, check=True
+    )
+    process_s = time.perf_counter() - started
+    started = time.perf_counter()
+    read_map(path)
+    return [
+        Figure("large file", size / 1e6, "MB", at_least=100),
+        Figure("large file, opened until the first answer", float(answered.stdout), "s", at_most=1),
+        Figure("the same with starting Python", process_s, "s"),
+        Figure("large file, read whole and checked", time.perf_counter() - started, "s"),
+    ]

@@ -1,0 +1,281 @@
+"""``triquad-eval``: how good a mesh or a map is."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from triquad_tools.console.arguments import count, not_negative, positive, seed
+from triquad_tools.console.errors import ToolError
+from triquad_tools.console.report import Row, centimetres, json_text, percent, print_table
+
+if TYPE_CHECKING:
+    from triquad_tools.evaluation.map_scores import StreetScores, WithheldScores
+    from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings
+    from triquad_tools.simulation.lidar import SimulatedDrive
+
+OK, FAILED, BAD_INPUT = 0, 1, 2
+
+_SEED = 0  # of the points that are drawn; scores can be repeated
+_SERVER_SAMPLES_MAX = 3_000_000  # of a street's mesh: more change the scores by little
+_STREET_VOXEL_M = 0.05  # between the street's points that completion asks for
+
+Results = dict[str, Any]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool: 0 done, 1 a server failed, 2 wrong usage or input that cannot be used."""
+    options = _parser().parse_args(argv)
+    from triquad_tools.evaluation.open_map import MapUnreachableError
+
+    evaluate: Callable[[argparse.Namespace], Results] = options.evaluate
+    try:
+        results = evaluate(options)
+    except MapUnreachableError as error:
+        return _complain(str(error), FAILED)
+    except (ToolError, OSError) as error:
+        return _complain(str(error), BAD_INPUT)
+    except KeyboardInterrupt:
+        return _complain("interrupted", FAILED)
+    if options.json:
+        print(json_text(results))
+        return OK
+    for name, scores in results.items():
+        print_table(_TITLES[name], _ROWS[name](scores))
+    return OK
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"triquad-eval: {message}", file=sys.stderr)
+    return code
+
+
+def evaluate_mesh(options: argparse.Namespace) -> Results:
+    """Scores of a mesh file against a cloud, a folder of scans or a simulated street."""
+    import numpy as np
+
+    from triquad_tools.evaluation.meshfile import read_mesh
+    from triquad_tools.evaluation.metrics import score_against_cloud, score_against_scene
+
+    mesh = read_mesh(options.mesh)
+    if not len(mesh.faces):
+        raise ToolError(f"{options.mesh}: has no faces; a cloud can only be a --reference")
+    settings = _score_settings(options)
+    rng = np.random.default_rng(_SEED)
+    if options.street is None:
+        reference = _reference(options.reference, settings.voxel_m, options.range_min)
+        return {"mesh": score_against_cloud(mesh, reference, settings, rng)}
+    drive = _drive(options)
+    visible = drive.true_hits(settings.voxel_m)
+    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings, rng)}
+
+
+def evaluate_map(options: argparse.Namespace) -> Results:
+    """Scores of a map against a simulated street, or at scans that were withheld from it."""
+    return _at_withheld(options) if options.street is None else _on_street(options)
+
+
+def _on_street(options: argparse.Namespace) -> Results:
+    import numpy as np
+
+    from triquad_tools.evaluation.map_scores import score_street, street_probes
+    from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
+    from triquad_tools.evaluation.open_map import open_map
+
+    drive = _drive(options)
+    rng = np.random.default_rng(_SEED)
+    probes = street_probes(drive, rng)
+    with open_map(options.target, options.map) as opened:
+        results: Results = {"street": score_street(opened.query, probes)}
+        mesh = opened.mesh(drive.scene.bounds) if opened.mesh else None
+    if mesh is not None:
+        settings = ScoreSettings(samples_max=_SERVER_SAMPLES_MAX)
+        visible = drive.true_hits(_STREET_VOXEL_M)
+        results["mesh"] = score_against_scene(mesh, drive.scene, visible, settings, rng)
+    return results
+
+
+def _at_withheld(options: argparse.Namespace) -> Results:
+    from triquad_tools.evaluation.cloud import is_withheld, world_points
+    from triquad_tools.evaluation.kitti import read_folder
+    from triquad_tools.evaluation.map_scores import score_withheld
+    from triquad_tools.evaluation.open_map import open_map
+
+    folder = read_folder(options.withheld)
+    every = options.skip_every
+    indices = [i for i in range(len(folder)) if every == 0 or is_withheld(i, every)]
+    if not indices:
+        raise ToolError(
+            f"{options.withheld}: --skip-every {every} withholds none of its {len(folder)} scans; "
+            "use a smaller number"
+        )
+    limits = (options.range_min, options.range_max)
+    with open_map(options.target, options.map) as opened:
+        clouds = (world_points(folder, index, *limits) for index in indices)
+        return {"withheld": score_withheld(opened.query, clouds)}
+
+
+def _reference(path: Path, voxel_m: float, range_min_m: float) -> Any:
+    """The points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
+    from triquad_tools.evaluation.cloud import world_points
+    from triquad_tools.evaluation.kitti import read_folder
+    from triquad_tools.evaluation.meshfile import read_mesh
+    from triquad_tools.simulation.voxel import merged
+
+    if path.is_dir():
+        folder = read_folder(path)
+        clouds = (world_points(folder, index, range_min_m) for index in range(len(folder)))
+        points = merged(clouds, voxel_m)
+    else:
+        points = read_mesh(path).vertices.astype(float)
+    if not len(points):
+        raise ToolError(f"{path}: holds no points")
+    return points
+
+
+def _drive(options: argparse.Namespace) -> "SimulatedDrive":
+    from triquad_tools.simulation.street_drive import street_drive
+
+    return street_drive(options.street, options.scans, options.step)
+
+
+def _score_settings(options: argparse.Namespace) -> "ScoreSettings":
+    from triquad_tools.evaluation.metrics import ScoreSettings
+
+    return ScoreSettings(
+        threshold_m=options.threshold,
+        accuracy_cut_m=options.accuracy_cut,
+        completion_cut_m=options.completion_cut,
+        voxel_m=options.voxel,
+    )
+
+
+def mesh_rows(scores: "MeshScores") -> list[Row]:
+    """The scores of a mesh as lines of a table."""
+    return [
+        Row("accuracy", centimetres(scores.accuracy_m), "mean, mesh to truth, outliers left out"),
+        Row("accuracy, median", centimetres(scores.accuracy_median_m)),
+        Row("accuracy ratio", percent(scores.accuracy_ratio), "outliers left out"),
+        Row("completion", centimetres(scores.completion_m), "mean, truth to mesh"),
+        Row("completion ratio", percent(scores.completion_ratio)),
+        Row("F-score", percent(scores.f_score), "of both ratios"),
+        Row("outliers", percent(scores.outlier_ratio), "mesh beyond the accuracy cut"),
+        Row("mesh samples", f"{scores.samples:,}"),
+        Row("reference points", f"{scores.references:,}"),
+    ]
+
+
+def street_rows(scores: "StreetScores") -> list[Row]:
+    """The scores of a map of a street as lines of a table."""
+    return [
+        Row("SDF error", centimetres(scores.sdf_error_m), "mean, within 10 cm of the surface"),
+        Row("SDF error, median", centimetres(scores.sdf_error_median_m)),
+        Row("SDF error, 95 %", centimetres(scores.sdf_error_p95_m)),
+        Row("gradient angle", f"{scores.gradient_angle_deg:.1f} deg", "median"),
+        Row("of these SURFACE", percent(scores.near_surface_ratio)),
+        Row("points", f"{scores.near_points:,}"),
+        Row("houses UNKNOWN", percent(scores.houses_unknown_ratio), "deeper than 0.5 m in them"),
+        Row("points in houses", f"{scores.house_points:,}"),
+    ]
+
+
+def withheld_rows(scores: "WithheldScores") -> list[Row]:
+    """The scores of a map at withheld scans as lines of a table."""
+    return [
+        Row("SURFACE", percent(scores.surface_ratio), "of all points"),
+        Row("UNKNOWN", percent(scores.unknown_ratio), "of all points"),
+        Row("|SDF|, median", centimetres(scores.sdf_median_m), "all points"),
+        Row("|SDF|, 90 %", centimetres(scores.sdf_p90_m), "all points"),
+        Row("|SDF|, median", centimetres(scores.surface_sdf_median_m), "SURFACE points"),
+        Row("|SDF|, 90 %", centimetres(scores.surface_sdf_p90_m), "SURFACE points"),
+        Row("points", f"{scores.points:,}"),
+    ]
+
+
+_TITLES = {
+    "mesh": "Mesh",
+    "street": "Map, against the exact street",
+    "withheld": "Map, at the points of withheld scans",
+}
+_ROWS: dict[str, Callable[[Any], list[Row]]] = {
+    "mesh": mesh_rows,
+    "street": street_rows,
+    "withheld": withheld_rows,
+}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="triquad-eval",
+        description="Score a mesh or a map. docs/tools.md defines the figures.",
+        epilog="Exit status: 0 done, 1 the server failed, 2 wrong usage or input.",
+    )
+    kinds = parser.add_subparsers(required=True, metavar="{mesh,map}")
+    _add_mesh(kinds.add_parser("mesh", help="score a mesh file"))
+    _add_map(kinds.add_parser("map", help="score a map file, or the map of a running server"))
+    return parser
+
+
+def _add_mesh(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(evaluate=evaluate_mesh)
+    add = parser.add_argument
+    add("mesh", type=Path, metavar="MESH", help=".ply or .glb")
+    truth = parser.add_mutually_exclusive_group(required=True)
+    truth.add_argument(
+        "--reference",
+        type=Path,
+        metavar="PATH",
+        help="true surface points: a .ply file, or a KITTI-style folder of scans",
+    )
+    _add_street(parser, truth)
+    add("--threshold", type=positive, default=0.1, metavar="M", help="default: 0.1")
+    add("--accuracy-cut", type=positive, default=0.2, metavar="M", help="default: 0.2")
+    add("--completion-cut", type=positive, default=2.0, metavar="M", help="default: 2")
+    add("--voxel", type=positive, default=0.02, metavar="M", help="thinning (default: 0.02)")
+    add(
+        "--range-min",
+        type=not_negative,
+        default=0.0,
+        metavar="M",
+        help="leave out nearer points of a folder's scans (default: 0)",
+    )
+
+
+def _add_map(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(evaluate=evaluate_map)
+    add = parser.add_argument
+    add("target", metavar="MAP", help="map file, or endpoint of a server (tcp/HOST:PORT)")
+    add("--map", default="default", metavar="NAME", help="map of the server (default: default)")
+    truth = parser.add_mutually_exclusive_group(required=True)
+    truth.add_argument(
+        "--withheld",
+        type=Path,
+        metavar="FOLDER",
+        help="KITTI-style folder with scans that the map has not seen",
+    )
+    _add_street(parser, truth)
+    add(
+        "--skip-every",
+        type=count,
+        default=0,
+        metavar="N",
+        help="as given to triquad-replay: score at every Nth scan only (default: at all)",
+    )
+    add("--range-min", type=not_negative, default=0.0, metavar="M", help="default: 0")
+    add("--range-max", type=positive, default=50.0, metavar="M", help="default: 50")
+
+
+def _add_street(parser: argparse.ArgumentParser, truth: Any) -> None:
+    truth.add_argument("--street", type=seed, metavar="SEED", help="the simulated street")
+    parser.add_argument(
+        "--scans", type=count, default=60, metavar="N", help="of the drive (default: 60)"
+    )
+    parser.add_argument(
+        "--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,223 @@
+"""``triquad-replay``: publish a recorded folder of scans to a map server."""
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from triquad_tools.console.arguments import count, not_negative, positive
+from triquad_tools.console.errors import ToolError
+from triquad_tools.console.progress import progress
+from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
+
+if TYPE_CHECKING:
+    from triquad_client import Client, FlushReport
+
+    from triquad_tools.evaluation.kitti import KittiFolder
+
+OK, FAILED, BAD_INPUT = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Pace:
+    """When scans are sent; by default as soon as the server has taken in those before."""
+
+    rate_hz: float | None = None
+    as_recorded: bool = False
+
+    @property
+    def by_server(self) -> bool:
+        """Whether the server sets the pace: nothing is lost then."""
+        return self.rate_hz is None and not self.as_recorded
+
+
+@dataclass(frozen=True)
+class ReplayReport:
+    """What became of the scans."""
+
+    published: int
+    skipped: int  # not sent: no point was left of them
+    flush: "FlushReport | None"  # None: nothing was published
+    refusals: dict[str, int]  # on the server meanwhile, by reason
+    seconds: float  # until the server had taken in all
+
+    @property
+    def complete(self) -> bool:
+        """Whether every scan is in the map."""
+        return self.flush is None or self.flush.lost == self.flush.refused == 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool: 0 done, 1 scans were lost or refused or the server failed, 2 bad input."""
+    options = _parser().parse_args(argv)
+    from triquad_client import ConnectError, InvalidInputError, TriquadError, UnknownMapError
+    from triquad_format.errors import FormatError
+
+    try:
+        return _run(options)
+    except (ConnectError, UnknownMapError) as error:
+        return _complain(str(error), FAILED)
+    except (ToolError, InvalidInputError, FormatError, OSError) as error:
+        return _complain(str(error), BAD_INPUT)
+    except TriquadError as error:
+        return _complain(str(error), FAILED)
+    except KeyboardInterrupt:
+        return _complain("interrupted; scans that were sent are in the map", FAILED)
+
+
+def _run(options: argparse.Namespace) -> int:
+    from triquad_client import connect
+
+    from triquad_tools.evaluation.cloud import is_withheld
+    from triquad_tools.evaluation.kitti import read_folder
+
+    folder = read_folder(options.folder)
+    indices = [i for i in range(len(folder)) if not is_withheld(i, options.skip_every)]
+    if not indices:
+        raise ToolError(f"{options.folder}: --skip-every {options.skip_every} leaves no scan")
+    pace = Pace(options.rate, options.as_recorded)
+    with connect(options.connect, options.map) as client:
+        publisher = _Publisher(client, options.source, pace)
+        report = publisher.replay(folder, indices, options.range_min)
+        print(_summary(report))
+        if options.settle:
+            _settle(client)
+    return OK if report.complete else FAILED
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"triquad-replay: {message}", file=sys.stderr)
+    return code
+
+
+def _settle(client: "Client") -> None:
+    status = wait_until_settled(client)
+    print(f"settled: epoch {status.epoch}, {status.samples_trained / 1e6:.1f} M samples trained")
+
+
+class _Publisher:
+    """Publishes scans of a folder through a client."""
+
+    def __init__(self, client: "Client", source: str, pace: Pace) -> None:
+        self._client = client
+        self._source = source
+        self._pace = pace
+
+    def replay(
+        self, folder: "KittiFolder", indices: Sequence[int], range_min_m: float
+    ) -> ReplayReport:
+        """Publish the scans ``indices`` and wait until the server has dealt with them."""
+        before = self._client.status().scans_dropped
+        due_s = due_times(self._pace, [int(folder.stamps_ns[index]) for index in indices])
+        published = skipped = 0
+        started = time.monotonic()
+        with progress("publishing", len(indices)) as report:
+            for done, index in enumerate(indices):
+                _wait_until(started + due_s[done])
+                sent = self._publish(folder, index, range_min_m)
+                published += sent
+                skipped += not sent
+                if sent and self._pace.by_server:
+                    keep_few_pending(self._client, published)
+                report(done + 1, f"{done + 1} of {len(indices)} scans")
+            flush = self._client.flush(FLUSH_TIMEOUT_S) if published else None
+        seconds = time.monotonic() - started
+        after = self._client.status().scans_dropped
+        refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
+        refusals = {reason: count for reason, count in refusals.items() if count > 0}
+        return ReplayReport(published, skipped, flush, refusals, seconds)
+
+    def _publish(self, folder: "KittiFolder", index: int, range_min_m: float) -> bool:
+        """Publish one scan; False where no point of it is left."""
+        from triquad_tools.evaluation.cloud import points_in_range
+
+        points = points_in_range(folder.read_points(index), range_min_m)
+        if not len(points):
+            return False
+        stamp_s = int(folder.stamps_ns[index]) / 1e9
+        self._client.publish_scan(points, folder.poses[index], stamp_s, self._source)
+        return True
+
+
+def due_times(pace: Pace, stamps_ns: Sequence[int]) -> list[float]:
+    """When each scan is to be sent, seconds after the first."""
+    if pace.as_recorded:
+        return [(stamp - stamps_ns[0]) / 1e9 for stamp in stamps_ns]
+    period_s = 0.0 if pace.rate_hz is None else 1.0 / pace.rate_hz
+    return [index * period_s for index in range(len(stamps_ns))]
+
+
+def _wait_until(due: float) -> None:
+    """Return at the monotonic time ``due``, at once where it has passed."""
+    wait_s = due - time.monotonic()
+    if wait_s > 0.0:
+        time.sleep(wait_s)
+
+
+def _summary(report: ReplayReport) -> str:
+    flush = report.flush
+    taken, refused, lost = (flush.taken, flush.refused, flush.lost) if flush else (0, 0, 0)
+    rate_hz = report.published / max(report.seconds, 1e-9)
+    reasons = ", ".join(f"{reason}: {count}" for reason, count in report.refusals.items())
+    parts = [
+        f"{report.published} scans published",
+        f"{taken} taken",
+        f"{refused} refused" + (f" ({reasons})" if refused and reasons else ""),
+        f"{lost} lost",
+    ]
+    if report.skipped:
+        parts.append(f"{report.skipped} without points not sent")
+    line = f"{', '.join(parts)}, {report.seconds:.1f} s, {rate_hz:.1f} scans/s"
+    if flush and flush.last_refusal:
+        line += f"\nlast refusal: {flush.last_refusal}"
+    return line
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="triquad-replay",
+        description="Publish a KITTI-style folder of scans to a map server. By default the server "
+        "sets the pace, and no scan is lost.",
+        epilog="Exit status: 0 all scans are in the map, 1 some were lost or refused or the "
+        "server failed, 2 wrong usage or input.",
+    )
+    add = parser.add_argument
+    add("folder", type=Path, metavar="FOLDER", help="poses.txt, scans and perhaps times.txt")
+    add(
+        "--connect",
+        default="tcp/127.0.0.1:7447",
+        metavar="ENDPOINT",
+        help="of the server (default: tcp/127.0.0.1:7447)",
+    )
+    add("--map", default="default", metavar="NAME", help="default: default")
+    add("--source", default="default", metavar="NAME", help="name of the sensor (default: default)")
+    pace = parser.add_mutually_exclusive_group()
+    pace.add_argument(
+        "--rate", type=positive, metavar="HZ", help="scans a second, whatever the server takes"
+    )
+    pace.add_argument(
+        "--as-recorded", action="store_true", help="at the times in times.txt (10 Hz without it)"
+    )
+    add(
+        "--skip-every",
+        type=count,
+        default=0,
+        metavar="N",
+        help="withhold every Nth scan, for triquad-eval --withheld",
+    )
+    add(
+        "--range-min",
+        type=not_negative,
+        default=0.0,
+        metavar="M",
+        help="do not send nearer points: the vehicle's own body (default: 0)",
+    )
+    add("--settle", action="store_true", help="wait until the server has learnt all of it")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

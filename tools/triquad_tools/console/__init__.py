@@ -1,0 +1,1 @@
+"""What every command shares: arguments, progress, tables, errors."""

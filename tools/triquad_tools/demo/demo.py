@@ -1,0 +1,151 @@
+"""``triquad-demo``: the whole of triquad on one simulated street."""
+
+import argparse
+import importlib.util
+import os
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from triquad_tools.console.arguments import count, seed
+from triquad_tools.console.errors import ToolError
+from triquad_tools.console.interruption import sigterm_interrupts
+
+if TYPE_CHECKING:
+    from triquad_tools.demo.demo_results import DemoResults
+
+OK, FAILED, BAD_INPUT = 0, 1, 2
+
+_NEEDED = ("torch", "numba", "scipy", "rich", "PIL")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool: 0 all is as promised, 1 something is not or failed, 2 wrong usage."""
+    options = _parser().parse_args(argv)
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        return _complain(f"{', '.join(missing)} is missing: install triquad[tools]", BAD_INPUT)
+    from triquad_client import TriquadError
+    from triquad_format.errors import FormatError
+
+    try:
+        with sigterm_interrupts():
+            results = run_demo(options.out, options.scans, options.seed)
+    except KeyboardInterrupt:
+        return _complain("interrupted; the server is stopped", FAILED)
+    except (ToolError, TriquadError, FormatError, OSError) as error:
+        return _complain(str(error), FAILED)
+    return _present(options.out, results)
+
+
+def run_demo(out: Path, scans: int, street_seed: int) -> "DemoResults":
+    """Map a street of ``scans`` scans, and leave all results in the folder ``out``.
+
+    Raises:
+        ToolError, TriquadError, FormatError, OSError: a step failed; the server is stopped.
+    """
+    from triquad_tools.console.report import json_text
+    from triquad_tools.demo import demo_steps as steps
+    from triquad_tools.demo.demo_results import DemoResults
+    from triquad_tools.demo.demo_server import DemoServer, ServerOptions, free_endpoint
+
+    laps = _Laps()
+    server_options = ServerOptions(free_endpoint(), steps.MAP, out / "store", out / "server.log")
+    _prepare(out)
+    street = steps.simulate(scans, street_seed)
+    laps.end("simulate")
+    _say("starting triquad-server (the first run of all compiles kernels: a minute more) ...")
+    with DemoServer(server_options) as server:
+        laps.end("start")
+        learnt = steps.learn(server.endpoint, street, out)
+        laps.end("learn")
+        _say_if_unsettled(learnt.intake.settled)
+        scored = steps.score(server.endpoint, street)
+        laps.end("score")
+        server.stop()
+        laps.end("stop")
+    _say("starting triquad-server again, from its checkpoint ...")
+    with DemoServer(server_options) as server:
+        restart = steps.compare(server.endpoint, scored)
+        server.stop()
+    laps.end("restart")
+    size = steps.pack(scored, out / "map.triquad")
+    laps.end("pack")
+    steps.draw(scored.surface, [out / "street.glb", out / "street.ply"], out / "street.png")
+    laps.end("draw")
+    cpus = os.cpu_count() or 1
+    parts = (learnt.intake, learnt.queries, scored.street, scored.mesh, restart, size)
+    results = DemoResults(street_seed, cpus, *parts, laps.seconds)
+    (out / "results.json").write_text(json_text(results) + "\n", encoding="utf-8")
+    return results
+
+
+class _Laps:
+    """How long each phase took."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._since = time.monotonic()
+
+    def end(self, phase: str) -> None:
+        """End a phase; the next begins."""
+        now = time.monotonic()
+        self.seconds[phase] = now - self._since
+        self._since = now
+
+
+def _prepare(out: Path) -> None:
+    """Make the folder; forget what an earlier demonstration left in its store and log."""
+    from triquad_tools.demo.demo_steps import MAP
+
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(out / "store" / MAP, ignore_errors=True)
+    (out / "server.log").unlink(missing_ok=True)
+
+
+def _say_if_unsettled(settled: bool) -> None:
+    if not settled:
+        _say("the server is still learning; it is scored as it is now")
+
+
+def _present(out: Path, results: "DemoResults") -> int:
+    from triquad_tools.console.report import print_table
+    from triquad_tools.demo.demo_results import broken_promises, table_rows
+
+    print_table(f"Street {results.seed}, {results.intake.scans} scans", table_rows(results))
+    print(f"In {out}: map.triquad, street.glb, street.ply, street.png, results.json, server.log")
+    broken = broken_promises(results)
+    for line in broken:
+        _complain(line, FAILED)
+    return FAILED if broken else OK
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr, flush=True)
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"triquad-demo: {message}", file=sys.stderr)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="triquad-demo",
+        description="Map a simulated street with a real server, ask it while it learns, score the "
+        "map against the exact street, restart the server and ask again. Takes some minutes.",
+        epilog="Exit status: 0 all is as the README promises, 1 something is not or failed, "
+        "2 wrong usage.",
+    )
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
+    add("--scans", type=count, default=60, metavar="N", help="a metre apart (default: 60)")
+    add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

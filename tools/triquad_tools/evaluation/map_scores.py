@@ -1,0 +1,169 @@
+"""Scores of a map that is asked for distances: against an exact street, and at withheld scans.
+
+``docs/tools.md`` defines every figure. What is asked, a file or a server, is a callable here.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.status import Status
+
+from triquad_tools.evaluation.metrics import field_scores
+from triquad_tools.simulation.lidar import SimulatedDrive
+from triquad_tools.simulation.scene import Scene
+
+NEAR_M = 0.1  # distances are scored up to this far from the surface
+HOUSE_MARGIN_M = 0.5  # deeper than this in a house nothing can be seen
+PROBE_SPACING_M = 0.1  # between surface points at which distances are scored
+_HOUSE_PROBES = 20_000
+_HOUSE_REACH_M = 20.0  # houses are probed up to this far from where the sensor was
+
+
+class MapAnswer(Protocol):
+    """What a map says of N points."""
+
+    @property
+    def sdf(self) -> NDArray[np.float32]:
+        """``[N]`` metres, NaN where the map has nothing."""
+
+    @property
+    def status(self) -> NDArray[np.uint8]:
+        """``[N]`` values of :class:`Status`."""
+
+    @property
+    def gradient(self) -> NDArray[np.float32] | None:
+        """``[N, 3]`` where it was asked for."""
+
+
+class MapQuery(Protocol):
+    """Asks a map for distances at points ``[N, 3]``, metres, map frame."""
+
+    def __call__(self, points: NDArray[np.float64], gradient: bool = False) -> MapAnswer:
+        """The answer."""
+
+
+@dataclass(frozen=True)
+class StreetProbes:
+    """Where a map of a street is asked, and the truth there."""
+
+    near: NDArray[np.float64]  # [N, 3] within NEAR_M of surface that the lidar truly hit
+    exact_sdf: NDArray[np.float64]  # [N] metres
+    exact_gradient: NDArray[np.float64]  # [N, 3]
+    in_houses: NDArray[np.float64]  # [M, 3] where no ray can have been
+
+
+@dataclass(frozen=True)
+class StreetScores:
+    """How well a map agrees with an exact street; NaN where there was nothing to score."""
+
+    sdf_error_m: float  # mean absolute error near the surface
+    sdf_error_median_m: float
+    sdf_error_p95_m: float
+    gradient_angle_deg: float  # median angle to the exact gradient
+    near_surface_ratio: float  # share of the near points with status SURFACE
+    near_points: int
+    houses_unknown_ratio: float  # share of the points in houses with status UNKNOWN
+    house_points: int
+
+
+@dataclass(frozen=True)
+class WithheldScores:
+    """What a map says where scans that it never saw hit something; NaN without points."""
+
+    points: int
+    surface_ratio: float  # share with status SURFACE
+    unknown_ratio: float  # share with status UNKNOWN
+    sdf_median_m: float  # of the magnitude, over all points
+    sdf_p90_m: float
+    surface_sdf_median_m: float  # the same over the points with status SURFACE
+    surface_sdf_p90_m: float
+
+
+def street_probes(drive: SimulatedDrive, rng: np.random.Generator) -> StreetProbes:
+    """Points at which a map of ``drive`` is scored."""
+    hits = drive.true_hits(PROBE_SPACING_M)
+    normals = drive.scene.gradient(hits)
+    near = hits + rng.uniform(-NEAR_M, NEAR_M, (len(hits), 1)) * normals
+    near = near[drive.scene.is_exact(near)]
+    return StreetProbes(
+        near=near,
+        exact_sdf=drive.scene.sdf(near),
+        exact_gradient=drive.scene.gradient(near),
+        in_houses=_points_in_houses(drive.scene, drive.poses[:, :3, 3], rng),
+    )
+
+
+def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
+    """Scores of a map at ``probes``."""
+    answer = query(probes.near, gradient=True)
+    if answer.gradient is None:
+        raise ValueError("the answer has no gradient although it was asked for")
+    known = np.isfinite(answer.sdf)
+    nan = float("nan")
+    errors = np.abs(answer.sdf.astype(np.float64) - probes.exact_sdf)[known]
+    angle = nan
+    if known.any():
+        angle = field_scores(
+            answer.sdf[known],
+            answer.gradient[known],
+            probes.exact_sdf[known],
+            probes.exact_gradient[known],
+        ).median_angle_deg
+    houses = query(probes.in_houses)
+    return StreetScores(
+        sdf_error_m=float(errors.mean()) if len(errors) else nan,
+        sdf_error_median_m=_quantile(errors, 0.5),
+        sdf_error_p95_m=_quantile(errors, 0.95),
+        gradient_angle_deg=angle,
+        near_surface_ratio=_share(answer.status, Status.SURFACE),
+        near_points=len(probes.near),
+        houses_unknown_ratio=_share(houses.status, Status.UNKNOWN),
+        house_points=len(probes.in_houses),
+    )
+
+
+def score_withheld(query: MapQuery, clouds: Iterable[NDArray[np.float64]]) -> WithheldScores:
+    """Scores of a map at the points ``[N, 3]`` of scans it never saw, map frame.
+
+    A point without any region around it has no distance: it counts as infinitely far off.
+    """
+    distances = [np.empty(0, np.float32)]
+    statuses = [np.empty(0, np.uint8)]
+    for cloud in clouds:
+        answer = query(cloud)
+        distances.append(np.nan_to_num(np.abs(answer.sdf), nan=np.inf))
+        statuses.append(answer.status)
+    distance, status = np.concatenate(distances), np.concatenate(statuses)
+    on_surface = distance[status == Status.SURFACE]
+    return WithheldScores(
+        points=len(distance),
+        surface_ratio=_share(status, Status.SURFACE),
+        unknown_ratio=_share(status, Status.UNKNOWN),
+        sdf_median_m=_quantile(distance, 0.5),
+        sdf_p90_m=_quantile(distance, 0.9),
+        surface_sdf_median_m=_quantile(on_surface, 0.5),
+        surface_sdf_p90_m=_quantile(on_surface, 0.9),
+    )
+
+
+def _points_in_houses(
+    scene: Scene, positions: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Uniform points ``[M, 3]`` above the ground in houses beside the sensor's ``positions``."""
+    low = np.maximum(scene.bounds[0], positions.min(axis=0) - _HOUSE_REACH_M)
+    high = np.minimum(scene.bounds[1], positions.max(axis=0) + _HOUSE_REACH_M)
+    low[2] = max(low[2], 0.0)
+    drawn = rng.uniform(low, high, (_HOUSE_PROBES * 5, 3))
+    return drawn[scene.is_inside_house(drawn, HOUSE_MARGIN_M)][:_HOUSE_PROBES]
+
+
+def _share(statuses: NDArray[np.uint8], wanted: Status) -> float:
+    return float(np.mean(statuses == wanted)) if len(statuses) else float("nan")
+
+
+def _quantile(values: NDArray[np.floating], level: float) -> float:
+    # "lower" never blends with an infinite neighbour.
+    return float(np.quantile(values, level, method="lower")) if len(values) else float("nan")

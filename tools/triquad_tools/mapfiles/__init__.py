@@ -1,0 +1,1 @@
+"""What can be done with map files: summaries, differences, packing, export."""

@@ -1,0 +1,71 @@
+"""A map as a file for other programs: a mesh, or distances on a lattice."""
+
+from pathlib import Path
+
+import numpy as np
+from triquad_client.mesh.glb import glb_bytes
+from triquad_client.mesh.ply import ply_bytes
+from triquad_format.mapfile.durable_file import replacing
+from triquad_format.records.crop import without_training
+from triquad_format.records.region import MapRecord
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import MeshSettings, Settings
+
+from triquad_tools.console.errors import ToolError
+from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.map_source import Box
+from triquad_tools.mapfiles.sdf_grid import (
+    DenseGrid,
+    SparseGrid,
+    dense_grid,
+    evidence_bounds,
+    sparse_grid,
+)
+from triquad_tools.mapfiles.surface_mesh import surface_mesh
+
+MARGIN_CELLS = 16
+"""A map that is exported within a box is needed so far around it."""
+
+_BYTES_OF = {".ply": ply_bytes, ".glb": glb_bytes}
+
+
+def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
+    """Write the mesh of a map; returns what was written.
+
+    Raises:
+        ToolError: the mesh is too large.
+        FormatError: ``cell_m`` is out of range.
+        OSError: the file cannot be written.
+    """
+    settings = MeshSettings(cell_m=cell_m)
+    epoch = _epoch(record, Settings(mesh=settings))
+    with progress("meshing", 1.0) as report:
+        mesh = surface_mesh(epoch, box, settings.tile_side_m, report)
+    packed = _BYTES_OF[path.suffix](mesh.vertices, mesh.faces)
+    with replacing(path) as stream:
+        stream.write(packed)
+    return f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
+
+
+def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool, path: Path) -> str:
+    """Write distances on a lattice as a numpy archive; errors as :func:`export_mesh`."""
+    filled = box if box is not None else evidence_bounds(record)
+    if filled is None:
+        raise ToolError("no ray has shown anything of this map: there is no box to fill")
+    epoch = _epoch(record, Settings())
+    grid: DenseGrid | SparseGrid
+    with progress("evaluating", 1.0) as report:
+        if sparse:
+            grid = sparse_grid(epoch.query, record, box, cell_m, report)
+        else:
+            grid = dense_grid(epoch.query, filled, cell_m, report)
+    with replacing(path) as stream:
+        np.savez(stream, epoch=record.epoch, **vars(grid))
+        size = stream.tell()
+    shape = " x ".join(str(count) for count in grid.sdf.shape)
+    return f"{size:,} bytes, distances {shape}"
+
+
+def _epoch(record: MapRecord, settings: Settings) -> Epoch:
+    return Mapper(record.name, settings, "cpu", without_training(record)).publish()

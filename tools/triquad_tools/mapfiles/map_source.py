@@ -1,0 +1,119 @@
+"""Where ``triquad-pack`` takes its map from: a file, or a folder of checkpoints."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.errors import NoIndexError
+from triquad_format.mapfile.history import (
+    checkpoint_at,
+    checkpoint_file,
+    checkpoint_files,
+    map_folder,
+)
+from triquad_format.mapfile.parts.part import TRAINING_TOPICS
+from triquad_format.records.crop import crop_record, without_training
+from triquad_format.records.region import MapRecord
+from triquad_map.stored_map import StoredMap
+
+from triquad_tools.console.errors import ToolError
+from triquad_tools.mapfiles.whole_map import read_whole
+
+Box = NDArray[np.float64]
+"""Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
+
+
+class NothingLeftError(ToolError):
+    """A box in which a map has nothing."""
+
+
+@dataclass(frozen=True)
+class SourceMap:
+    """A map to be written otherwise."""
+
+    record: MapRecord
+    stamp_ns: int | None  # when its epoch was written, nanoseconds since 1970
+
+
+def chosen_file(path: Path, when: str | None) -> Path:
+    """The file itself, or the checkpoint in a folder that ``when`` asks for.
+
+    Args:
+        path: a map file, a folder of checkpoints, or a store that holds one such folder.
+        when: number of an epoch, or a time; not given, the newest checkpoint is meant.
+
+    Raises:
+        ToolError: ``when`` is given for a file.
+        FormatError: the folder has no such checkpoint.
+        OSError: the folder cannot be read.
+    """
+    if not path.is_dir():
+        if when is not None:
+            raise ToolError(f"{path} is one map file: --at asks for a folder of checkpoints")
+        return path
+    folder = map_folder(path)
+    return (checkpoint_files(folder)[0] if when is None else checkpoint_at(folder, when)).path
+
+
+def epoch_of(path: Path) -> int | None:
+    """The epoch in the name of a checkpoint; ``None`` for another file."""
+    checkpoint = checkpoint_file(path)
+    return None if checkpoint is None else checkpoint.epoch
+
+
+def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
+    """The map in a file, cropped to a box.
+
+    Of a file with an index only the parts that the box needs are read, unless training state is
+    to be kept.
+
+    Args:
+        path: the file.
+        box: not given, all of the map is read.
+        training: whether training state is kept where there is some.
+
+    Raises:
+        NothingLeftError: no region lies in the box.
+        FormatError: the box is empty, or the file cannot be read.
+        ToolError: it needs other files, which are missing.
+        OSError: it cannot be read.
+    """
+    source = None if box is None else _box(path, box, training)
+    return cropped(source or _whole(path), box, training)
+
+
+def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
+    """The map within a box, with or without training state; errors as :func:`read_source`."""
+    record = source.record if box is None else crop_record(source.record, box[0], box[1])
+    if source.record.has_evidence and not record.has_evidence:
+        raise NothingLeftError("nothing of the map lies in the box")
+    return SourceMap(record if training else without_training(record), source.stamp_ns)
+
+
+def _whole(path: Path) -> SourceMap:
+    file = read_whole(path)
+    if file.manifest is not None:
+        return SourceMap(file.record, file.manifest.stamp_ns or None)
+    return SourceMap(file.record, _stamp_ns(file.metadata.get("created", "")))
+
+
+def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
+    """What answers in a box; ``None`` where the file has to be read whole."""
+    try:
+        with StoredMap.open(path) as stored:
+            topics = {entry.key.topic for entry in stored.manifest.entries}
+            if training and topics & set(TRAINING_TOPICS):
+                return None
+            return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
+    except NoIndexError:
+        return None
+
+
+def _stamp_ns(created: str) -> int | None:
+    """The time that a file of version 1 says that it was written."""
+    try:
+        return int(datetime.fromisoformat(created.replace("Z", "+00:00")).timestamp()) * 10**9
+    except ValueError:
+        return None

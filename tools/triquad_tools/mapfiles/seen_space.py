@@ -1,0 +1,89 @@
+"""The space that rays of a map have shown: voxels and columns of its evidence, in metres."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records import morton
+from triquad_format.records.evidence_voxels import masked, seen_voxels
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import (
+    BLOCK_VOXELS,
+    Evidence,
+    MapRecord,
+    Region,
+    owned_blocks,
+    region_corner,
+)
+
+_MasksOf = Callable[[Evidence], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Upright columns of voxels, each within one block of evidence."""
+
+    middles: NDArray[np.float64]  # [N, 2] metres, map frame
+    tops: NDArray[np.float64]  # [N] height of the middle of the highest voxel, metres
+
+
+def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
+    """The evidence that answers of the region hang on; the rest lies in its neighbours' space."""
+    blocks, mine = morton.decode(region.evidence.codes, 3), owned_blocks(settings)
+    owned = ((blocks >= mine.start) & (blocks < mine.stop)).all(axis=1, keepdims=True)
+    return masked(region.evidence, np.where(owned, np.uint8(0xFF), np.uint8(0)))
+
+
+def evidence_box(settings: FieldSettings, region: Region) -> NDArray[np.float64] | None:
+    """Corners [2, 3] of the box around a region's evidence, to whole blocks, metres, map frame.
+
+    ``None`` where there is no evidence.
+    """
+    if not len(region.evidence.codes):
+        return None
+    blocks = morton.decode(region.evidence.codes, 3)
+    ends = np.stack([blocks.min(axis=0), blocks.max(axis=0) + 1])
+    return region_corner(settings, region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
+
+
+def surface_voxels(record: MapRecord) -> NDArray[np.float64]:
+    """Middles ``[N, 3]`` of the voxels in which rays ended, metres, map frame."""
+    parts = [np.empty((0, 3))]
+    for region in record.regions:
+        evidence = owned_evidence(record.settings, region)
+        voxels = seen_voxels(evidence, evidence.surface)
+        parts.append(_metres(record.settings, region, voxels))
+    return np.concatenate(parts)
+
+
+def surface_columns(record: MapRecord) -> Columns:
+    """The columns in which rays ended."""
+    return _columns(record, lambda evidence: evidence.surface)
+
+
+def seen_columns(record: MapRecord) -> Columns:
+    """The columns in which rays ended or through which they passed."""
+    return _columns(record, lambda evidence: evidence.surface | evidence.free)
+
+
+def _columns(record: MapRecord, masks_of: _MasksOf) -> Columns:
+    parts = [np.empty((0, 3))]
+    for region in record.regions:
+        evidence = owned_evidence(record.settings, region)
+        octets = masks_of(evidence)  # a byte holds one column
+        rows, numbers = np.nonzero(octets)
+        x, y = np.divmod(numbers, BLOCK_VOXELS)
+        top = np.log2(octets[rows, numbers], dtype=np.float32).astype(np.int64)
+        voxels = morton.decode(evidence.codes, 3)[rows] * BLOCK_VOXELS + np.stack([x, y, top], 1)
+        parts.append(_metres(record.settings, region, voxels))
+    middles = np.concatenate(parts)
+    return Columns(middles[:, :2], middles[:, 2])
+
+
+def _metres(
+    settings: FieldSettings, region: Region, voxels: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Middles ``[N, 3]`` of voxels ``[N, 3]`` of a region."""
+    corner = region_corner(settings, region.index)
+    return corner + (voxels + 0.5) * settings.leaf_m

@@ -1,0 +1,165 @@
+"""The history of a map: the checkpoints of a folder, as their manifests tell of them."""
+
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_format.errors import FormatError, MapFileError, NoIndexError
+from triquad_format.mapfile.history import CheckpointFile, checkpoint_files, map_folder, set_aside
+from triquad_format.mapfile.index import MapIndex
+from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
+from triquad_format.mapfile.parts.part import REGION_TOPICS, PartKey
+from triquad_format.mapfile.random_access import FileBytes
+from triquad_format.records.region import RegionIndex
+
+from triquad_tools.console.report import print_columns, utc_time
+
+
+@dataclass(frozen=True)
+class LoggedParts:
+    """What a manifest tells."""
+
+    time: str | None  # of the epoch, UTC as in RFC 3339
+    stored: int  # parts in the file
+    total: int  # parts of the map
+    changed_regions: tuple[RegionIndex, ...]  # in which something changed with this epoch
+    other_files: tuple[str, ...]  # that are needed
+
+
+@dataclass(frozen=True)
+class LoggedCheckpoint:
+    """One checkpoint of a folder."""
+
+    file: str
+    epoch: int
+    complete: bool  # whether it needs no other file
+    bytes: int
+    parts: LoggedParts | None  # None: it has no index, or does not open
+    problem: str | None  # why it does not open
+
+
+@dataclass(frozen=True)
+class StoreLog:
+    """The checkpoints of a folder, newest first."""
+
+    folder: str
+    bytes: int
+    checkpoints: tuple[LoggedCheckpoint, ...]
+    set_aside: tuple[str, ...] = ()  # names of files that a server found damaged
+
+    @property
+    def damaged(self) -> int:
+        """How many do not open."""
+        return sum(checkpoint.problem is not None for checkpoint in self.checkpoints)
+
+
+def read_log(store: Path) -> StoreLog:
+    """The checkpoints of a folder, or of the only map in a server's store.
+
+    Parts are not read: only indices and manifests are, of the checkpoints and of what they need.
+
+    Raises:
+        MapFileError: there are no checkpoints, or those of several maps.
+        OSError: the folder cannot be read.
+    """
+    folder = map_folder(store)
+    indices = _Indices(folder)
+    checkpoints = tuple(_logged(file, indices) for file in checkpoint_files(folder))
+    aside = tuple(path.name for path in set_aside(folder))
+    return StoreLog(str(folder), sum(found.bytes for found in checkpoints), checkpoints, aside)
+
+
+def print_log(log: StoreLog) -> None:
+    """Print a table of the checkpoints, and what is wrong with those that do not open."""
+    print(f"{log.folder}: {len(log.checkpoints)} checkpoints, {log.bytes:,} bytes")
+    titles = ("epoch", "time", "kind", "bytes", "parts stored", "of", "regions changed", "opens")
+    print_columns(titles, [_row(checkpoint) for checkpoint in log.checkpoints])
+    for checkpoint in log.checkpoints:
+        if checkpoint.problem is not None:
+            print(f"  {checkpoint.file}: {checkpoint.problem}")
+    for name in log.set_aside:
+        print(f"  {name}: set aside as damaged; triquad-pack --recover saves what is intact")
+
+
+def _row(checkpoint: LoggedCheckpoint) -> tuple[str, ...]:
+    parts = checkpoint.parts
+    told = ("-", "-", "-")
+    if parts is not None:
+        told = (f"{parts.stored:,}", f"{parts.total:,}", str(len(parts.changed_regions)))
+    return (
+        str(checkpoint.epoch),
+        (parts and parts.time) or "-",
+        "complete" if checkpoint.complete else "delta",
+        f"{checkpoint.bytes:,}",
+        *told,
+        "no" if checkpoint.problem else "yes" if parts else "no index",
+    )
+
+
+def _logged(file: CheckpointFile, indices: "_Indices") -> LoggedCheckpoint:
+    size, parts, problem = 0, None, None
+    try:
+        size = file.path.stat().st_size
+        parts = indices.parts(file.path.name)
+    except NoIndexError:
+        pass  # of version 1: nothing is known against it, short of reading all of it
+    except (FormatError, OSError) as error:
+        problem = str(error)
+    return LoggedCheckpoint(file.path.name, file.epoch, file.complete, size, parts, problem)
+
+
+@dataclass(frozen=True)
+class _Index:
+    """What a file says of its parts."""
+
+    manifest: Manifest
+    manifest_sha256: bytes
+    digests: dict[PartKey, bytes]  # of the parts in the file itself
+
+
+class _Indices:
+    """The indices of a folder's files; each is read once."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._read: dict[str, _Index] = {}
+
+    def parts(self, name: str) -> LoggedParts:
+        """What the manifest of a file tells, where all of its parts are to be found."""
+        manifest = self._index(name).manifest
+        for file in manifest.files:
+            self._check_base(manifest, file)
+        epoch = manifest.facts.epoch
+        changed = {e.key.region for e in manifest.entries if e.epoch == epoch and _is_of_region(e)}
+        return LoggedParts(
+            time=utc_time(manifest.stamp_ns),
+            stored=len(manifest.own),
+            total=len(manifest.entries),
+            changed_regions=tuple(sorted(changed)),
+            other_files=tuple(file.name for file in manifest.files),
+        )
+
+    def _check_base(self, manifest: Manifest, file: FileRef) -> None:
+        """Raise unless another file is the one that was meant, and lists the parts."""
+        try:
+            index = self._index(file.name)
+        except FileNotFoundError as error:
+            raise MapFileError(f"it needs {file.name}, which is missing") from error
+        except (FormatError, OSError) as error:
+            raise MapFileError(f"it needs {file.name}: {error}") from error
+        wanted = [entry for entry in manifest.entries if entry.file == file]
+        same = index.manifest_sha256 == file.manifest_sha256
+        if not same or any(index.digests.get(e.key) != e.sha256 for e in wanted):
+            raise MapFileError(f"it needs {file.name}, but not the file that now has this name")
+
+    def _index(self, name: str) -> _Index:
+        if name not in self._read:
+            with closing(FileBytes(self._folder / name)) as source:
+                index = MapIndex(source)
+            digests = {entry.key: entry.sha256 for entry in index.manifest.own}
+            self._read[name] = _Index(index.manifest, index.manifest_sha256, digests)
+        return self._read[name]
+
+
+def _is_of_region(entry: Entry) -> bool:
+    return entry.key.topic in REGION_TOPICS

@@ -1,0 +1,1 @@
+"""Exact scenes and simulated sensors."""

@@ -1,0 +1,155 @@
+"""A simulated spinning lidar that drives through an exact scene."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.voxel import merged
+
+_SENSOR_HEIGHT_M = 1.8
+_LANE_M = 1.6  # lateral offset of the lane from the middle of the road
+_WEAVE_M = 0.3
+_TILT_RAD = math.radians(1.0)  # of the gentle roll and pitch
+
+
+@dataclass(frozen=True)
+class SimulatedScan:
+    """What the sensor measured, and the truth behind it; row ``i`` of both is the same ray."""
+
+    points: NDArray[np.float32]  # [N, 3] metres, sensor frame, with range noise; returns only
+    true_hits: NDArray[np.float64]  # [N, 3] metres, world frame, exactly on the surface
+    world_from_sensor: NDArray[np.float64]  # [4, 4]
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """A spinning lidar: ``beams`` rows of ``columns`` rays each, with Gaussian range noise.
+
+    All rays of a scan leave from one pose: the scan is as if already corrected for the motion
+    during the sweep.
+    """
+
+    beams: int = 64
+    columns: int = 720
+    elevation_min_deg: float = -25.0
+    elevation_max_deg: float = 15.0
+    range_min_m: float = 0.5
+    range_max_m: float = 50.0
+    noise_m: float = 0.01  # standard deviation of the range
+
+    @cached_property
+    def directions(self) -> NDArray[np.float64]:
+        """Unit vectors ``[beams * columns, 3]`` of the rays, sensor frame, column by column."""
+        low, high = math.radians(self.elevation_min_deg), math.radians(self.elevation_max_deg)
+        azimuth = np.arange(self.columns) * (2.0 * math.pi / self.columns)
+        azimuth, elevation = np.meshgrid(azimuth, np.linspace(low, high, self.beams), indexing="ij")
+        flat = np.cos(elevation)
+        rays = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))
+        return np.stack(rays, axis=-1).reshape(-1, 3)
+
+    def scan(
+        self, scene: Scene, world_from_sensor: NDArray[np.float64], rng: np.random.Generator
+    ) -> SimulatedScan:
+        """One scan of ``scene`` from a pose ``[4, 4]`` in its free space."""
+        rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
+        rays = self.directions @ rotation.T
+        ranges = scene.cast(origin, rays, self.range_max_m)
+        seen = np.isfinite(ranges) & (ranges >= self.range_min_m)
+        ranges = ranges[seen]
+        measured = ranges + rng.normal(0.0, self.noise_m, len(ranges))
+        return SimulatedScan(
+            points=(measured[:, None] * self.directions[seen]).astype(np.float32),
+            true_hits=origin + ranges[:, None] * rays[seen],
+            world_from_sensor=world_from_sensor,
+        )
+
+
+@dataclass(frozen=True)
+class SimulatedDrive:
+    """A sequence of scans along a drive. Each scan is made when asked for, always the same."""
+
+    scene: Scene
+    lidar: Lidar
+    poses: NDArray[np.float64]  # [n, 4, 4] world_from_sensor
+    seed: int = 0
+    period_s: float = 0.1
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def __iter__(self) -> Iterator[SimulatedScan]:
+        return (self.scan(index) for index in range(len(self)))
+
+    def scan(self, index: int) -> SimulatedScan:
+        """Scan ``index`` of the drive."""
+        rng = np.random.default_rng([self.seed, index])
+        return self.lidar.scan(self.scene, self.poses[index], rng)
+
+    def stamp_ns(self, index: int) -> int:
+        """Time of scan ``index`` in nanoseconds from the start of the drive."""
+        return round(index * self.period_s * 1e9)
+
+    def true_hits(self, voxel_m: float = 0.02) -> NDArray[np.float64]:
+        """What the sensor could have seen: exact surface points ``[N, 3]``, world frame.
+
+        The noise-free hits of all scans, one per voxel of side ``voxel_m``.
+        """
+        return merged((scan.true_hits for scan in self), voxel_m)
+
+
+def drive(scene: Scene, n_scans: int, step_m: float) -> NDArray[np.float64]:
+    """Poses ``world_from_sensor [n_scans, 4, 4]`` of a drive along a street.
+
+    The sensor starts at ``x = 0``, 1.8 m above the road, in the lane at ``y < 0``, weaving gently
+    and rolling and pitching by about a degree. At the end of the road it turns and comes back in
+    the other lane, and so on for as long as there are scans to make.
+    """
+    travelled = np.arange(n_scans, dtype=np.float64) * step_m
+    positions = _positions(travelled, scene.drive_length_m)
+    ahead = _positions(travelled + 0.05, scene.drive_length_m) - positions
+    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
+    roll = _TILT_RAD * np.sin(travelled * 0.31)
+    pitch = _TILT_RAD * np.sin(travelled * 0.23 + 1.0)
+    poses = np.tile(np.eye(4), (n_scans, 1, 1))
+    poses[:, :3, :3] = _rotations(roll, pitch, yaw)
+    poses[:, :3, 3] = positions
+    return poses
+
+
+def _positions(travelled: NDArray[np.float64], length_m: float) -> NDArray[np.float64]:
+    """Positions ``[n, 3]`` on a stadium of two lanes joined by half circles."""
+    turn = math.pi * _LANE_M
+    lap = travelled % (2.0 * (length_m + turn))
+    back = lap >= length_m + turn
+    along = np.where(back, lap - length_m - turn, lap)
+    angle = np.maximum(along - length_m, 0.0) / _LANE_M
+    lane = _LANE_M + _WEAVE_M * np.sin(travelled * 0.17)
+    x = np.minimum(along, length_m) + lane * np.sin(angle)
+    y = -lane * np.cos(angle)
+    return np.column_stack(
+        [
+            np.where(back, length_m - x, x),
+            np.where(back, -y, y),
+            np.full(len(travelled), _SENSOR_HEIGHT_M),
+        ]
+    )
+
+
+def _rotations(
+    roll: NDArray[np.float64], pitch: NDArray[np.float64], yaw: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rotations ``[n, 3, 3]``: roll about x, then pitch about y, then yaw about z."""
+    about = np.tile(np.eye(3), (3, len(roll), 1, 1))
+    for matrices, angle, (i, j) in zip(
+        about, (roll, pitch, yaw), ((1, 2), (2, 0), (0, 1)), strict=True
+    ):
+        matrices[:, i, i] = matrices[:, j, j] = np.cos(angle)
+        matrices[:, j, i] = np.sin(angle)
+        matrices[:, i, j] = -np.sin(angle)
+    rotations: NDArray[np.float64] = about[2] @ about[1] @ about[0]
+    return rotations

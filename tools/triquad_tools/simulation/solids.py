@@ -1,0 +1,175 @@
+"""Convex solids and their exact signed distances.
+
+Distances are metres, positive outside a solid and negative inside.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_tools.simulation.compiled import compiled
+
+Vector = tuple[float, float, float]
+
+_COLUMNS = 11
+_KIND, X, Y, Z, _COS, _SIN, _A, _B, _C, _D, BOUND = range(_COLUMNS)
+
+HALF_SPACE, BOX, CYLINDER, GABLE = range(4)
+
+
+class Label(IntEnum):
+    """What a solid is part of."""
+
+    GROUND = 0
+    PAVEMENT = 1
+    HOUSE = 2
+    CAR = 3
+    POLE = 4
+    TREE = 5
+
+
+@dataclass(frozen=True)
+class Solid:
+    """One convex solid; made by the functions below."""
+
+    kind: int
+    label: Label
+    centre: Vector  # metres, world frame; of the bounding sphere
+    yaw: float  # radians, about z
+    size: tuple[float, float, float, float]  # metres; the meaning depends on the kind
+    bound_m: float  # radius of the bounding sphere
+
+    @property
+    def row(self) -> tuple[float, ...]:
+        """The solid as a row of the table that the kernels read."""
+        turn = (math.cos(self.yaw), math.sin(self.yaw))
+        return (float(self.kind), *self.centre, *turn, *self.size, self.bound_m)
+
+
+def half_space(height_m: float, label: Label = Label.GROUND) -> Solid:
+    """All that lies below ``z = height_m``."""
+    return Solid(HALF_SPACE, label, (0.0, 0.0, height_m), 0.0, (0.0,) * 4, math.inf)
+
+
+def box(label: Label, centre: Vector, half: Vector, yaw: float = 0.0, radius: float = 0.0) -> Solid:
+    """A box with half sides ``half``, its edges rounded with ``radius`` within these sides."""
+    if not 0.0 <= radius <= min(half):
+        raise ValueError(f"radius {radius!r} does not fit a box of half sides {half!r}")
+    core = (half[0] - radius, half[1] - radius, half[2] - radius)
+    return Solid(BOX, label, centre, yaw, (*core, radius), math.hypot(*core) + radius)
+
+
+def sphere(label: Label, centre: Vector, radius: float) -> Solid:
+    """A ball: a box that is nothing but rounding."""
+    return box(label, centre, (radius, radius, radius), 0.0, radius)
+
+
+def cylinder(label: Label, centre: Vector, radius: float, half_height: float) -> Solid:
+    """A vertical cylinder with flat caps."""
+    size = (radius, half_height, 0.0, 0.0)
+    return Solid(CYLINDER, label, centre, 0.0, size, math.hypot(radius, half_height))
+
+
+def gable(label: Label, centre: Vector, half: Vector, eave: float, yaw: float = 0.0) -> Solid:
+    """A house with a pitched roof: a box of half sides ``half`` cut by two slopes.
+
+    The ridge runs along the local x axis at the top of the box; the slopes begin at height
+    ``eave`` above its bottom.
+    """
+    if not 0.0 < eave < 2.0 * half[2]:
+        raise ValueError(f"eave {eave!r} is not between 0 and the full height {2 * half[2]!r}")
+    return Solid(GABLE, label, centre, yaw, (*half, eave), math.hypot(*half))
+
+
+def solid_table(solids: tuple[Solid, ...]) -> NDArray[np.float64]:
+    """The table ``[S, 11]`` of solids that the kernels read."""
+    return np.array([solid.row for solid in solids], np.float64).reshape(-1, _COLUMNS)
+
+
+Distance = tuple[float, float, float, float]  # and its gradient
+
+
+@compiled
+def _box_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
+    qx, qy, qz = abs(x) - row[_A], abs(y) - row[_B], abs(z) - row[_C]
+    sx, sy, sz = math.copysign(1.0, x), math.copysign(1.0, y), math.copysign(1.0, z)
+    if qx <= 0.0 and qy <= 0.0 and qz <= 0.0:
+        if qx >= qy and qx >= qz:
+            return qx - row[_D], sx, 0.0, 0.0
+        if qy >= qz:
+            return qy - row[_D], 0.0, sy, 0.0
+        return qz - row[_D], 0.0, 0.0, sz
+    mx, my, mz = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
+    length = math.sqrt(mx * mx + my * my + mz * mz)
+    return length - row[_D], sx * mx / length, sy * my / length, sz * mz / length
+
+
+@compiled
+def _extrude(profile: float, along: float) -> tuple[float, float, float]:
+    """Distance to a profile extruded along an axis, and its derivatives by both arguments."""
+    if profile <= 0.0 and along <= 0.0:
+        return (profile, 1.0, 0.0) if profile >= along else (along, 0.0, 1.0)
+    mp, ma = max(profile, 0.0), max(along, 0.0)
+    length = math.sqrt(mp * mp + ma * ma)
+    return length, mp / length, ma / length
+
+
+@compiled
+def _cylinder_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
+    rho = math.sqrt(x * x + y * y)
+    distance, wr, wz = _extrude(rho - row[_A], abs(z) - row[_B])
+    ux, uy = (x / rho, y / rho) if rho > 0.0 else (1.0, 0.0)
+    return distance, wr * ux, wr * uy, math.copysign(wz, z)
+
+
+@compiled
+def _gable_profile(row: NDArray[np.float64], y: float, z: float) -> tuple[float, float, float]:
+    """Distance to the right half of a gable's outline (``y >= 0``, ``z`` from the bottom)."""
+    width, ridge, eave = row[_B], 2.0 * row[_C], row[_D]
+    slope = math.sqrt(width * width + (ridge - eave) * (ridge - eave))
+    ny, nz = (ridge - eave) / slope, width / slope  # normal of the roof
+    bottom, wall, roof = -z, y - width, ny * y + nz * (z - ridge)
+    if bottom <= 0.0 and wall <= 0.0 and roof <= 0.0:
+        if bottom >= wall and bottom >= roof:
+            return bottom, 0.0, -1.0
+        return (wall, 1.0, 0.0) if wall >= roof else (roof, ny, nz)
+    # Nearest points on the three edges of the half outline; the fold at y = 0 is no edge.
+    best, by, bz = math.inf, 0.0, 0.0
+    along = min(max((nz * y - ny * (z - ridge)) / slope, 0.0), 1.0)
+    for ey, ez in (
+        (min(max(y, 0.0), width), 0.0),
+        (width, min(max(z, 0.0), eave)),
+        (along * width, ridge - along * (ridge - eave)),
+    ):
+        gap = math.sqrt((y - ey) ** 2 + (z - ez) ** 2)
+        if gap < best:
+            best, by, bz = gap, y - ey, z - ez
+    return (best, by / best, bz / best) if best > 0.0 else (0.0, ny, nz)
+
+
+@compiled
+def _gable_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
+    profile, gy, gz = _gable_profile(row, abs(y), z + row[_C])
+    distance, wp, wx = _extrude(profile, abs(x) - row[_A])
+    return distance, math.copysign(wx, x), math.copysign(wp * gy, y), wp * gz
+
+
+@compiled
+def distance_to(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
+    """Signed distance of a world point to the solid of a row, and its gradient, world frame."""
+    kind = row[_KIND]
+    if kind == HALF_SPACE:
+        return z - row[Z], 0.0, 0.0, 1.0
+    dx, dy, dz = x - row[X], y - row[Y], z - row[Z]
+    cos, sin = row[_COS], row[_SIN]
+    lx, ly = cos * dx + sin * dy, cos * dy - sin * dx
+    if kind == BOX:
+        distance, gx, gy, gz = _box_distance(row, lx, ly, dz)
+    elif kind == CYLINDER:
+        distance, gx, gy, gz = _cylinder_distance(row, lx, ly, dz)
+    else:
+        distance, gx, gy, gz = _gable_distance(row, lx, ly, dz)
+    return distance, cos * gx - sin * gy, sin * gx + cos * gy, gz
