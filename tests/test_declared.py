@@ -50,7 +50,7 @@ def imported(folder: str) -> set[str]:
 @pytest.mark.parametrize(
     ("folder", "extras"),
     [
-        ("format", ("draco",)),
+        ("format", ()),
         ("client", ()),
         ("query", ()),
         ("kernels", ("fast",)),
@@ -65,4 +65,4 @@ def test_what_is_imported_is_declared(folder, extras):
 def test_what_is_declared_is_imported():
     folders = ("format", "query", "kernels", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
-    assert declared("fast", "server", "tools", "draco") <= used
+    assert declared("fast", "server", "tools") <= used
