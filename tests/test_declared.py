@@ -54,8 +54,8 @@ def imported(folder: str) -> set[str]:
         ("client", ()),
         ("query", ()),
         ("kernels", ("fast",)),
-        ("server", ("fast", "server")),
-        ("tools", ("fast", "server", "tools")),
+        ("server", ("fast", "preview", "server")),
+        ("tools", ("fast", "preview", "server", "tools")),
     ],
 )
 def test_what_is_imported_is_declared(folder, extras):
@@ -65,4 +65,4 @@ def test_what_is_imported_is_declared(folder, extras):
 def test_what_is_declared_is_imported():
     folders = ("format", "query", "kernels", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
-    assert declared("fast", "server", "tools") <= used
+    assert declared("fast", "preview", "server", "tools") <= used

@@ -12,8 +12,8 @@ from mcap_protobuf.decoder import DecoderFactory
 from triquad_format import morton
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.field_settings import FieldSettings
-from triquad_format.preview import CLUSTER_CELLS, NET_LEAVES
 from triquad_format.region import BLOCK_BYTES, BLOCK_VOXELS, Evidence
+from triquad_server.coarse_mesh import CLUSTER_CELLS, NET_LEAVES
 
 SETTINGS = FieldSettings()
 GROUND_M = 1.3

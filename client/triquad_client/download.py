@@ -11,6 +11,7 @@ from triquad_format import keys
 from triquad_format.crop import crop_record
 from triquad_format.durable_file import replacing
 from triquad_format.errors import FormatError
+from triquad_format.mapfile_writer import write_map
 from triquad_format.messages import MapInfo, MapInfoRequest
 from triquad_format.stored_map import StoredMap
 from triquad_format.written_map import MapFileInfo
@@ -58,9 +59,6 @@ def _fetch(run: Run, path: Path, training: bool) -> MapInfo:
 def _fetch_box(
     run: Run, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
 ) -> MapFileInfo:
-    # Most clients fetch no box: they need none of what previews take.
-    from triquad_format.mapfile_writer import write_map
-
     try:
         stored = StoredMap(RemoteBytes(run, run(newest_file(training=False))))
         record = crop_record(stored.box(minimum, maximum), minimum, maximum)

@@ -49,6 +49,7 @@ from triquad_server.file_identity import FileIdentity, file_identity
 from triquad_server.folder_lock import FolderLock
 from triquad_server.known_parts import KnownParts, known_parts, own_bytes
 from triquad_server.mapper import MapChanges
+from triquad_server.preview import preview_schema
 from triquad_server.retention import KeptCheckpoint, Retention
 from triquad_server.stamp import stamp_now_ns
 
@@ -155,6 +156,7 @@ class Store:
                     stamp_ns,
                     checkpoint_parts(changes, known, None if delta else others, stamp_ns),
                     {} if known is None else known.entries if delta else known.stored_here(),
+                    preview_schema=preview_schema(),
                 )
             info = _written_info(path, written)
         except MapFileError as error:
@@ -185,7 +187,9 @@ class Store:
             with closing(OtherFiles(files_in(self.folder))) as others:
                 parts = unless(stopping, copied_parts(known.entries.values(), others))
                 here = known.stored_here()
-                written = write_parts(path, known.facts, known.stamp_ns, parts, here)
+                written = write_parts(
+                    path, known.facts, known.stamp_ns, parts, here, preview_schema=preview_schema()
+                )
             info = _written_info(path, written)
         except StoppedError:
             return None
