@@ -62,6 +62,18 @@ def test_bombs_are_not_allocated():
         read_bytes(chunk_file(10 * 2**20, zstandard.compress(bytes(10 * 2**20)) + b"more"))
 
 
+def test_what_follows_a_frame_is_refused_before_the_frame_is_decompressed():
+    """Four bytes at the end are a checksum only where the frame's head says so."""
+    content = np.random.default_rng(0).bytes(10 * 2**20)
+    mutant = chunk_file(len(content), zstandard.compress(content) + b"more")
+    tracemalloc.start()
+    with pytest.raises(DamagedMapFileError, match="does not end with its zstd frame"):
+        read_bytes(mutant)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < len(mutant) + len(content)
+
+
 def bomb_of(payload):
     """A file with this payload as the head of its region."""
     parts = parts_of(DATA)

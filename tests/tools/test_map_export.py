@@ -144,7 +144,7 @@ def test_refusals(map_file, tmp_path, capsys):
 
 def test_regions_too_far_for_a_mesh_are_told(tmp_path, capsys):
     record = random_record(0, indices=((2**31 - 1, 0, 0),))
-    write_map(record, tmp_path / "far.triquad", preview=False)
+    write_map(record, tmp_path / "far.triquad")
     assert main([str(tmp_path / "far.triquad"), str(tmp_path / "far.ply")]) == 2
     assert "too far from the origin" in capsys.readouterr().err
     assert not (tmp_path / "far.ply").exists()

@@ -26,6 +26,7 @@ from triquad_format.records.region import (
     TrainingState,
     VertexTable,
 )
+from triquad_server.mesh.preview import previews_of
 
 _SETTINGS = FieldSettings(
     depth=6, feature_levels=1, feature_size=2, frequencies=1, hidden=2, logit_scale_m=0.5
@@ -67,20 +68,19 @@ def sound_maps(folder: Path, given: Sequence[Path]) -> list[SoundMap]:
 
 def _complete(folder: Path, kind: str, record: MapRecord) -> SoundMap:
     folder.mkdir()
-    write_map(record, folder / "map.triquad", preview=kind == "complete")
+    previews = previews_of(record) if kind == "complete" else None
+    write_map(record, folder / "map.triquad", previews=previews)
     return _found(folder, kind, "map.triquad")
 
 
 def _delta(folder: Path, base: MapRecord) -> SoundMap:
     folder.mkdir()
     facts = MapFacts(base.name, base.epoch, base.settings)
-    first = write_parts(
-        folder / "base.triquad", facts, 10**9, record_parts(base, "<f2", None, 0), {}
-    )
+    first = write_parts(folder / "base.triquad", facts, 10**9, record_parts(base, "<f2", {}), {})
     known = first.manifest.elsewhere(FileRef("base.triquad", first.manifest_sha256))
     later = dataclasses.replace(_with_integers(base), epoch=base.epoch + 1)
     facts = dataclasses.replace(facts, epoch=later.epoch)
-    parts = record_parts(later, "<f2", None, 0)
+    parts = record_parts(later, "<f2", {})
     write_parts(folder / "map.triquad", facts, 2 * 10**9, parts, known)
     return _found(folder, "delta", "map.triquad")
 
