@@ -25,7 +25,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_server.settings import MeshSettings
 
-SETTINGS = replace(servers.SMALL, mesh=MeshSettings(tile_cells=16, tolerance_m=0.1))
+SETTINGS = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16, tolerance_m=0.1)})
 
 ResultT = TypeVar("ResultT")
 

@@ -28,10 +28,10 @@ from triquad_format.wire.messages import (
     TileUpdatesRequest,
 )
 from triquad_format.wire.tile_codec import decode_tile
-from triquad_server.settings import MeshSettings
+from triquad_server.settings import MeshSettings, ServiceSettings
 
 POSE = np.eye(4)
-SETTINGS = replace(servers.SMALL, mesh=MeshSettings(tile_cells=16, tolerance_m=0.1))
+SETTINGS = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16, tolerance_m=0.1)})
 
 
 def digests(watch: MeshWatch) -> dict[tuple[int, int, int], str]:
@@ -296,7 +296,7 @@ def held_by(session: zenoh.Session) -> "zenoh.handlers.FifoChannel":
 
 
 def test_too_many_followers_are_told_to_come_back() -> None:
-    few = replace(SETTINGS, service=replace(SETTINGS.service, request_queue=2))
+    few = SETTINGS.model_copy(update={"service": ServiceSettings(request_queue=2)})
     with servers.running_service(few) as endpoint, servers.raw_session(connect=endpoint) as session:
         held = [held_by(session) for _ in range(2)]
         assert servers.RawPeer(session).refusal(keys.TILE_UPDATES, request()) == "busy"

@@ -2,23 +2,25 @@
 
 import asyncio
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
 from triquad_client import Client, InvalidInputError, RefusedError
+from triquad_server.settings import ServiceSettings
 
 POSE = np.eye(4)
 POINTS = servers.sphere(300).astype(np.float64)
-LIMITS = replace(servers.SMALL.service, epochs_kept=1, epochs_pinned=2)
+SETTINGS = servers.SMALL.model_copy(
+    update={"service": ServiceSettings(epochs_kept=1, epochs_pinned=2)}
+)
 
 
 @pytest.fixture
 def client() -> Iterator[Client]:
     """Of a service that keeps the newest epoch, and two that are asked for."""
-    with servers.service_and_client(replace(servers.SMALL, service=LIMITS)) as client:
+    with servers.service_and_client(SETTINGS) as client:
         learn_more(client)
         yield client
 
@@ -80,7 +82,7 @@ def test_an_epoch_may_be_any_integer(client):
 
 
 def test_the_other_client_pins_alike():
-    with servers.running_service(replace(servers.SMALL, service=LIMITS)) as endpoint:
+    with servers.running_service(SETTINGS) as endpoint:
         asyncio.run(asyncio.wait_for(pin_with(endpoint), servers.WAIT_S))
 
 

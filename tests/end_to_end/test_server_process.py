@@ -172,7 +172,10 @@ def test_a_store_in_use_is_exit_code_4(tmp_path, arguments):
 @pytest.mark.parametrize(
     ("toml", "text"),
     [
-        ("[service]\nscan_que = 3\n", "unknown key 'scan_que'"),
+        (
+            "[service]\nscan_que = 3\n",
+            "unknown setting service.scan_que: did you mean service.scan_queue?",
+        ),
         ("[service]\nscan_queue = -3\n", "scan_queue = -3 is out of range"),
         ("[service\n", "settings file"),
     ],

@@ -1,6 +1,5 @@
 """The service with a real map, asked by the real client over the loopback."""
 
-import dataclasses
 import math
 import shutil
 import threading
@@ -25,6 +24,7 @@ from triquad_format.wire.messages import (
 )
 from triquad_map.questions.answers import Answers
 from triquad_map.reference.evaluator import MapEvaluator
+from triquad_server.settings import ServiceSettings
 from triquad_server.store.store import Store
 
 POSE = np.eye(4)
@@ -318,8 +318,8 @@ def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
         return answer(queries, request)
 
     monkeypatch.setattr(Answers, "sdf", answer_later)
-    limits = dataclasses.replace(servers.SMALL.service, request_queue=1, query_workers=1)
-    settings = dataclasses.replace(servers.SMALL, service=limits)
+    limits = ServiceSettings(request_queue=1, query_workers=1)
+    settings = servers.SMALL.model_copy(update={"service": limits})
     key = keys.operation_key(servers.MAP, keys.SDF)
     payload = codec.encode(SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), True, 0))
     with (

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.small_world import settings, settled_mapper, world
@@ -64,7 +62,9 @@ def test_no_points_give_an_empty_answer(epoch: Epoch) -> None:
 
 def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
     chosen = settings(visits=1.2)
-    small = replace(chosen, mesh=MeshSettings(cell_m=0.05, tile_cells=16, reach_m=0.2))
+    small = chosen.model_copy(
+        update={"mesh": MeshSettings(cell_m=0.05, tile_cells=16, reach_m=0.2)}
+    )
     mapper = Mapper("test", small, "cpu")
     scan = world(1).scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)

@@ -6,7 +6,7 @@ from support.small_world import settings, settle, settled_mapper, surface_error,
 from triquad_format.records.status import Status
 from triquad_server.intake.scan import ScanRefusedError
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import parse_settings
+from triquad_server.settings import Settings
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
@@ -72,7 +72,9 @@ def test_ghost_cells_are_unknown(mapped: Mapper) -> None:
 
 def test_regions_meet_without_hole_or_step() -> None:
     """The sensor drives over the border of two regions; the ground must go on."""
-    chosen = parse_settings({"field": {"depth": 7}, "training": {"batch": 4096, "visits": 18.0}})
+    chosen = Settings.model_validate(
+        {"field": {"depth": 7}, "training": {"batch": 4096, "visits": 18.0}}
+    )
     border = chosen.field.region_pitch_m / 2
     drive_through = world(8)
     moved = np.eye(4)
@@ -94,7 +96,7 @@ def test_regions_meet_without_hole_or_step() -> None:
 
 def test_free_space_is_seen_in_all_regions_that_rays_pass() -> None:
     """A wall beyond the border of two regions, seen from this side of it."""
-    chosen = parse_settings({"field": {"depth": 8}})
+    chosen = Settings.model_validate({"field": {"depth": 8}})
     half = chosen.field.region_side_m / 2
     mapper = Mapper("test", chosen, "cpu")
     across = np.mgrid[-2:2:0.1, -2:2:0.1].reshape(2, -1).T

@@ -115,7 +115,9 @@ def strip(scan: SimulatedScan, low_m: float) -> NDArray[np.float32]:
 @pytest.mark.parametrize("level", range(LEVELS))
 def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
     """After partial updates, all tiles have the triangles that meshing in one piece gives."""
-    chosen = replace(settings(), mesh=replace(MESH, cell_m=0.1 / 2**level, tolerance_m=0.03))
+    chosen = settings().model_copy(
+        update={"mesh": MeshSettings(tile_cells=16, cell_m=0.1 / 2**level, tolerance_m=0.03)}
+    )
     mapper = Mapper("test", chosen, "cpu")
     shelf = TileShelf(chosen.mesh)
     epochs: dict[int, Epoch] = {}
@@ -219,7 +221,7 @@ def test_a_few_voxels_count_where_the_surface_left_them(height_m: float, tiles: 
 
 
 def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
-    chosen = replace(settings(), mesh=MESH)
+    chosen = settings().model_copy(update={"mesh": MESH})
     mapper = Mapper("test", chosen, "cpu")
     for scan in world(2).scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
@@ -264,7 +266,7 @@ def test_a_box_has_the_tiles_that_meet_it() -> None:
 
 
 def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
-    shelf = TileShelf(replace(MESH, shelf_bytes=2000))
+    shelf = TileShelf(MeshSettings(tile_cells=16, cache_bytes=2000))
     epoch = ground(flat(0.3))
     shelf.look(epoch)
     made = make_all(shelf)

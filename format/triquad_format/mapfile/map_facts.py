@@ -2,7 +2,6 @@
 
 import dataclasses
 import reprlib
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -28,14 +27,14 @@ class MapFacts:
 
 def pack_facts(facts: MapFacts) -> dict[str, object]:
     """The facts as a msgpack map."""
-    hints = typing.get_type_hints(FieldSettings)
+    defaults = dataclasses.asdict(FieldSettings())
     settings = dataclasses.asdict(facts.settings)
     return {
         "name": facts.name,
         "epoch": facts.epoch,
         "frame_id": FRAME_ID,
         "units": UNITS,
-        "settings": {name: hints[name](value) for name, value in settings.items()},
+        "settings": {name: type(defaults[name])(value) for name, value in settings.items()},
     }
 
 
@@ -61,13 +60,12 @@ def check_map_part(payload: bytes, facts: MapFacts) -> None:
 
 def unpack_settings(body: Mapping[str, object]) -> FieldSettings:
     """The settings of a field; all must be there."""
-    hints = typing.get_type_hints(FieldSettings)
     values: dict[str, Any] = {}
-    for field in dataclasses.fields(FieldSettings):
-        value = body.get(field.name)
-        if hints[field.name] is float and type(value) is int and abs(value) < 2**53:
+    for name, default in dataclasses.asdict(FieldSettings()).items():
+        value = body.get(name)
+        if type(default) is float and type(value) is int and abs(value) < 2**53:
             value = float(value)
-        if type(value) is not hints[field.name]:
-            raise DamagedMapFileError(f"{MAP}: setting {field.name} = {reprlib.repr(value)}")
-        values[field.name] = value
+        if type(value) is not type(default):
+            raise DamagedMapFileError(f"{MAP}: setting {name} = {reprlib.repr(value)}")
+        values[name] = value
     return FieldSettings(**values)

@@ -249,7 +249,7 @@ class TileShelf:
         """Keep bytes; those unused for longest go where there are too many."""
         self._bytes += len(data) - len(self._data.pop(key, b""))
         self._data[key] = data
-        while self._bytes > self._settings.shelf_bytes and len(self._data) > 1:
+        while self._bytes > self._settings.cache_bytes and len(self._data) > 1:
             _, gone = self._data.popitem(last=False)
             self._bytes -= len(gone)
 

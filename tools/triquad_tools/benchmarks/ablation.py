@@ -35,9 +35,9 @@ class Variant:
 def run_variant(encoding: str, through: SimulatedDrive) -> Variant:
     """Map a drive with one encoding until all is learnt, and score the map."""
     from triquad_server.mapping.mapper import Mapper
-    from triquad_server.settings import parse_settings
+    from triquad_server.settings import Settings
 
-    mapper = Mapper("ablation", parse_settings({"field": {"encoding": encoding}}), "cpu")
+    mapper = Mapper("ablation", Settings.model_validate({"field": {"encoding": encoding}}), "cpu")
     for scan in through:
         mapper.ingest(scan.points, scan.world_from_sensor)
     while not mapper.settled:
