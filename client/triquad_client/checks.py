@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_format.wire.messages import LEVELS
 from triquad_map.questions.pose import RIGID_TOLERANCE
 from triquad_map.unknown import Unknown
 
@@ -16,9 +17,6 @@ Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
 
 FARTHEST_M = 1e9
-
-LEVELS = 3
-"""Levels of detail: cells of level ``l`` are ``2**l`` times as large as those of level 0."""
 
 
 def query_points(points: ArrayLike) -> NDArray[np.float64]:

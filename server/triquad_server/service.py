@@ -41,11 +41,12 @@ from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
 from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
-from triquad_server.mesh.tile_cache import TileShelf
+from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
-from triquad_server.net.handlers import Handler, RequestDesk
-from triquad_server.net.payload import payload_limit
-from triquad_server.net.requests import EpochViews, Resets, TileQueries, answering
+from triquad_server.mesh.tile_queries import TileQueries
+from triquad_server.net.handlers import Handler, HandlerLimits, RequestHandlers, answering
+from triquad_server.net.request import payload_limit
+from triquad_server.net.requests import EpochViews, Resets
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoints import Checkpoints
 from triquad_server.store.download import MapDownloads
@@ -131,11 +132,11 @@ class Service:
             self._mapper,
             checkpoints,
         )
-        self._open_desks(health, identity)
+        self._open_handlers(health, identity)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         # Closed before the last checkpoint is written: it shows every reset that was answered.
-        self._open_admin_desk(checkpoints)
+        self._open_admin_handlers(checkpoints)
         self._parts.callback(self._mapper.rest)
         self._open_intake()
         self._parts.callback(Heartbeat(self._session, identity.map_name, health).close)
@@ -176,34 +177,34 @@ class Service:
         )
         self._parts.callback(intake.close)
 
-    def _open_desks(self, health: Health, identity: Identity) -> None:
-        """One desk per group of operations, so that none waits for a slower one."""
-        self._open_question_desks()
-        self._open_mesh_desks(identity)
-        self._open_status_desk(health)
+    def _open_handlers(self, health: Health, identity: Identity) -> None:
+        """One group of handlers for operations of a kind, so that none waits for a slower kind."""
+        self._open_question_handlers()
+        self._open_mesh_handlers(identity)
+        self._open_status_handlers(health)
         downloads = MapDownloads(self._mapper)
-        self._open_desk(
+        self._handle(
             {
                 keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
                 keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
             },
         )
 
-    def _open_question_desks(self) -> None:
+    def _open_question_handlers(self) -> None:
         limits = self._settings.service
         views = EpochViews(self._mapper.epochs, self._gate)
         answers = Answers(
             views.view, QuestionLimits(limits.max_query_points, limits.max_search_points)
         )
-        self._open_desk({keys.SDF: answering(SdfRequest, answers.sdf)}, limits.query_workers)
-        self._open_desk(
+        self._handle({keys.SDF: answering(SdfRequest, answers.sdf)}, limits.query_workers)
+        self._handle(
             {
                 keys.DISTANCE: answering(DistanceRequest, answers.distance),
                 keys.SPHERES: answering(SpheresRequest, answers.spheres),
             },
             limits.query_workers,
         )
-        self._open_desk(
+        self._handle(
             {
                 keys.SEGMENTS: answering(SegmentsRequest, answers.segments),
                 keys.RAYS: answering(RaysRequest, answers.rays),
@@ -211,37 +212,33 @@ class Service:
             },
             limits.query_workers,
         )
-        self._open_desk({keys.ALIGN: answering(AlignRequest, answers.align)})
+        self._handle({keys.ALIGN: answering(AlignRequest, answers.align)})
 
-    def _open_mesh_desks(self, identity: Identity) -> None:
-        shelf = TileShelf(self._settings.mesh)
-        tiles = TileQueries(self._mapper.epochs, shelf)
+    def _open_mesh_handlers(self, identity: Identity) -> None:
+        cache = TileCache(self._settings.mesh)
+        tiles = TileQueries(self._mapper.epochs, cache)
         feed = TileFeed(
-            shelf,
+            cache,
             self._mapper.epochs,
             self._gate,
-            identity.server,
-            self._settings.mesh,
-            self._settings.service.request_queue,
+            server=identity.server,
+            settings=self._settings.mesh,
+            limit=self._settings.service.request_queue,
         )
         feed.start()
         self._parts.callback(feed.close)
-        self._open_desk(
+        self._handle(
             {
                 keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
                 keys.TILE: answering(TileRequest, tiles.tile),
             },
             _TILE_WORKERS,
         )
-        self._open_desk(
-            {
-                keys.TILE_UPDATES: lambda request: feed.hold(
-                    request, request.read(TileUpdatesRequest)
-                ),
-            },
+        self._handle(
+            {keys.TILE_UPDATES: lambda request: feed.add(request, request.read(TileUpdatesRequest))}
         )
 
-    def _open_status_desk(self, health: Health) -> None:
+    def _open_status_handlers(self, health: Health) -> None:
         limits = self._settings.service
         flush = FlushDesk(
             self._ledger,
@@ -251,31 +248,37 @@ class Service:
         )
         flush.start()
         self._parts.callback(flush.close)
-        self._open_desk(
+        self._handle(
             {
                 keys.STATUS: answering(StatusRequest, health.answer),
                 keys.FLUSH: lambda request: flush.hold(request, request.read(FlushRequest)),
             },
         )
 
-    def _open_admin_desk(self, checkpoints: Checkpoints) -> None:
+    def _open_admin_handlers(self, checkpoints: Checkpoints) -> None:
         resets = Resets(self._mapper)
-        self._open_desk(
+        self._handle(
             {
                 keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
                 keys.RESET: answering(ResetRequest, resets.answer),
             },
         )
 
-    def _open_desk(self, operations: dict[str, Handler], workers: int = 1) -> None:
+    def _handle(self, operations: dict[str, Handler], workers: int = 1) -> None:
+        """Serve some operations from now on, until the service is closed."""
         limits = self._settings.service
-        desk = RequestDesk(
+        name = self._served.name
+        handlers = RequestHandlers(
             self._session,
-            self._served.name,
-            operations,
-            workers,
-            limits.request_queue,
-            payload_limit(limits.max_query_points),
+            {
+                keys.operation_key(name, operation): operations[operation]
+                for operation in operations
+            },
+            HandlerLimits(
+                workers=workers,
+                waiting=limits.request_queue,
+                request_bytes=payload_limit(limits.max_query_points),
+            ),
             self._counts.requests_refused,
         )
-        self._parts.callback(desk.close)
+        self._parts.callback(handlers.close)

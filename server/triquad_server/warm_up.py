@@ -6,7 +6,7 @@ import numpy as np
 from triquad_map.questions.distance import DistanceOptions, distances
 
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_cache import TileShelf
+from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.settings import Settings
 
 _DIRECTIONS = 400
@@ -35,6 +35,6 @@ def warm_up(
     epoch.query(directions, gradient=True)
     distances(epoch, directions, DistanceOptions(unknown_distance=True))
     report("meshes")
-    shelf = TileShelf(settings.mesh)
-    shelf.look(epoch)
-    shelf.make(0, (0, 0, 0))
+    cache = TileCache(settings.mesh)
+    cache.refresh(epoch)
+    cache.make(0, (0, 0, 0))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
+from triquad_format.wire.messages import MAX_HELD_TILES, TileUpdates, TileUpdatesRequest
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
@@ -17,7 +17,6 @@ from triquad_client.mesh.mesh_tiles import HeldTiles, MeshTile, TileIndex
 from triquad_client.mesh.welding import joined
 
 _REPLY_BYTES = 1_000_000
-_MAX_HELD = 100_000  # the server's limit; of more the rest travels again
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,8 @@ class FollowedMesh:
     def request(self, wait_s: float) -> TileUpdatesRequest:
         """What to ask; the server answers once something changed, or after ``wait_s``."""
         # Until all is known, the server has to be told what is held; then the revision says it.
-        known = [] if self.complete else list(self.held().tiles.values())[:_MAX_HELD]
+        # Of more tiles than may be named, the rest travels again.
+        known = [] if self.complete else list(self.held().tiles.values())[:MAX_HELD_TILES]
         return TileUpdatesRequest(
             self.minimum,
             self.maximum,

@@ -62,6 +62,13 @@ class SdfReply(Message):
     gradient: Positions | None  # [N, 3] d(sdf)/dx, map frame
 
 
+LEVELS = 3
+"""Mesh levels of detail: cells of level ``l`` are ``2**l`` times as large as of level 0."""
+
+MAX_HELD_TILES = 100_000
+"""Tiles that a :class:`TileUpdatesRequest` may name as held."""
+
+
 @dataclass(frozen=True)
 class TileListRequest(Message):
     """Which mesh tiles meet a box of the map frame; an open side is infinite."""

@@ -12,7 +12,7 @@ from triquad_format.wire.messages import Scan
 
 from triquad_server.counter import Tally
 from triquad_server.intake.sources import SourceLedger
-from triquad_server.net.payload import payload_limit
+from triquad_server.net.request import payload_limit
 
 _log = logging.getLogger(__name__)
 

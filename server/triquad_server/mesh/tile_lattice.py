@@ -7,9 +7,6 @@ from numpy.typing import NDArray
 
 from triquad_server.settings import MeshSettings
 
-LEVELS = 3
-"""Levels of detail: cells of level ``l`` are ``2**l`` times as large as those of level 0."""
-
 _GROUP_CELLS = 8
 
 

@@ -17,6 +17,14 @@ _log = logging.getLogger(__name__)
 
 RequestT = TypeVar("RequestT", bound=Message)
 
+_POINT_BYTES = 12
+_OTHER_BYTES = 4096  # the largest message takes less without its points
+
+
+def payload_limit(points: int) -> int:
+    """Most bytes that a message of so many points may have: what is larger is not decoded."""
+    return points * _POINT_BYTES + _OTHER_BYTES
+
 
 class Request:
     """A query that waits for its answer."""

@@ -12,7 +12,7 @@ from triquad_format.wire.tile_codec import decode_tile
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import TileIndex
-from triquad_server.mesh.tile_cache import TileShelf
+from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_lattice import tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings, Settings
 from triquad_server.warm_up import warm_up
@@ -170,25 +170,25 @@ def _work(made: BenchStreet) -> list[Figure]:
     for scan in made.scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
     _settle(mapper)
-    shelf = TileShelf(settings.mesh)
-    shelf.look(mapper.publish())
-    _make(shelf)
-    whole = shelf.tiles_made
-    before = _meshes(shelf)
+    cache = TileCache(settings.mesh)
+    cache.refresh(mapper.publish())
+    _make(cache)
+    whole = cache.tiles_made
+    before = _meshes(cache)
 
     scan = _one_more(made)
     mapper.ingest(scan.points, scan.world_from_sensor)
     epoch = mapper.publish()
-    look_s = seconds(lambda: shelf.look(epoch))
-    evidence = len(shelf.news(0, *_EVERYWHERE, shelf.revision, {}).to_make)
+    look_s = seconds(lambda: cache.refresh(epoch))
+    evidence = len(cache.delta(0, *_EVERYWHERE, cache.revision, {}).to_make)
     _settle(mapper)
     epoch = mapper.publish()
-    shelf.look(epoch)
-    touched = len(shelf.news(0, *_EVERYWHERE, shelf.revision, {}).to_make)
+    cache.refresh(epoch)
+    touched = len(cache.delta(0, *_EVERYWHERE, cache.revision, {}).to_make)
     started = time.perf_counter()
-    again = _make(shelf)
+    again = _make(cache)
     made_s = time.perf_counter() - started
-    meshed = shelf.tiles_made - whole
+    meshed = cache.tiles_made - whole
     changed = _changed(before, epoch, settings.mesh)
     lattice = tile_lattice(settings.mesh, 0)
     ends = scan.points @ scan.world_from_sensor[:3, :3].T + scan.world_from_sensor[:3, 3]
@@ -208,13 +208,13 @@ def _work(made: BenchStreet) -> list[Figure]:
     ]  # fmt: skip
 
 
-def _meshes(shelf: TileShelf) -> dict[TileIndex, Mesh]:
-    """All tiles of a shelf that show what the map has, in the map frame."""
-    lattice = shelf.lattice(0)
+def _meshes(cache: TileCache) -> dict[TileIndex, Mesh]:
+    """All tiles of a cache that show what the map has, in the map frame."""
+    lattice = cache.lattice(0)
     meshes = {}
-    for tile in shelf.news(0, *_EVERYWHERE, 0, {}).ready:
-        data = shelf.data(0, tile)
-        assert data is not None, "the shelf is too small for the street"
+    for tile in cache.delta(0, *_EVERYWHERE, 0, {}).ready:
+        data = cache.data(0, tile)
+        assert data is not None, "the cache is too small for the street"
         surface = decode_tile(data)
         corner = np.array(tile.index) * lattice.tile_side_m
         meshes[tile.index] = Mesh(corner + surface.positions(lattice.cell_m), surface.faces)
@@ -223,10 +223,10 @@ def _meshes(shelf: TileShelf) -> dict[TileIndex, Mesh]:
 
 def _changed(before: dict[TileIndex, Mesh], epoch: Epoch, settings: MeshSettings) -> set[TileIndex]:
     """Tiles whose surface is another one in an epoch, all meshed anew."""
-    shelf = TileShelf(settings)
-    shelf.look(epoch)
-    _make(shelf)
-    return changed_tiles(before, _meshes(shelf), settings.tolerance_m, settings.cell_m)
+    cache = TileCache(settings)
+    cache.refresh(epoch)
+    _make(cache)
+    return changed_tiles(before, _meshes(cache), settings.tolerance_m, settings.cell_m)
 
 
 def _settle(mapper: Mapper) -> None:
@@ -236,11 +236,11 @@ def _settle(mapper: Mapper) -> None:
             report(0, f"{mapper.samples_trained / 1e6:.1f} M samples")
 
 
-def _make(shelf: TileShelf) -> set[TileIndex]:
+def _make(cache: TileCache) -> set[TileIndex]:
     """Make what has to be made; returns which tiles that were."""
     made: set[TileIndex] = set()
-    while to_make := shelf.news(0, *_EVERYWHERE, shelf.revision, {}).to_make:
+    while to_make := cache.delta(0, *_EVERYWHERE, cache.revision, {}).to_make:
         for index in to_make:
-            shelf.make(0, index)
+            cache.make(0, index)
         made.update(to_make)
     return made

@@ -8,12 +8,13 @@ import pytest
 from numpy.typing import NDArray
 from support.exact_maps import SETTINGS, exact_map, flat, table
 from support.small_world import settings, settle, world
+from triquad_format.wire.messages import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import TileIndex, mesh_tile
-from triquad_server.mesh.tile_cache import TileShelf
-from triquad_server.mesh.tile_lattice import LEVELS, TileLattice, tile_lattice
+from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.mesh.tile_lattice import TileLattice, tile_lattice
 from triquad_server.settings import MeshSettings, Settings
 from triquad_tools.simulation.lidar import SimulatedScan
 
@@ -21,29 +22,29 @@ EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 MESH = MeshSettings(tile_cells=16)
 
 
-def make_all(shelf: TileShelf, level: int = 0) -> list[TileIndex]:
+def make_all(cache: TileCache, level: int = 0) -> list[TileIndex]:
     """Make what has to be made; returns it."""
     made: list[TileIndex] = []
-    while to_make := shelf.news(level, *EVERYWHERE, 0, {}).to_make:
+    while to_make := cache.delta(level, *EVERYWHERE, 0, {}).to_make:
         for index in to_make:
-            shelf.make(level, index)
+            cache.make(level, index)
         made += to_make
     return made
 
 
-def surfaces(shelf: TileShelf, level: int = 0) -> dict[TileIndex, TileSurface]:
+def surfaces(cache: TileCache, level: int = 0) -> dict[TileIndex, TileSurface]:
     """All tiles with faces, decoded."""
     found = {}
-    for tile in shelf.news(level, *EVERYWHERE, 0, {}).ready:
+    for tile in cache.delta(level, *EVERYWHERE, 0, {}).ready:
         assert not tile.empty, "who has nothing need not be told of nothing"
-        data = shelf.data(level, tile)
+        data = cache.data(level, tile)
         assert data is not None
         found[tile.index] = decode_tile(data)
     return found
 
 
-def versions(shelf: TileShelf, level: int = 0) -> dict[TileIndex, int]:
-    return {tile.index: tile.version for tile in shelf.news(level, *EVERYWHERE, 0, {}).ready}
+def versions(cache: TileCache, level: int = 0) -> dict[TileIndex, int]:
+    return {tile.index: tile.version for tile in cache.delta(level, *EVERYWHERE, 0, {}).ready}
 
 
 def triangles(tiles: Iterable[tuple[TileIndex, TileSurface]], cells: int) -> NDArray[np.int64]:
@@ -58,9 +59,9 @@ def triangles(tiles: Iterable[tuple[TileIndex, TileSurface]], cells: int) -> NDA
 
 @dataclass
 class Patchwork:
-    """A map of many epochs: in each tile the one of which the shelf made it.
+    """A map of many epochs: in each tile the one of which the cache made it.
 
-    On the tiles' faces the distances are those that the shelf used.
+    On the tiles' faces the distances are those that the cache used.
     """
 
     lattice: TileLattice
@@ -93,11 +94,11 @@ class Patchwork:
         }
 
 
-def patchwork(shelf: TileShelf, epochs: dict[int, Epoch], level: int) -> Patchwork:
-    lattice = shelf.lattice(level)
+def patchwork(cache: TileCache, epochs: dict[int, Epoch], level: int) -> Patchwork:
+    lattice = cache.lattice(level)
     made: dict[TileIndex, Epoch] = {}
     borders: dict[tuple[int, int, int], float] = {}
-    for index, tile in shelf._levels[level].tiles.items():
+    for index, tile in cache._levels[level]._tiles.items():
         made[index] = epochs[tile.made]
         points = tile.border.points + np.array(index) * lattice.cells
         for point, value in zip(points.tolist(), tile.border.values.tolist(), strict=True):
@@ -119,7 +120,7 @@ def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
         update={"mesh": MeshSettings(tile_cells=16, cell_m=0.1 / 2**level, tolerance_m=0.03)}
     )
     mapper = Mapper("test", chosen, "cpu")
-    shelf = TileShelf(chosen.mesh)
+    cache = TileCache(chosen.mesh)
     epochs: dict[int, Epoch] = {}
     some_kept = 0
     for number, scan in enumerate(world(6).scans):
@@ -129,21 +130,21 @@ def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
             mapper.train()
         epoch = mapper.publish()
         epochs[epoch.number] = epoch
-        shelf.look(epoch)
+        cache.refresh(epoch)
         low, high = np.array([0.0, -8, -2]), np.array([10.0, 8, 6])
-        wanted = shelf.news(level, low, high, 0, {})
+        wanted = cache.delta(level, low, high, 0, {})
         some_kept += len(wanted.ready)
         while wanted.to_make:  # also those that no longer fit what was made beside them
             for index in wanted.to_make[::-1]:
-                shelf.make(level, index)
-            wanted = shelf.news(level, low, high, 0, {})
+                cache.make(level, index)
+            wanted = cache.delta(level, low, high, 0, {})
     assert some_kept > 50
-    assert len(set(versions(shelf, level).values())) > 3
+    assert len(set(versions(cache, level).values())) > 3
 
-    lattice = shelf.lattice(level)
+    lattice = cache.lattice(level)
     whole = replace(lattice, cells=128)
-    source = patchwork(shelf, epochs, level)
-    apart = surfaces(shelf, level)
+    source = patchwork(cache, epochs, level)
+    apart = surfaces(cache, level)
     compared = 0
     for index in [(0, -1, 0), (0, 0, 0), (0, -1, -1), (0, 0, -1)]:
         inside = {
@@ -178,45 +179,45 @@ def ground(height: object) -> Epoch:
 
 @pytest.mark.parametrize("level", range(LEVELS))
 def test_only_tiles_whose_surface_moved_are_made_again(level: int) -> None:
-    shelf = TileShelf(MESH)
-    shelf.look(ground(flat(0.3)))
-    first = make_all(shelf, level)
-    before = versions(shelf, level)
+    cache = TileCache(MESH)
+    cache.refresh(ground(flat(0.3)))
+    first = make_all(cache, level)
+    before = versions(cache, level)
     side_m = tile_lattice(MESH, level).tile_side_m
     epoch = bump(4.0, 0.05)
-    shelf.look(epoch)
-    made = make_all(shelf, level)
+    cache.refresh(epoch)
+    made = make_all(cache, level)
     low, high = np.floor(2.6 / side_m), np.floor(5.4 / side_m)
     assert {(x, y) for x, y, _ in made} == {
         (x, y) for x, y, _ in first if low <= x <= high and low <= y <= high
     }
-    after = versions(shelf, level)
+    after = versions(cache, level)
     for index, version in after.items():
         assert version == (epoch.number if index in made else before[index])
     assert len(made) < len(first)
 
 
 def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up() -> None:
-    shelf = TileShelf(MESH)
-    shelf.look(ground(flat(0.3)))
-    make_all(shelf)
+    cache = TileCache(MESH)
+    cache.refresh(ground(flat(0.3)))
+    make_all(cache)
     for height_m in (0.306, 0.302, 0.294):
-        shelf.look(ground(flat(height_m)))
-        assert make_all(shelf) == []
-    shelf.look(ground(flat(0.3001)))
-    assert make_all(shelf) == []
-    shelf.look(ground(flat(0.312)))
-    assert len(make_all(shelf)) > 100
+        cache.refresh(ground(flat(height_m)))
+        assert make_all(cache) == []
+    cache.refresh(ground(flat(0.3001)))
+    assert make_all(cache) == []
+    cache.refresh(ground(flat(0.312)))
+    assert len(make_all(cache)) > 100
 
 
 @pytest.mark.parametrize(("height_m", "tiles"), [(0.25, set()), (0.39, {-1, 0})])
 def test_a_few_voxels_count_where_the_surface_left_them(height_m: float, tiles: set[int]) -> None:
     """Within one layer of voxels, so that the evidence stays the same."""
-    shelf = TileShelf(MESH)
-    shelf.look(ground(flat(0.21)))
-    make_all(shelf)
-    shelf.look(ground(table(0.21, height_m, 1.6)))
-    made = make_all(shelf)
+    cache = TileCache(MESH)
+    cache.refresh(ground(flat(0.21)))
+    make_all(cache)
+    cache.refresh(ground(table(0.21, height_m, 1.6)))
+    made = make_all(cache)
     assert {x for x, _, _ in made} == {y for _, y, _ in made} == tiles
 
 
@@ -226,71 +227,71 @@ def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
     for scan in world(2).scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
     settle(mapper)
-    shelf = TileShelf(MESH)
-    shelf.look(mapper.publish())
-    make_all(shelf)
-    before = surfaces(shelf)
-    known = shelf.revision
+    cache = TileCache(MESH)
+    cache.refresh(mapper.publish())
+    make_all(cache)
+    before = surfaces(cache)
+    known = cache.revision
     mapper.reset(np.array([0.0, -50, -50]), np.array([50.0, 50, 50]))
-    shelf.look(mapper.publish())
-    made = make_all(shelf)
-    side_m = shelf.lattice(0).tile_side_m
+    cache.refresh(mapper.publish())
+    made = make_all(cache)
+    side_m = cache.lattice(0).tile_side_m
     assert all((x + 1) * side_m > -0.5 for x, _, _ in made), "only what is near the box"
-    news = shelf.news(0, *EVERYWHERE, known, {})
+    delta = cache.delta(0, *EVERYWHERE, known, {})
     far = {index for index in before if index[0] * side_m > 0.5}
     assert far
-    assert far <= {tile.index for tile in news.ready if tile.empty}
-    assert not far & set(surfaces(shelf))
+    assert far <= {tile.index for tile in delta.ready if tile.empty}
+    assert not far & set(surfaces(cache))
 
 
 def test_who_knows_everything_is_told_nothing() -> None:
-    shelf = TileShelf(MESH)
-    shelf.look(ground(flat(0.3)))
-    make_all(shelf)
-    news = shelf.news(0, *EVERYWHERE, shelf.revision, {})
-    assert (news.ready, news.removed, news.to_make) == ([], [], [])
-    held = versions(shelf)
-    news = shelf.news(0, *EVERYWHERE, 0, held)
-    assert (news.ready, news.removed, news.to_make) == ([], [], [])
+    cache = TileCache(MESH)
+    cache.refresh(ground(flat(0.3)))
+    make_all(cache)
+    delta = cache.delta(0, *EVERYWHERE, cache.revision, {})
+    assert (delta.ready, delta.removed, delta.to_make) == ([], [], [])
+    held = versions(cache)
+    delta = cache.delta(0, *EVERYWHERE, 0, held)
+    assert (delta.ready, delta.removed, delta.to_make) == ([], [], [])
     index = min(held)
-    news = shelf.news(0, *EVERYWHERE, 0, held | {index: 77, (500, 0, 0): 1})
-    assert [tile.index for tile in news.ready] == [index]
-    assert news.removed == [(500, 0, 0)]
+    delta = cache.delta(0, *EVERYWHERE, 0, held | {index: 77, (500, 0, 0): 1})
+    assert [tile.index for tile in delta.ready] == [index]
+    assert delta.removed == [(500, 0, 0)]
 
 
 def test_a_box_has_the_tiles_that_meet_it() -> None:
-    shelf = TileShelf(MESH)
-    shelf.look(ground(flat(0.3)))
-    news = shelf.news(0, np.array([0.1, 0.1, 0.1]), np.array([1.7, 0.2, 0.2]), 0, {})
-    assert {index[:2] for index in news.to_make} == {(0, 0), (1, 0)}
+    cache = TileCache(MESH)
+    cache.refresh(ground(flat(0.3)))
+    delta = cache.delta(0, np.array([0.1, 0.1, 0.1]), np.array([1.7, 0.2, 0.2]), 0, {})
+    assert {index[:2] for index in delta.to_make} == {(0, 0), (1, 0)}
 
 
 def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
-    shelf = TileShelf(MeshSettings(tile_cells=16, cache_bytes=2000))
+    cache = TileCache(MeshSettings(tile_cells=16, cache_bytes=2000))
     epoch = ground(flat(0.3))
-    shelf.look(epoch)
-    made = make_all(shelf)
-    assert shelf.size <= 2000
-    ready = shelf.news(0, *EVERYWHERE, 0, {}).ready
-    gone = [tile for tile in ready if shelf.data(0, tile) is None]
+    cache.refresh(epoch)
+    made = make_all(cache)
+    assert cache.size <= 2000
+    ready = cache.delta(0, *EVERYWHERE, 0, {}).ready
+    gone = [tile for tile in ready if cache.data(0, tile) is None]
     assert len(gone) > len(made) / 4
-    revision = shelf.revision
+    revision = cache.revision
     for tile in gone:
-        again = shelf.make(0, tile.index)
+        again = cache.make(0, tile.index)
         assert (again.digest, again.version, again.revision) == (
             tile.digest,
             tile.version,
             tile.revision,
         )
-    assert shelf.revision == revision
+    assert cache.revision == revision
 
 
 def test_when_tiles_changed_is_told_for_any_of_them() -> None:
-    shelf = TileShelf(MESH)
+    cache = TileCache(MESH)
     first = ground(flat(0.3))
-    shelf.look(first)
+    cache.refresh(first)
     second = bump(4.0, 0.05)
-    shelf.look(second)
-    shelf.look(first)  # an older one tells nothing
+    cache.refresh(second)
+    cache.refresh(first)  # an older one tells nothing
     asked = np.array([[2, 2, 0], [-2, -2, 0], [900, 0, 0]])
-    assert shelf.changed(0, asked).tolist() == [second.number, first.number, 0]
+    assert cache.changed(0, asked).tolist() == [second.number, first.number, 0]
