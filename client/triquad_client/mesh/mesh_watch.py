@@ -10,9 +10,9 @@ from types import MappingProxyType, TracebackType
 from typing import Any
 
 import zenoh
+from triquad_format.errors import TriquadError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import TileUpdates
-from triquad_map.errors import TriquadError
 
 from triquad_client.calls.async_queries import AsyncRun
 from triquad_client.errors import ClosedError, RequestTimeoutError

@@ -66,7 +66,7 @@ def open_map(path: str | Path) -> OfflineMap:
             store, of which the newest checkpoint is taken.
 
     Raises:
-        triquad_format.errors.MapFileError: it is no map file, is damaged, or needs a newer reader.
+        MapFileError: it is no map file, is damaged, or needs a newer reader.
         OSError: it cannot be read.
     """
     chosen = Path(path)

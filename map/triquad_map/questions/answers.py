@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
@@ -48,14 +49,6 @@ _RANGE_EACH_M = 10.0
 """Range of a ray that counts as much."""
 
 
-class QuestionError(Exception):
-    """Why a question is not answered; ``code`` is one of ``messages.ERROR_CODES``."""
-
-    def __init__(self, code: str, text: str) -> None:
-        super().__init__(text)
-        self.code = code
-
-
 @dataclass(frozen=True)
 class QuestionLimits:
     """How much one question may ask."""
@@ -79,7 +72,7 @@ class Answers:
         """The answer to a question of any kind.
 
         Raises:
-            QuestionError: it is not answered.
+            RefusedError: it is not answered.
             KeyError: it is no question about the map.
         """
         return _ANSWERS[type(request)](self, request)
@@ -117,7 +110,7 @@ class Answers:
         good = (request.radii >= 0) & (request.radii <= MAX_DISTANCE_M)
         if not good.all():
             worst = int((~good).argmax())
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request",
                 f"radius {worst} is {request.radii[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
             )
@@ -159,7 +152,7 @@ class Answers:
         bad = ~(np.abs(lengths - 1.0) < 1e-3)
         if bad.any():
             worst = int(bad.argmax())
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
             )
         reach_m = _within("max_range_m", request.max_range_m, MAX_RANGE_M)
@@ -176,7 +169,7 @@ class Answers:
         counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
         cell_m = _within("cell_m", request.cell_m, MAX_DISTANCE_M)
         if min(counts) < 1 or not np.isfinite(request.corner).all():
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request", f"not a grid: counts {counts}, corner {request.corner}"
             )
         shape = GridShape(request.corner, cell_m, counts)
@@ -190,7 +183,7 @@ class Answers:
         """The pose of a scan near a guess."""
         self._check_count(len(request.points), f"{len(request.points)} points")
         if not is_rigid(request.world_from_sensor):
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request",
                 f"world_from_sensor is no rotation and translation: {request.world_from_sensor}",
             )
@@ -220,7 +213,7 @@ class Answers:
 
     def _check_count(self, count: float, what: str) -> None:
         if count > self._limits.searches:
-            raise QuestionError(
+            raise RefusedError(
                 "too_large",
                 f"{what} exceed the limit of {self._limits.searches} searches: split the request",
             )
@@ -243,10 +236,10 @@ def _points(
     """Points [N, 3] of the map frame.
 
     Raises:
-        QuestionError: they are too many, or not all finite.
+        RefusedError: they are too many, or not all finite.
     """
     if len(offsets) > most:
-        raise QuestionError(
+        raise RefusedError(
             "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
         )
     # Single precision from an origin is good to that. Unrounded, a point that somebody chose on a
@@ -254,13 +247,13 @@ def _points(
     points = np.round(origin + offsets.astype(np.float64), _DECIMALS)
     if not np.isfinite(points).all():
         index = int(np.isfinite(points).all(axis=1).argmin())
-        raise QuestionError("bad_request", f"{what} {index} is not finite: {points[index]}")
+        raise RefusedError("bad_request", f"{what} {index} is not finite: {points[index]}")
     return points
 
 
 def _within(name: str, value: float, most: float, least: float = 1e-6) -> float:
     if not least <= value <= most:
-        raise QuestionError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
+        raise RefusedError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
     return float(value)
 
 
@@ -268,7 +261,7 @@ def _short(what: str, lengths: NDArray[np.float64]) -> None:
     """Refuse ways [N] that are too long: each of their steps waits for the one before."""
     if lengths.max(initial=0.0) > MAX_RANGE_M:
         worst = int(lengths.argmax())
-        raise QuestionError(
+        raise RefusedError(
             "bad_request",
             f"{what} {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
         )
@@ -276,7 +269,7 @@ def _short(what: str, lengths: NDArray[np.float64]) -> None:
 
 def _same_length(first: NDArray[np.float32], name: str, second: NDArray[np.float32]) -> None:
     if len(first) != len(second):
-        raise QuestionError("bad_request", f"{len(second)} {name} for {len(first)} points")
+        raise RefusedError("bad_request", f"{len(second)} {name} for {len(first)} points")
 
 
 def _relative(

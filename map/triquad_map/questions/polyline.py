@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from triquad_map.errors import UnknownSpaceError
 from triquad_map.questions.segments import Segments
-from triquad_map.unknown import Unknown
+from triquad_map.unknown import Unknown, UnknownSpaceError
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from triquad_format.errors import FormatError
+from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import draco, keys
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_format.wire.tile_codec import Codec, decode_tile
@@ -17,7 +17,6 @@ from triquad_map.compiled.team import be_patient
 
 from triquad_server.epochs.epochs import EpochShelf
 from triquad_server.epochs.gate import QueryGate
-from triquad_server.errors import RequestError
 from triquad_server.mesh.bandwidth import BURST_S, Bandwidth
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import ShelvedTile, TileNews, TileShelf
@@ -121,7 +120,7 @@ class TileFeed:
         """Take over a request; it is answered once there are tiles for it, or in time.
 
         Raises:
-            RequestError: a field is out of range, or too many are held.
+            RefusedError: a field is out of range, or too many are held.
         """
         self._check(asks)
         restart = asks.server not in ("", self._server)
@@ -138,7 +137,7 @@ class TileFeed:
         with self._news:
             waiting = len(self._held) + self._sending
             if self._stopping or waiting >= self._limit:
-                raise RequestError("busy", f"{waiting} followers of the mesh wait already")
+                raise RefusedError("busy", f"{waiting} followers of the mesh wait already")
             self._held.append(held)
             self._news.notify_all()
 
@@ -153,29 +152,29 @@ class TileFeed:
         try:
             keys.check_name("client", asks.client)
         except FormatError as error:
-            raise RequestError("bad_request", str(error)) from error
+            raise RefusedError("bad_request", str(error)) from error
         # Written so that NaN is refused as well.
         if not 0 <= asks.timeout_s < math.inf:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request", f"timeout_s = {asks.timeout_s} is not a time: use 0 or more"
             )
         if asks.max_bytes < 1 or asks.max_bytes_per_s < 0:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"max_bytes = {asks.max_bytes}, max_bytes_per_s = {asks.max_bytes_per_s}: "
                 "use at least 1, and at least 0",
             )
         if len(asks.held) != len(asks.held_versions):
-            raise RequestError(
+            raise RefusedError(
                 "bad_request", f"{len(asks.held_versions)} versions of {len(asks.held)} held tiles"
             )
         if len(asks.held) > MAX_HELD:
-            raise RequestError(
+            raise RefusedError(
                 "too_large", f"{len(asks.held)} held tiles exceed the limit of {MAX_HELD}"
             )
         known = self._shelf.revision if asks.server == self._server else 0
         if asks.server in ("", self._server) and not 0 <= asks.revision <= known:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"revision = {asks.revision} was never given by server {asks.server!r}: "
                 "use that of the reply before, or 0",
