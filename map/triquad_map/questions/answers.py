@@ -93,29 +93,29 @@ class Answers:
             answer = distances(view, points, options)
         return DistanceReply(
             answer.epoch,
-            answer.distance,
+            answer.distance_m,
             answer.gradient,
             answer.found.astype(np.uint8),
             answer.status,
             answer.confidence,
             _relative(answer.surface_point, request.origin),
-            answer.unknown_distance,
+            answer.unknown_distance_m,
             _relative(answer.unknown_point, request.origin),
         )
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
         """What spheres hold."""
         centres = self._searched("sphere", request.origin, request.centres)
-        _same_length(request.centres, "radii", request.radii)
-        good = (request.radii >= 0) & (request.radii <= MAX_DISTANCE_M)
+        _same_length(request.centres, "radii_m", request.radii_m)
+        good = (request.radii_m >= 0) & (request.radii_m <= MAX_DISTANCE_M)
         if not good.all():
             worst = int((~good).argmax())
             raise RefusedError(
                 "bad_request",
-                f"radius {worst} is {request.radii[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
+                f"radius {worst} is {request.radii_m[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
             )
         with self._view(request.epoch) as view:
-            answer = spheres(view, centres, request.radii.astype(np.float64))
+            answer = spheres(view, centres, request.radii_m.astype(np.float64))
         return SpheresReply(answer.epoch, answer.status)
 
     def segments(self, request: SegmentsRequest) -> SegmentsReply:
@@ -134,13 +134,13 @@ class Answers:
             answer = segments(view, starts, ends, options)
         return SegmentsReply(
             answer.epoch,
-            answer.length,
+            answer.length_m,
             answer.blocked.astype(np.uint8),
-            answer.contact,
-            answer.clearance,
-            answer.clearance_at,
+            answer.contact_m,
+            answer.clearance_m,
+            answer.clearance_at_m,
             answer.meets_unknown.astype(np.uint8),
-            answer.unknown_contact,
+            answer.unknown_contact_m,
         )
 
     def rays(self, request: RaysRequest) -> RaysReply:
@@ -162,7 +162,7 @@ class Answers:
         options = RayOptions(reach_m, request.through_unknown)
         with self._view(request.epoch) as view:
             answer = rays(view, starts, directions / lengths[:, None], options)
-        return RaysReply(answer.epoch, answer.range, answer.status)
+        return RaysReply(answer.epoch, answer.range_m, answer.status)
 
     def grid(self, request: GridRequest) -> GridReply:
         """Distance and status at a grid's cells."""
@@ -177,7 +177,7 @@ class Answers:
         reach_m = _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
             answer = grid(view, shape, reach_m)
-        return GridReply(answer.epoch, answer.distance, answer.status)
+        return GridReply(answer.epoch, answer.distance_m, answer.status)
 
     def align(self, request: AlignRequest) -> AlignReply:
         """The pose of a scan near a guess."""
