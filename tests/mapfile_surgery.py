@@ -77,6 +77,11 @@ def rebuild(parts, metadata, *, encoding="msgpack", chunk_size=1, **options):
     return stream.getvalue()
 
 
+def without_index(data):
+    """The map with all parts in one chunk, as other tools write it: it can only be read whole."""
+    return rebuild(parts_of(data), metadata_of(data), chunk_size=1 << 30)
+
+
 def listed(parts, manifest):
     """Parts and a manifest with their sizes and digests; keys are those of ``manifest``."""
     own = tuple(

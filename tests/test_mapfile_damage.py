@@ -32,7 +32,7 @@ from triquad_format.errors import (
 )
 from triquad_format.mapfile import read_map
 
-GOLDEN = Path(__file__).parent / "golden" / "map_v2.triquad"
+GOLDEN = Path(__file__).parent / "golden" / "map_v1.triquad"
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +220,7 @@ def test_another_mcap_file():
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
-        ({"min_reader_version": "3"}, UnsupportedMapFileError, "version 3"),
+        ({"min_reader_version": "2"}, UnsupportedMapFileError, "version 2"),
         ({"required_features": "colour"}, UnsupportedMapFileError, "colour"),
         ({"required_features": "zeta, base-files, alpha"}, UnsupportedMapFileError, "alpha, zeta"),
         ({"required_features": None}, DamagedMapFileError, "required_features"),

@@ -1,7 +1,6 @@
 import dataclasses
 import itertools
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from map_records import SMALL, assert_same, random_record, with_integers
 from mapfile_surgery import edited, file_bytes, set_array, stored, write_pair, write_record
 from triquad_format import morton
 from triquad_format.crop import crop_record, without_training
-from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError, NoIndexError
+from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.evaluator import MapEvaluator
 from triquad_format.field_settings import FieldSettings
 from triquad_format.mapfile import read_map, write_map
@@ -17,7 +16,6 @@ from triquad_format.random_access import FileBytes
 from triquad_format.region import AXES
 from triquad_format.stored_map import StoredMap
 
-VERSION_1 = Path(__file__).parent / "golden" / "map_v1.triquad"
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 WIDE = dataclasses.replace(SMALL, depth=11, feature_levels=4)
 """A region of 512 m: 8 squares of 64 m along each side."""
@@ -177,11 +175,6 @@ def test_outside_of_all_regions_nothing_is_known():
         assert np.isnan(answer.sdf).all()
         assert not answer.status.any()
         assert len(map_file.query(np.zeros((0, 3))).sdf) == 0
-
-
-def test_version_1_has_no_index():
-    with pytest.raises(NoIndexError, match="version 1"):
-        StoredMap.open(VERSION_1)
 
 
 # A file that changes while it is open

@@ -28,7 +28,6 @@ from triquad_format.part import (
 )
 from triquad_format.part_reader import RegionParts
 from triquad_format.record_check import check_record
-from triquad_format.recover_version_1 import is_version_1, recover_version_1
 from triquad_format.recovery import Loss, Recovery, felt_box, loss_of
 from triquad_format.region import (
     AXES,
@@ -58,10 +57,7 @@ def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> Recovery:
     """
     with named(str(path)):
         messages = list(read_messages(path, max_bytes))
-        if is_version_1(messages):
-            recovery = recover_version_1(messages)
-        else:
-            recovery = _recover(salvage(messages, path, max_bytes))
+        recovery = _recover(salvage(messages, path, max_bytes))
         if not recovery.record.regions and not recovery.complete:
             raise MapFileError("nothing can be saved: no region is intact")
         return recovery

@@ -29,7 +29,7 @@ from triquad_format.region import AXES, MapRecord, RegionIndex, leaf_coordinates
 
 
 class StoredMap:
-    """A map file of version 2, open for reading. One thread at a time may use it."""
+    """A map file, open for reading. One thread at a time may use it."""
 
     def __init__(self, source: RandomAccess, open_file: OpenFile | None = None) -> None:
         """Read the manifest; arguments and errors are those of :class:`MapIndex`."""

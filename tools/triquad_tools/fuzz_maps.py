@@ -79,7 +79,7 @@ class Reader:
 
     name: str
     read: Callable[[Path], Results]
-    sound: dict[str, Results]  # empty where it cannot read them: files of version 1
+    sound: dict[str, Results]  # empty where it cannot read them
 
 
 def main(arguments: list[str] | None = None) -> int:
