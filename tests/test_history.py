@@ -1,8 +1,8 @@
 from pathlib import Path
 
 import pytest
+from fuzz.mapfile_edit import without_index, write_record
 from map_records import random_record
-from mapfile_surgery import without_index, write_record
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
 from triquad_format.history import (
     CheckpointFile,

@@ -5,10 +5,7 @@ import dataclasses
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from map_records import SMALL, assert_same, random_record, with_levels
-from mapfile_surgery import (
+from fuzz.mapfile_edit import (
     edited,
     file_bytes,
     manifest_of,
@@ -17,6 +14,9 @@ from mapfile_surgery import (
     stored,
     write_pair,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from map_records import SMALL, assert_same, random_record, with_levels
 from triquad_format.crop import crop_record
 from triquad_format.evidence_voxels import masked, seen_voxels, surface_counts
 from triquad_format.mapfile import read_map

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from fuzz.mapfile_edit import file_bytes
 from map_records import random_record
-from mapfile_surgery import file_bytes
 from small_world import settings, settled_mapper, world
 from triquad_format.crop import crop_record
 from triquad_format.evaluator import MapEvaluator

@@ -6,8 +6,7 @@ import os
 import shutil
 
 import pytest
-from map_records import assert_same, random_record, with_integers
-from mapfile_surgery import (
+from fuzz.mapfile_edit import (
     file_bytes,
     metadata_of,
     parts_of,
@@ -16,6 +15,7 @@ from mapfile_surgery import (
     write_pair,
     write_record,
 )
+from map_records import assert_same, random_record, with_integers
 from mcap.writer import CompressionType, IndexType, Writer
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
 from triquad_format.manifest import FileRef

@@ -8,10 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from map_records import SMALL, assert_same, random_record, with_integers, with_levels
-from mapfile_surgery import (
+from fuzz.mapfile_edit import (
     edited,
     file_bytes,
     manifest_of,
@@ -22,6 +19,9 @@ from mapfile_surgery import (
     stored,
     write_pair,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from map_records import SMALL, assert_same, random_record, with_integers, with_levels
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from triquad_format import morton

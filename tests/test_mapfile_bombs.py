@@ -9,8 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
-from map_records import SMALL, random_record, with_levels
-from mapfile_surgery import (
+from fuzz.mapfile_edit import (
     RawPart,
     edited,
     file_bytes,
@@ -25,6 +24,7 @@ from mapfile_surgery import (
     stored,
     with_manifest,
 )
+from map_records import SMALL, random_record, with_levels
 from mcap.writer import IndexType
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.manifest import FileRef

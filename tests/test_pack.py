@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 from checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoints
+from fuzz.mapfile_edit import with_metadata, without_index
 from map_records import SMALL, assert_same, random_record
-from mapfile_surgery import with_metadata, without_index
 from mcap.reader import make_reader
 from triquad_format.crop import crop_record, without_training
 from triquad_format.errors import FormatError

@@ -5,8 +5,8 @@ import io
 
 import numpy as np
 import pytest
+from fuzz.mapfile_edit import RawPart, file_bytes, metadata_of, parts_of, read_bytes, rebuild
 from map_records import SMALL, random_record
-from mapfile_surgery import RawPart, file_bytes, metadata_of, parts_of, read_bytes, rebuild
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from triquad_format import morton

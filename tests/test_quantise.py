@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from fuzz.mapfile_edit import file_bytes, read_bytes
 from map_records import SMALL, assert_same, random_record
-from mapfile_surgery import file_bytes, read_bytes
 from small_world import settings, settled_mapper, world
 from triquad_format.crop import crop_record
 from triquad_format.errors import FormatError

@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 from checkpoint_folder import FIRST, SECOND, map_at, write_checkpoints
+from fuzz.mapfile_edit import file_bytes, manifest_of, rebuild, with_metadata
 from map_records import SMALL, assert_same, random_record
-from mapfile_surgery import file_bytes, manifest_of, rebuild, with_metadata
 from mcap.reader import make_reader
 from triquad_format import morton
 from triquad_format.crop import without_training
@@ -63,10 +63,10 @@ def chunks(data):
 
 
 def flipped(data, *places):
-    spoilt = bytearray(data)
+    corrupt = bytearray(data)
     for place in places:
-        spoilt[place] ^= 0x10
-    return bytes(spoilt)
+        corrupt[place] ^= 0x10
+    return bytes(corrupt)
 
 
 def zeroed(data, first, last):
@@ -236,21 +236,21 @@ def test_without_its_front(recovered):
 
 def test_without_its_manifest(recovered):
     manifest = chunks(DATA)[-1]
-    spoilt = zeroed(DATA, manifest.start, manifest.end)
-    recovery = recovered(spoilt)
+    corrupt = zeroed(DATA, manifest.start, manifest.end)
+    recovery = recovered(corrupt)
     assert not recovery.complete
     assert recovery.losses == ()
     assert_same(recovery.record, RECORD)
     # Neither channels at the front nor in the summary:
     first = next(chunk for chunk in chunks(DATA) if chunk.topic == MAP)
-    assert_same(recovered(zeroed(spoilt, 0, first.start)[: manifest.end]).record, RECORD)
+    assert_same(recovered(zeroed(corrupt, 0, first.start)[: manifest.end]).record, RECORD)
 
 
 def test_lost_vertices_are_missed_without_a_manifest(recovered):
     *parts, manifest = chunks(DATA)
     for chunk in [chunk for chunk in parts if chunk.topic == VERTICES]:
-        spoilt = zeroed(DATA[: manifest.start], chunk.start, chunk.end)
-        recovery = recovered(spoilt)
+        corrupt = zeroed(DATA[: manifest.start], chunk.start, chunk.end)
+        recovery = recovered(corrupt)
         assert [loss.key.topic for loss in recovery.losses].count(VERTICES) == 1
         assert_answers(recovery)
 

@@ -189,8 +189,8 @@ def flip(path: Path, at: int) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("at", range(0, (GOLDEN / "map_v1.triquad").stat().st_size, 2003))
-def test_a_flipped_bit_is_refused(tmp_path: Path, at: int) -> None:
+@pytest.mark.parametrize("at", [1000, -1000])
+def test_a_flipped_bit_of_data_or_summary_is_refused(tmp_path: Path, at: int) -> None:
     path = tmp_path / "map.triquad"
     shutil.copyfile(GOLDEN / "map_v1.triquad", path)
     flip(path, at)

@@ -3,8 +3,8 @@ import shutil
 
 import pytest
 from checkpoint_folder import write_checkpoints
+from fuzz.mapfile_edit import file_bytes, without_index
 from map_records import random_record
-from mapfile_surgery import file_bytes, without_index
 from triquad_format.mapfile import read_map_file
 from triquad_tools.inspect import main
 from triquad_tools.pack import main as pack

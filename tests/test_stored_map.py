@@ -4,8 +4,8 @@ import os
 
 import numpy as np
 import pytest
+from fuzz.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
 from map_records import SMALL, assert_same, random_record, with_integers
-from mapfile_surgery import edited, file_bytes, set_array, stored, write_pair, write_record
 from triquad_format import morton
 from triquad_format.crop import crop_record, without_training
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError

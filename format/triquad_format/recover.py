@@ -1,4 +1,4 @@
-"""What is intact in a damaged map file, as a sound map.
+"""What is intact in a damaged map file, as a valid map.
 
 Every chunk is looked for on its own (:mod:`triquad_format.chunk_scan`). Where the manifest is
 intact, it tells what each part is and what is missing; else the parts tell of themselves.
@@ -43,7 +43,7 @@ from triquad_format.salvage import Salvage, read_messages, salvage
 def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> Recovery:
     """All that is intact in a map file, and in the files of its folder that it needs.
 
-    The result is sound. It answers as the whole map did wherever no loss reaches. Where vertices
+    The result is valid. It answers as the whole map did wherever no loss reaches. Where vertices
     are lost, evidence goes with them: so nothing there passes for known. Training state stays
     where all of a region's is intact.
 
