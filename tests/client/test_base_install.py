@@ -3,7 +3,7 @@ import sys
 
 import pytest
 from support.map_records import random_record
-from support.mapfile_surgery import file_bytes, parts_of
+from support.mapfile_edit import file_bytes, parts_of
 from triquad_format.mapfile.mapfile import read_map
 from triquad_tools.commands import pack
 

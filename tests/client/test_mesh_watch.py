@@ -176,11 +176,11 @@ def test_a_cap_makes_replies_small(client: Client) -> None:
     learn(client)
     with client.watch_mesh() as free, client.watch_mesh(max_bytes_per_s=20_000) as capped:
         free.catch_up()
-        largest = max(tile.size for tile in free.tiles.values())
+        largest = max(tile.size_bytes for tile in free.tiles.values())
         sizes = []
         while not capped.complete:
             update = capped.next(servers.WAIT_S)
-            sizes.append(update.size)
+            sizes.append(update.size_bytes)
         assert len(sizes) > 1
         assert max(sizes) <= max(20_000, largest)
         assert digests(capped) == digests(free)
@@ -417,7 +417,7 @@ def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
     ):
         learn(client, half(1))
         watch.catch_up()
-        size = sum(tile.size for tile in watch.tiles.values())
+        size = sum(tile.size_bytes for tile in watch.tiles.values())
         assert size > 500_000
         command = [sys.executable, "-c", FROZEN, server.endpoint]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as frozen:

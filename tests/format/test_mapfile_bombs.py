@@ -11,7 +11,7 @@ import pytest
 import zstandard
 from mcap.writer import IndexType
 from support.map_records import SMALL, random_record, with_levels
-from support.mapfile_surgery import (
+from support.mapfile_edit import (
     RawPart,
     edited,
     file_bytes,

@@ -27,7 +27,7 @@ class MeshUpdate:
     removed: tuple[TileIndex, ...]
     epoch: int
     complete: bool  # all tiles show this epoch
-    size: int  # bytes of the tiles as they came
+    size_bytes: int  # of the tiles as they came
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ class MeshTile:
     index: TileIndex
     version: int  # epoch of which it is
     digest: str  # SHA-256 of the bytes as they came, 64 hexadecimal digits
-    size: int  # bytes as they came
+    size_bytes: int  # as they came
     origin: NDArray[np.float64]  # [3] metres, map frame: the minimum corner
     vertices: NDArray[np.float32]  # [V, 3] metres, relative to the origin
     faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space

@@ -268,19 +268,5 @@ class MapChunk(Message):
 class ErrorReply(Message):
     """What an operation answers, as a Zenoh error reply, where it cannot do what was asked."""
 
-    code: str  # see ERROR_CODES
+    code: str  # one of triquad_format.errors.ERROR_CODES
     message: str
-
-
-ERROR_CODES = {
-    "bad_request": "the request is malformed or out of range",
-    "bad_version": "the request is of another protocol version",
-    "too_large": "the request exceeds a limit of the server; split it",
-    "epoch_gone": "the pinned epoch is no longer kept",
-    "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
-    "unknown_map": "the server has no map of this name",
-    "timeout": "the server could not finish in the time that the request allows",
-    "busy": "too many requests are waiting",
-    "store": "the checkpoint could not be written",
-    "internal": "a defect of the server; its log has the details",
-}

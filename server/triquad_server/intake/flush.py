@@ -6,11 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from triquad_format.errors import FormatError
+from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushRequest
 
-from triquad_server.errors import RequestError
 from triquad_server.intake.sources import MAX_SEQUENCE, SourceLedger
 from triquad_server.net.request import Request
 
@@ -68,13 +67,13 @@ class FlushDesk:
         """Take over a request; it is answered once its scan is settled.
 
         Raises:
-            RequestError: a field is out of range, or too many are held.
+            RefusedError: a field is out of range, or too many are held.
         """
         self._check(asks)
         now = time.monotonic()
         with self._ledger.changed:
             if self._stopping or len(self._held) >= self._limit:
-                raise RequestError("busy", f"{len(self._held)} flush requests wait already")
+                raise RefusedError("busy", f"{len(self._held)} flush requests wait already")
             held = _Held(request, asks, now + ARRIVAL_GRACE_S, now + asks.timeout_s)
             self._held.append(held)
             self._ledger.changed.notify_all()
@@ -83,15 +82,15 @@ class FlushDesk:
         try:
             keys.check_name("source", asks.source)
         except FormatError as error:
-            raise RequestError("bad_request", str(error)) from error
+            raise RefusedError("bad_request", str(error)) from error
         if not 0 <= asks.sequence < MAX_SEQUENCE:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"sequence = {asks.sequence} is out of range: use 0 to {MAX_SEQUENCE - 1}",
             )
         # Written so that NaN is refused as well.
         if not 0 <= asks.timeout_s <= self._timeout_max_s:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"timeout_s = {asks.timeout_s} is out of range: use 0 to {self._timeout_max_s:g}",
             )

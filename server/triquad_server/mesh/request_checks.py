@@ -4,11 +4,10 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.errors import FormatError
+from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import LEVELS, MAX_HELD_TILES, TileUpdatesRequest
 
-from triquad_server.errors import RequestError
 from triquad_server.mesh.mesher import TileIndex
 
 TILE_INDEX_LIMIT = 1_000_000
@@ -18,19 +17,19 @@ TILE_INDEX_LIMIT = 1_000_000
 def check_level(level: int) -> None:
     """Refuse a level of detail that there is not."""
     if not 0 <= level < LEVELS:
-        raise RequestError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
+        raise RefusedError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
 
 
 def check_box(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> None:
     """Refuse a box [3], [3] with NaN or with corners the wrong way round; infinite is allowed."""
     if np.isnan([minimum, maximum]).any() or (minimum > maximum).any():
-        raise RequestError("bad_request", f"not a box: minimum {minimum}, maximum {maximum}")
+        raise RefusedError("bad_request", f"not a box: minimum {minimum}, maximum {maximum}")
 
 
 def check_index(index: TileIndex) -> None:
     """Refuse a tile that is too far away."""
     if max(map(abs, index)) > TILE_INDEX_LIMIT:
-        raise RequestError(
+        raise RefusedError(
             "bad_request",
             f"tile {index} is out of range: use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
         )
@@ -46,14 +45,14 @@ def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
     try:
         keys.check_name("client", asks.client)
     except FormatError as error:
-        raise RequestError("bad_request", str(error)) from error
+        raise RefusedError("bad_request", str(error)) from error
     # Written so that NaN is refused as well.
     if not 0 <= asks.timeout_s < math.inf:
-        raise RequestError(
+        raise RefusedError(
             "bad_request", f"timeout_s = {asks.timeout_s} is not a time: use 0 or more"
         )
     if asks.max_bytes < 1 or asks.max_bytes_per_s < 0:
-        raise RequestError(
+        raise RefusedError(
             "bad_request",
             f"max_bytes = {asks.max_bytes}, max_bytes_per_s = {asks.max_bytes_per_s}: "
             "use at least 1, and at least 0",
@@ -61,7 +60,7 @@ def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
     _check_held(asks)
     newest = revision if asks.server == server else 0
     if asks.server in ("", server) and not 0 <= asks.revision <= newest:
-        raise RequestError(
+        raise RefusedError(
             "bad_request",
             f"revision = {asks.revision} was never given by server {asks.server!r}: "
             "use that of the reply before, or 0",
@@ -70,10 +69,10 @@ def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
 
 def _check_held(asks: TileUpdatesRequest) -> None:
     if len(asks.held) != len(asks.held_versions):
-        raise RequestError(
+        raise RefusedError(
             "bad_request", f"{len(asks.held_versions)} versions of {len(asks.held)} held tiles"
         )
     if len(asks.held) > MAX_HELD_TILES:
-        raise RequestError(
+        raise RefusedError(
             "too_large", f"{len(asks.held)} held tiles exceed the limit of {MAX_HELD_TILES}"
         )

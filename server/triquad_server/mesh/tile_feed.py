@@ -5,12 +5,12 @@ import logging
 import threading
 import time
 
+from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_map.compiled.team import be_patient
 
 from triquad_server.epochs.epochs import EpochShelf
 from triquad_server.epochs.gate import QueryGate
-from triquad_server.errors import RequestError
 from triquad_server.mesh.bandwidth import BURST_S
 from triquad_server.mesh.follower import Follower, new_follower
 from triquad_server.mesh.mesher import TileIndex
@@ -80,7 +80,7 @@ class TileFeed:
         """Take over a request; it is answered once there are tiles for it, or in time.
 
         Raises:
-            RequestError: a field is out of range, or too many are pending.
+            RefusedError: a field is out of range, or too many are pending.
         """
         check_updates(asks, self._server, self._cache.revision)
         follower = new_follower(
@@ -93,7 +93,7 @@ class TileFeed:
         with self._changed:
             waiting = len(self._pending) + self._senders.sending
             if self._stopping or waiting >= self._limit:
-                raise RequestError("busy", f"{waiting} followers of the mesh wait already")
+                raise RefusedError("busy", f"{waiting} followers of the mesh wait already")
             self._pending.append(follower)
             self._changed.notify_all()
 

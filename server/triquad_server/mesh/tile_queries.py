@@ -1,10 +1,10 @@
 """Answers to queries of single mesh tiles, and of which there are."""
 
 import numpy as np
+from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
 from triquad_server.epochs.epochs import EpochShelf
-from triquad_server.errors import RequestError
 from triquad_server.mesh.request_checks import check_box, check_index, check_level
 from triquad_server.mesh.tile_cache import TileCache
 
@@ -27,7 +27,7 @@ class TileQueries:
         epoch = self._epochs.get(request.epoch)
         tiles = epoch.tiles(request.minimum, request.maximum, request.level)
         if len(tiles) > MAX_TILES:
-            raise RequestError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
+            raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
         self._cache.refresh(epoch)
         changed = self._cache.changed(request.level, tiles)
         return TileList(

@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import zenoh
+from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
-from triquad_map.questions.answers import QuestionError
 
 from triquad_server.counter import Tally
-from triquad_server.errors import RequestError
 from triquad_server.net.request import Request
 
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[Request], None]
-"""Reads the request and answers it, or raises :class:`RequestError`."""
+"""Reads the request and answers it, or raises :class:`RefusedError`."""
 
 RequestT = TypeVar("RequestT", bound=Message)
 
@@ -27,11 +26,7 @@ def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Ha
     """A handler that decodes a ``kind`` and replies with what ``answer`` makes of it."""
 
     def handle(request: Request) -> None:
-        try:
-            reply = answer(request.read(kind))
-        except QuestionError as error:
-            raise RequestError(error.code, str(error)) from error
-        request.answer(reply)
+        request.answer(answer(request.read(kind)))
 
     return handle
 
@@ -113,8 +108,8 @@ class RequestHandlers:
         while (job := self._jobs.get()) is not None:
             try:
                 job.handler(job.request)
-            except RequestError as error:
-                job.request.refuse(error.code, str(error))
+            except RefusedError as error:
+                job.request.refuse(error.code, error.message)
             except Exception as error:
                 _log.exception("a request met an internal error")
                 job.request.refuse("internal", f"{type(error).__name__}: {error}")

@@ -52,7 +52,7 @@ def _differences(offline: OfflineMap, epoch: Epoch, points: NDArray[np.float64])
     field, live_field = offline.query_sdf(points), epoch.query(points)
     have, want = offline.query_distance(points), distances(epoch, points, DistanceOptions())
     sdf_m = np.quantile(np.abs(field.sdf - live_field.sdf), 0.99)
-    distance_m = np.quantile(np.abs(have.distance - want.distance), 0.99)
+    distance_m = np.quantile(np.abs(have.distance_m - want.distance_m), 0.99)
     equal = np.mean((field.status == live_field.status) & (have.status == want.status))
     return [
         Figure("offline against live, SDF, 99 %", 1e3 * float(sdf_m), "mm", at_most=1),
