@@ -2,10 +2,14 @@
 
 The table is derived, not copied. On each face of a cell, every run of solid corners is cut off by
 one segment; so two solid corners that face each other across a face are never joined. What happens
-on a face hangs on its four corners alone: cells on both sides of it agree. The segments of the six
-faces join into loops, and each loop is filled by a fan.
+on a face depends on its four corners alone: cells on both sides of it agree. The segments of the
+six faces join into loops, and each loop is filled by a fan.
 
 Vertices lie on lattice edges, so each is named by the edge's lower lattice point and its axis.
+
+:func:`skimage.measure.marching_cubes` finds the same vertices (a test holds them equal); this one
+searches only the cells it is given, names the edges, on which neighbouring tiles meet exactly, and
+takes 4 ms for a tile of 64^3 cells, without Python's lock: the other takes 8 ms and holds it.
 """
 
 import numba
@@ -163,7 +167,7 @@ class Crossings:
         """Find the surface, where the distance is 0.
 
         Args:
-            cells: [C, 3] cells to look into, by their lower lattice points.
+            cells: [C, 3] cells to search, by their lower lattice points.
             volume: [S, S, S] distances at the lattice points.
         """
         solid, triangles = _configurations(cells, volume, COUNTS)

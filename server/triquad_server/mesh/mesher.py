@@ -3,7 +3,7 @@
 Lattice points are multiples of the cell, whatever the tile, so neighbouring tiles share the
 points of their common face and meet without seams, also where they were meshed at different
 times: the later one takes over the values of the earlier one there. Only faces where the evidence
-saw a surface are kept: elsewhere the field has zeros that nobody taught it.
+saw a surface are kept: elsewhere the field has zeros that no ray taught it.
 """
 
 import functools
@@ -49,8 +49,8 @@ class TileMesh:
         return TileSurface(self.points, self.axes, steps, self.faces)
 
 
-class Distances(Protocol):
-    """What the mesher asks of an epoch."""
+class SurfaceSource(Protocol):
+    """What the mesher asks of a map: its distances, and where a surface was seen."""
 
     def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
         """Signed distances [N] at points [N, 3], metres."""
@@ -60,7 +60,7 @@ class Distances(Protocol):
 
 
 def mesh_tile(
-    source: Distances,
+    source: SurfaceSource,
     tile: TileIndex,
     lattice: TileLattice,
     around: TileBorder | None = None,
@@ -94,13 +94,13 @@ def mesh_tile(
 
 
 def _seen_cells(
-    source: Distances, first: NDArray[np.int64], lattice: TileLattice
+    source: SurfaceSource, first: NDArray[np.int64], lattice: TileLattice
 ) -> NDArray[np.int64]:
     """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
     reach_m = lattice.cell_m / 2 + lattice.reach_m
     groups = _grid(-(-lattice.cells // lattice.group)) * lattice.group
     centres = _positions(groups, lattice.group / 2, first, lattice.cell_m)
-    # A group is looked into where any of its cells may be such.
+    # A group is searched where any of its cells may be such.
     wide = lattice.cell_m * (lattice.group - 1) / 2 + reach_m
     groups = groups[source.status(centres, wide) == Status.SURFACE]
     cells = _cells_of(groups, lattice.group, lattice.cells)
@@ -188,7 +188,7 @@ def _corners(seen: NDArray[np.int64], volume: NDArray[np.float32]) -> NDArray[np
 
 
 def _lattice_values(
-    source: Distances,
+    source: SurfaceSource,
     seen: NDArray[np.int64],
     first: NDArray[np.int64],
     lattice: TileLattice,
