@@ -24,8 +24,9 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.session import NetworkOptions, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
+from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.retention import Retention
-from triquad_server.store.store import Restored, Store
+from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
 
 MAP = "default"
@@ -69,7 +70,7 @@ def running_service(
     endpoint = free_endpoint()
     network = NetworkOptions((endpoint,), connect, multicast_scouting=False)
     opened = Store(store, map_name, Retention.chosen(settings.store)) if store else None
-    restored: Restored | None = opened.newest() if opened else None
+    restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
     info = restored.info if restored else None
     session = open_session(network)

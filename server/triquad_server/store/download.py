@@ -50,7 +50,12 @@ class MapDownloads:
         buffer, stamp_ns = io.BytesIO(), stamp_now_ns()
         previews = previews_of(record, distances=newest.distances, stamp_ns=stamp_ns)
         written = write_map(record, buffer, stamp_ns=stamp_ns, previews=previews)
-        info = MapInfo(written.epoch, written.bytes, written.sha256, CHUNK_BYTES)
+        info = MapInfo(
+            epoch=written.epoch,
+            bytes=written.bytes,
+            sha256=written.sha256,
+            chunk_bytes=CHUNK_BYTES,
+        )
         with self._lock:
             self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())
             while len(self._files) > FILES_KEPT:
