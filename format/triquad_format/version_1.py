@@ -237,7 +237,7 @@ def _unpack_training(
         mlp_steps=body.count("mlp_steps"),
         sample_points=points,
         sample_labels=labels,
-        visits_owed=body.count("visits_owed"),
+        budget_samples=body.count("visits_owed"),
     )
 
 

@@ -163,7 +163,7 @@ def _training(mlp: Mlp, tables: tuple[VertexTable, ...]) -> TrainingState:
         mlp_steps=7,
         sample_points=np.ones((_POINTS, 3), np.float32),
         sample_labels=np.ones(_POINTS, np.float16),
-        visits_owed=9,
+        budget_samples=9,
     )
 
 
