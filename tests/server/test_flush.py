@@ -1,5 +1,6 @@
 import math
 import queue
+import threading
 from contextlib import closing
 
 import pytest
@@ -79,6 +80,35 @@ def test_an_internal_error_ends_one_request_and_no_other(handler):
     assert bad.reply == "internal"
     handler.add(good, asks())
     assert good.reply == FlushReply(0, 0, 1, None)
+
+
+def test_a_scan_that_stays_out_of_the_map_ends_in_a_timeout(handler, ledger):
+    ledger.arrive(servers.scan(0))
+    request = PendingRequest()
+    handler.add(request, asks(timeout_s=0.01))
+    assert request.reply == "timeout"
+
+
+def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
+    asked = threading.Event()
+    with closing(FlushHandler(ledger, asked.set, 600.0, 8)) as handler:
+        handler.start()
+        request = PendingRequest()
+        ledger.arrive(servers.scan(0))
+        handler.add(request, asks())
+        ledger.take(servers.scan(0))
+        assert asked.wait(servers.WAIT_S)
+        ledger.publish()
+        assert request.reply == FlushReply(1, 0, 0, None)
+
+
+def test_pending_requests_are_refused_when_the_server_stops(ledger):
+    request = PendingRequest()
+    with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
+        handler.start()
+        ledger.arrive(servers.scan(0))
+        handler.add(request, asks())
+    assert request.reply == "timeout"
 
 
 def test_questions_about_strangers_push_nobody_out(handler, ledger, monkeypatch):

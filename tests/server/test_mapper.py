@@ -2,11 +2,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from support.small_world import settings, settle, settled_mapper, surface_error, world
 from triquad_format.records.status import Status
+from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.intake.scan import ScanRefusedError
+from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import parse_settings
+from triquad_server.threads import Teams
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
@@ -168,6 +172,24 @@ def test_the_number_of_regions_is_bounded() -> None:
         mapper.ingest(scan.points, scan.world_from_sensor)
     assert refusal.value.reason == "too_many_regions"
     assert mapper.publish().regions == 0
+
+
+def test_neighbouring_regions_start_differently() -> None:
+    """Numbers that are hashed alike, such as -1 and -2, are no exception."""
+    chosen = settings()
+    setup = RegionSetup(
+        field=chosen.field,
+        scan=chosen.scan,
+        training=chosen.training,
+        device=torch.device("cpu"),
+        sums=GradientSums(),
+        team=Teams().mapping,
+    )
+    indices = [(x, y, 0) for x in range(-3, 3) for y in range(-3, 3)]
+    starts = [LiveRegion.unseen(index, setup).field.frequencies for index in indices]
+    assert len({tuple(start.tolist()) for start in starts}) == len(indices)
+    again = LiveRegion.unseen(indices[0], setup).field.frequencies
+    assert torch.equal(again, starts[0])
 
 
 def test_a_refused_scan_changes_nothing() -> None:

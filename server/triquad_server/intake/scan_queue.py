@@ -97,7 +97,7 @@ class ScanIntake:
         for sample in self._subscriber:
             try:
                 self._receive(str(sample.key_expr), sample.payload)
-            except Exception:  # a defect must not stop the intake of all other scans
+            except Exception:  # an internal error must not stop the intake of other scans
                 self._dropped.add("internal")
                 _log.exception("a scan on %s could not be received", sample.key_expr)
             self._arrived()

@@ -48,13 +48,6 @@ class _Command:
     run: Callable[[Mapper], Any]
     result: Future[Any]
 
-    def carry_out(self, mapper: Mapper) -> None:
-        """Run it; whoever waits gets the result or the error."""
-        try:
-            self.result.set_result(self.run(mapper))
-        except BaseException as error:
-            self.result.set_exception(error)
-
 
 @dataclass(frozen=True)
 class MapperInputs:
@@ -180,8 +173,14 @@ class MapperThread:
 
     def _run_commands(self) -> None:
         while (command := self._next_command()) is not None:
-            command.carry_out(self._mapper)
-            self._publish()
+            try:
+                result = command.run(self._mapper)
+                self._publish()  # first: whoever gets the result may ask for its epoch
+            except BaseException as error:
+                self._unpublished = True
+                command.result.set_exception(error)
+            else:
+                command.result.set_result(result)
 
     def _next_command(self) -> _Command | None:
         with self._lock:
