@@ -9,9 +9,9 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 """
 
 from triquad_format import __version__
+from triquad_format.errors import MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
-from triquad_map.errors import TriquadError, UnknownSpaceError
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances
 from triquad_map.questions.grid import Grid
@@ -19,7 +19,7 @@ from triquad_map.questions.polyline import Polyline
 from triquad_map.questions.rays import Rays
 from triquad_map.questions.segments import Segments
 from triquad_map.questions.spheres import Spheres
-from triquad_map.unknown import Unknown
+from triquad_map.unknown import Unknown, UnknownSpaceError
 
 from triquad_client.async_client import AsyncClient, connect_async
 from triquad_client.calls.async_queries import AsyncPinnedMap
@@ -36,7 +36,6 @@ from triquad_client.errors import (
     InvalidInputError,
     InvalidScanError,
     NoReplyError,
-    RefusedError,
     RequestTimeoutError,
     UnknownMapError,
 )
@@ -67,6 +66,7 @@ __all__ = [
     "HeldTiles",
     "InvalidInputError",
     "InvalidScanError",
+    "MapFileError",
     "MapInfo",
     "MapQueries",
     "Mesh",

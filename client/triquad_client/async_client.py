@@ -52,21 +52,21 @@ class AsyncClient(AsyncMapQueries):
         self,
         points: ArrayLike,
         world_from_sensor: ArrayLike,
-        stamp: float | None = None,
+        stamp_s: float | None = None,
         source: str = "default",
     ) -> None:
         """As :meth:`Client.publish_scan`; scans go out in the order of the calls."""
         await self._driver.in_order(
-            lambda: self._scans.publish(points, world_from_sensor, stamp, source)
+            lambda: self._scans.publish(points, world_from_sensor, stamp_s, source)
         )
 
-    async def flush(self, timeout: float = 30.0, pending: int = 0) -> FlushReport:
+    async def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
         """As :meth:`Client.flush`."""
-        return await self._run(self._scans.flush(timeout, pending))
+        return await self._run(self._scans.flush(timeout_s, pending))
 
-    async def settle(self, timeout: float = 600.0) -> ServerStatus:
+    async def settle(self, timeout_s: float = 600.0) -> ServerStatus:
         """As :meth:`Client.settle`."""
-        return await self._run(admin.settle(timeout))
+        return await self._run(admin.settle(timeout_s))
 
     async def pinned(self) -> AsyncPinnedMap:
         """As :meth:`Client.pinned`."""

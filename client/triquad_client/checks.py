@@ -83,15 +83,15 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
     return exact
 
 
-def stamp_ns(stamp: float) -> int:
+def stamp_ns(stamp_s: float) -> int:
     """A stamp in seconds since 1970 as nanoseconds.
 
     Raises:
         InvalidScanError: it is not a time.
     """
-    if not math.isfinite(stamp) or not 0 <= stamp < 2**63 / 1e9:
-        raise InvalidScanError(f"stamp = {stamp!r} is not a time in seconds since 1970")
-    return round(stamp * 1e9)
+    if not math.isfinite(stamp_s) or not 0 <= stamp_s < 2**63 / 1e9:
+        raise InvalidScanError(f"stamp_s = {stamp_s!r} is not a time in seconds since 1970")
+    return round(stamp_s * 1e9)
 
 
 def epoch(number: int) -> int:
@@ -215,7 +215,7 @@ def radii(values: ArrayLike, count: int) -> NDArray[np.float32]:
     try:
         array = np.broadcast_to(np.asarray(values, np.float32), (count,))
     except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"radii are not one number or {count}: {error}") from error
+        raise InvalidInputError(f"radii_m are not one number or {count}: {error}") from error
     bad = ~(np.isfinite(array) & (array >= 0))
     if bad.any():
         index = int(bad.argmax())

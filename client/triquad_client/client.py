@@ -61,7 +61,7 @@ class Client(MapQueries):
         self,
         points: ArrayLike,
         world_from_sensor: ArrayLike,
-        stamp: float | None = None,
+        stamp_s: float | None = None,
         source: str = "default",
     ) -> None:
         """Send a scan to be learnt. Returns once it is handed to the network.
@@ -69,19 +69,18 @@ class Client(MapQueries):
         Args:
             points: [N, 3] metres, sensor frame; points that are not finite are left out.
             world_from_sensor: [4, 4] rigid pose of the sensor in the map frame.
-            stamp: seconds since 1970, never running backwards within a source; ``None``: now.
+            stamp_s: since 1970, never running backwards within a source; ``None``: now.
             source: name of the sensor.
 
         Raises:
             InvalidScanError: the scan cannot be used; nothing was sent.
         """
-        self._scans.publish(points, world_from_sensor, stamp, source)
+        self._scans.publish(points, world_from_sensor, stamp_s, source)
 
-    def flush(self, timeout: float = 30.0, pending: int = 0) -> FlushReport:
+    def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
         """Wait until what this client published is dealt with and queries see it.
 
         Args:
-            timeout: seconds.
             pending: number of scans that may still be under way: more than 0 lets a fast
                 publisher run ahead of the server by so many.
 
@@ -91,18 +90,15 @@ class Client(MapQueries):
         Raises:
             RefusedError: ``timeout``.
         """
-        return self._run(self._scans.flush(timeout, pending))
+        return self._run(self._scans.flush(timeout_s, pending))
 
-    def settle(self, timeout: float = 600.0) -> ServerStatus:
+    def settle(self, timeout_s: float = 600.0) -> ServerStatus:
         """Wait until the server has nothing left to learn from the scans that reached it.
 
-        Args:
-            timeout: seconds.
-
         Raises:
-            RequestTimeoutError: it still had after that time.
+            RequestTimeoutError: it still had some after ``timeout_s``.
         """
-        return self._run(admin.settle(timeout))
+        return self._run(admin.settle(timeout_s))
 
     def pinned(self) -> PinnedMap:
         """The map as it is now, for queries that belong together."""
@@ -176,7 +172,8 @@ class Client(MapQueries):
     def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
         """Write to a file what the newest map needs to answer within ``bounds``.
 
-        Only the file's index and the parts that the box needs are sent.
+        Only the file's index and the parts that the box needs are sent. The file has no preview
+        for MCAP viewers: ``triquad-pack`` adds one.
 
         Args:
             path: the file; an older one is replaced.

@@ -57,7 +57,7 @@ def assert_same_answers(local, client, points=POINTS):
     have, want = local.query_distance(points), client.query_distance(points)
     assert have.epoch == want.epoch
     np.testing.assert_array_equal(have.status, want.status)
-    assert np.quantile(np.abs(have.distance - want.distance), 0.99) < 1e-3
+    assert np.quantile(np.abs(have.distance_m - want.distance_m), 0.99) < 1e-3
 
 
 def test_a_copy_answers_as_the_server(client, tmp_path):
@@ -68,7 +68,7 @@ def test_a_copy_answers_as_the_server(client, tmp_path):
     assert_same_answers(local, client, POINTS + (FAR_M, 0, 0))
     with triquad_client.open_map(path) as offline:
         again = offline.query_distance(POINTS)
-    np.testing.assert_array_equal(again.distance, local.query_distance(POINTS).distance)
+    np.testing.assert_array_equal(again.distance_m, local.query_distance(POINTS).distance_m)
 
 
 def test_a_copy_holds_what_its_box_needs_and_no_more(client, tmp_path):
@@ -137,7 +137,7 @@ def test_it_goes_on_answering_while_the_server_is_gone(tmp_path):
     with pytest.raises(ConnectError, match="down"):
         local.refresh()
     assert local.age_s > age_s
-    np.testing.assert_array_equal(local.query_distance(POINTS).distance, before.distance)
+    np.testing.assert_array_equal(local.query_distance(POINTS).distance_m, before.distance_m)
     assert triquad_client.open_map(path).epoch == before.epoch
     with client, servers.server_process(options, endpoint=server.endpoint):
         assert refreshed_once_linked(local).parts_kept > 0
@@ -262,7 +262,7 @@ def test_copies_for_event_loops(endpoint, client, tmp_path):
             answers = await asyncio.gather(*(local.query_distance(POINTS) for _ in range(4)))
             want = client.query_distance(POINTS)
             for answer in answers:
-                assert np.quantile(np.abs(answer.distance - want.distance), 0.99) < 1e-3
+                assert np.quantile(np.abs(answer.distance_m - want.distance_m), 0.99) < 1e-3
             assert (await local.refresh()).bytes_received == 0
             assert local.age_s >= 0
         with pytest.raises(ClosedError):

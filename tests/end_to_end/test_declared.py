@@ -50,11 +50,11 @@ def imported(folder: str) -> set[str]:
 @pytest.mark.parametrize(
     ("folder", "extras"),
     [
-        ("format", ("draco",)),
+        ("format", ()),
         ("client", ()),
         ("map", ("fast",)),
-        ("server", ("fast", "server")),
-        ("tools", ("fast", "server", "tools")),
+        ("server", ("fast", "preview", "server")),
+        ("tools", ("fast", "preview", "server", "tools")),
     ],
 )
 def test_what_is_imported_is_declared(folder, extras):
@@ -64,4 +64,4 @@ def test_what_is_imported_is_declared(folder, extras):
 def test_what_is_declared_is_imported():
     folders = ("format", "map", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
-    assert declared("fast", "server", "tools", "draco") <= used
+    assert declared("fast", "preview", "server", "tools") <= used

@@ -8,7 +8,7 @@ import shutil
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 from support.map_records import assert_same, random_record, with_integers
-from support.mapfile_surgery import (
+from support.mapfile_edit import (
     file_bytes,
     metadata_of,
     parts_of,

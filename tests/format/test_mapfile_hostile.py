@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from support.map_records import random_record, with_integers, with_levels
-from support.mapfile_surgery import (
+from support.mapfile_edit import (
     RawPart,
     all_of,
     edited,

@@ -5,9 +5,9 @@ import re
 from pathlib import Path
 
 import pytest
+from triquad_format.errors import ERROR_CODES
 from triquad_format.wire import keys, messages, query_messages
 from triquad_format.wire.codec import Message
-from triquad_format.wire.messages import ERROR_CODES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-protocol.md").read_text(encoding="utf-8")
 PASSAGES = re.split(r"^(?:#{2,3} |(?=`[A-Z]\w+`))", PAGE, flags=re.MULTILINE)

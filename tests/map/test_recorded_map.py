@@ -119,8 +119,8 @@ def test_distances_are_the_same(ground):
     assert not want.found.all()
     np.testing.assert_array_equal(have.found, want.found)
     np.testing.assert_array_equal(have.status, want.status)
-    np.testing.assert_allclose(have.distance, want.distance, atol=1e-5)
-    np.testing.assert_allclose(have.unknown_distance, want.unknown_distance, atol=1e-5)
+    np.testing.assert_allclose(have.distance_m, want.distance_m, atol=1e-5)
+    np.testing.assert_allclose(have.unknown_distance_m, want.unknown_distance_m, atol=1e-5)
     np.testing.assert_allclose(have.confidence, want.confidence, atol=1e-6)
     gaps = np.linalg.norm(points - have.surface_point, axis=1)
     wanted_gaps = np.linalg.norm(points - want.surface_point, axis=1)
@@ -140,13 +140,13 @@ def test_answers_of_planners_are_the_same(ground):
     for through in (False, True):
         have, want = (rays(v, starts, ways, RayOptions(15.0, through)) for v in ground)
         np.testing.assert_array_equal(have.status, want.status)
-        np.testing.assert_allclose(have.range, want.range, atol=1e-3)
+        np.testing.assert_allclose(have.range_m, want.range_m, atol=1e-3)
     have, want = (segments(v, starts, ends, SegmentOptions(0.2, 2.0)) for v in ground)
     for name, value in vars(want).items():
         np.testing.assert_allclose(getattr(have, name), value, atol=1e-3, err_msg=name)
     shape = GridShape(np.array([-3.0, -3.0, -1.0]), 0.5, (12, 12, 4))
     have, want = (grid(view, shape, 3.0) for view in ground)
-    np.testing.assert_allclose(have.distance, want.distance, atol=1e-5)
+    np.testing.assert_allclose(have.distance_m, want.distance_m, atol=1e-5)
     np.testing.assert_array_equal(have.status, want.status)
 
 
@@ -158,7 +158,7 @@ def test_maps_of_several_regions_answer_alike(seed, indices):
     have, want = (distances(v, points, DistanceOptions(6.0)) for v in both(record))
     np.testing.assert_array_equal(have.status, want.status)
     # Where a random field makes a surfel a disc or a point may hang on the last bit.
-    same = np.abs(have.distance - want.distance) < 1e-3
+    same = np.abs(have.distance_m - want.distance_m) < 1e-3
     assert same.mean() > 0.98
     assert (np.abs(have.confidence - want.confidence) < 1e-6)[same].mean() > 0.98
 
@@ -169,7 +169,7 @@ def test_a_map_of_which_nothing_is_known(ground):
         assert view.number == 3
         assert not answer.found.any()
         assert not answer.status.any()
-        assert not answer.unknown_distance.any()
+        assert not answer.unknown_distance_m.any()
         assert np.isnan(view.query(places(10)).sdf).all()
 
 
@@ -187,7 +187,7 @@ def test_points_far_from_the_map_are_unknown_however_far_apart(ground):
 def test_no_points_get_no_answers(ground):
     for view in ground:
         answer = distances(view, np.zeros((0, 3)), DistanceOptions(unknown_distance=True))
-        assert len(answer.distance) == len(answer.gradient) == 0
+        assert len(answer.distance_m) == len(answer.gradient) == 0
 
 
 def test_surfels_are_fitted_once_however_many_threads_ask(ground):

@@ -1,13 +1,12 @@
 import dataclasses
 import itertools
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.map_records import SMALL, assert_same, random_record, with_integers
-from support.mapfile_surgery import edited, file_bytes, set_array, stored, write_pair, write_record
-from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError, NoIndexError
+from support.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
+from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.mapfile.random_access import FileBytes
 from triquad_format.records import morton
@@ -17,7 +16,6 @@ from triquad_format.records.region import AXES
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.stored_map import StoredMap
 
-VERSION_1 = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 WIDE = dataclasses.replace(SMALL, depth=11, feature_levels=4)
 """A region of 512 m: 8 squares of 64 m along each side."""
@@ -41,7 +39,7 @@ def near_borders(settings, count, seed):
 def test_opening_and_asking_at_one_place_reads_index_and_tile_alone(tmp_path):
     record = random_record(40, settings=FieldSettings(), points=20_000)
     path = tmp_path / "map.triquad"
-    write_map(record, path, preview=False)
+    write_map(record, path)
     source = FileBytes(path)
     with StoredMap(source) as map_file:
         opened = source.bytes_read
@@ -97,7 +95,7 @@ def test_far_from_the_centre_rounding_does_not_leave_a_square(tmp_path):
     record = dataclasses.replace(record, regions=(covering(region, settings, leaves),))
     whole = MapEvaluator(record)
     path = tmp_path / "map.triquad"
-    write_map(record, path, feature_dtype="<f4", preview=False)
+    write_map(record, path, feature_dtype="<f4")
     for point in points:
         with StoredMap.open(path) as map_file:
             answer = map_file.query(point[None], gradient=True)
@@ -129,7 +127,7 @@ BOXES = [
 def test_a_box_holds_what_it_needs(tmp_path, low, high):
     record = random_record(44, settings=WIDE, points=3000)
     path = tmp_path / "map.triquad"
-    write_map(record, path, preview=False)
+    write_map(record, path)
     with StoredMap.open(path) as map_file:
         cropped = crop_record(map_file.box(low, high), low, high)
     wanted = without_training(crop_record(read_map(path), low, high))
@@ -150,7 +148,7 @@ def assert_same_places(have, want):
 
 def test_a_small_box_is_read_from_few_parts(tmp_path):
     path = tmp_path / "map.triquad"
-    write_map(random_record(44, settings=WIDE, points=3000), path, preview=False)
+    write_map(random_record(44, settings=WIDE, points=3000), path)
     source = FileBytes(path)
     with StoredMap(source) as map_file:
         map_file.box([-1, -1, -1], [1, 1, 1])
@@ -179,11 +177,6 @@ def test_outside_of_all_regions_nothing_is_known():
         assert len(map_file.query(np.zeros((0, 3))).sdf) == 0
 
 
-def test_version_1_has_no_index():
-    with pytest.raises(NoIndexError, match="version 1"):
-        StoredMap.open(VERSION_1)
-
-
 # A file that changes while it is open
 
 
@@ -210,7 +203,7 @@ def test_a_replaced_file_answers_as_before(tmp_path):
 def test_a_file_cut_meanwhile_is_named(tmp_path):
     record = random_record(46, indices=((0, 0, 0), (3, 0, 0)))
     path = tmp_path / "map.triquad"
-    write_map(record, path, preview=False)
+    write_map(record, path)
     far = np.array([[36.0, 0.0, 0.0]])
     with StoredMap.open(path) as map_file:
         near = map_file.query(np.zeros((1, 3)))

@@ -3,11 +3,11 @@ from dataclasses import dataclass
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.compiled_view import in_one
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory, EpochLimits
-from triquad_server.errors import RequestError
 
 
 @dataclass
@@ -31,7 +31,7 @@ def history(
 def is_gone(epochs: EpochHistory, number: int) -> bool:
     try:
         found = epochs.get(number)
-    except RequestError as error:
+    except RefusedError as error:
         return error.code == "epoch_gone"
     assert found.number == number  # never another one
     return False
@@ -49,7 +49,7 @@ def test_older_epochs_that_nobody_asked_for_go():
     for number in (2, 3):
         epochs.get(0)
         epochs.add(epoch(number))
-    with pytest.raises(RequestError, match=r"epoch 1 is not kept; kept are \[2, 3\]") as caught:
+    with pytest.raises(RefusedError, match=r"epoch 1 is not kept; kept are \[2, 3\]") as caught:
         epochs.get(1)
     assert caught.value.code == "epoch_gone"
 

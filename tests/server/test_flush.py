@@ -5,8 +5,8 @@ from contextlib import closing
 
 import pytest
 from support import servers
+from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import FlushReply, FlushRequest
-from triquad_server.errors import RequestError
 from triquad_server.intake import flush, sources
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.sources import SourceLedger
@@ -66,7 +66,7 @@ def asks(sequence: int = 0, **changes: object) -> FlushRequest:
     ],
 )
 def test_requests_out_of_range_are_refused_and_others_are_answered(handler, request_):
-    with pytest.raises(RequestError) as caught:
+    with pytest.raises(RefusedError) as caught:
         handler.add(PendingRequest(), request_)
     assert caught.value.code == "bad_request"
     good = PendingRequest()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.map_records import SMALL, assert_same, random_record, with_levels
-from support.mapfile_surgery import (
+from support.mapfile_edit import (
     edited,
     file_bytes,
     manifest_of,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from support.map_records import random_record
-from support.mapfile_surgery import file_bytes
+from support.mapfile_edit import file_bytes
 from support.small_world import settings, settled_mapper, world
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.records.crop import crop_record
@@ -144,7 +144,7 @@ def test_refusals(map_file, tmp_path, capsys):
 
 def test_regions_too_far_for_a_mesh_are_told(tmp_path, capsys):
     record = random_record(0, indices=((2**31 - 1, 0, 0),))
-    write_map(record, tmp_path / "far.triquad", preview=False)
+    write_map(record, tmp_path / "far.triquad")
     assert main([str(tmp_path / "far.triquad"), str(tmp_path / "far.ply")]) == 2
     assert "too far from the origin" in capsys.readouterr().err
     assert not (tmp_path / "far.ply").exists()

@@ -2,14 +2,13 @@ import dataclasses
 import io
 import itertools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from support.checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoints
 from support.map_records import SMALL, assert_same, random_record
-from support.mapfile_surgery import with_metadata
+from support.mapfile_edit import file_bytes, with_metadata, without_index
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.mapfile import read_map, read_map_file, write_map
 from triquad_format.records.crop import crop_record, without_training
@@ -18,14 +17,13 @@ from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.stored_map import StoredMap
 from triquad_tools.commands.pack import main
 
-VERSION_1 = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 
 
 @pytest.fixture
 def map_file(tmp_path):
     path = tmp_path / "in.triquad"
-    write_map(random_record(1, indices=CUBE, points=200), path)
+    path.write_bytes(file_bytes(random_record(1, indices=CUBE, points=200), preview=True))
     return path
 
 
@@ -135,7 +133,7 @@ def test_tool_packs(map_file, tmp_path, capsys):
 def test_tool_changes_precision(tmp_path):
     record = random_record(7, feature_dtype="<f4")
     fine, coarse = tmp_path / "fine.triquad", tmp_path / "coarse.triquad"
-    write_map(record, fine, feature_dtype="<f4")
+    fine.write_bytes(file_bytes(record, preview=True, feature_dtype="<f4"))
     assert main([str(fine), str(coarse), "--precision", "fp16"]) == 0
     assert read_map(coarse).regions[0].tables[0].features.dtype == np.float16
     again = tmp_path / "again.triquad"
@@ -177,7 +175,7 @@ def test_tool_reads_only_what_the_box_needs(tmp_path, capsys):
     wide = dataclasses.replace(SMALL, depth=10)
     source, out = tmp_path / "in.triquad", tmp_path / "out.triquad"
     record = random_record(2, settings=wide, points=2000, training=False)
-    write_map(record, source, preview=False)
+    write_map(record, source)
     box = ["--crop", "-60", "-60", "-60", "-40", "-40", "-40"]
     assert main([str(source), str(out), *box]) == 0
     assert_same(read_map(out), crop_record(record, [-60] * 3, [-40] * 3))
@@ -223,17 +221,15 @@ def test_tool_takes_an_epoch_of_a_store(tmp_path, capsys):
     assert_same(read_map(out).regions, map_at(9).regions[1:])
 
 
-def test_tool_rewrites_version_1_in_the_newest(tmp_path):
-    out = tmp_path / "out.triquad"
-    assert main([str(VERSION_1), str(out)]) == 0
-    file = read_map_file(out)
-    assert file.metadata["format_version"] == "2"
-    assert_same(file.record, read_map(VERSION_1))
+def test_tool_gives_a_file_without_index_one(map_file, tmp_path):
+    out, record = tmp_path / "out.triquad", read_map(map_file)
+    map_file.write_bytes(without_index(map_file.read_bytes()))
+    assert main([str(map_file), str(out)]) == 0
     with StoredMap.open(out) as stored:
-        assert_same(stored.record(), file.record)
+        assert_same(stored.record(), record)
     box = ["--crop", "-1", "-1", "-1", "1", "1", "1", "--no-training", "--force"]
-    assert main([str(VERSION_1), str(out), *box]) == 0
-    expected = crop_record(without_training(file.record), [-1] * 3, [1] * 3)
+    assert main([str(map_file), str(out), *box]) == 0
+    expected = crop_record(without_training(record), [-1] * 3, [1] * 3)
     assert_same(read_map(out), expected)
 
 

@@ -47,7 +47,7 @@ class AsyncMapQueries:
     async def query_distance(
         self,
         points: ArrayLike,
-        max_distance: float = 5.0,
+        max_distance_m: float = 5.0,
         *,
         unknown: Unknown | str = Unknown.FREE,
         surface_point: bool = False,
@@ -55,69 +55,69 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> Distances:
         """As :meth:`MapQueries.query_distance`."""
-        options = DistanceOptions(max_distance, surface_point, unknown_distance)
+        options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
         return await self._run(distance.query(points, options, unknown, self._chosen(at_epoch)))
 
     async def query_spheres(
-        self, centres: ArrayLike, radii: ArrayLike, at_epoch: int | None = None
+        self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Spheres:
         """As :meth:`MapQueries.query_spheres`."""
-        return await self._run(spheres.query(centres, radii, self._chosen(at_epoch)))
+        return await self._run(spheres.query(centres, radii_m, self._chosen(at_epoch)))
 
     async def query_segments(
         self,
         starts: ArrayLike,
         ends: ArrayLike,
-        radius: float = 0.0,
-        max_distance: float = 5.0,
+        radius_m: float = 0.0,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Segments:
         """As :meth:`MapQueries.query_segments`."""
-        options = SegmentOptions(radius, max_distance)
+        options = SegmentOptions(radius_m, max_distance_m)
         return await self._run(segments.query(starts, ends, options, self._chosen(at_epoch)))
 
     async def query_polyline(
         self,
         points: ArrayLike,
-        radius: float = 0.0,
-        max_distance: float = 5.0,
+        radius_m: float = 0.0,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Polyline:
         """As :meth:`MapQueries.query_polyline`."""
-        options = SegmentOptions(radius, max_distance)
+        options = SegmentOptions(radius_m, max_distance_m)
         return await self._run(segments.query_polyline(points, options, self._chosen(at_epoch)))
 
     async def query_rays(
         self,
         origins: ArrayLike,
         directions: ArrayLike,
-        max_range: float = 50.0,
+        max_range_m: float = 50.0,
         through_unknown: bool = False,
         at_epoch: int | None = None,
     ) -> Rays:
         """As :meth:`MapQueries.query_rays`."""
-        options = RayOptions(max_range, through_unknown)
+        options = RayOptions(max_range_m, through_unknown)
         return await self._run(rays.query(origins, directions, options, self._chosen(at_epoch)))
 
     async def query_grid(
         self,
         bounds: Bounds,
-        cell: float = 0.1,
-        max_distance: float = 5.0,
+        cell_m: float = 0.1,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Grid:
         """As :meth:`MapQueries.query_grid`."""
-        return await self._run(grid.query(bounds, cell, max_distance, self._chosen(at_epoch)))
+        return await self._run(grid.query(bounds, cell_m, max_distance_m, self._chosen(at_epoch)))
 
     async def align(
         self,
         points: ArrayLike,
         world_from_sensor_guess: ArrayLike,
-        max_distance: float = 6.0,
+        max_distance_m: float = 6.0,
         at_epoch: int | None = None,
     ) -> Alignment:
         """As :meth:`MapQueries.align`."""
-        options = AlignOptions(max_distance)
+        options = AlignOptions(max_distance_m)
         call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
         return await self._run(call)
 

@@ -26,7 +26,7 @@ def query(
     """Distances at ``points`` [N, 3] of the map frame, metres."""
     checked = checks.query_points(points)
     policy = checks.unknown_policy(unknown)
-    reach_m = checks.positive("max_distance", options.max_distance_m)
+    reach_m = checks.positive("max_distance_m", options.max_distance_m)
     with_unknown_space = options.unknown_distance or policy is not Unknown.FREE
 
     def request(part: slice, number: int) -> Ask[DistanceReply]:
@@ -63,9 +63,9 @@ def _joined(parts: Sequence[DistanceReply], points: NDArray[np.float64]) -> Dist
         ]
         return np.concatenate(given) if given else None
 
-    unknown = [part.unknown_distance for part in parts if part.unknown_distance is not None]
+    unknown = [part.unknown_distance_m for part in parts if part.unknown_distance_m is not None]
     return Distances(
-        np.concatenate([part.distance for part in parts]),
+        np.concatenate([part.distance_m for part in parts]),
         np.concatenate([part.gradient for part in parts]),
         np.concatenate([part.found for part in parts]).astype(np.bool_),
         np.concatenate([part.status for part in parts]),

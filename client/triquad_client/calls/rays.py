@@ -26,7 +26,7 @@ def query(
             f"{len(places)} origins for {len(ways)} directions: one, or as many"
         )
     starts = np.broadcast_to(places, ways.shape)
-    reach_m = checks.positive("max_range", options.max_range_m)
+    reach_m = checks.positive("max_range_m", options.max_range_m)
 
     def request(part: slice, number: int) -> Ask[RaysReply]:
         place = placed(starts[part])
@@ -43,7 +43,7 @@ def query(
     epoch = checks.chosen_epoch(at_epoch)
     parts = yield from in_parts(len(ways), PART_RAYS, request, epoch)
     return Rays(
-        np.concatenate([part.range for part in parts]),
+        np.concatenate([part.range_m for part in parts]),
         np.concatenate([part.status for part in parts]),
         parts[0].epoch,
     )

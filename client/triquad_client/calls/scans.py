@@ -53,7 +53,7 @@ class ScanPublisher:
         self,
         points: ArrayLike,
         world_from_sensor: ArrayLike,
-        stamp: float | None,
+        stamp_s: float | None,
         source: str,
     ) -> None:
         """Send a scan; arguments as in ``Client.publish_scan``."""
@@ -63,16 +63,16 @@ class ScanPublisher:
             raise InvalidScanError(str(error)) from error
         pose = checks.rigid_pose(world_from_sensor)
         cloud = np.ascontiguousarray(checks.scan_points(points))
-        stamp_ns = time.time_ns() if stamp is None else checks.stamp_ns(stamp)
+        stamp_ns = time.time_ns() if stamp_s is None else checks.stamp_ns(stamp_s)
         # Held while sending: the server takes a scan that is overtaken by its successor for lost.
         with self._sending:
             state = self._source(source)
-            if stamp_ns < state.stamp_ns and stamp is None:
+            if stamp_ns < state.stamp_ns and stamp_s is None:
                 stamp_ns = state.stamp_ns  # the system's clock was set back
             if stamp_ns < state.stamp_ns:
                 raise InvalidScanError(
-                    f"stamp = {stamp!r} lies before {state.stamp_ns / 1e9!r}, that of an earlier "
-                    f"scan of source {source!r}; publish in order",
+                    f"stamp_s = {stamp_s!r} lies before {state.stamp_ns / 1e9!r}, that of an "
+                    f"earlier scan of source {source!r}; publish in order",
                 )
             scan = Scan(cloud, pose, stamp_ns, source, self._session, state.next_sequence)
             self._connection.put(key, scan)
@@ -82,7 +82,7 @@ class ScanPublisher:
     def flush(self, timeout_s: float, pending: int) -> Call[FlushReport]:
         """Wait for the server; arguments as in ``Client.flush``."""
         if timeout_s < 0 or pending < 0:
-            raise InvalidInputError(f"timeout = {timeout_s!r}, pending = {pending!r}: negative")
+            raise InvalidInputError(f"timeout_s = {timeout_s!r}, pending = {pending!r}: negative")
         requests = list(self._requests(timeout_s, pending))
         # All at once: each waits for its source, and they share the time.
         replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))

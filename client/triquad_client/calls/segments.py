@@ -42,8 +42,8 @@ def _query(
     options: SegmentOptions,
     at_epoch: int | None,
 ) -> Call[Segments]:
-    radius_m = checks.not_negative("radius", options.radius_m)
-    reach_m = checks.positive("max_distance", options.max_distance_m)
+    radius_m = checks.not_negative("radius_m", options.radius_m)
+    reach_m = checks.positive("max_distance_m", options.max_distance_m)
 
     def request(part: slice, number: int) -> Ask[SegmentsReply]:
         place = placed(starts[part])
@@ -54,12 +54,12 @@ def _query(
     epoch = checks.chosen_epoch(at_epoch)
     parts = yield from in_parts(len(starts), PART_SEGMENTS, request, epoch)
     return Segments(
-        np.concatenate([part.length for part in parts]),
+        np.concatenate([part.length_m for part in parts]),
         np.concatenate([part.blocked for part in parts]).astype(np.bool_),
-        np.concatenate([part.contact for part in parts]),
-        np.concatenate([part.clearance for part in parts]),
-        np.concatenate([part.clearance_at for part in parts]),
+        np.concatenate([part.contact_m for part in parts]),
+        np.concatenate([part.clearance_m for part in parts]),
+        np.concatenate([part.clearance_at_m for part in parts]),
         np.concatenate([part.meets_unknown for part in parts]).astype(np.bool_),
-        np.concatenate([part.unknown_contact for part in parts]),
+        np.concatenate([part.unknown_contact_m for part in parts]),
         parts[0].epoch,
     )

@@ -12,10 +12,10 @@ from triquad_client.net.call import Ask, Call
 from triquad_client.net.parts import in_parts, placed
 
 
-def query(centres: ArrayLike, radii: ArrayLike, at_epoch: int | None) -> Call[Spheres]:
-    """What spheres around ``centres`` [N, 3] hold; ``radii`` are one number or [N], metres."""
+def query(centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None) -> Call[Spheres]:
+    """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one number or [N]."""
     checked = checks.query_points(centres)
-    sizes = checks.radii(radii, len(checked))
+    sizes = checks.radii(radii_m, len(checked))
 
     def request(part: slice, number: int) -> Ask[SpheresReply]:
         place = placed(checked[part])

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.wire import draco
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 
 from triquad_client import checks
@@ -29,7 +28,7 @@ class MeshUpdate:
     removed: tuple[TileIndex, ...]
     epoch: int
     complete: bool  # all tiles show this epoch
-    size: int  # bytes of the tiles as they came
+    size_bytes: int  # of the tiles as they came
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,6 @@ class FollowedMesh:
             wait_s,
             self.name,
             self.max_bytes_per_s,
-            draco.AVAILABLE,
         )
 
     def after(self, reply: TileUpdates, changed: Mapping[TileIndex, MeshTile]) -> "FollowedMesh":

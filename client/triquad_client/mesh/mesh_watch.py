@@ -10,9 +10,9 @@ from types import MappingProxyType, TracebackType
 from typing import Any
 
 import zenoh
+from triquad_format.errors import TriquadError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import TileUpdates
-from triquad_map.errors import TriquadError
 
 from triquad_client.calls.async_queries import AsyncRun
 from triquad_client.errors import ClosedError, RequestTimeoutError
@@ -59,8 +59,8 @@ class _Watch:
         """The tiles, for a later watch to go on with."""
         return self._followed.held()
 
-    def _next(self, timeout: float | None) -> Call[MeshUpdate | None]:
-        ends = math.inf if timeout is None else time.monotonic() + timeout
+    def _next(self, timeout_s: float | None) -> Call[MeshUpdate | None]:
+        ends = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while True:
             left_s = max(0.0, ends - time.monotonic())
             update = yield from self._update(min(left_s, _LONGEST_WAIT_S))
@@ -69,12 +69,12 @@ class _Watch:
             if time.monotonic() >= ends:
                 return None
 
-    def _catch_up(self, timeout: float) -> Call[None]:
-        ends = time.monotonic() + timeout
+    def _catch_up(self, timeout_s: float) -> Call[None]:
+        ends = time.monotonic() + timeout_s
         wait_s = 0.0
         while not (update := (yield from self._update(wait_s))).complete:
             if time.monotonic() > ends:
-                raise RequestTimeoutError(f"the mesh is not complete after {timeout:g} s")
+                raise RequestTimeoutError(f"the mesh is not complete after {timeout_s:g} s")
             # Nothing came although there is something: the bandwidth is used up for a while.
             wait_s = 0.0 if update.changed else 1.0
 
@@ -130,11 +130,11 @@ class MeshWatch(_Watch):
         """Updates as they come, until the watch is closed."""
         return iter(self.next, None)
 
-    def next(self, timeout: float | None = None) -> MeshUpdate | None:
+    def next(self, timeout_s: float | None = None) -> MeshUpdate | None:
         """Wait for the next change.
 
         Args:
-            timeout: seconds; ``None``: for ever.
+            timeout_s: how long; ``None``: for ever.
 
         Returns:
             What changed; ``None`` where nothing did in that time, or the watch was closed.
@@ -144,20 +144,17 @@ class MeshWatch(_Watch):
             RequestTimeoutError: it does not answer.
         """
         with suppress(_WatchClosedError):
-            return self._run(self._next(timeout))
+            return self._run(self._next(timeout_s))
         return None
 
-    def catch_up(self, timeout: float = 60.0) -> None:
+    def catch_up(self, timeout_s: float = 60.0) -> None:
         """Fetch all that changed until now.
-
-        Args:
-            timeout: seconds.
 
         Raises:
             RequestTimeoutError: that was not all of it.
             ClosedError: the watch was closed.
         """
-        self._run(self._catch_up(timeout))
+        self._run(self._catch_up(timeout_s))
 
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""
@@ -182,7 +179,7 @@ class AsyncMeshWatch(_Watch):
 
     Where the client is closed, what is awaited raises :class:`ClosedError`. Several tasks may use
     it: each change is told to one of them. A task that is cancelled may take a change with it,
-    which then is in :attr:`tiles` without having been told; a ``timeout`` does not.
+    which then is in :attr:`tiles` without having been told; a ``timeout_s`` does not.
     """
 
     def __init__(self, run: AsyncRun, followed: FollowedMesh) -> None:
@@ -212,15 +209,15 @@ class AsyncMeshWatch(_Watch):
             raise StopAsyncIteration
         return update
 
-    async def next(self, timeout: float | None = None) -> MeshUpdate | None:
+    async def next(self, timeout_s: float | None = None) -> MeshUpdate | None:
         """As :meth:`MeshWatch.next`."""
         with suppress(_WatchClosedError):
-            return await self._run(self._next(timeout))
+            return await self._run(self._next(timeout_s))
         return None
 
-    async def catch_up(self, timeout: float = 60.0) -> None:
+    async def catch_up(self, timeout_s: float = 60.0) -> None:
         """As :meth:`MeshWatch.catch_up`."""
-        await self._run(self._catch_up(timeout))
+        await self._run(self._catch_up(timeout_s))
 
     async def mesh(self) -> Mesh:
         """As :meth:`MeshWatch.mesh`; the tiles are joined in a thread."""

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
+from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
-
-from triquad_client.errors import RefusedError
 
 PARTS_IN_FLIGHT = 4
 """Requests of one call that wait for their replies at the same time."""

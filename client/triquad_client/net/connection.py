@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import zenoh
-from triquad_format.errors import FormatError, WireError
+from triquad_format.errors import FormatError, RefusedError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
@@ -17,7 +17,6 @@ from triquad_client.errors import (
     ConnectError,
     InvalidInputError,
     NoReplyError,
-    RefusedError,
     RequestTimeoutError,
     UnknownMapError,
 )

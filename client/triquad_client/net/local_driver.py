@@ -5,11 +5,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from triquad_format.wire.codec import Message
-from triquad_map.questions.answers import Answers, QuestionError, QuestionLimits
+from triquad_format.errors import RefusedError
+from triquad_map.questions.answers import Answers, QuestionLimits
 from triquad_map.view import MapView
 
-from triquad_client.errors import RefusedError
 from triquad_client.net.call import Batch, Call, Pause, ResultT, Step, finished
 
 _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
@@ -29,22 +28,16 @@ class LocalDriver:
 
     def _take(self, step: Step) -> Any:
         if isinstance(step, Batch):
-            return [self._answer(step.request(item).message) for item in step.items]
+            return [self._answers.answer(step.request(item).message) for item in step.items]
         if isinstance(step, Pause):
             return time.sleep(step.seconds)
         return step.job(self.run)
-
-    def _answer(self, request: Message) -> Message:
-        try:
-            return self._answers.answer(request)
-        except QuestionError as error:
-            raise RefusedError(error.code, str(error)) from error
 
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:
         """The view, where its epoch is asked for, or the newest."""
         if number not in (0, self._view.number):
-            raise QuestionError(
+            raise RefusedError(
                 "epoch_gone", f"epoch {number} is not kept; kept is [{self._view.number}]"
             )
         yield self._view

@@ -21,7 +21,6 @@ Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
 Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Epochs = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
-Codecs = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Sizes = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 Faces = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 
@@ -120,7 +119,6 @@ class TileUpdatesRequest(Message):
     timeout_s: float
     client: str  # a name, on which max_bytes_per_s is counted
     max_bytes_per_s: int  # 0: whatever the server allows
-    draco: bool  # whether the client can decode Draco
 
 
 @dataclass(frozen=True)
@@ -136,9 +134,8 @@ class TileUpdates(Message):
     cell_m: float
     tiles: TileIndices  # [T, 3] that changed
     versions: Epochs  # [T] epoch of which each is
-    codecs: Codecs  # [T] triquad_format.wire.tile_codec.Codec
     sizes: Sizes  # [T] bytes of each
-    data: bytes  # of all, one behind the other
+    data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
     removed: TileIndices  # [R, 3] that have no faces any more
 
 
@@ -264,19 +261,5 @@ class MapChunk(Message):
 class ErrorReply(Message):
     """What an operation answers, as a Zenoh error reply, where it cannot do what was asked."""
 
-    code: str  # see ERROR_CODES
+    code: str  # one of triquad_format.errors.ERROR_CODES
     message: str
-
-
-ERROR_CODES = {
-    "bad_request": "the request is malformed or out of range",
-    "bad_version": "the request is of another protocol version",
-    "too_large": "the request exceeds a limit of the server; split it",
-    "epoch_gone": "the pinned epoch is no longer kept",
-    "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
-    "unknown_map": "the server has no map of this name",
-    "timeout": "the server could not finish in the time that the request allows",
-    "busy": "too many requests are waiting",
-    "store": "the checkpoint could not be written",
-    "internal": "a defect of the server; its log has the details",
-}

@@ -38,13 +38,13 @@ class DistanceReply(Message):
     """Answer to :class:`DistanceRequest`."""
 
     epoch: int
-    distance: Values  # [N] metres, negative behind a surface; at most max_distance_m
+    distance_m: Values  # [N] metres, negative behind a surface; at most max_distance_m
     gradient: Positions  # [N, 3] its unit gradient, map frame; zero where nothing was found
     found: Flags  # [N] whether there is a surface within max_distance_m
     status: StatusCodes  # [N] of the points themselves
     confidence: Values  # [N] in [0, 1]
     surface_point: Positions | None  # [N, 3] relative to origin; the point where nothing was found
-    unknown_distance: Values | None  # [N] metres, at most max_distance_m
+    unknown_distance_m: Values | None  # [N] metres, at most max_distance_m
     unknown_point: Positions | None  # [N, 3] relative to origin; the point where there is none
 
 
@@ -54,7 +54,7 @@ class SpheresRequest(Message):
 
     origin: Point  # metres, map frame
     centres: Positions  # [N, 3] metres, relative to origin
-    radii: Values  # [N] metres
+    radii_m: Values  # [N] metres
     epoch: int
 
 
@@ -83,13 +83,13 @@ class SegmentsReply(Message):
     """Answer to :class:`SegmentsRequest`; places are metres along the segment."""
 
     epoch: int
-    length: Values  # [N]
+    length_m: Values  # [N]
     blocked: Flags  # [N] the ball touches a seen surface
-    contact: Values  # [N] where it first does; the length where it does not
-    clearance: Values  # [N] least distance of the centre to a surface, up to the contact
-    clearance_at: Values  # [N] where
+    contact_m: Values  # [N] where it first does; the length where it does not
+    clearance_m: Values  # [N] least distance of the centre to a surface, up to the contact
+    clearance_at_m: Values  # [N] where
     meets_unknown: Flags  # [N] the ball enters unknown space, before any contact
-    unknown_contact: Values  # [N] where it first does; the length where it does not
+    unknown_contact_m: Values  # [N] where it first does; the length where it does not
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class RaysReply(Message):
     """Answer to :class:`RaysRequest`."""
 
     epoch: int
-    range: Values  # [N] metres
+    range_m: Values  # [N] metres
     status: StatusCodes  # [N] what it ends at: surface, unknown space, or the largest range (free)
 
 
@@ -129,7 +129,7 @@ class GridReply(Message):
     """Answer to :class:`GridRequest`."""
 
     epoch: int
-    distance: Volume  # [x, y, z] metres, as in DistanceReply
+    distance_m: Volume  # [x, y, z] metres, as in DistanceReply
     status: StatusVolume  # [x, y, z]
 
 

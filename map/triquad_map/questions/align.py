@@ -204,7 +204,7 @@ def _normal(
     turned = points @ pose[:3, :3].T
     reach_m = min(options.max_distance_m, _REACH_SCALES * scale)
     answer = distances(view, turned + pose[:3, 3], DistanceOptions(reach_m))
-    distance = answer.distance.astype(np.float64)
+    distance = answer.distance_m.astype(np.float64)
     spread = 1.0 if is_final else 1.0 + _PER_RANGE * np.linalg.norm(points, axis=1)
     counts = answer.found.astype(np.float64)
     if scale <= _SURE_VOXELS * view.voxel_m:
@@ -235,10 +235,10 @@ def _judged(
     world = points @ found.pose[:3, :3].T + found.pose[:3, 3]
     answer = distances(view, world, DistanceOptions(options.max_distance_m))
     known = answer.status != Status.UNKNOWN
-    inliers = answer.found & known & (np.abs(answer.distance) <= _INLIER_SCALES * final)
+    inliers = answer.found & known & (np.abs(answer.distance_m) <= _INLIER_SCALES * final)
     count = int(inliers.sum())
     share = count / max(int((answer.found | known).sum()), 1)
-    squares = answer.distance[inliers].astype(np.float64) ** 2
+    squares = answer.distance_m[inliers].astype(np.float64) ** 2
     rms_m = math.sqrt(float(squares.sum()) / max(count, 1))
     normal = _normal(view, points, found.pose, final, options, is_final=True)
     covariance = np.diag(np.repeat([_UNSEEN_M**2, _UNSEEN_RAD**2], 3))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
@@ -48,14 +49,6 @@ _RANGE_EACH_M = 10.0
 """Range of a ray that counts as much."""
 
 
-class QuestionError(Exception):
-    """Why a question is not answered; ``code`` is one of ``messages.ERROR_CODES``."""
-
-    def __init__(self, code: str, text: str) -> None:
-        super().__init__(text)
-        self.code = code
-
-
 @dataclass(frozen=True)
 class QuestionLimits:
     """How much one question may ask."""
@@ -79,7 +72,7 @@ class Answers:
         """The answer to a question of any kind.
 
         Raises:
-            QuestionError: it is not answered.
+            RefusedError: it is not answered.
             KeyError: it is no question about the map.
         """
         return _ANSWERS[type(request)](self, request)
@@ -100,29 +93,29 @@ class Answers:
             answer = distances(view, points, options)
         return DistanceReply(
             answer.epoch,
-            answer.distance,
+            answer.distance_m,
             answer.gradient,
             answer.found.astype(np.uint8),
             answer.status,
             answer.confidence,
             _relative(answer.surface_point, request.origin),
-            answer.unknown_distance,
+            answer.unknown_distance_m,
             _relative(answer.unknown_point, request.origin),
         )
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
         """What spheres hold."""
         centres = self._searched("sphere", request.origin, request.centres)
-        _same_length(request.centres, "radii", request.radii)
-        good = (request.radii >= 0) & (request.radii <= MAX_DISTANCE_M)
+        _same_length(request.centres, "radii_m", request.radii_m)
+        good = (request.radii_m >= 0) & (request.radii_m <= MAX_DISTANCE_M)
         if not good.all():
             worst = int((~good).argmax())
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request",
-                f"radius {worst} is {request.radii[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
+                f"radius {worst} is {request.radii_m[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
             )
         with self._view(request.epoch) as view:
-            answer = spheres(view, centres, request.radii.astype(np.float64))
+            answer = spheres(view, centres, request.radii_m.astype(np.float64))
         return SpheresReply(answer.epoch, answer.status)
 
     def segments(self, request: SegmentsRequest) -> SegmentsReply:
@@ -141,13 +134,13 @@ class Answers:
             answer = segments(view, starts, ends, options)
         return SegmentsReply(
             answer.epoch,
-            answer.length,
+            answer.length_m,
             answer.blocked.astype(np.uint8),
-            answer.contact,
-            answer.clearance,
-            answer.clearance_at,
+            answer.contact_m,
+            answer.clearance_m,
+            answer.clearance_at_m,
             answer.meets_unknown.astype(np.uint8),
-            answer.unknown_contact,
+            answer.unknown_contact_m,
         )
 
     def rays(self, request: RaysRequest) -> RaysReply:
@@ -159,7 +152,7 @@ class Answers:
         bad = ~(np.abs(lengths - 1.0) < 1e-3)
         if bad.any():
             worst = int(bad.argmax())
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
             )
         reach_m = _within("max_range_m", request.max_range_m, MAX_RANGE_M)
@@ -169,14 +162,14 @@ class Answers:
         options = RayOptions(reach_m, request.through_unknown)
         with self._view(request.epoch) as view:
             answer = rays(view, starts, directions / lengths[:, None], options)
-        return RaysReply(answer.epoch, answer.range, answer.status)
+        return RaysReply(answer.epoch, answer.range_m, answer.status)
 
     def grid(self, request: GridRequest) -> GridReply:
         """Distance and status at a grid's cells."""
         counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
         cell_m = _within("cell_m", request.cell_m, MAX_DISTANCE_M)
         if min(counts) < 1 or not np.isfinite(request.corner).all():
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request", f"not a grid: counts {counts}, corner {request.corner}"
             )
         shape = GridShape(request.corner, cell_m, counts)
@@ -184,13 +177,13 @@ class Answers:
         reach_m = _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
             answer = grid(view, shape, reach_m)
-        return GridReply(answer.epoch, answer.distance, answer.status)
+        return GridReply(answer.epoch, answer.distance_m, answer.status)
 
     def align(self, request: AlignRequest) -> AlignReply:
         """The pose of a scan near a guess."""
         self._check_count(len(request.points), f"{len(request.points)} points")
         if not is_rigid(request.world_from_sensor):
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request",
                 f"world_from_sensor is no rotation and translation: {request.world_from_sensor}",
             )
@@ -220,7 +213,7 @@ class Answers:
 
     def _check_count(self, count: float, what: str) -> None:
         if count > self._limits.searches:
-            raise QuestionError(
+            raise RefusedError(
                 "too_large",
                 f"{what} exceed the limit of {self._limits.searches} searches: split the request",
             )
@@ -243,10 +236,10 @@ def _points(
     """Points [N, 3] of the map frame.
 
     Raises:
-        QuestionError: they are too many, or not all finite.
+        RefusedError: they are too many, or not all finite.
     """
     if len(offsets) > most:
-        raise QuestionError(
+        raise RefusedError(
             "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
         )
     # Single precision from an origin is good to that. Unrounded, a point that somebody chose on a
@@ -254,13 +247,13 @@ def _points(
     points = np.round(origin + offsets.astype(np.float64), _DECIMALS)
     if not np.isfinite(points).all():
         index = int(np.isfinite(points).all(axis=1).argmin())
-        raise QuestionError("bad_request", f"{what} {index} is not finite: {points[index]}")
+        raise RefusedError("bad_request", f"{what} {index} is not finite: {points[index]}")
     return points
 
 
 def _within(name: str, value: float, most: float, least: float = 1e-6) -> float:
     if not least <= value <= most:
-        raise QuestionError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
+        raise RefusedError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
     return float(value)
 
 
@@ -268,7 +261,7 @@ def _short(what: str, lengths: NDArray[np.float64]) -> None:
     """Refuse ways [N] that are too long: each of their steps waits for the one before."""
     if lengths.max(initial=0.0) > MAX_RANGE_M:
         worst = int(lengths.argmax())
-        raise QuestionError(
+        raise RefusedError(
             "bad_request",
             f"{what} {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
         )
@@ -276,7 +269,7 @@ def _short(what: str, lengths: NDArray[np.float64]) -> None:
 
 def _same_length(first: NDArray[np.float32], name: str, second: NDArray[np.float32]) -> None:
     if len(first) != len(second):
-        raise QuestionError("bad_request", f"{len(second)} {name} for {len(first)} points")
+        raise RefusedError("bad_request", f"{len(second)} {name} for {len(first)} points")
 
 
 def _relative(

@@ -31,13 +31,13 @@ class DistanceOptions:
 class Distances:
     """Distances from N points to the nearest seen surface, metres, map frame, of one epoch."""
 
-    distance: NDArray[np.float32]  # [N] negative behind a surface; at most max_distance_m
+    distance_m: NDArray[np.float32]  # [N] negative behind a surface; at most max_distance_m
     gradient: NDArray[np.float32]  # [N, 3] its unit gradient, pointing to free space; 0: not found
-    found: NDArray[np.bool_]  # [N] False: no surface within max_distance_m, which distance then is
+    found: NDArray[np.bool_]  # [N] False: no surface within max_distance_m, distance_m then
     status: NDArray[np.uint8]  # [N] Status of the points themselves
     confidence: NDArray[np.float32]  # [N] in [0, 1]; 0 where nothing was found or the point unknown
     surface_point: NDArray[np.float64] | None  # [N, 3] nearest point; the point itself: not found
-    unknown_distance: NDArray[np.float32] | None  # [N] to unknown space, at most max_distance_m
+    unknown_distance_m: NDArray[np.float32] | None  # [N] at most max_distance_m, 0 in unknown space
     unknown_point: NDArray[np.float64] | None  # [N, 3] nearest point of it, within max_distance_m
     epoch: int
 
@@ -82,9 +82,9 @@ def with_unknown(answer: Distances, points: NDArray[np.float64], unknown: Unknow
     """
     if unknown is Unknown.FREE:
         return answer
-    assert answer.unknown_distance is not None
+    assert answer.unknown_distance_m is not None
     assert answer.unknown_point is not None
-    nearer = answer.unknown_distance < answer.distance
+    nearer = answer.unknown_distance_m < answer.distance_m
     if unknown is Unknown.ERROR:
         refuse_unknown("point", nearer)
     away = points - answer.unknown_point
@@ -95,7 +95,7 @@ def with_unknown(answer: Distances, points: NDArray[np.float64], unknown: Unknow
         surface_point = np.where(nearer[:, None], answer.unknown_point, surface_point)
     return dataclasses.replace(
         answer,
-        distance=np.where(nearer, answer.unknown_distance, answer.distance),
+        distance_m=np.where(nearer, answer.unknown_distance_m, answer.distance_m),
         gradient=np.where(nearer[:, None], gradient, answer.gradient).astype(np.float32),
         found=answer.found | nearer,
         confidence=np.where(nearer, np.float32(0), answer.confidence),

@@ -34,7 +34,7 @@ class Grid:
     """A map at the middles of a grid's cells, of one epoch."""
 
     shape: GridShape
-    distance: NDArray[np.float32]  # [x, y, z] to the nearest seen surface, at most max_distance_m
+    distance_m: NDArray[np.float32]  # [x, y, z] to the nearest surface, at most max_distance_m
     status: NDArray[np.uint8]  # [x, y, z] Status
     epoch: int
 
@@ -44,7 +44,7 @@ def grid(view: MapView, shape: GridShape, max_distance_m: float) -> Grid:
     answer = distances(view, shape.middles(), DistanceOptions(max_distance_m))
     return Grid(
         shape,
-        answer.distance.reshape(shape.counts),
+        answer.distance_m.reshape(shape.counts),
         answer.status.reshape(shape.counts),
         view.number,
     )

@@ -35,7 +35,7 @@ class Rays:
     largest range, through space that was seen to be free (or, where asked for, unknown).
     """
 
-    range: NDArray[np.float32]  # [N]
+    range_m: NDArray[np.float32]  # [N]
     status: NDArray[np.uint8]  # [N] Status
     epoch: int
 
@@ -71,7 +71,7 @@ def _trace(
     ask = DistanceOptions(min(_LOOK_AHEAD_M, float(ranges.max(initial=_HIT_M))))
     while len(going):
         points = origins[going] + at[going, None] * directions[going]
-        distance = distances(view, points, ask).distance.astype(np.float64)
+        distance = distances(view, points, ask).distance_m.astype(np.float64)
         inside = distance <= _HIT_M
         # Between the last place and this one the distance falls about evenly.
         share = np.clip(before[going] / np.maximum(before[going] - distance, 1e-9), 0.0, 1.0)

@@ -29,17 +29,17 @@ class SegmentOptions:
 class Segments:
     """What a ball meets on N segments, metres, of one epoch.
 
-    Places are distances along the segment from its start. ``clearance`` is that of the ball's
+    Places are distances along the segment from its start. ``clearance_m`` is that of the ball's
     centre, up to where it first touches a surface; it is right within half a step of half a voxel.
     """
 
-    length: NDArray[np.float32]  # [N]
+    length_m: NDArray[np.float32]  # [N]
     blocked: NDArray[np.bool_]  # [N] the ball touches a seen surface
-    contact: NDArray[np.float32]  # [N] where it first does; the length where it does not
-    clearance: NDArray[np.float32]  # [N] least distance to a surface, at most max_distance_m
-    clearance_at: NDArray[np.float32]  # [N] where
+    contact_m: NDArray[np.float32]  # [N] where it first does; the length where it does not
+    clearance_m: NDArray[np.float32]  # [N] least distance to a surface, at most max_distance_m
+    clearance_at_m: NDArray[np.float32]  # [N] where
     meets_unknown: NDArray[np.bool_]  # [N] the ball enters unknown space, before any contact
-    unknown_contact: NDArray[np.float32]  # [N] where it first does; the length where it does not
+    unknown_contact_m: NDArray[np.float32]  # [N] where it first does; the length where it does not
     epoch: int
 
     def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> NDArray[np.bool_]:
@@ -84,7 +84,7 @@ def segments(
     step_m = STEP_VOXELS * view.voxel_m
 
     def to_surface(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return distances(view, points, DistanceOptions(reach_m)).distance.astype(np.float64)
+        return distances(view, points, DistanceOptions(reach_m)).distance_m.astype(np.float64)
 
     def to_unknown(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return view.nearest_unknown(points, reach_m).distance

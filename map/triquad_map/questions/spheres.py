@@ -41,8 +41,8 @@ def spheres(view: MapView, centres: NDArray[np.float64], radii: NDArray[np.float
     # A little beyond the largest, so that what touches it is found.
     reach_m = float(radii.max(initial=0.0)) + view.voxel_m
     answer = distances(view, centres, DistanceOptions(reach_m, unknown_distance=True))
-    assert answer.unknown_distance is not None
+    assert answer.unknown_distance_m is not None
     status = np.full(len(centres), Status.FREE, np.uint8)
-    status[(answer.unknown_distance < radii) | (answer.status == Status.UNKNOWN)] = Status.UNKNOWN
-    status[answer.found & (answer.distance <= radii)] = Status.SURFACE
+    status[(answer.unknown_distance_m < radii) | (answer.status == Status.UNKNOWN)] = Status.UNKNOWN
+    status[answer.found & (answer.distance_m <= radii)] = Status.SURFACE
     return Spheres(status, view.number)

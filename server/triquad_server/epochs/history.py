@@ -5,8 +5,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from triquad_format.errors import RefusedError
+
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.errors import RequestError
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,12 @@ class EpochHistory:
         belong together, do not lose their epoch while they go on.
 
         Raises:
-            RequestError: ``epoch_gone``.
+            RefusedError: ``epoch_gone``.
         """
         with self._lock:
             epoch = self._epochs.get(number) if number else self._newest
             if epoch is None:
-                raise RequestError(
+                raise RefusedError(
                     "epoch_gone",
                     f"epoch {number} is not kept; kept are {sorted(self._epochs)}",
                 )

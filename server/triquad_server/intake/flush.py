@@ -6,11 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from triquad_format.errors import FormatError
+from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest
 
-from triquad_server.errors import RequestError
 from triquad_server.intake.sources import MAX_SEQUENCE, SourceLedger
 from triquad_server.net.request import Request
 
@@ -20,7 +19,7 @@ ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived so long after the flush request, which travels the same way behind
 it, is lost."""
 
-Outcome = FlushReply | RequestError
+Outcome = FlushReply | RefusedError
 """What a request is answered with: a reply, or why there is none."""
 
 
@@ -41,7 +40,7 @@ class _Pending:
     def send(self, outcome: Outcome) -> None:
         """Answer the request; an internal error ends this one only, not the thread of all."""
         try:
-            if isinstance(outcome, RequestError):
+            if isinstance(outcome, RefusedError):
                 self.request.refuse(outcome.code, str(outcome))
             else:
                 self.request.answer(outcome)
@@ -88,14 +87,14 @@ class FlushHandler:
         """Take over a request; it is answered once its scan is settled.
 
         Raises:
-            RequestError: a field is out of range, or too many are pending.
+            RefusedError: a field is out of range, or too many are pending.
         """
         self._check(asks)
         now = time.monotonic()
         with self._ledger.changed:
             if self._stopping or len(self._pending) >= self._limit:
                 text = f"{len(self._pending)} flush requests are pending already; try later"
-                raise RequestError("busy", text)
+                raise RefusedError("busy", text)
             times = now + ARRIVAL_GRACE_S, now + asks.timeout_s
             self._pending.append(_Pending(request, asks, *times))
             self._ledger.changed.notify_all()
@@ -104,15 +103,15 @@ class FlushHandler:
         try:
             keys.check_name("source", asks.source)
         except FormatError as error:
-            raise RequestError("bad_request", str(error)) from error
+            raise RefusedError("bad_request", str(error)) from error
         if not 0 <= asks.sequence < MAX_SEQUENCE:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"sequence = {asks.sequence} is out of range: use 0 to {MAX_SEQUENCE - 1}",
             )
         # Written so that NaN is refused as well.
         if not 0 <= asks.timeout_s <= self._timeout_max_s:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"timeout_s = {asks.timeout_s} is out of range: use 0 to {self._timeout_max_s:g}",
             )
@@ -125,7 +124,7 @@ class FlushHandler:
                     self._ledger.changed.wait(self._time_left_s())
                 stopping = self._stopping
                 if stopping:
-                    why = RequestError("timeout", "the server is stopping")
+                    why = RefusedError("timeout", "the server is stopping")
                     decided = [(entry, why) for entry in self._pending]
             for entry, outcome in decided:
                 entry.send(outcome)
@@ -148,7 +147,7 @@ class FlushHandler:
         if reply is not None or now < entry.deadline:
             return reply
         asks = entry.asks
-        return RequestError(
+        return RefusedError(
             "timeout",
             f"scan {asks.sequence} of {asks.source} is not in the map after {asks.timeout_s} s",
         )

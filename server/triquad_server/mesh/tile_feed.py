@@ -9,15 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from triquad_format.errors import FormatError
-from triquad_format.wire import draco, keys
+from triquad_format.errors import FormatError, RefusedError
+from triquad_format.wire import keys
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
-from triquad_format.wire.tile_codec import Codec, decode_tile
 from triquad_map.compiled.team import be_patient
 
 from triquad_server.epochs.gate import QueryGate
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.errors import RequestError
 from triquad_server.mesh.bandwidth import BURST_S, Bandwidth
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import ShelvedTile, TileNews, TileShelf
@@ -64,7 +62,6 @@ class _Reply:
     complete: bool
     revision: int
     tiles: list[ShelvedTile] = field(default_factory=list)
-    codecs: list[Codec] = field(default_factory=list)
     data: list[bytes] = field(default_factory=list)
     removed: list[TileIndex] = field(default_factory=list)
 
@@ -121,7 +118,7 @@ class TileFeed:
         """Take over a request; it is answered once there are tiles for it, or in time.
 
         Raises:
-            RequestError: a field is out of range, or too many are held.
+            RefusedError: a field is out of range, or too many are held.
         """
         self._check(asks)
         restart = asks.server not in ("", self._server)
@@ -138,7 +135,7 @@ class TileFeed:
         with self._news:
             waiting = len(self._held) + self._sending
             if self._stopping or waiting >= self._limit:
-                raise RequestError("busy", f"{waiting} followers of the mesh wait already")
+                raise RefusedError("busy", f"{waiting} followers of the mesh wait already")
             self._held.append(held)
             self._news.notify_all()
 
@@ -153,29 +150,29 @@ class TileFeed:
         try:
             keys.check_name("client", asks.client)
         except FormatError as error:
-            raise RequestError("bad_request", str(error)) from error
+            raise RefusedError("bad_request", str(error)) from error
         # Written so that NaN is refused as well.
         if not 0 <= asks.timeout_s < math.inf:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request", f"timeout_s = {asks.timeout_s} is not a time: use 0 or more"
             )
         if asks.max_bytes < 1 or asks.max_bytes_per_s < 0:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"max_bytes = {asks.max_bytes}, max_bytes_per_s = {asks.max_bytes_per_s}: "
                 "use at least 1, and at least 0",
             )
         if len(asks.held) != len(asks.held_versions):
-            raise RequestError(
+            raise RefusedError(
                 "bad_request", f"{len(asks.held_versions)} versions of {len(asks.held)} held tiles"
             )
         if len(asks.held) > MAX_HELD:
-            raise RequestError(
+            raise RefusedError(
                 "too_large", f"{len(asks.held)} held tiles exceed the limit of {MAX_HELD}"
             )
         known = self._shelf.revision if asks.server == self._server else 0
         if asks.server in ("", self._server) and not 0 <= asks.revision <= known:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"revision = {asks.revision} was never given by server {asks.server!r}: "
                 "use that of the reply before, or 0",
@@ -272,7 +269,7 @@ class TileFeed:
                 reply.removed.append(tile.index)
                 reply.revision = tile.revision
                 continue
-            codec, data = self._encoded(entry, tile)
+            data = self._encoded(entry.asks.level, tile)
             if data is None:  # it came out different: it is news again
                 reply.complete = False
                 continue
@@ -280,7 +277,6 @@ class TileFeed:
                 reply.complete = False
                 break
             reply.tiles.append(tile)
-            reply.codecs.append(codec)
             reply.data.append(data)
             reply.revision = tile.revision
         if reply.complete:
@@ -288,23 +284,15 @@ class TileFeed:
             reply.complete = self._shelf.epoch >= entry.needs
         return reply
 
-    def _encoded(self, entry: _Held, tile: ShelvedTile) -> tuple[Codec, bytes | None]:
+    def _encoded(self, level: int, tile: ShelvedTile) -> bytes | None:
         """The bytes of a tile; None where they were gone and the tile has others now."""
-        level = entry.asks.level
         data = self._shelf.data(level, tile)
         if data is None:
             self._gate.give_way(_GIVE_WAY_S)
             if self._shelf.make(level, tile.index).revision != tile.revision:
-                return Codec.TRIQUAD, None
+                return None
             data = self._shelf.data(level, tile)
-        if data is not None and entry.asks.draco and draco.AVAILABLE:
-            surface = decode_tile(data)
-            lattice = self._shelf.lattice(level)
-            positions = surface.positions(lattice.cell_m)
-            compact = draco.encode_draco(positions, surface.faces, lattice.tile_side_m)
-            if compact is not None:
-                return Codec.DRACO, compact
-        return Codec.TRIQUAD, data
+        return data
 
     def _send(self, entry: _Held, reply: _Reply) -> None:
         """Hand a reply to the senders: a client that does not read would hold up this thread."""
@@ -327,7 +315,6 @@ class TileFeed:
                     lattice.cell_m,
                     _indices([tile.index for tile in reply.tiles]),
                     np.array([tile.version for tile in reply.tiles], np.int64),
-                    np.array(reply.codecs, np.uint8),
                     np.array([len(data) for data in reply.data], np.int64),
                     b"".join(reply.data),
                     _indices(reply.removed),

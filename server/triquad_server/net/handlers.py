@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import zenoh
+from triquad_format.errors import RefusedError
 from triquad_format.wire import keys
 
 from triquad_server.counter import Counter
-from triquad_server.errors import RequestError
 from triquad_server.net.request import Request
 
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[Request], None]
-"""Reads the request and answers it, or raises :class:`RequestError`."""
+"""Reads the request and answers it, or raises :class:`RefusedError`."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ class RequestDesk:
         while (job := self._jobs.get()) is not None:
             try:
                 job.handler(job.request)
-            except RequestError as error:
-                job.request.refuse(error.code, str(error))
+            except RefusedError as error:
+                job.request.refuse(error.code, error.message)
             except Exception as error:
                 _log.exception("a request met a defect")
                 job.request.refuse("internal", f"{type(error).__name__}: {error}")

@@ -5,13 +5,12 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import zenoh
-from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.errors import ProtocolVersionError, RefusedError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 
 from triquad_server.counter import Counter
-from triquad_server.errors import RequestError
 
 _log = logging.getLogger(__name__)
 
@@ -37,17 +36,17 @@ class Request:
         """The request's message.
 
         Raises:
-            RequestError: there is none, or it cannot be decoded.
+            RefusedError: there is none, or it cannot be decoded.
         """
         payload = self._query.payload
         if payload is None:
-            raise RequestError("bad_request", f"no payload: expected a {kind.__name__}")
+            raise RefusedError("bad_request", f"no payload: expected a {kind.__name__}")
         try:
             return codec.decode(kind, payload.to_bytes())
         except ProtocolVersionError as error:
-            raise RequestError("bad_version", str(error)) from error
+            raise RefusedError("bad_version", str(error)) from error
         except WireError as error:
-            raise RequestError("bad_request", str(error)) from error
+            raise RefusedError("bad_request", str(error)) from error
 
     def answer(self, message: Message) -> None:
         """Reply with ``message``."""
@@ -57,7 +56,7 @@ class Request:
         )
 
     def refuse(self, code: str, text: str) -> None:
-        """Reply with an error; ``code`` is one of ``messages.ERROR_CODES``."""
+        """Reply with an error; ``code`` is one of ``ERROR_CODES``."""
         self._refused.add(code)
         _log.debug("request on %s refused (%s): %s", self._key, code, text)
         payload = codec.encode(ErrorReply(code, text[:4096]))

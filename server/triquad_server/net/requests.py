@@ -5,6 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import (
     Tile,
@@ -12,10 +13,8 @@ from triquad_format.wire.messages import (
     TileListRequest,
     TileRequest,
 )
-from triquad_map.questions.answers import QuestionError
 
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.errors import RequestError
 from triquad_server.mesh.epoch_mesh import EpochMesh
 from triquad_server.mesh.tile_cache import TileShelf
 from triquad_server.mesh.tile_lattice import LEVELS
@@ -36,11 +35,7 @@ def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Ha
     """A handler that decodes a ``kind`` and replies with what ``answer`` makes of it."""
 
     def handle(request: Request) -> None:
-        try:
-            reply = answer(request.read(kind))
-        except QuestionError as error:
-            raise RequestError(error.code, str(error)) from error
-        request.answer(reply)
+        request.answer(answer(request.read(kind)))
 
     return handle
 
@@ -62,7 +57,7 @@ class TileQueries:
         mesh = EpochMesh(epoch, self._settings)
         tiles = mesh.tiles(request.minimum, request.maximum, request.level)
         if len(tiles) > MAX_TILES:
-            raise RequestError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
+            raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
         side_m = self._shelf.lattice(request.level).tile_side_m
         self._shelf.look(epoch)
         changed = np.minimum(self._shelf.changed(request.level, tiles), epoch.number)
@@ -72,7 +67,7 @@ class TileQueries:
         """The mesh of one tile."""
         index = (request.x, request.y, request.z)
         if max(map(abs, index)) > TILE_INDEX_LIMIT:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"tile {index} is out of range: use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
             )
@@ -89,13 +84,13 @@ class TileQueries:
 def check_level(level: int) -> None:
     """Refuse a level of detail that there is not."""
     if not 0 <= level < LEVELS:
-        raise RequestError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
+        raise RefusedError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
 
 
 def check_box(minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> None:
     """Refuse a box [3], [3] with NaN or with corners the wrong way round; infinite is allowed."""
     if np.isnan([minimum, maximum]).any() or (minimum > maximum).any():
-        raise RequestError(
+        raise RefusedError(
             "bad_request",
             f"not a box: minimum {minimum}, maximum {maximum}",
         )

@@ -6,10 +6,11 @@ import threading
 import time
 from concurrent.futures import Future
 
+from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
 from triquad_map.compiled.team import be_patient
 
-from triquad_server.errors import RequestError, StoreBaseError, StoreError
+from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.store import Store
@@ -61,14 +62,14 @@ class Checkpoints:
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
         """A checkpoint of the map as it is now; the last one where nothing changed."""
         if self._store is None:
-            raise RequestError("store", _NO_STORE)
+            raise RefusedError("store", _NO_STORE)
         asked: Future[CheckpointInfo] = Future()
         self._asked.put(asked)
         self._wake.set()
         try:
             return asked.result()
         except StoreError as error:
-            raise RequestError("store", str(error)) from error
+            raise RefusedError("store", str(error)) from error
 
     def _run(self) -> None:
         be_patient(2 * NICENESS)  # mapping comes first, too

@@ -44,14 +44,14 @@ def _distances(
     slopes = scene.gradient(points)
     answer = distances(view, points, DistanceOptions(REACH_M, unknown_distance=True))
     feet_seen = view.status(points - truth[:, None] * slopes) == Status.SURFACE
-    assert answer.unknown_distance is not None
+    assert answer.unknown_distance_m is not None
     # What a planner can tell from the answer itself.
-    known = answer.unknown_distance >= answer.distance
+    known = answer.unknown_distance_m >= answer.distance_m
     figures = [Figure("points to which a surface is nearer than unknown space",
                       100 * known.mean(), "%")]  # fmt: skip
     figures += _errors("known space", answer, truth, slopes, known, (5.0, 12.0, 0.15))
     figures += _errors("nearest surface seen", answer, truth, slopes, feet_seen, None)
-    wary = np.minimum(answer.distance, answer.unknown_distance) - truth
+    wary = np.minimum(answer.distance_m, answer.unknown_distance_m) - truth
     figures += [
         Figure("all, unknown as an obstacle: too large, 99.9 %", np.quantile(wary, 0.999), "m"),
         Figure("all, unknown as an obstacle: share too large by a voxel",
@@ -69,7 +69,7 @@ def _errors(
     chosen: NDArray[np.bool_],
     bounds: tuple[float, float, float] | None,
 ) -> list[Figure]:
-    error = (answer.distance - truth)[chosen]
+    error = (answer.distance_m - truth)[chosen]
     away = chosen & (truth > _NEAR_M)
     aligned = (answer.gradient[away] * slopes[away]).sum(axis=1) >= np.cos(np.deg2rad(10.0))
     mean_cm, tail_cm, most_m = bounds or (None, None, None)
@@ -89,7 +89,7 @@ def _calibration(
 ) -> list[Figure]:
     """Whether errors fall as the stated confidence rises."""
     chosen = chosen & answer.found
-    error = np.abs(answer.distance - truth)[chosen]
+    error = np.abs(answer.distance_m - truth)[chosen]
     levels = level_confidence()
     edges = np.concatenate([[0.0], (levels[1:] + levels[:-1]) / 2, [1.01]])
     means = []
@@ -122,7 +122,7 @@ def _corridor(probes: AnswerProbes, view: MapView) -> list[Figure]:
     """Obstacles around the way of the sensor, where there are none."""
     balls = spheres(view, probes.corridor, np.full(len(probes.corridor), _BALL_M))
     answer = distances(view, probes.corridor, DistanceOptions(REACH_M))
-    false = (balls.status == Status.SURFACE) | (answer.distance <= 0)
+    false = (balls.status == Status.SURFACE) | (answer.distance_m <= 0)
     return [
         Figure(f"{len(probes.corridor)} balls in the corridor: false obstacles",
                float(false.sum()), "", at_most=0),

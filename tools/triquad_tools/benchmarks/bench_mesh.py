@@ -95,7 +95,7 @@ def _fetched(client: Client) -> list[Figure]:
 
 def _sizes(watch: MeshWatch) -> list[Figure]:
     tiles = watch.tiles.values()
-    sent = sum(tile.size for tile in tiles)
+    sent = sum(tile.size_bytes for tile in tiles)
     raw = sum(tile.vertices.nbytes + tile.faces.nbytes for tile in tiles)
     return [
         Figure("tiles of the street", len(tiles), ""),
@@ -115,10 +115,10 @@ def _followed(client: Client, watch: MeshWatch, scan: SimulatedScan) -> list[Fig
     while not settled:
         settled = client.status().settled
         while (update := watch.next(0.0)) is not None:
-            sent += update.size
+            sent += update.size_bytes
             replies += 1
             changed.update(update.changed)
-    size = sum(watch.tiles[index].size for index in changed if index in watch.tiles)
+    size = sum(watch.tiles[index].size_bytes for index in changed if index in watch.tiles)
     return [
         Figure("one more scan: tiles that changed", len(changed), ""),
         Figure("one more scan: bytes sent", sent / 1e3, "kB"),
@@ -143,7 +143,7 @@ def _levels(client: Client, planner: Client, made: BenchStreet) -> list[Figure]:
         for level in (1, 2):
             with client.watch_mesh(level=level) as watch:
                 watch.catch_up(_FETCH_LIMIT_S)
-                size = sum(tile.size for tile in watch.tiles.values())
+                size = sum(tile.size_bytes for tile in watch.tiles.values())
             figures.append(Figure(f"the street on level {level}", size / 1e6, "MB"))
         stop.set()
         met = asking.result()

@@ -30,7 +30,7 @@ def measure_twin(made: BenchStreet) -> list[Figure]:
     points = seen_points(epoch, made, np.random.default_rng(_SEED))
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         path = Path(name) / "street.triquad"
-        write_map(epoch.record(), path, distances=epoch.distances)
+        write_map(epoch.record(), path)
         open_map(path).query_distance(points[:10])  # compiled code is loaded
         opening_s = seconds(lambda: open_map(path))
         with open_map(path) as offline:
@@ -52,7 +52,7 @@ def _differences(offline: OfflineMap, epoch: Epoch, points: NDArray[np.float64])
     field, live_field = offline.query_sdf(points), epoch.query(points)
     have, want = offline.query_distance(points), distances(epoch, points, DistanceOptions())
     sdf_m = np.quantile(np.abs(field.sdf - live_field.sdf), 0.99)
-    distance_m = np.quantile(np.abs(have.distance - want.distance), 0.99)
+    distance_m = np.quantile(np.abs(have.distance_m - want.distance_m), 0.99)
     equal = np.mean((field.status == live_field.status) & (have.status == want.status))
     return [
         Figure("offline against live, SDF, 99 %", 1e3 * float(sdf_m), "mm", at_most=1),

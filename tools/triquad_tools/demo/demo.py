@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
-_NEEDED = ("torch", "numba", "scipy", "rich", "PIL")
+_NEEDED = ("torch", "numba", "scipy", "rich", "PIL", "foxglove_schemas_protobuf")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from triquad_client import CheckpointInfo, Client, Mesh, SdfResult, connect
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.records.crop import without_training
+from triquad_server.mesh.preview import previews_of
 
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
@@ -138,7 +139,8 @@ def compare(endpoint: str, scored: Scored) -> Restart:
 
 def pack(scored: Scored, path: Path) -> MapSize:
     """Write the map without the state that only training needs."""
-    packed = write_map(without_training(read_map(scored.checkpoint.path)), path)
+    record = without_training(read_map(scored.checkpoint.path))
+    packed = write_map(record, path, previews=previews_of(record))
     return MapSize(packed.bytes, scored.checkpoint.bytes, scored.parameters)
 
 

@@ -27,7 +27,7 @@ def slice_picture(title: str, answer: Grid) -> Image.Image:
     """The lowest layer of a grid: its distances beside its status."""
     shape = answer.shape
     grid = PlanGrid(shape.corner[:2], shape.cell_m, shape.counts[1], shape.counts[0])
-    distance, status = _plan(answer.distance), _plan(answer.status)
+    distance, status = _plan(answer.distance_m), _plan(answer.status)
     scale = ColourScale(
         f"distance to the nearest seen surface in m, {_MAX_DISTANCE_M:g} or more",
         HEIGHT,
