@@ -150,11 +150,11 @@ class Service:
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
         inputs = MapperInputs(
-            self._scans,
-            self._ledger,
-            self._gate,
-            self._counts.scans_dropped,
-            self._counts.points_dropped,
+            scans=self._scans,
+            ledger=self._ledger,
+            gate=self._gate,
+            scans_dropped=self._counts.scans_dropped,
+            points_dropped=self._counts.points_dropped,
         )
         limits = self._settings.service
         mapper = MapperThread(

@@ -1,6 +1,5 @@
 """Between the field of a region and the plain arrays of its record."""
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,23 +19,8 @@ from triquad_map.compiled.compiled_engine import FieldArrays
 from triquad_map.compiled.evidence.evidence import Evidence
 from triquad_map.compiled.field.quadtree import TriQuadtree
 
+from triquad_server.engine.batch import Batch
 from triquad_server.engine.live_field import LiveField
-
-
-@dataclass(frozen=True)
-class OptimiserState:
-    """The optimiser's moments and steps of a field, in the order of its record."""
-
-    table_means: tuple[NDArray[np.float32], ...]
-    table_variances: tuple[NDArray[np.float32], ...]
-    table_steps: tuple[NDArray[np.int32], ...]
-    mlp_means: tuple[NDArray[np.float32], ...]
-    mlp_variances: tuple[NDArray[np.float32], ...]
-    mlp_steps: int
-
-    def as_fields(self) -> dict[str, Any]:
-        """The state by name, as :class:`triquad_format.records.region.TrainingState` has it."""
-        return dict(vars(self))
 
 
 class StoredField(Protocol):
@@ -79,8 +63,14 @@ def region_record(
     )
 
 
-def optimiser_state(field: LiveField) -> OptimiserState:
-    """A copy of the optimiser's state."""
+def training_state(field: LiveField, samples: Batch, budget_samples: int) -> TrainingState:
+    """What training needs beyond the field itself, sharing nothing with it.
+
+    Args:
+        field: whose optimiser state is copied.
+        samples: what is to be trained on again.
+        budget_samples: how many samples are still to be trained on.
+    """
     features = field.features
     rows = [
         torch.from_numpy(field.tree.table(plane, h)[1])
@@ -88,13 +78,16 @@ def optimiser_state(field: LiveField) -> OptimiserState:
         for h in range(field.settings.feature_levels)
     ]
     mlp = field.mlp[0::2] + field.mlp[1::2]
-    return OptimiserState(
-        tuple(_array(features.means[chosen]) for chosen in rows),
-        tuple(_array(features.variances[chosen]) for chosen in rows),
-        tuple(_array(features.steps[chosen]) for chosen in rows),
-        tuple(_array(part.means[0]) for part in mlp),
-        tuple(_array(part.variances[0]) for part in mlp),
-        int(mlp[0].steps[0]),
+    return TrainingState(
+        table_means=tuple(_array(features.means[chosen]) for chosen in rows),
+        table_variances=tuple(_array(features.variances[chosen]) for chosen in rows),
+        table_steps=tuple(_array(features.steps[chosen]) for chosen in rows),
+        mlp_means=tuple(_array(part.means[0]) for part in mlp),
+        mlp_variances=tuple(_array(part.variances[0]) for part in mlp),
+        mlp_steps=int(mlp[0].steps[0]),
+        sample_points=_array(samples.points),
+        sample_labels=_array(samples.labels).astype(np.float16),
+        budget_samples=budget_samples,
     )
 
 

@@ -10,7 +10,6 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
     Region,
     RegionIndex,
-    TrainingState,
     leaf_coordinates,
     region_centre,
 )
@@ -23,7 +22,7 @@ from triquad_map.compiled.voxel_index import thin
 
 from triquad_server.engine.adam import Rates
 from triquad_server.engine.compiled_trainer import GradientSums
-from triquad_server.engine.field_record import field_from_record, optimiser_state, region_record
+from triquad_server.engine.field_record import field_from_record, region_record, training_state
 from triquad_server.engine.live_field import LiveField, initial_field
 from triquad_server.engine.trainer import Loss, make_trainer
 from triquad_server.epochs.epoch import FrozenRegion
@@ -55,10 +54,10 @@ class RegionSetup:
     def placement(self) -> Placement:
         """Where samples lie."""
         return Placement(
-            self.scan.surface_share,
-            self.scan.spread_m,
-            self.scan.truncation_m,
-            self.field.region_side_m / 2,
+            surface_share=self.scan.surface_share,
+            spread_m=self.scan.spread_m,
+            truncation_m=self.scan.truncation_m,
+            half_side_m=self.field.region_side_m / 2,
         )
 
     def seeds(self, index: RegionIndex) -> tuple[int, int]:
@@ -81,7 +80,11 @@ class LiveRegion:
         self.evidence = evidence
         _, seed = setup.seeds(index)
         self.pool = ReplayPool(
-            setup.training.pool_rays, setup.placement, setup.device, seed, setup.team
+            capacity=setup.training.pool_rays,
+            placement=setup.placement,
+            device=setup.device,
+            seed=seed,
+            team=setup.team,
         )
         self.budget_samples = 0  # the training budget: samples that are still to be trained on
         self._fresh_budget_samples = 0  # those of them that are to be from the newest scan
@@ -194,12 +197,7 @@ class LiveRegion:
     def record(self) -> Region:
         """The region with its training state as plain arrays, sharing nothing with this one."""
         samples = self.pool.sample(_CHECKPOINT_SAMPLES)
-        state = TrainingState(
-            **optimiser_state(self.field).as_fields(),
-            sample_points=samples.points.cpu().numpy(),
-            sample_labels=samples.labels.cpu().numpy().astype(np.float16),
-            budget_samples=self.budget_samples,
-        )
+        state = training_state(self.field, samples, self.budget_samples)
         return region_record(self.index, self.field, self.evidence, state)
 
     def _cooling(self) -> float:

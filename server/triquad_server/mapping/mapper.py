@@ -53,12 +53,12 @@ class Mapper:
             torch.set_num_threads(1)
         self._normals = SurfaceNormals(self._teams.mapping)
         self._setup = RegionSetup(
-            self._field_settings,
-            settings.scan,
-            settings.training,
-            self._device,
-            GradientSums(),
-            self._teams.mapping,
+            field=self._field_settings,
+            scan=settings.scan,
+            training=settings.training,
+            device=self._device,
+            sums=GradientSums(),
+            team=self._teams.mapping,
         )
         self._regions: dict[RegionIndex, LiveRegion] = {}
         self._number = record.epoch if record else 0
@@ -138,11 +138,11 @@ class Mapper:
         )
         regions = tuple(self._freeze(region, before) for region in self._regions.values())
         self._epoch = Epoch(
-            self._name,
-            self._number,
-            self._field_settings,
-            regions,
-            self._teams.answers.split,
+            name=self._name,
+            number=self._number,
+            settings=self._field_settings,
+            regions=regions,
+            split=self._teams.answers.split,
         )
         self._structure_changed = False
         return self._epoch

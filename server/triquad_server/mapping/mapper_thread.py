@@ -239,9 +239,9 @@ class MapperThread:
 
     def _record_progress(self) -> None:
         self.progress = Progress(
-            self._mapper.settled and not self._unpublished,
-            self._scans_taken,
-            self._mapper.samples_trained,
-            self._mapper.rays_kept,
-            self._loss,
+            settled=self._mapper.settled and not self._unpublished,
+            scans_taken=self._scans_taken,
+            samples_trained=self._mapper.samples_trained,
+            rays_kept=self._mapper.rays_kept,
+            loss=self._loss,
         )
