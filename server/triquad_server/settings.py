@@ -79,16 +79,16 @@ class TrainingSettings(BaseModel):
     beta2: Annotated[float, Field(ge=0.001, le=0.99999)] = 0.99
     """Decay of Adam's mean of squared gradients; at least the square of `beta1`."""
 
-    pool_segments: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
+    pool_rays: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
     """What so many rays taught is kept for training, over the whole map."""
 
     fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Share of a batch that is drawn from the newest scans while they stream in."""
 
-    visits: Annotated[float, Field(ge=0, le=1000)] = 48.0
-    """Training samples that each new ray adds to the training budget of its region."""
+    samples_per_ray: Annotated[float, Field(ge=0, le=1000)] = 48.0
+    """Each new ray raises the training budget of its region by so many samples."""
 
-    max_backlog: Annotated[int, Field(ge=1, le=10_000_000_000)] = 24_000_000
+    max_budget_samples: Annotated[int, Field(ge=1, le=10_000_000_000)] = 24_000_000
     """Largest training budget of a region, in samples."""
 
     cooldown: Annotated[float, Field(ge=0.001, le=1000)] = 8.0

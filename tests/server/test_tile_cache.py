@@ -16,10 +16,12 @@ from triquad_server.mesh.mesher import TileIndex, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_lattice import TileLattice, tile_lattice
 from triquad_server.settings import MeshSettings, Settings
+from triquad_server.threads import Teams
 from triquad_tools.simulation.lidar import SimulatedScan
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 MESH = MeshSettings(tile_cells=16)
+TEAM = Teams().meshing
 
 
 def make_all(cache: TileCache, level: int = 0) -> list[TileIndex]:
@@ -120,7 +122,7 @@ def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
         update={"mesh": MeshSettings(tile_cells=16, cell_m=0.1 / 2**level, tolerance_m=0.03)}
     )
     mapper = Mapper("test", chosen, "cpu")
-    cache = TileCache(chosen.mesh)
+    cache = TileCache(chosen.mesh, TEAM)
     epochs: dict[int, Epoch] = {}
     some_kept = 0
     for number, scan in enumerate(world(6).scans):
@@ -179,7 +181,7 @@ def ground(height: object) -> Epoch:
 
 @pytest.mark.parametrize("level", range(LEVELS))
 def test_only_tiles_whose_surface_moved_are_made_again(level: int) -> None:
-    cache = TileCache(MESH)
+    cache = TileCache(MESH, TEAM)
     cache.refresh(ground(flat(0.3)))
     first = make_all(cache, level)
     before = versions(cache, level)
@@ -198,7 +200,7 @@ def test_only_tiles_whose_surface_moved_are_made_again(level: int) -> None:
 
 
 def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up() -> None:
-    cache = TileCache(MESH)
+    cache = TileCache(MESH, TEAM)
     cache.refresh(ground(flat(0.3)))
     make_all(cache)
     for height_m in (0.306, 0.302, 0.294):
@@ -213,7 +215,7 @@ def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up(
 @pytest.mark.parametrize(("height_m", "tiles"), [(0.25, set()), (0.39, {-1, 0})])
 def test_a_few_voxels_count_where_the_surface_left_them(height_m: float, tiles: set[int]) -> None:
     """Within one layer of voxels, so that the evidence stays the same."""
-    cache = TileCache(MESH)
+    cache = TileCache(MESH, TEAM)
     cache.refresh(ground(flat(0.21)))
     make_all(cache)
     cache.refresh(ground(table(0.21, height_m, 1.6)))
@@ -227,7 +229,7 @@ def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
     for scan in world(2).scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
     settle(mapper)
-    cache = TileCache(MESH)
+    cache = TileCache(MESH, TEAM)
     cache.refresh(mapper.publish())
     make_all(cache)
     before = surfaces(cache)
@@ -245,7 +247,7 @@ def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
 
 
 def test_who_knows_everything_is_told_nothing() -> None:
-    cache = TileCache(MESH)
+    cache = TileCache(MESH, TEAM)
     cache.refresh(ground(flat(0.3)))
     make_all(cache)
     delta = cache.delta(0, *EVERYWHERE, cache.revision, {})
@@ -260,14 +262,14 @@ def test_who_knows_everything_is_told_nothing() -> None:
 
 
 def test_a_box_has_the_tiles_that_meet_it() -> None:
-    cache = TileCache(MESH)
+    cache = TileCache(MESH, TEAM)
     cache.refresh(ground(flat(0.3)))
     delta = cache.delta(0, np.array([0.1, 0.1, 0.1]), np.array([1.7, 0.2, 0.2]), 0, {})
     assert {index[:2] for index in delta.to_make} == {(0, 0), (1, 0)}
 
 
 def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
-    cache = TileCache(MeshSettings(tile_cells=16, cache_bytes=2000))
+    cache = TileCache(MeshSettings(tile_cells=16, cache_bytes=2000), TEAM)
     epoch = ground(flat(0.3))
     cache.refresh(epoch)
     made = make_all(cache)
@@ -287,7 +289,7 @@ def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
 
 
 def test_when_tiles_changed_is_told_for_any_of_them() -> None:
-    cache = TileCache(MESH)
+    cache = TileCache(MESH, TEAM)
     first = ground(flat(0.3))
     cache.refresh(first)
     second = bump(4.0, 0.05)

@@ -32,7 +32,7 @@ class IngestReport:
 
 
 @dataclass(frozen=True)
-class Rays:
+class ScanRays:
     """The usable rays of a scan, in the map frame, metres."""
 
     origin: NDArray[np.float64]  # [3] the sensor
@@ -66,6 +66,17 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
         )
 
 
+def _check_points(points: NDArray[np.float32], max_points: int) -> None:
+    """Refuse points that are not [N, 3], or more than ``max_points``."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ScanRefusedError("points_shape", f"points are {list(points.shape)}, not [N, 3]")
+    if len(points) > max_points:
+        raise ScanRefusedError(
+            "too_many_points",
+            f"{len(points)} points exceed scan.max_points = {max_points}",
+        )
+
+
 @numba.njit(cache=True, nogil=True)
 def _select(
     points: NDArray[np.float32],
@@ -96,7 +107,7 @@ def usable_rays(
     points: NDArray[np.float32],
     world_from_sensor: NDArray[np.float64],
     settings: ScanSettings,
-) -> Rays:
+) -> ScanRays:
     """The rays of a scan that are finite, in range and thinned.
 
     Args:
@@ -108,13 +119,7 @@ def usable_rays(
         ScanRefusedError: the pose is bad, or no point can be used.
     """
     check_pose(world_from_sensor)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ScanRefusedError("points_shape", f"points are {list(points.shape)}, not [N, 3]")
-    if len(points) > settings.max_points:
-        raise ScanRefusedError(
-            "too_many_points",
-            f"{len(points)} points exceed scan.max_points = {settings.max_points}",
-        )
+    _check_points(points, settings.max_points)
     kept, not_finite, too_near, too_far = _select(
         np.ascontiguousarray(points),
         settings.range_min_m,
@@ -131,4 +136,4 @@ def usable_rays(
         )
     rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
     report = IngestReport(len(kept), {reason: n for reason, n in dropped.items() if n})
-    return Rays(origin.copy(), kept @ rotation.T + origin, report)
+    return ScanRays(origin.copy(), kept @ rotation.T + origin, report)

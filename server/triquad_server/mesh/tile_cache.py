@@ -19,10 +19,6 @@ from triquad_server.mesh.tile_bytes import TileBytes
 from triquad_server.mesh.tile_lattice import TileLattice, tile_lattice
 from triquad_server.mesh.tile_level import CachedTile, TileDelta, TileLevel
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import PATIENCE
-
-MESHING = Team("triquad-meshing", PATIENCE)
-"""For tiles that nobody waits for at the moment."""
 
 
 class TileCache:
@@ -31,8 +27,10 @@ class TileCache:
     One thread makes tiles and asks for what is new; any thread may ask what changed.
     """
 
-    def __init__(self, settings: MeshSettings) -> None:
+    def __init__(self, settings: MeshSettings, team: Team) -> None:
+        """``team`` shares the work of making tiles."""
         self._lock = threading.Lock()
+        self._team = team
         self._settings = settings
         self._levels = [TileLevel(tile_lattice(settings, level)) for level in range(LEVELS)]
         self._changes: SurfaceChanges | None = None
@@ -76,7 +74,7 @@ class TileCache:
                     epoch.field_settings,
                     self._settings.tolerance_m,
                     self._settings.tile_side_m,
-                    MESHING,
+                    self._team,
                 )
             changes = self._changes.since_last(epoch.frozen_regions)
             for level in self._levels:
@@ -84,7 +82,7 @@ class TileCache:
             self._epoch = epoch
             # The threads that answer queries are spared: these give way to them.
             self._view = CompiledView(
-                epoch.number, epoch.field_settings, epoch.frozen_regions, MESHING.split
+                epoch.number, epoch.field_settings, epoch.frozen_regions, self._team.split
             )
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> NDArray[np.int64]:

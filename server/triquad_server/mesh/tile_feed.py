@@ -9,8 +9,8 @@ from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_map.compiled.team import be_patient
 
-from triquad_server.epochs.epochs import EpochShelf
 from triquad_server.epochs.gate import QueryGate
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.bandwidth import BURST_S
 from triquad_server.mesh.follower import Follower, new_follower
 from triquad_server.mesh.mesher import TileIndex
@@ -21,7 +21,7 @@ from triquad_server.mesh.tile_reply import TileReply
 from triquad_server.mesh.tile_senders import TileSenders
 from triquad_server.net.request import Request
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import PATIENCE
+from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ class TileFeed:
     def __init__(
         self,
         cache: TileCache,
-        epochs: EpochShelf,
+        epochs: EpochHistory,
         gate: QueryGate,
         *,
         server: str,
@@ -98,7 +98,7 @@ class TileFeed:
             self._changed.notify_all()
 
     def _run(self) -> None:
-        be_patient(PATIENCE)
+        be_patient(NICENESS)
         while True:
             with self._changed:
                 if not self._pending and not self._stopping:

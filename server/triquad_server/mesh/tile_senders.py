@@ -10,7 +10,7 @@ from triquad_map.compiled.team import be_patient
 
 from triquad_server.mesh.bandwidth import Bandwidth
 from triquad_server.mesh.follower import Follower
-from triquad_server.threads import PATIENCE
+from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ class TileSenders:
         self._lock = threading.Lock()
         self._sending = 0
         self._threads = ThreadPoolExecutor(
-            _SENDERS, "tile-sender", initializer=be_patient, initargs=(PATIENCE,)
+            _SENDERS, "tile-sender", initializer=be_patient, initargs=(NICENESS,)
         )
 
     @property

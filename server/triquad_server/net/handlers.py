@@ -11,7 +11,7 @@ import zenoh
 from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
 
-from triquad_server.counter import Tally
+from triquad_server.counter import Counter
 from triquad_server.net.request import Request
 
 _log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class RequestHandlers:
         session: zenoh.Session,
         operations: Mapping[str, Handler],
         limits: HandlerLimits,
-        refused: Tally,
+        refused: Counter,
     ) -> None:
         """Begin to serve ``operations``: handlers by key. What is refused is counted."""
         self._limits = limits

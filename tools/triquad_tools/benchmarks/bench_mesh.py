@@ -15,6 +15,7 @@ from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_lattice import tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings, Settings
+from triquad_server.threads import Teams
 from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.bench_figures import Figure, seconds
@@ -170,7 +171,7 @@ def _work(made: BenchStreet) -> list[Figure]:
     for scan in made.scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
     _settle(mapper)
-    cache = TileCache(settings.mesh)
+    cache = TileCache(settings.mesh, Teams().meshing)
     cache.refresh(mapper.publish())
     _make(cache)
     whole = cache.tiles_made
@@ -223,7 +224,7 @@ def _meshes(cache: TileCache) -> dict[TileIndex, Mesh]:
 
 def _changed(before: dict[TileIndex, Mesh], epoch: Epoch, settings: MeshSettings) -> set[TileIndex]:
     """Tiles whose surface is another one in an epoch, all meshed anew."""
-    cache = TileCache(settings)
+    cache = TileCache(settings, Teams().meshing)
     cache.refresh(epoch)
     _make(cache)
     return changed_tiles(before, _meshes(cache), settings.tolerance_m, settings.cell_m)

@@ -59,7 +59,7 @@ class _TrainingHead:
     mlp_means: tuple[NDArray[np.float32], ...]
     mlp_variances: tuple[NDArray[np.float32], ...]
     mlp_steps: int
-    visits_owed: int
+    budget_samples: int
     samples: int
 
 
@@ -162,7 +162,7 @@ class RegionParts:
             mlp_steps=head.mlp_steps,
             sample_points=points,
             sample_labels=labels,
-            visits_owed=head.visits_owed,
+            budget_samples=head.budget_samples,
         )
 
 

@@ -1,30 +1,10 @@
-"""What each request gets: from its message to the answer's message."""
-
-from collections.abc import Iterator
-from contextlib import contextmanager
+"""Forgetting parts of the map on request."""
 
 from triquad_format.wire.messages import ResetReply, ResetRequest
 
-from triquad_server.epochs.epoch import Epoch
-from triquad_server.epochs.epochs import EpochShelf
-from triquad_server.epochs.gate import QueryGate
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.request_checks import check_box
-
-
-class EpochViews:
-    """The epochs as questions see them; training gives way while one is asked."""
-
-    def __init__(self, epochs: EpochShelf, gate: QueryGate) -> None:
-        self._epochs = epochs
-        self._gate = gate
-
-    @contextmanager
-    def view(self, number: int) -> Iterator[Epoch]:
-        """The epoch of that number, or the newest for 0."""
-        with self._gate.query():
-            yield self._epochs.get(number)
 
 
 class Resets:
