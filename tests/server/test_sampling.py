@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from triquad_server.engine.batch import Batch
-from triquad_server.intake.scan import IngestReport, ScanRays
+from triquad_server.intake.scan import ScanRays
 from triquad_server.mapping.ray_intervals import ray_intervals
 from triquad_server.mapping.sampling import Placement, draw_ordered_samples, draw_samples
 from triquad_server.settings import ScanSettings
@@ -17,7 +17,7 @@ def rays_to_ground(count: int = 500, height_m: float = 2.0) -> ScanRays:
     rng = np.random.default_rng(0)
     ends = np.column_stack([rng.uniform(2, 30, (count, 1)), rng.uniform(-9, 9, (count, 1))])
     ends = np.column_stack([ends, np.zeros(count)])
-    return ScanRays(np.array([0, 0, height_m]), ends, IngestReport(count, {}))
+    return ScanRays(np.array([0, 0, height_m]), ends, points_dropped={})
 
 
 def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placement:

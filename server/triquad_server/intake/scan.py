@@ -24,20 +24,12 @@ class ScanRefusedError(Exception):
 
 
 @dataclass(frozen=True)
-class IngestReport:
-    """What became of a scan's points."""
-
-    points_used: int
-    points_dropped: dict[str, int]  # by reason
-
-
-@dataclass(frozen=True)
 class ScanRays:
     """The usable rays of a scan, in the map frame, metres."""
 
     origin: NDArray[np.float64]  # [3] the sensor
     ends: NDArray[np.float64]  # [N, 3]
-    report: IngestReport
+    points_dropped: dict[str, int]  # points of the scan that are not used, by reason
 
 
 def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
@@ -135,5 +127,5 @@ def usable_rays(
             f"{settings.range_max_m} m from the sensor",
         )
     rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
-    report = IngestReport(len(kept), {reason: n for reason, n in dropped.items() if n})
-    return ScanRays(origin.copy(), kept @ rotation.T + origin, report)
+    counts = {reason: count for reason, count in dropped.items() if count}
+    return ScanRays(origin.copy(), kept @ rotation.T + origin, counts)

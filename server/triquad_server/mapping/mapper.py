@@ -12,7 +12,7 @@ from triquad_format.records.region import MapRecord, RegionIndex
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.engine.trainer import Loss
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
-from triquad_server.intake.scan import IngestReport, ScanRays, ScanRefusedError, usable_rays
+from triquad_server.intake.scan import ScanRays, ScanRefusedError, usable_rays
 from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.settings import Settings
@@ -95,10 +95,13 @@ class Mapper:
         points: NDArray[np.float32],
         world_from_sensor: NDArray[np.float64],
         stamp_s: int = 0,
-    ) -> IngestReport:
+    ) -> dict[str, int]:
         """Take in a scan: ``points`` [N, 3] in metres of the sensor frame, pose [4, 4].
 
         ``stamp_s`` is when it was taken, seconds since 1970.
+
+        Returns:
+            How many points were not used, by reason.
 
         Raises:
             ScanRefusedError: the scan cannot be used; the map is unchanged.
@@ -114,7 +117,7 @@ class Mapper:
             for region in regions:
                 region.learn(rays, normals)
             self._share_pool()
-        return rays.report
+        return rays.points_dropped
 
     def train(self) -> None:
         """One optimiser step where the training budget is largest; nothing once all is settled."""

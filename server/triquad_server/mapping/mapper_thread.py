@@ -200,7 +200,7 @@ class MapperThread:
         if scan is None:
             return False
         try:
-            report = self._mapper.ingest(
+            points_dropped = self._mapper.ingest(
                 scan.points, scan.world_from_sensor, scan.stamp_ns // 1_000_000_000
             )
         except ScanRefusedError as error:
@@ -212,7 +212,7 @@ class MapperThread:
             self._inputs.ledger.refuse(scan, f"internal error of the server: {error!r}")
             _log.exception("scan %d of %s could not be taken in", scan.sequence, scan.source)
         else:
-            for reason, count in report.points_dropped.items():
+            for reason, count in points_dropped.items():
                 self._inputs.points_dropped.add(reason, count)
             self._scans_taken += 1
             self._unpublished = True
