@@ -4,31 +4,10 @@ import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from types import TracebackType
 
 import zenoh
 from triquad_format.wire import keys
-from triquad_format.wire.messages import (
-    CheckpointInfo,
-    CheckpointRequest,
-    FlushRequest,
-    MapChunkRequest,
-    MapInfoRequest,
-    ResetRequest,
-    SdfRequest,
-    StatusRequest,
-    TileListRequest,
-    TileRequest,
-    TileUpdatesRequest,
-)
-from triquad_format.wire.query_messages import (
-    AlignRequest,
-    DistanceRequest,
-    GridRequest,
-    RaysRequest,
-    SegmentsRequest,
-    SpheresRequest,
-)
+from triquad_format.wire.messages import CheckpointInfo
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.counter import Counter
@@ -46,15 +25,21 @@ from triquad_server.mapping.resets import Resets
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.net.handlers import Handler, HandlerLimits, RequestHandlers, answering
+from triquad_server.net.handlers import HandlerLimits, RequestHandlers
 from triquad_server.net.request import payload_limit
+from triquad_server.operations import (
+    Operations,
+    admin_operations,
+    download_operations,
+    mesh_operations,
+    query_operations,
+    status_operations,
+)
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoints import Checkpoints
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.store import Store
 from triquad_server.threads import Teams
-
-_TILE_WORKERS = 2  # one computes while another packs
 
 
 @dataclass(frozen=True)
@@ -79,7 +64,7 @@ class Service:
         settings: Settings,
         failed: Callable[[], None] = lambda: None,
     ) -> None:
-        """Begin to serve; ``failed`` is called where mapping stops by a defect."""
+        """Begin to serve; ``failed`` is called where mapping stops by an internal error."""
         self._session = session
         self._served = served
         self._settings = settings
@@ -98,17 +83,6 @@ class Service:
             self._parts.close()
             raise
 
-    def __enter__(self) -> "Service":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
     @property
     def epoch(self) -> int:
         """Number of the newest epoch."""
@@ -119,6 +93,8 @@ class Service:
         self._parts.close()
 
     def _open(self, failed: Callable[[], None]) -> None:
+        """Open the parts, in the reverse of the order in which they have to be closed."""
+        identity = Identity(self._served.name, secrets.token_hex(8), self._served.device)
         self._mapper = self._open_mapper(failed)
         checkpoints = Checkpoints(
             self._mapper,
@@ -126,40 +102,34 @@ class Service:
             self._settings.store.period_s,
             self._served.restored,
         )
-        identity = Identity(self._served.name, secrets.token_hex(8), self._served.device)
         health = Health(
-            identity,
-            self._counts,
-            self._ledger,
-            self._scans,
-            self._mapper,
-            checkpoints,
+            identity, self._counts, self._ledger, self._scans, self._mapper, checkpoints
         )
-        self._open_handlers(health, identity)
+        self._serve(*self._queries())
+        self._serve(*mesh_operations(*self._open_mesh(identity.server)))
+        self._serve(status_operations(health, self._open_flush()))
+        self._serve(download_operations(MapDownloads(self._mapper)))
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         # Closed before the last checkpoint is written: it shows every reset that was answered.
-        self._open_admin_handlers(checkpoints)
+        self._serve(admin_operations(checkpoints, Resets(self._mapper)))
         self._parts.callback(self._mapper.rest)
         self._open_intake()
         self._parts.callback(Heartbeat(self._session, identity.map_name, health).close)
-        token = self._session.liveliness().declare_token(
-            keys.alive_key(identity.map_name, identity.server),
-        )
-        self._parts.callback(token.undeclare)
+        alive = keys.alive_key(identity.map_name, identity.server)
+        self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
-        inputs = MapperInputs(
-            scans=self._scans,
-            ledger=self._ledger,
-            gate=self._gate,
-            scans_dropped=self._counts.scans_dropped,
-            points_dropped=self._counts.points_dropped,
-        )
         limits = self._settings.service
         mapper = MapperThread(
             self._served.mapper,
-            inputs,
+            MapperInputs(
+                scans=self._scans,
+                ledger=self._ledger,
+                gate=self._gate,
+                scans_dropped=self._counts.scans_dropped,
+                points_dropped=self._counts.points_dropped,
+            ),
             limits.publish_period_s,
             EpochLimits(limits.epochs_kept, limits.epochs_pinned, limits.pin_s),
             failed,
@@ -168,80 +138,27 @@ class Service:
         self._parts.callback(mapper.close)
         return mapper
 
-    def _open_intake(self) -> None:
-        intake = ScanIntake(
-            self._session,
-            self._served.name,
-            self._settings.service.scan_queue,
-            self._settings.scan.max_points,
-            self._scans,
-            self._counts.scans_dropped,
-            self._mapper.wake,
-        )
-        self._parts.callback(intake.close)
-
-    def _open_handlers(self, health: Health, identity: Identity) -> None:
-        """One group of handlers for operations of a kind, so that none waits for a slower kind."""
-        self._open_question_handlers()
-        self._open_mesh_handlers(identity)
-        self._open_status_handlers(health)
-        downloads = MapDownloads(self._mapper)
-        self._handle(
-            {
-                keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
-                keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
-            },
-        )
-
-    def _open_question_handlers(self) -> None:
+    def _queries(self) -> list[Operations]:
         limits = self._settings.service
         views = EpochViews(self._mapper.epochs, self._gate)
-        answers = Answers(
-            views.view, QuestionLimits(limits.max_query_points, limits.max_search_points)
-        )
-        self._handle({keys.SDF: answering(SdfRequest, answers.sdf)}, limits.query_workers)
-        self._handle(
-            {
-                keys.DISTANCE: answering(DistanceRequest, answers.distance),
-                keys.SPHERES: answering(SpheresRequest, answers.spheres),
-            },
-            limits.query_workers,
-        )
-        self._handle(
-            {
-                keys.SEGMENTS: answering(SegmentsRequest, answers.segments),
-                keys.RAYS: answering(RaysRequest, answers.rays),
-                keys.GRID: answering(GridRequest, answers.grid),
-            },
-            limits.query_workers,
-        )
-        self._handle({keys.ALIGN: answering(AlignRequest, answers.align)})
+        most = QuestionLimits(limits.max_query_points, limits.max_search_points)
+        return query_operations(Answers(views.view, most), limits.query_workers)
 
-    def _open_mesh_handlers(self, identity: Identity) -> None:
+    def _open_mesh(self, server: str) -> tuple[TileQueries, TileFeed]:
         cache = TileCache(self._settings.mesh, self._served.teams.meshing)
-        tiles = TileQueries(self._mapper.epochs, cache, self._settings.mesh)
         feed = TileFeed(
             cache,
             self._mapper.epochs,
             self._gate,
-            server=identity.server,
+            server=server,
             settings=self._settings.mesh,
             limit=self._settings.service.request_queue,
         )
         feed.start()
         self._parts.callback(feed.close)
-        self._handle(
-            {
-                keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
-                keys.TILE: answering(TileRequest, tiles.tile),
-            },
-            _TILE_WORKERS,
-        )
-        self._handle(
-            {keys.TILE_UPDATES: lambda request: feed.add(request, request.read(TileUpdatesRequest))}
-        )
+        return TileQueries(self._mapper.epochs, cache, self._settings.mesh), feed
 
-    def _open_status_handlers(self, health: Health) -> None:
+    def _open_flush(self) -> FlushHandler:
         limits = self._settings.service
         flush = FlushHandler(
             self._ledger,
@@ -251,37 +168,32 @@ class Service:
         )
         flush.start()
         self._parts.callback(flush.close)
-        self._handle(
-            {
-                keys.STATUS: answering(StatusRequest, health.answer),
-                keys.FLUSH: lambda request: flush.add(request, request.read(FlushRequest)),
-            },
-        )
+        return flush
 
-    def _open_admin_handlers(self, checkpoints: Checkpoints) -> None:
-        resets = Resets(self._mapper)
-        self._handle(
-            {
-                keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
-                keys.RESET: answering(ResetRequest, resets.answer),
-            },
-        )
-
-    def _handle(self, operations: dict[str, Handler], workers: int = 1) -> None:
-        """Serve some operations from now on, until the service is closed."""
-        limits = self._settings.service
-        name = self._served.name
-        handlers = RequestHandlers(
+    def _open_intake(self) -> None:
+        intake = ScanIntake(
             self._session,
-            {
-                keys.operation_key(name, operation): operations[operation]
-                for operation in operations
-            },
-            HandlerLimits(
-                workers=workers,
-                waiting=limits.request_queue,
-                request_bytes=payload_limit(limits.max_query_points),
-            ),
-            self._counts.requests_refused,
+            self._served.name,
+            limit=self._settings.service.scan_queue,
+            max_points=self._settings.scan.max_points,
+            queue=self._scans,
+            dropped=self._counts.scans_dropped,
+            arrived=self._mapper.wake,
         )
-        self._parts.callback(handlers.close)
+        self._parts.callback(intake.close)
+
+    def _serve(self, *groups: Operations) -> None:
+        """Answer operations from now on, until the service is closed."""
+        limits = self._settings.service
+        for group in groups:
+            handlers = RequestHandlers(
+                self._session,
+                {keys.operation_key(self._served.name, o): h for o, h in group.handlers.items()},
+                HandlerLimits(
+                    workers=group.workers,
+                    waiting=limits.request_queue,
+                    request_bytes=payload_limit(limits.max_query_points),
+                ),
+                self._counts.requests_refused,
+            )
+            self._parts.callback(handlers.close)

@@ -77,7 +77,7 @@ def running_service(
     info = restored.info if restored else None
     session = open_session(network)
     try:
-        with Service(session, ServedMap(map_name, mapper, "cpu", opened, info), settings):
+        with closing(Service(session, ServedMap(map_name, mapper, "cpu", opened, info), settings)):
             yield endpoint
     finally:
         session.close()

@@ -95,10 +95,10 @@ class Checkpoints:
         try:
             self._write()
         except StoreError:
-            return  # noted in the status and in the log
+            return  # the status and the log have it
         except Exception:
-            self.error = "a defect of the server; its log has the details"
-            _log.exception("a checkpoint met a defect")
+            self.error = "an internal error of the server; its log has the details"
+            _log.exception("a checkpoint met an internal error")
 
     def _write(self) -> CheckpointInfo:
         assert self._store is not None
@@ -141,7 +141,7 @@ class Checkpoints:
             _log.error("%s", error)
             return
         except Exception:
-            _log.exception("folding checkpoints met a defect")
+            _log.exception("folding checkpoints met an internal error")
             return
         if info is None:
             return
