@@ -109,8 +109,8 @@ def test_scans_are_learnt_and_all_questions_answered_as_by_the_other_client(tmp_
             assert (report.taken, report.refused, report.lost) == (3, 0, 0)
             assert (await client.settle(servers.WAIT_S)).settled
             with triquad_client.connect(endpoint) as other:
-                expected = other.query_gradient(POINTS)
-                result = await client.query_gradient(POINTS)
+                expected = other.query_sdf(POINTS, gradient=True)
+                result = await client.query_sdf(POINTS, gradient=True)
                 np.testing.assert_array_equal(result.sdf, expected.sdf)
                 np.testing.assert_array_equal(result.status, expected.status)
                 np.testing.assert_array_equal(result.gradient, expected.gradient)
@@ -160,7 +160,7 @@ def test_a_query_of_many_parts_is_joined_in_order(endpoint):
     points = np.tile(POINTS, (1750, 1))  # 3.5 parts
 
     async def use(client: AsyncClient) -> None:
-        few, many = await asyncio.gather(client.query_gradient(POINTS), client.query_sdf(points))
+        few, many = await asyncio.gather(client.query_sdf(POINTS), client.query_sdf(points))
         np.testing.assert_allclose(many.sdf, np.tile(few.sdf, 1750), atol=1e-6)
         assert many.gradient is None
         assert many.epoch == few.epoch
@@ -462,14 +462,19 @@ def test_other_tasks_run_while_a_program_waits():
         (triquad_client.Client, AsyncClient),
         (triquad_client.PinnedMap, triquad_client.AsyncPinnedMap),
         (triquad_client.SyncedMap, triquad_client.AsyncSyncedMap),
+        (triquad_client.MeshWatch, triquad_client.AsyncMeshWatch),
     ],
 )
-def test_both_clients_are_asked_alike(blocking, awaited):
-    def parameters(kind: type) -> dict[str, list[tuple[str, object]]]:
+def test_both_clients_are_asked_alike_and_documented_alike(blocking: type, awaited: type) -> None:
+    def methods(kind: type) -> dict[str, tuple[object, ...]]:
         return {
-            name: [(one.name, one.default) for one in inspect.signature(method).parameters.values()]
+            name: (
+                inspect.getdoc(method),
+                *((one.name, one.default) for one in inspect.signature(method).parameters.values()),
+            )
             for name, method in inspect.getmembers(kind, inspect.isfunction)
             if not name.startswith("_")
         }
 
-    assert parameters(awaited) == parameters(blocking)
+    assert methods(awaited) == methods(blocking)
+    assert all(documentation for documentation, *_ in methods(awaited).values())

@@ -201,7 +201,7 @@ def test_points_that_are_not_finite_are_refused_by_index(client):
     with pytest.raises(InvalidInputError, match="point 1 is .* metres of the map frame"):
         client.query_sdf([[0, 0, 0], [0, 2e9, 0]])
     with pytest.raises(ValueError, match="not finite"):
-        client.query_gradient([[np.inf, 0, 0]])
+        client.query_sdf([[np.inf, 0, 0]], gradient=True)
 
 
 @pytest.mark.parametrize(

@@ -32,8 +32,7 @@ ENDS = np.random.default_rng(1).uniform(-6, 6, (200, 3))
 Question = Callable[[MapQueries], Any]
 
 QUESTIONS: dict[str, Question] = {
-    "query_sdf": lambda view: view.query_sdf(POINTS),
-    "query_gradient": lambda view: view.query_gradient(POINTS),
+    "query_sdf": lambda view: view.query_sdf(POINTS, gradient=True),
     "query_distance": lambda view: view.query_distance(
         POINTS, 3.0, unknown="obstacle", surface_point=True, unknown_distance=True
     ),

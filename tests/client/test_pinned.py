@@ -32,11 +32,11 @@ def learn_more(client: Client) -> None:
 
 def test_a_pinned_map_stays_as_it_was(client):
     view = client.pinned()
-    before = view.query_gradient(POINTS)
+    before = view.query_sdf(POINTS, gradient=True)
     assert before.epoch == view.epoch == client.status().epoch
     for _ in range(3):
         learn_more(client)
-        after = view.query_gradient(POINTS)
+        after = view.query_sdf(POINTS, gradient=True)
         assert after.epoch == view.epoch
         np.testing.assert_array_equal(after.sdf, before.sdf)
         np.testing.assert_array_equal(after.gradient, before.gradient)
@@ -76,7 +76,7 @@ def test_what_is_no_epoch_is_refused_here(client, epoch):
 
 def test_an_epoch_may_be_any_integer(client):
     epoch = client.query_sdf(POINTS).epoch
-    assert client.query_gradient(POINTS, at_epoch=np.int64(epoch)).epoch == epoch
+    assert client.query_sdf(POINTS, at_epoch=np.int64(epoch)).epoch == epoch
 
 
 def test_the_other_client_pins_alike():
@@ -91,7 +91,7 @@ async def pin_with(endpoint: str) -> None:
             view = await client.pinned()
             before = await view.query_sdf(POINTS)
             await asyncio.to_thread(learn_more, learner)
-            after = await asyncio.gather(*(view.query_gradient(POINTS) for _ in range(50)))
+            after = await asyncio.gather(*(view.query_sdf(POINTS) for _ in range(50)))
             assert {result.epoch for result in after} == {view.epoch}
             np.testing.assert_array_equal(after[0].sdf, before.sdf)
             assert (await client.query_sdf(POINTS)).epoch > view.epoch

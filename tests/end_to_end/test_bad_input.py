@@ -237,7 +237,7 @@ def test_a_request_for_another_map_gets_no_reply(peer):
 def test_far_tiles_and_far_points_are_empty(client):
     tile = client.mesh_tile(1_000_000, -1_000_000, 0)
     assert len(tile.faces) == 0
-    result = client.query_gradient([[1e9, 0, 0], [-1e9, 1e9, 1e9]])
+    result = client.query_sdf([[1e9, 0, 0], [-1e9, 1e9, 1e9]], gradient=True)
     assert (result.status == triquad_client.Status.UNKNOWN).all()
     assert np.isnan(result.sdf).all()
 

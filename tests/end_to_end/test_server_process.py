@@ -36,12 +36,12 @@ def learn(endpoint: str) -> SdfResult:
             client.publish_scan(servers.sphere(), POSE)
         assert client.flush(servers.WAIT_S).taken == 2
         client.settle(servers.WAIT_S)
-        return client.query_gradient(PROBES)
+        return client.query_sdf(PROBES, gradient=True)
 
 
 def ask(endpoint: str) -> SdfResult:
     with triquad_client.connect(endpoint) as client:
-        return client.query_gradient(PROBES)
+        return client.query_sdf(PROBES, gradient=True)
 
 
 def assert_same_map(before: SdfResult, after: SdfResult) -> None:

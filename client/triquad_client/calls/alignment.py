@@ -8,7 +8,7 @@ from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions
 from triquad_map.questions.thinning import thinned
 
 from triquad_client import checks
-from triquad_client.net.call import Ask, Call, ask, worked
+from triquad_client.net.call import Ask, Call, ask, offload
 from triquad_client.net.parts import NEWEST
 
 
@@ -22,7 +22,7 @@ def query(
     epoch = checks.chosen_epoch(at_epoch)
     cloud = checks.scan_points(points)
     # Here, not only where it is answered: a hundredth of a scan travels.
-    few = yield from worked(lambda _: thinned(cloud.astype(np.float64), FINE_POINTS))
+    few = yield from offload(lambda _: thinned(cloud.astype(np.float64), FINE_POINTS))
     request = AlignRequest(
         few.astype(np.float32),
         checks.rigid_pose(guess),

@@ -11,7 +11,7 @@ from triquad_map.unknown import Unknown
 
 from triquad_client import checks
 from triquad_client.net.call import Ask, Call
-from triquad_client.net.parts import in_parts, placed
+from triquad_client.net.parts import in_parts, relative
 
 PART_POINTS = 20_000
 """Points of one request: it takes the server some tens of milliseconds, and others wait as long."""
@@ -30,10 +30,10 @@ def query(
     with_unknown_space = options.unknown_distance or policy is not Unknown.FREE
 
     def request(part: slice, number: int) -> Ask[DistanceReply]:
-        place = placed(checked[part])
+        sent = relative(checked[part])
         message = DistanceRequest(
-            place.origin,
-            place.offsets,
+            sent.origin,
+            sent.offsets,
             reach_m,
             options.surface_point,
             with_unknown_space,
@@ -48,7 +48,7 @@ def query(
 
 def _joined(parts: Sequence[DistanceReply], points: NDArray[np.float64]) -> Distances:
     origins = [
-        placed(points[start : start + PART_POINTS]).origin
+        relative(points[start : start + PART_POINTS]).origin
         for start in range(0, max(1, len(points)), PART_POINTS)
     ]
 

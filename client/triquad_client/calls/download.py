@@ -20,7 +20,7 @@ from triquad_client import checks
 from triquad_client.calls.remote_bytes import RemoteBytes
 from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError
-from triquad_client.net.call import Ask, Call, Run, ask, retried, worked
+from triquad_client.net.call import Ask, Call, Run, ask, offload, retried
 
 _PREPARE_S = 120.0
 """The server writes the file before it answers."""
@@ -35,7 +35,7 @@ def fetch(path: Path, training: bool) -> Call[MapInfo]:
         DownloadError: the bytes are not those the server announced.
     """
     # Newer map files may push this one out of the server: then the newest is taken.
-    return retried("chunk_gone", lambda: worked(lambda run: _fetch(run, path, training)))
+    return retried("chunk_gone", lambda: offload(lambda run: _fetch(run, path, training)))
 
 
 def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
@@ -46,7 +46,7 @@ def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
     """
     minimum, maximum = checks.filled_box(bounds)
     job = partial(_fetch_box, path=path, minimum=minimum, maximum=maximum)
-    return (yield from retried("chunk_gone", lambda: worked(job)))
+    return (yield from retried("chunk_gone", lambda: offload(job)))
 
 
 def _fetch(run: Run, path: Path, training: bool) -> MapInfo:
@@ -74,7 +74,7 @@ def _fetch_box(
 def newest_file(training: bool) -> Call[MapInfo]:
     """The file of the newest epoch, which the server keeps for a while."""
     request = MapInfoRequest(training)
-    return ask(Ask(keys.MAP_INFO, request, MapInfo, background=True, at_least_s=_PREPARE_S))
+    return ask(Ask(keys.MAP_INFO, request, MapInfo, background=True, min_timeout_s=_PREPARE_S))
 
 
 def _copy(remote: RemoteBytes, file: BinaryIO, sha256: str) -> None:

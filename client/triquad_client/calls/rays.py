@@ -9,7 +9,7 @@ from triquad_map.questions.rays import RayOptions, Rays
 from triquad_client import checks
 from triquad_client.errors import InvalidInputError
 from triquad_client.net.call import Ask, Call
-from triquad_client.net.parts import in_parts, placed
+from triquad_client.net.parts import in_parts, relative
 
 PART_RAYS = 2_000
 """Rays of one request."""
@@ -29,10 +29,10 @@ def query(
     reach_m = checks.positive("max_range_m", options.max_range_m)
 
     def request(part: slice, number: int) -> Ask[RaysReply]:
-        place = placed(starts[part])
+        sent = relative(starts[part])
         message = RaysRequest(
-            place.origin,
-            place.offsets,
+            sent.origin,
+            sent.offsets,
             ways[part].astype(np.float32),
             reach_m,
             options.through_unknown,

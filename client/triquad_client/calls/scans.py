@@ -110,4 +110,4 @@ class ScanPublisher:
 
 def _ask_flush(request: FlushRequest) -> Ask[FlushReply]:
     wait_s = request.timeout_s + _REPLY_MARGIN_S
-    return Ask(keys.FLUSH, request, FlushReply, at_least_s=wait_s)
+    return Ask(keys.FLUSH, request, FlushReply, min_timeout_s=wait_s)

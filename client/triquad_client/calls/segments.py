@@ -10,7 +10,7 @@ from triquad_map.questions.segments import SegmentOptions, Segments
 from triquad_client import checks
 from triquad_client.errors import InvalidInputError
 from triquad_client.net.call import Ask, Call
-from triquad_client.net.parts import in_parts, placed
+from triquad_client.net.parts import in_parts, relative
 
 PART_SEGMENTS = 2_000
 """Segments of one request."""
@@ -46,9 +46,9 @@ def _query(
     reach_m = checks.positive("max_distance_m", options.max_distance_m)
 
     def request(part: slice, number: int) -> Ask[SegmentsReply]:
-        place = placed(starts[part])
-        offsets = (ends[part] - place.origin).astype(np.float32)
-        message = SegmentsRequest(place.origin, place.offsets, offsets, radius_m, reach_m, number)
+        sent = relative(starts[part])
+        offsets = (ends[part] - sent.origin).astype(np.float32)
+        message = SegmentsRequest(sent.origin, sent.offsets, offsets, radius_m, reach_m, number)
         return Ask(keys.SEGMENTS, message, SegmentsReply)
 
     epoch = checks.chosen_epoch(at_epoch)

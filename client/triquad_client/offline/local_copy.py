@@ -23,9 +23,8 @@ from triquad_client.calls.download import newest_file
 from triquad_client.calls.remote_bytes import RemoteBytes
 from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError
-from triquad_client.net.call import Call, ResultT, Run, retried, worked
-from triquad_client.net.local_driver import LocalDriver
-from triquad_client.offline.view import view_of
+from triquad_client.net.call import Call, ResultT, Run, offload, retried
+from triquad_client.offline.local_driver import LocalDriver
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class _State:
 
 
 class LocalCopy:
-    """The copy; for several threads. It is empty until :meth:`update` has run."""
+    """The copy; for several threads. It is empty until :meth:`_update` has run."""
 
     def __init__(self, path: Path, bounds: Bounds) -> None:
         """``path`` is the file, ``bounds`` are the corners of the box.
@@ -70,37 +69,37 @@ class LocalCopy:
 
     @property
     def epoch(self) -> int:
-        """Number of the epoch that it was made from."""
-        return self._there().epoch
+        """The server's epoch, a published state of its map, that the copy was made from."""
+        return self._current().epoch
 
     @property
     def age_s(self) -> float:
-        """Seconds since the server had nothing newer."""
-        return time.monotonic() - self._there().checked_s
+        """Seconds since the server had nothing newer: how old the copy may be at most."""
+        return time.monotonic() - self._current().checked_s
 
     @property
     def report(self) -> SyncReport:
-        """What its last update took."""
-        return self._there().report
+        """What it took to bring the copy up to date the last time."""
+        return self._current().report
 
-    def run(self, call: Call[ResultT]) -> ResultT:
+    def _answer(self, call: Call[ResultT]) -> ResultT:
         """Answer a call, all of it from one epoch."""
-        return self._there().driver.run(call)
+        return self._current().driver.run(call)
 
-    def update(self) -> Call[SyncReport]:
+    def _update(self) -> Call[SyncReport]:
         """Fetch what changed; where that fails, the copy stays as it was.
 
         Raises:
-            DownloadError: what arrived is not sound.
+            DownloadError: what arrived is not valid.
             OSError: the file cannot be written.
         """
-        return retried("chunk_gone", lambda: worked(self._update))
+        return retried("chunk_gone", lambda: offload(self._fetch))
 
-    def _there(self) -> _State:
-        assert self._state is not None, "update() comes first"
+    def _current(self) -> _State:
+        assert self._state is not None, "_update() comes first"
         return self._state
 
-    def _update(self, run: Run) -> SyncReport:
+    def _fetch(self, run: Run) -> SyncReport:
         with self._updating:
             asked_s = time.monotonic()
             info = run(newest_file(training=False))
@@ -112,7 +111,7 @@ class LocalCopy:
             remote = RemoteBytes(run, info)
             try:
                 parts = _Parts(StoredMap(remote), self._low, self._high)
-                parts.take_up(self._path)
+                parts.reuse(self._path)
                 parts.fetch()
                 record = parts.record()
                 parts.write(self._path)
@@ -120,7 +119,7 @@ class LocalCopy:
                 raise DownloadError(str(error)) from error
             received = len(parts.wanted) - parts.kept
             report = SyncReport(info.epoch, remote.bytes_read, received, parts.kept)
-            driver = LocalDriver(view_of(record))
+            driver = LocalDriver(record)
             self._state = _State(info.sha256, driver, info.epoch, asked_s, report)
             return report
 
@@ -136,8 +135,8 @@ class _Parts:
         self._payloads: dict[PartKey, bytes] = {}
         self.kept = 0
 
-    def take_up(self, path: Path) -> None:
-        """Take what is there already, whatever the file is."""
+    def reuse(self, path: Path) -> None:
+        """Take the parts that the file has already; it may be no map file."""
         try:
             with StoredMap.open(path) as older:
                 known = {entry.key: entry for entry in older.manifest.entries}

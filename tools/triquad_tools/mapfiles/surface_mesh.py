@@ -26,9 +26,10 @@ def surface_mesh(epoch: Epoch, box: Box | None, tile_side_m: float, report: Repo
     indices = epoch.tiles(low, high).tolist()
     for number, (x, y, z) in enumerate(indices):
         tile = epoch.mesh((x, y, z))
-        tiles.append((tile.origin + tile.vertices, tile.faces))
+        tiles.append(Triangles(tile.origin + tile.vertices, tile.faces))
         faces += len(tile.faces)
         if faces > MAX_FACES:
             raise ToolError(f"the mesh has more than {MAX_FACES:,} faces: use --crop or --cell")
         report((number + 1) / len(indices), f"{faces:,} faces")
-    return Mesh(*joined(tiles, tile_side_m, low, high), epoch.number)
+    triangles = joined(tiles, tile_side_m, low, high)
+    return Mesh(triangles.vertices, triangles.faces, epoch.number)
