@@ -26,7 +26,7 @@ def query(
     request = AlignRequest(
         few.astype(np.float32),
         checks.rigid_pose(guess),
-        checks.positive("max_distance_m", options.max_distance_m),
+        checks.within("max_distance_m", options.max_distance_m),
         options.max_iterations,
         NEWEST if epoch is None else epoch,
     )

@@ -26,7 +26,7 @@ def query(
     """Distances at ``points`` [N, 3] of the map frame, metres."""
     checked = checks.query_points(points)
     policy = checks.unknown_policy(unknown)
-    reach_m = checks.positive("max_distance_m", options.max_distance_m)
+    reach_m = checks.within("max_distance_m", options.max_distance_m)
     with_unknown_space = options.unknown_distance or policy is not Unknown.FREE
 
     def request(part: slice, number: int) -> Ask[DistanceReply]:

@@ -42,9 +42,9 @@ def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
     """Write what answers in the bounds; only its parts travel.
 
     Raises:
-        DownloadError: nothing of the map lies in the box, or its parts are not sound.
+        DownloadError: nothing of the map lies in the box, or its parts are not valid.
     """
-    minimum, maximum = checks.filled_box(bounds)
+    minimum, maximum = checks.finite_box(bounds)
     job = partial(_fetch_box, path=path, minimum=minimum, maximum=maximum)
     return (yield from retried("chunk_gone", lambda: offload(job)))
 

@@ -19,8 +19,8 @@ MAX_CELLS = 100_000_000
 
 def query(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | None) -> Call[Grid]:
     """The map at the cells that fill ``bounds``; a flat box is one layer of them."""
-    shape = _shape(bounds, checks.positive("cell_m", cell_m))
-    reach_m = checks.positive("max_distance_m", max_distance_m)
+    shape = _shape(bounds, checks.within("cell_m", cell_m))
+    reach_m = checks.within("max_distance_m", max_distance_m)
     columns, *layer = shape.counts
     at_once = max(1, PART_CELLS // (layer[0] * layer[1]))
 

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_RANGE_M
 from triquad_format.wire.query_messages import RaysReply, RaysRequest
 from triquad_map.questions.rays import RayOptions, Rays
 
@@ -26,7 +27,7 @@ def query(
             f"{len(places)} origins for {len(ways)} directions: one, or as many"
         )
     starts = np.broadcast_to(places, ways.shape)
-    reach_m = checks.positive("max_range_m", options.max_range_m)
+    reach_m = checks.within("max_range_m", options.max_range_m, MAX_RANGE_M)
 
     def request(part: slice, number: int) -> Ask[RaysReply]:
         sent = relative(starts[part])

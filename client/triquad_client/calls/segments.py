@@ -42,8 +42,8 @@ def _query(
     options: SegmentOptions,
     at_epoch: int | None,
 ) -> Call[Segments]:
-    radius_m = checks.not_negative("radius_m", options.radius_m)
-    reach_m = checks.positive("max_distance_m", options.max_distance_m)
+    radius_m = checks.within("radius_m", options.radius_m, least=0.0)
+    reach_m = checks.within("max_distance_m", options.max_distance_m)
 
     def request(part: slice, number: int) -> Ask[SegmentsReply]:
         sent = relative(starts[part])

@@ -63,7 +63,7 @@ class LocalCopy:
             InvalidInputError: the bounds are not a box, or hold nothing.
         """
         self._path = path
-        self._low, self._high = checks.filled_box(bounds)
+        self._low, self._high = checks.finite_box(bounds)
         self._updating = threading.Lock()
         self._state: _State | None = None
 
