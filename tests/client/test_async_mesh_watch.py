@@ -2,15 +2,15 @@
 
 import asyncio
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 import pytest
 import triquad_client
 import zenoh
 from support import servers
+from support.event_loop import connected
 from triquad_client import (
     AsyncClient,
     AsyncMeshWatch,
@@ -26,8 +26,6 @@ from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_server.settings import MeshSettings
 
 SETTINGS = replace(servers.SMALL, mesh=MeshSettings(tile_cells=16, tolerance_m=0.1))
-
-ResultT = TypeVar("ResultT")
 
 
 def half(side: int) -> np.ndarray:
@@ -50,18 +48,6 @@ def endpoint() -> Iterator[str]:
         with triquad_client.connect(endpoint) as client:
             learn(client, half(1))
         yield endpoint
-
-
-def connected(
-    endpoint: str, use: Callable[[AsyncClient], Awaitable[ResultT]], timeout_s: float = 10.0
-) -> ResultT:
-    """What ``use`` returns of a client in an event loop of its own."""
-
-    async def main() -> ResultT:
-        async with triquad_client.connect_async(endpoint, timeout_s=timeout_s) as client:
-            return await asyncio.wait_for(use(client), servers.WAIT_S)
-
-    return asyncio.run(main())
 
 
 def digests(watch: MeshWatch | AsyncMeshWatch) -> dict[tuple[int, int, int], str]:
@@ -271,23 +257,6 @@ def test_a_server_that_does_not_answer_is_an_error_and_its_tiles_stay(endpoint: 
         connected(endpoint, use, timeout_s=0.5)
         for query in silent:
             query.drop()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"level": 3},
-        {"max_bytes_per_s": 0},
-        {"bounds": ((np.nan, 0, 0), (1, 1, 1))},
-        {"known": KnownTiles("s", 1, 6.4)},
-    ],
-)
-def test_bad_arguments_are_refused(endpoint: str, arguments: dict[str, object]) -> None:
-    async def use(client: AsyncClient) -> None:
-        with pytest.raises(InvalidInputError):
-            client.watch_mesh(**arguments)  # type: ignore[arg-type]
-
-    connected(endpoint, use)
 
 
 def test_both_clients_fetch_all_levels(endpoint: str) -> None:

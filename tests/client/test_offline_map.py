@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from triquad_client import (
     Client,
     ClosedError,
     InvalidInputError,
+    OfflineMap,
     RefusedError,
     UnknownSpaceError,
     open_map,
@@ -62,7 +63,7 @@ class Twins:
 
 
 @pytest.fixture(scope="module")
-def twins(tmp_path_factory):
+def twins(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Twins]:
     path = tmp_path_factory.mktemp("twin") / "map.triquad"
     with servers.service_and_client() as client:
         for _ in range(3):
@@ -74,7 +75,7 @@ def twins(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def offline(twins):
+def offline(twins: Twins) -> Iterator[OfflineMap]:
     with open_map(twins.path) as offline:
         yield offline
 
@@ -102,24 +103,24 @@ def assert_close(have: Any, want: Any, name: str) -> None:
         assert have == want, name
 
 
-def test_every_query_of_a_client_is_compared():
+def test_every_query_of_a_client_is_compared() -> None:
     assert set(QUESTIONS) == {name for name in vars(MapQueries) if not name.startswith("_")}
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
-def test_the_file_answers_as_the_server(twins, offline, name):
+def test_the_file_answers_as_the_server(twins: Twins, offline: OfflineMap, name: str) -> None:
     assert offline.compiled
     assert_close(QUESTIONS[name](offline), QUESTIONS[name](twins.client), name)
 
 
-def test_it_tells_what_it_is(twins, offline):
+def test_it_tells_what_it_is(twins: Twins, offline: OfflineMap) -> None:
     status = twins.client.status()
     assert (offline.name, offline.epoch) == (status.map_name, status.epoch)
     assert offline.stamp_ns > 1.7e18
     assert offline.query_distance(POINTS).epoch == offline.epoch
 
 
-def test_large_questions_are_one_call(offline):
+def test_large_questions_are_one_call(offline: OfflineMap) -> None:
     many = np.tile(POINTS, (60, 1))  # more than go into one request
     answer = offline.query_distance(many)
     np.testing.assert_array_equal(
@@ -128,7 +129,7 @@ def test_large_questions_are_one_call(offline):
     assert len(offline.query_sdf(many).sdf) == len(many)
 
 
-def test_only_its_own_epoch_can_be_asked_for(offline):
+def test_only_its_own_epoch_can_be_asked_for(offline: OfflineMap) -> None:
     here = offline.query_sdf(POINTS, at_epoch=offline.epoch)
     np.testing.assert_array_equal(here.sdf, offline.query_sdf(POINTS).sdf)
     for question in (offline.query_sdf, offline.query_distance):
@@ -153,7 +154,9 @@ def test_only_its_own_epoch_can_be_asked_for(offline):
         lambda view: view.query_distance([[9.0, 9, 9]], unknown="error"),
     ],
 )
-def test_what_the_server_does_not_answer_the_file_does_not_either(twins, offline, ask):
+def test_what_the_server_does_not_answer_the_file_does_not_either(
+    twins: Twins, offline: OfflineMap, ask: Question
+) -> None:
     errors = (InvalidInputError, RefusedError, UnknownSpaceError)
     with pytest.raises(errors) as online:
         ask(twins.client)
@@ -162,14 +165,14 @@ def test_what_the_server_does_not_answer_the_file_does_not_either(twins, offline
     assert str(refusal.value) == str(online.value)
 
 
-def test_a_closed_map_says_so(twins):
+def test_a_closed_map_says_so(twins: Twins) -> None:
     offline = open_map(twins.path)
     offline.close()
     with pytest.raises(ClosedError):
         offline.query_sdf(POINTS)
 
 
-def test_of_a_store_the_newest_checkpoint_is_opened(tmp_path):
+def test_of_a_store_the_newest_checkpoint_is_opened(tmp_path: Path) -> None:
     folder = tmp_path / "store" / "site"
     folder.mkdir(parents=True)
     write_checkpoints(folder, (3, 5, 8))
@@ -182,7 +185,7 @@ def test_of_a_store_the_newest_checkpoint_is_opened(tmp_path):
     np.testing.assert_array_equal(whole.query_sdf(POINTS).sdf, delta.query_sdf(POINTS).sdf)
 
 
-def test_damaged_and_foreign_files_are_refused_by_name(tmp_path):
+def test_damaged_and_foreign_files_are_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
     write_map(exact_map(flat(0.0)), path)
     whole = path.read_bytes()
@@ -212,7 +215,7 @@ assert loaded <= {"zenoh"}, loaded
 """
 
 
-def test_without_numba_and_torch_it_answers_the_same(tmp_path):
+def test_without_numba_and_torch_it_answers_the_same(tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
     write_map(exact_map(flat(0.07)), path)
     done = subprocess.run(

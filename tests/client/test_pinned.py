@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def learn_more(client: Client) -> None:
     client.settle(servers.WAIT_S)
 
 
-def test_a_pinned_map_stays_as_it_was(client):
+def test_a_pinned_map_stays_as_it_was(client: Client) -> None:
     view = client.pinned()
     before = view.query_sdf(POINTS, gradient=True)
     assert before.epoch == view.epoch == client.status().epoch
@@ -46,7 +47,7 @@ def test_a_pinned_map_stays_as_it_was(client):
     assert client.pinned().epoch == newest.epoch
 
 
-def test_all_parts_of_a_big_query_come_from_the_epoch_that_is_asked_for(client):
+def test_all_parts_of_a_big_query_come_from_the_epoch_that_is_asked_for(client: Client) -> None:
     view = client.pinned()
     learn_more(client)
     big = client.query_sdf(np.tile(POINTS, (1000, 1)), at_epoch=view.epoch)
@@ -55,7 +56,7 @@ def test_all_parts_of_a_big_query_come_from_the_epoch_that_is_asked_for(client):
     np.testing.assert_allclose(big.sdf, np.tile(expected, 1000), atol=1e-6)
 
 
-def test_an_epoch_that_is_gone_is_refused_and_no_other_answers(client):
+def test_an_epoch_that_is_gone_is_refused_and_no_other_answers(client: Client) -> None:
     view = client.pinned()
     for _ in range(2):  # two others are asked for since
         learn_more(client)
@@ -69,17 +70,17 @@ def test_an_epoch_that_is_gone_is_refused_and_no_other_answers(client):
 
 
 @pytest.mark.parametrize("epoch", [0, -1, 2**63, 1.5, "newest"])
-def test_what_is_no_epoch_is_refused_here(client, epoch):
+def test_what_is_no_epoch_is_refused_here(client: Client, epoch: Any) -> None:
     with pytest.raises(InvalidInputError, match="at_epoch"):
         client.query_sdf(POINTS, at_epoch=epoch)
 
 
-def test_an_epoch_may_be_any_integer(client):
+def test_an_epoch_may_be_any_integer(client: Client) -> None:
     epoch = client.query_sdf(POINTS).epoch
     assert client.query_sdf(POINTS, at_epoch=np.int64(epoch)).epoch == epoch
 
 
-def test_the_other_client_pins_alike():
+def test_the_other_client_pins_alike() -> None:
     with servers.running_service(replace(servers.SMALL, service=LIMITS)) as endpoint:
         asyncio.run(asyncio.wait_for(pin_with(endpoint), servers.WAIT_S))
 
