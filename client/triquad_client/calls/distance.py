@@ -32,12 +32,12 @@ def query(
     def request(part: slice, number: int) -> Ask[DistanceReply]:
         sent = relative(checked[part])
         message = DistanceRequest(
-            sent.origin,
-            sent.offsets,
-            reach_m,
-            options.surface_point,
-            with_unknown_space,
-            number,
+            origin=sent.origin,
+            points=sent.offsets,
+            max_distance_m=reach_m,
+            surface_point=options.surface_point,
+            unknown_distance=with_unknown_space,
+            epoch=number,
         )
         return Ask(keys.DISTANCE, message, DistanceReply)
 
@@ -65,13 +65,13 @@ def _joined(parts: Sequence[DistanceReply], points: NDArray[np.float64]) -> Dist
 
     unknown = [part.unknown_distance_m for part in parts if part.unknown_distance_m is not None]
     return Distances(
-        np.concatenate([part.distance_m for part in parts]),
-        np.concatenate([part.gradient for part in parts]),
-        np.concatenate([part.found for part in parts]).astype(np.bool_),
-        np.concatenate([part.status for part in parts]),
-        np.concatenate([part.confidence for part in parts]),
-        positions(lambda part: part.surface_point),
-        np.concatenate(unknown) if unknown else None,
-        positions(lambda part: part.unknown_point),
-        parts[0].epoch,
+        distance_m=np.concatenate([part.distance_m for part in parts]),
+        gradient=np.concatenate([part.gradient for part in parts]),
+        found=np.concatenate([part.found for part in parts]).astype(np.bool_),
+        status=np.concatenate([part.status for part in parts]),
+        confidence=np.concatenate([part.confidence for part in parts]),
+        surface_point=positions(lambda part: part.surface_point),
+        unknown_distance_m=np.concatenate(unknown) if unknown else None,
+        unknown_point=positions(lambda part: part.unknown_point),
+        epoch=parts[0].epoch,
     )

@@ -28,16 +28,18 @@ def query(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | 
         corner = shape.corner + (part.start * shape.cell_m, 0.0, 0.0)
         count = min(part.stop, columns) - part.start
         counts = np.array([count, *layer], np.int32)
-        message = GridRequest(corner, shape.cell_m, counts, reach_m, number)
+        message = GridRequest(
+            corner=corner, cell_m=shape.cell_m, counts=counts, max_distance_m=reach_m, epoch=number
+        )
         return Ask(keys.GRID, message, GridReply)
 
     epoch = checks.chosen_epoch(at_epoch)
     parts = yield from in_parts(columns, at_once, request, epoch)
     return Grid(
-        shape,
-        np.concatenate([part.distance_m for part in parts]),
-        np.concatenate([part.status for part in parts]),
-        parts[0].epoch,
+        shape=shape,
+        distance_m=np.concatenate([part.distance_m for part in parts]),
+        status=np.concatenate([part.status for part in parts]),
+        epoch=parts[0].epoch,
     )
 
 

@@ -46,7 +46,7 @@ def _mesh(minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int
 def _tiles(
     minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int
 ) -> Call[TileList]:
-    request = TileListRequest(minimum, maximum, 0, level)
+    request = TileListRequest(minimum=minimum, maximum=maximum, epoch=0, level=level)
     return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
 
 

@@ -32,12 +32,12 @@ def query(
     def request(part: slice, number: int) -> Ask[RaysReply]:
         sent = relative(starts[part])
         message = RaysRequest(
-            sent.origin,
-            sent.offsets,
-            ways[part].astype(np.float32),
-            reach_m,
-            options.through_unknown,
-            number,
+            origin=sent.origin,
+            starts=sent.offsets,
+            directions=ways[part].astype(np.float32),
+            max_range_m=reach_m,
+            through_unknown=options.through_unknown,
+            epoch=number,
         )
         return Ask(keys.RAYS, message, RaysReply)
 

@@ -54,15 +54,15 @@ def pin_newest() -> Call[int]:
 
 def _ask(points: NDArray[np.float64], gradient: bool, epoch: int) -> Ask[SdfReply]:
     sent = relative(points)
-    request = SdfRequest(sent.origin, sent.offsets, gradient, epoch)
+    request = SdfRequest(origin=sent.origin, points=sent.offsets, gradient=gradient, epoch=epoch)
     return Ask(keys.SDF, request, SdfReply)
 
 
 def _joined(parts: Sequence[SdfReply]) -> SdfResult:
     gradients = [part.gradient for part in parts if part.gradient is not None]
     return SdfResult(
-        np.concatenate([part.sdf for part in parts]),
-        np.concatenate([part.status for part in parts]),
-        np.concatenate(gradients) if gradients else None,
-        parts[0].epoch,
+        sdf=np.concatenate([part.sdf for part in parts]),
+        status=np.concatenate([part.status for part in parts]),
+        gradient=np.concatenate(gradients) if gradients else None,
+        epoch=parts[0].epoch,
     )

@@ -48,18 +48,25 @@ def _query(
     def request(part: slice, number: int) -> Ask[SegmentsReply]:
         sent = relative(starts[part])
         offsets = (ends[part] - sent.origin).astype(np.float32)
-        message = SegmentsRequest(sent.origin, sent.offsets, offsets, radius_m, reach_m, number)
+        message = SegmentsRequest(
+            origin=sent.origin,
+            starts=sent.offsets,
+            ends=offsets,
+            radius_m=radius_m,
+            max_distance_m=reach_m,
+            epoch=number,
+        )
         return Ask(keys.SEGMENTS, message, SegmentsReply)
 
     epoch = checks.chosen_epoch(at_epoch)
     parts = yield from in_parts(len(starts), PART_SEGMENTS, request, epoch)
     return Segments(
-        np.concatenate([part.length_m for part in parts]),
-        np.concatenate([part.blocked for part in parts]).astype(np.bool_),
-        np.concatenate([part.contact_m for part in parts]),
-        np.concatenate([part.clearance_m for part in parts]),
-        np.concatenate([part.clearance_at_m for part in parts]),
-        np.concatenate([part.meets_unknown for part in parts]).astype(np.bool_),
-        np.concatenate([part.unknown_contact_m for part in parts]),
-        parts[0].epoch,
+        length_m=np.concatenate([part.length_m for part in parts]),
+        blocked=np.concatenate([part.blocked for part in parts]).astype(np.bool_),
+        contact_m=np.concatenate([part.contact_m for part in parts]),
+        clearance_m=np.concatenate([part.clearance_m for part in parts]),
+        clearance_at_m=np.concatenate([part.clearance_at_m for part in parts]),
+        meets_unknown=np.concatenate([part.meets_unknown for part in parts]).astype(np.bool_),
+        unknown_contact_m=np.concatenate([part.unknown_contact_m for part in parts]),
+        epoch=parts[0].epoch,
     )

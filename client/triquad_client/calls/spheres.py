@@ -19,7 +19,9 @@ def query(centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None) -> Call[
 
     def request(part: slice, number: int) -> Ask[SpheresReply]:
         sent = relative(checked[part])
-        message = SpheresRequest(sent.origin, sent.offsets, sizes[part], number)
+        message = SpheresRequest(
+            origin=sent.origin, centres=sent.offsets, radii_m=sizes[part], epoch=number
+        )
         return Ask(keys.SPHERES, message, SpheresReply)
 
     epoch = checks.chosen_epoch(at_epoch)

@@ -81,17 +81,17 @@ class FollowedMesh:
         # Until all is known, the server has to be told which tiles are; then the revision says it.
         known = [] if self.complete else list(self.known_tiles().tiles.values())[:_MAX_HELD]
         return TileUpdatesRequest(
-            self.minimum,
-            self.maximum,
-            self.level,
-            self.server,
-            self.revision,
-            np.array([tile.index for tile in known], np.int32).reshape(-1, 3),
-            np.array([tile.version for tile in known], np.int64),
-            _REPLY_BYTES,
-            wait_s,
-            self.name,
-            self.max_bytes_per_s,
+            minimum=self.minimum,
+            maximum=self.maximum,
+            level=self.level,
+            server=self.server,
+            revision=self.revision,
+            held=np.array([tile.index for tile in known], np.int32).reshape(-1, 3),
+            held_versions=np.array([tile.version for tile in known], np.int64),
+            max_bytes=_REPLY_BYTES,
+            timeout_s=wait_s,
+            client=self.name,
+            max_bytes_per_s=self.max_bytes_per_s,
         )
 
     def after(self, reply: TileUpdates, changed: Mapping[TileIndex, MeshTile]) -> "FollowedMesh":
@@ -122,7 +122,9 @@ class FollowedMesh:
     def known_tiles(self) -> KnownTiles:
         """The tiles to go on with."""
         tiles = {index: tile for index, tile in self.tiles.items() if index not in self.stale}
-        return KnownTiles(self.server, self.level, self.tile_side_m, tiles)
+        return KnownTiles(
+            server=self.server, level=self.level, tile_side_m=self.tile_side_m, tiles=tiles
+        )
 
 
 def _meeting(

@@ -67,13 +67,13 @@ def unpacked(updates: TileUpdates) -> list[MeshTile]:
             raise BadReplyError(f"tile {(x, y, z)}: {error}") from error
         tiles.append(
             MeshTile(
-                (x, y, z),
-                int(updates.versions[row]),
-                hashlib.sha256(data).hexdigest(),
-                len(data),
-                np.array((x, y, z)) * updates.tile_side_m,
-                surface.positions(updates.cell_m),
-                surface.faces,
+                index=(x, y, z),
+                version=int(updates.versions[row]),
+                digest=hashlib.sha256(data).hexdigest(),
+                size_bytes=len(data),
+                origin=np.array((x, y, z)) * updates.tile_side_m,
+                vertices=surface.positions(updates.cell_m),
+                faces=surface.faces,
             )
         )
     return tiles

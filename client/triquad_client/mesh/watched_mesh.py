@@ -85,7 +85,19 @@ class WatchedMesh:
         after = before.after(reply, changed)
         with self._changing:
             if self._followed is not before:  # by what is known now, the reply may be old
-                return MeshUpdate((), (), self._followed.epoch, self._followed.complete, 0)
+                return MeshUpdate(
+                    changed=(),
+                    removed=(),
+                    epoch=self._followed.epoch,
+                    complete=self._followed.complete,
+                    size_bytes=0,
+                )
             self._followed = after
         removed = tuple(sorted(before.tiles.keys() - after.tiles.keys()))
-        return MeshUpdate(tuple(changed), removed, after.epoch, after.complete, len(reply.data))
+        return MeshUpdate(
+            changed=tuple(changed),
+            removed=removed,
+            epoch=after.epoch,
+            complete=after.complete,
+            size_bytes=len(reply.data),
+        )

@@ -105,7 +105,12 @@ class LocalCopy:
             info = run(newest_file(training=False))
             known = self._state
             if known is not None and known.sha256 == info.sha256:
-                report = SyncReport(info.epoch, 0, 0, known.report.parts)
+                report = SyncReport(
+                    epoch=info.epoch,
+                    bytes_received=0,
+                    parts_received=0,
+                    parts_kept=known.report.parts,
+                )
                 self._state = dataclasses.replace(known, checked_s=asked_s, report=report)
                 return report
             remote = RemoteBytes(run, info)
@@ -118,9 +123,20 @@ class LocalCopy:
             except FormatError as error:
                 raise DownloadError(str(error)) from error
             received = len(parts.wanted) - parts.kept
-            report = SyncReport(info.epoch, remote.bytes_read, received, parts.kept)
+            report = SyncReport(
+                epoch=info.epoch,
+                bytes_received=remote.bytes_read,
+                parts_received=received,
+                parts_kept=parts.kept,
+            )
             driver = LocalDriver(record)
-            self._state = _State(info.sha256, driver, info.epoch, asked_s, report)
+            self._state = _State(
+                sha256=info.sha256,
+                driver=driver,
+                epoch=info.epoch,
+                checked_s=asked_s,
+                report=report,
+            )
             return report
 
 
