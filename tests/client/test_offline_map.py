@@ -55,7 +55,7 @@ def moved(x_m: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Twins:
+class Pair:
     """A server that has learnt a sphere, and its map as a file."""
 
     client: Client
@@ -63,20 +63,20 @@ class Twins:
 
 
 @pytest.fixture(scope="module")
-def twins(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Twins]:
-    path = tmp_path_factory.mktemp("twin") / "map.triquad"
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
+    path = tmp_path_factory.mktemp("pair") / "map.triquad"
     with servers.service_and_client() as client:
         for _ in range(3):
             client.publish_scan(servers.sphere(20_000), POSE, stamp_s=1.7e9)
         client.flush(servers.WAIT_S)
         client.settle(servers.WAIT_S)
         client.download_map(path)
-        yield Twins(client, path)
+        yield Pair(client, path)
 
 
 @pytest.fixture(scope="module")
-def offline(twins: Twins) -> Iterator[OfflineMap]:
-    with open_map(twins.path) as offline:
+def offline(pair: Pair) -> Iterator[OfflineMap]:
+    with open_map(pair.path) as offline:
         yield offline
 
 
@@ -108,13 +108,13 @@ def test_every_query_of_a_client_is_compared() -> None:
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
-def test_the_file_answers_as_the_server(twins: Twins, offline: OfflineMap, name: str) -> None:
+def test_the_file_answers_as_the_server(pair: Pair, offline: OfflineMap, name: str) -> None:
     assert offline.compiled
-    assert_close(QUESTIONS[name](offline), QUESTIONS[name](twins.client), name)
+    assert_close(QUESTIONS[name](offline), QUESTIONS[name](pair.client), name)
 
 
-def test_it_tells_what_it_is(twins: Twins, offline: OfflineMap) -> None:
-    status = twins.client.status()
+def test_it_tells_what_it_is(pair: Pair, offline: OfflineMap) -> None:
+    status = pair.client.status()
     assert (offline.name, offline.epoch) == (status.map_name, status.epoch)
     assert offline.stamp_ns > 1.7e18
     assert offline.query_distance(POINTS).epoch == offline.epoch
@@ -155,18 +155,18 @@ def test_only_its_own_epoch_can_be_asked_for(offline: OfflineMap) -> None:
     ],
 )
 def test_what_the_server_does_not_answer_the_file_does_not_either(
-    twins: Twins, offline: OfflineMap, ask: Question
+    pair: Pair, offline: OfflineMap, ask: Question
 ) -> None:
     errors = (InvalidInputError, RefusedError, UnknownSpaceError)
     with pytest.raises(errors) as online:
-        ask(twins.client)
+        ask(pair.client)
     with pytest.raises(type(online.value)) as refusal:
         ask(offline)
     assert str(refusal.value) == str(online.value)
 
 
-def test_a_closed_map_says_so(twins: Twins) -> None:
-    offline = open_map(twins.path)
+def test_a_closed_map_says_so(pair: Pair) -> None:
+    offline = open_map(pair.path)
     offline.close()
     with pytest.raises(ClosedError):
         offline.query_sdf(POINTS)
