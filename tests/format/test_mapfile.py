@@ -25,9 +25,8 @@ from support.mapfile_edit import (
     write_pair,
 )
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.map_facts import MapFacts
-from triquad_format.mapfile.mapfile import MapFileInfo, read_map, read_map_file, write_map
-from triquad_format.mapfile.parts.shuffle import (
+from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.parts.columns import (
     join_integers,
     shuffle,
     shuffle_codes,
@@ -35,7 +34,9 @@ from triquad_format.mapfile.parts.shuffle import (
     unshuffle,
     unshuffle_codes,
 )
-from triquad_format.mapfile.writer import Previews, record_parts, write_parts
+from triquad_format.mapfile.parts.pack import pack_record
+from triquad_format.mapfile.reader import read_map, read_map_file
+from triquad_format.mapfile.writer import MapFileInfo, Previews, write_map, write_parts
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
@@ -249,7 +250,7 @@ def test_golden_files_read_back():
 @pytest.fixture
 def golden_pairs(monkeypatch, tmp_path):
     """The golden files, and what the writer writes now, under the name that it had then."""
-    monkeypatch.setattr("triquad_format.mapfile.writer.__version__", GOLDEN_PRODUCER)
+    monkeypatch.setattr("triquad_format.mapfile.metadata.__version__", GOLDEN_PRODUCER)
     write_golden(tmp_path)
     names = (*GOLDEN_NAMES, GOLDEN_LEVELS)
     return [((GOLDEN / name).read_bytes(), (tmp_path / name).read_bytes()) for name in names]
@@ -302,9 +303,9 @@ def test_previews_are_written_with_their_schema_only():
     record = random_record(6)
     previews = previews_of(record)
     facts = MapFacts(record.name, record.epoch, record.settings)
-    parts = record_parts(record, "<f2", previews.parts)
+    parts = pack_record(record, "<f2", previews.parts)
     with pytest.raises(FormatError, match="give preview_schema"):
-        write_parts(io.BytesIO(), facts, None, parts, {})
+        write_parts(io.BytesIO(), facts, parts)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from triquad_format.errors import (
     UnsupportedMapFileError,
 )
 from triquad_format.mapfile import reader
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 

@@ -6,7 +6,8 @@ import pytest
 from support.map_records import SMALL, assert_same, random_record, with_integers
 from support.mapfile_edit import write_pair, write_record
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_INTEGER, MAX_SEEN_S
@@ -165,9 +166,9 @@ def test_an_unchanged_part_keeps_its_epoch_and_time(tmp_path):
         ),
     )
     record = dataclasses.replace(base, epoch=5, regions=(one, changed))
-    first = write_record(tmp_path / "first.triquad", base, 10**9, {})
+    first = write_record(tmp_path / "first.triquad", base, stamp_ns=10**9)
     known = {entry.key: entry for entry in first.manifest.entries}
-    written = write_record(tmp_path / "second.triquad", record, 2 * 10**9, known)
+    written = write_record(tmp_path / "second.triquad", record, stamp_ns=2 * 10**9, known=known)
     assert_same(read_map(tmp_path / "second.triquad"), record)
     assert not written.manifest.files
     for entry in written.manifest.entries:

@@ -11,7 +11,6 @@ from support.checkpoint_folder import FIRST, SECOND, map_at, write_checkpoints
 from support.map_records import SMALL, assert_same, random_record
 from support.mapfile_edit import file_bytes, manifest_of, rebuild, with_metadata
 from triquad_format.errors import MapFileError, UnsupportedMapFileError
-from triquad_format.mapfile.mapfile import read_map
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     FIELD_TOPICS,
@@ -24,12 +23,13 @@ from triquad_format.mapfile.parts.part import (
     TRAINING,
     VERTICES,
 )
+from triquad_format.mapfile.reader import read_map
 from triquad_format.records import morton
 from triquad_format.records.crop import without_training
 from triquad_format.records.evidence_voxels import seen_voxels
 from triquad_format.records.region import region_centre, region_corner
 from triquad_format.records.status import Status
-from triquad_format.recovery.recover import recover
+from triquad_format.recovery.recovered_map import recover
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.pack import main
 

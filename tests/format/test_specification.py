@@ -13,7 +13,8 @@ from support import map_records, spec_reader
 from support.map_records import SMALL
 from support.spec_parts import Map, RefusedError
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.region import MapRecord
 from triquad_map.reference.evaluator import MapEvaluator

@@ -22,8 +22,8 @@ def seen_voxels(evidence: Evidence, masks: NDArray[np.uint8]) -> NDArray[np.int6
     return blocks + inner
 
 
-def voxels_felt(evidence: Evidence, box: LeafBox) -> NDArray[np.uint8]:
-    """Bits [B, BLOCK_BYTES] of the voxels on which the status in a box hangs."""
+def status_voxels(evidence: Evidence, box: LeafBox) -> NDArray[np.uint8]:
+    """Bits [B, BLOCK_BYTES] of the voxels that decide the status in a box."""
     first = morton.decode(evidence.codes, 3) * BLOCK_VOXELS
     voxels = first[:, :, None] + np.arange(BLOCK_VOXELS)  # [B, 3, 8]
     low, high = box.low - _REACH_VOXELS, box.high + _REACH_VOXELS

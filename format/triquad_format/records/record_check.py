@@ -1,4 +1,4 @@
-"""What a map record must hold to be sound: checked before it is written and after it is read."""
+"""What a map record must hold to be valid: checked before it is written and after it is read."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ _FLOATS = ("<f2", "<f4")
 
 
 def check_record(record: MapRecord) -> None:
-    """Raise :class:`FormatError`, naming region and field, unless ``record`` is sound."""
+    """Raise :class:`FormatError`, naming region and field, unless ``record`` is valid."""
     check_name("map", record.name)
     _check_count("epoch", record.epoch)
     indices = [region.index for region in record.regions]
