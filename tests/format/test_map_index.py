@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
+from support.file_damage import flipped
 from support.map_records import assert_same, random_record, with_integers
 from support.mapfile_edit import (
     MemoryBytes,
@@ -105,10 +106,6 @@ DAMAGED_BASES = {
     ),
     "a part altered": lambda data: flipped(data, len(data) // 3),
 }
-
-
-def flipped(data, at):
-    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
 
 
 @pytest.mark.parametrize("case", DAMAGED_BASES)

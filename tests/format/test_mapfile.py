@@ -26,14 +26,6 @@ from support.mapfile_edit import (
 )
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.metadata import MapFacts
-from triquad_format.mapfile.parts.columns import (
-    join_integers,
-    shuffle,
-    shuffle_codes,
-    split_integers,
-    unshuffle,
-    unshuffle_codes,
-)
 from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import MapFileInfo, Previews, write_map, write_parts
@@ -208,32 +200,6 @@ def test_info_of_parts():
     assert [part.topic for part in file.parts] == [part.topic for part in parts_of(data)[:-1]]
     assert 0 < sum(part.stored_size for part in file.parts) < len(data)
     assert file.manifest == manifest_of(data)
-
-
-# Columns
-
-
-@given(st.lists(st.integers(0, 2**47), unique=True))
-def test_codes_round_trip(codes):
-    array = np.array(sorted(codes), np.int64)
-    np.testing.assert_array_equal(unshuffle_codes(shuffle_codes(array)), array)
-
-
-@given(st.lists(st.integers(-MAX_INTEGER, MAX_INTEGER), min_size=1))
-def test_integers_round_trip(integers):
-    array = np.array(integers, np.int16)[:, None]
-    np.testing.assert_array_equal(join_integers(split_integers(array)), array)
-
-
-def test_literal_bytes_of_columns():
-    assert shuffle_codes(np.array([1, 3, 300])).tolist() == [[1, 2, 41], [0, 0, 1]]
-    assert shuffle_codes(np.array([], np.int64)).shape == (1, 0)
-    halves = np.array([[1.0, -2.0]], "<f2")  # 0x3c00, 0xc000
-    assert shuffle(halves).tolist() == [[[0x00, 0x00]], [[0x3C, 0xC0]]]
-    np.testing.assert_array_equal(unshuffle(shuffle(halves), "<f2"), halves)
-    assert split_integers(np.array([[1, -128], [2, 127]])).tolist() == [[[1, 2], [-128, 127]]]
-    wide = np.array([[128, -300, MAX_INTEGER]])
-    assert split_integers(wide).tolist() == [[[-128], [-44], [127]], [[1], [-1], [127]]]
 
 
 # The golden files

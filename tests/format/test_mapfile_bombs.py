@@ -24,6 +24,7 @@ from support.mapfile_edit import (
     rebuild,
     set_array,
     stored,
+    stored_record,
     with_manifest,
 )
 from triquad_format.errors import DamagedMapFileError, MapFileError
@@ -110,11 +111,6 @@ BOMBS = {
     "times": lambda: bomb_of_evidence("seen_s", (1, 11 * 2**20)),
     "parts": lambda: bomb_of_parts(2**18),
 }
-
-
-def stored_record(data):
-    with stored(data) as map_file:
-        return map_file.record()
 
 
 @pytest.mark.parametrize("name", BOMBS)

@@ -21,7 +21,7 @@ def with_table(record, **changes):
     return dataclasses.replace(record, regions=(region, *record.regions[1:]))
 
 
-UNSOUND = {
+INVALID = {
     "epoch": lambda r: dataclasses.replace(r, epoch=-1),
     "name": lambda r: dataclasses.replace(r, name="a/b"),
     "a region twice": lambda r: dataclasses.replace(r, regions=r.regions * 2),
@@ -40,15 +40,15 @@ UNSOUND = {
 }
 
 
-@pytest.mark.parametrize("case", UNSOUND)
-def test_unsound_records_are_not_written(tmp_path, case):
+@pytest.mark.parametrize("case", INVALID)
+def test_invalid_records_are_not_written(tmp_path, case):
     path = tmp_path / "map.triquad"
     with pytest.raises(FormatError):
-        write_map(UNSOUND[case](random_record(15)), path)
+        write_map(INVALID[case](random_record(15)), path)
     assert not list(tmp_path.iterdir())
 
 
-UNSOUND_EVIDENCE = {
+INVALID_EVIDENCE = {
     "a level less": ("levels", np.zeros(39, np.uint8), r"levels: expected an array \[40\]"),
     "wide levels": ("levels", np.zeros(40, np.int64), r"levels: expected .* of \|u1"),
     "a level too high": ("levels", np.full(40, 8, np.uint8), "levels: one exceeds 7"),
@@ -66,9 +66,9 @@ def with_evidence(record, **changes):
     return dataclasses.replace(record, regions=(region,))
 
 
-@pytest.mark.parametrize("case", UNSOUND_EVIDENCE)
-def test_unsound_evidence_is_not_written(tmp_path, case):
-    field, array, message = UNSOUND_EVIDENCE[case]
+@pytest.mark.parametrize("case", INVALID_EVIDENCE)
+def test_invalid_evidence_is_not_written(tmp_path, case):
+    field, array, message = INVALID_EVIDENCE[case]
     with pytest.raises(FormatError, match=message):
         write_map(with_evidence(random_record(15), **{field: array}), tmp_path / "map.triquad")
     assert not list(tmp_path.iterdir())

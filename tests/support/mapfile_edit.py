@@ -7,8 +7,10 @@ from typing import NamedTuple
 
 import msgpack
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.manifest import FileRef, pack_manifest, unpack_manifest
 from triquad_format.mapfile.mcap.random_access import check_range
 from triquad_format.mapfile.metadata import MapFacts
@@ -61,6 +63,20 @@ def read_bytes(data):
 def stored(data):
     """The map of a file's bytes, by random access."""
     return StoredMap(MemoryBytes(data))
+
+
+def stored_record(data):
+    """The record in a file's bytes, part by part."""
+    with stored(data) as map_file:
+        return map_file.record()
+
+
+def assert_refused(data):
+    """Both ways of reading refuse the file as damaged, with a text."""
+    for read, error in ((read_bytes, DamagedMapFileError), (stored_record, MapFileError)):
+        with pytest.raises(error) as refusal:
+            read(data)
+        assert str(refusal.value)
 
 
 def parts_of(data):

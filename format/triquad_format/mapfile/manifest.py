@@ -210,7 +210,12 @@ def _entries(
     listed = {name: columns[name].tolist() for name in columns if name != "sha256"}
     for i in range(len(columns["topic"])):
         x, y, z = listed["region"][i]
-        key = PartKey(topics[listed["topic"][i]], (x, y, z), listed["plane"][i], listed["cell"][i])
+        key = PartKey(
+            topics[listed["topic"][i]],
+            (x, y, z),
+            plane=listed["plane"][i],
+            cell=listed["cell"][i],
+        )
         yield Entry(
             key,
             size=listed["bytes"][i],

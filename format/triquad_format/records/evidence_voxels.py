@@ -53,4 +53,4 @@ def masked(evidence: Evidence, mask: NDArray[np.uint8]) -> Evidence:
         levels = levels[after[before]]
     if seen_s is not None:
         seen_s = np.where(surface.any(axis=1), seen_s, 0)[rows]
-    return Evidence(evidence.codes[rows], surface[rows], free[rows], levels, seen_s)
+    return Evidence(evidence.codes[rows], surface[rows], free[rows], levels=levels, seen_s=seen_s)

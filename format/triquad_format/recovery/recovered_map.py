@@ -151,7 +151,9 @@ def _missing_squares(
         nodes = np.unique(voxels[:, list(AXES[table.plane])] >> shift, axis=0)
         for corner in np.ndindex(2, 2):
             squares = cells_at((nodes + corner) << shift)
-            needed |= {PartKey(VERTICES, region.index, table.plane, cell) for cell in squares}
+            needed |= {
+                PartKey(VERTICES, region.index, plane=table.plane, cell=cell) for cell in squares
+            }
     return needed - payloads.keys()
 
 

@@ -120,7 +120,7 @@ class McapWriter:
         """
         spec = self._specs[topic]
         number = spec.number
-        chunk = _chunk(spec, payload, time_ns, seams)
+        chunk = _chunk(spec, payload, time_ns=time_ns, seams=seams)
         start = self.size
         self._record(chunk)
         index_start = self.size
@@ -203,7 +203,7 @@ def _channel_records(specs: Sequence[ChannelSpec], schemas: Sequence[Schema]) ->
     ]
 
 
-def _chunk(spec: ChannelSpec, payload: bytes, time_ns: int, seams: Sequence[int]) -> Chunk:
+def _chunk(spec: ChannelSpec, payload: bytes, *, time_ns: int, seams: Sequence[int]) -> Chunk:
     """A chunk of one message."""
     message = _packed(
         Message(

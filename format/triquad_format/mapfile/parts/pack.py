@@ -114,7 +114,9 @@ def _pack_vertices(
             except FormatError as error:
                 raise FormatError(f"region {region.index}: {error}") from error
             levels.append({"codes": pack_array(codes), **features})
-        yield _pack_part(PartKey(VERTICES, region.index, plane, cell), {"levels": levels})
+        yield _pack_part(
+            PartKey(VERTICES, region.index, plane=plane, cell=cell), {"levels": levels}
+        )
 
 
 def _squares(
@@ -162,7 +164,7 @@ def _pack_evidence(region: Region) -> Iterator[Part]:
             fields["levels"] = pack_array(split_levels(levels))
         if evidence.seen_s is not None:
             fields |= _seen_fields(evidence.seen_s[rows][surface.any(axis=1)])
-        yield _pack_part(PartKey(EVIDENCE, region.index, 0, cell), fields)
+        yield _pack_part(PartKey(EVIDENCE, region.index, cell=cell), fields)
 
 
 def _seen_fields(seen_s: NDArray[np.int64]) -> dict[str, object]:
@@ -191,7 +193,7 @@ def _pack_training(
             "points": pack_array(shuffle(training.sample_points[rows])),
             "labels": pack_array(shuffle(training.sample_labels[rows])),
         }
-        yield _pack_part(PartKey(SAMPLES, region.index, 0, number), samples)
+        yield _pack_part(PartKey(SAMPLES, region.index, cell=number), samples)
 
 
 def _pack_moments(
@@ -209,4 +211,6 @@ def _pack_moments(
                 }
                 for i, of_level in zip(numbers, rows, strict=True)
             ]
-            yield _pack_part(PartKey(MOMENTS, region.index, plane, cell), {"levels": levels})
+            yield _pack_part(
+                PartKey(MOMENTS, region.index, plane=plane, cell=cell), {"levels": levels}
+            )
