@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from numpy.typing import ArrayLike
-from triquad_format.mapfile.written_map import MapFileInfo
+from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
 from triquad_client.calls import admin, download, meshes, sdf

@@ -23,7 +23,7 @@ from triquad_client import (
 )
 from triquad_client.calls.queries import MapQueries
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.mapfile import write_map
+from triquad_format.mapfile.writer import write_map
 
 POSE = np.eye(4)
 BOX = ((-5.0, -5.0, -1.0), (5.0, 5.0, 1.0))

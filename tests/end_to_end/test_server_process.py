@@ -8,7 +8,7 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import SdfResult
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
 POSE = np.eye(4)

@@ -11,7 +11,7 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import DownloadError, InvalidInputError, RefusedError, Status
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.durable_file import replacing
-from triquad_format.mapfile.writer import write_map
-from triquad_format.mapfile.written_map import MapFileInfo
+from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MapInfo, MapInfoRequest

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from triquad_format.mapfile.history import checkpoint_files, map_folder
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.reader import MapFile, read_map_file
 
 from triquad_client.calls.queries import MapQueries

@@ -21,7 +21,7 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.history import (
+from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_file,
     checkpoint_files,
@@ -31,10 +31,9 @@ from triquad_format.mapfile.history import (
 )
 from triquad_format.mapfile.index import DAMAGED_SUFFIX, OtherFiles, files_in
 from triquad_format.mapfile.manifest import FileRef
-from triquad_format.mapfile.map_facts import MapFacts
-from triquad_format.mapfile.mapfile import MapFile, read_map_file
-from triquad_format.mapfile.writer import write_parts
-from triquad_format.mapfile.written_map import WrittenMap
+from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.reader import MapFile, read_map_file
+from triquad_format.mapfile.writer import WrittenMap, write_parts
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.messages import CheckpointInfo
@@ -154,9 +153,9 @@ class Store:
                 written = write_parts(
                     path,
                     MapFacts(record.name, record.epoch, record.settings),
-                    stamp_ns,
                     checkpoint_parts(changes, known, None if delta else others, stamp_ns),
-                    {} if known is None else known.entries if delta else known.stored_here(),
+                    stamp_ns=stamp_ns,
+                    known={} if known is None else known.entries if delta else known.stored_here(),
                     preview_schema=preview_schema(),
                 )
             info = _written_info(path, written)
@@ -187,9 +186,13 @@ class Store:
             self._lock.renew()
             with closing(OtherFiles(files_in(self.folder))) as others:
                 parts = unless(stopping, copied_parts(known.entries.values(), others))
-                here = known.stored_here()
                 written = write_parts(
-                    path, known.facts, known.stamp_ns, parts, here, preview_schema=preview_schema()
+                    path,
+                    known.facts,
+                    parts,
+                    stamp_ns=known.stamp_ns,
+                    known=known.stored_here(),
+                    preview_schema=preview_schema(),
                 )
             info = _written_info(path, written)
         except StoppedError:
