@@ -19,6 +19,7 @@ from triquad_server.settings import Settings
 from triquad_server.stop import Stop, Stops, wait_for_stop
 from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
+from triquad_server.threads import Teams
 from triquad_server.warm_up import warm_up
 
 _log = logging.getLogger("triquad_server")
@@ -66,10 +67,11 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         if record is not None and record.settings != options.settings.field:
             _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
         _prepare(options.settings, device)
-        mapper = Mapper(options.map_name, options.settings, device, record)
+        teams = Teams()
+        mapper = Mapper(options.map_name, options.settings, device, record, teams)
         session = stack.enter_context(closing(open_session(options.network)))
         info = restored.info if restored else None
-        served = ServedMap(options.map_name, mapper, device, store, info)
+        served = ServedMap(options.map_name, mapper, device, store, info, teams)
         service = Service(session, served, options.settings, lambda: stops.put(Stop.DEFECT))
         stack.enter_context(closing(service))
         spare_from_collection()

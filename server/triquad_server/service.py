@@ -3,7 +3,7 @@
 import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 
 import zenoh
@@ -31,25 +31,28 @@ from triquad_format.wire.query_messages import (
 )
 from triquad_map.questions.answers import Answers, QuestionLimits
 
-from triquad_server.counter import Tally
-from triquad_server.epochs.epochs import ShelfLimits
+from triquad_server.counter import Counter
 from triquad_server.epochs.gate import QueryGate
+from triquad_server.epochs.history import EpochLimits
+from triquad_server.epochs.views import EpochViews
 from triquad_server.health import Counts, Health, Identity
 from triquad_server.heartbeat import Heartbeat
-from triquad_server.intake.flush import FlushDesk
+from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
 from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
+from triquad_server.mapping.resets import Resets
 from triquad_server.mesh.tile_cache import TileShelf
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.net.handlers import Handler, RequestDesk
 from triquad_server.net.payload import payload_limit
-from triquad_server.net.requests import EpochViews, Resets, TileQueries, answering
+from triquad_server.net.requests import TileQueries, answering
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoints import Checkpoints
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.store import Store
+from triquad_server.threads import Teams
 
 _TILE_WORKERS = 2  # one computes while another packs
 
@@ -63,6 +66,7 @@ class ServedMap:
     device: str  # where the mapper computes
     store: Store | None = None  # where its checkpoints go
     restored: CheckpointInfo | None = None  # the checkpoint it was restored from
+    teams: Teams = field(default_factory=Teams)  # whose threads make mesh tiles
 
 
 class Service:
@@ -79,7 +83,7 @@ class Service:
         self._session = session
         self._served = served
         self._settings = settings
-        self._counts = Counts(Tally(), Tally(), Tally())
+        self._counts = Counts(Counter(), Counter(), Counter())
         self._gate = QueryGate()
         self._ledger = SourceLedger()
         self._scans = ScanQueue(
@@ -146,18 +150,18 @@ class Service:
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
         inputs = MapperInputs(
-            self._scans,
-            self._ledger,
-            self._gate,
-            self._counts.scans_dropped,
-            self._counts.points_dropped,
+            scans=self._scans,
+            ledger=self._ledger,
+            gate=self._gate,
+            scans_dropped=self._counts.scans_dropped,
+            points_dropped=self._counts.points_dropped,
         )
         limits = self._settings.service
         mapper = MapperThread(
             self._served.mapper,
             inputs,
             limits.publish_period_s,
-            ShelfLimits(limits.epochs_kept, limits.epochs_pinned, limits.pin_s),
+            EpochLimits(limits.epochs_kept, limits.epochs_pinned, limits.pin_s),
             failed,
         )
         mapper.start()
@@ -214,8 +218,8 @@ class Service:
         self._open_desk({keys.ALIGN: answering(AlignRequest, answers.align)})
 
     def _open_mesh_desks(self, identity: Identity) -> None:
-        shelf = TileShelf(self._settings.mesh)
-        tiles = TileQueries(self._mapper.epochs, shelf)
+        shelf = TileShelf(self._settings.mesh, self._served.teams.meshing)
+        tiles = TileQueries(self._mapper.epochs, shelf, self._settings.mesh)
         feed = TileFeed(
             shelf,
             self._mapper.epochs,
@@ -243,7 +247,7 @@ class Service:
 
     def _open_status_desk(self, health: Health) -> None:
         limits = self._settings.service
-        flush = FlushDesk(
+        flush = FlushHandler(
             self._ledger,
             self._mapper.publish_soon,
             limits.flush_timeout_max_s,
@@ -254,7 +258,7 @@ class Service:
         self._open_desk(
             {
                 keys.STATUS: answering(StatusRequest, health.answer),
-                keys.FLUSH: lambda request: flush.hold(request, request.read(FlushRequest)),
+                keys.FLUSH: lambda request: flush.add(request, request.read(FlushRequest)),
             },
         )
 

@@ -49,11 +49,11 @@ class TrainingSettings:
     learning_rate: float = 0.01
     beta1: float = 0.9
     beta2: float = 0.99
-    pool_segments: int = 1_200_000  # what so many rays taught is kept, over the whole map
+    pool_rays: int = 1_200_000  # what so many rays taught is kept, over the whole map
     fresh_share: float = 0.5  # of a batch, drawn from the newest scans while they stream in
-    visits: float = 48.0  # training samples that each new segment pays for
-    max_backlog: int = 24_000_000  # samples owed at most, per region
-    cooldown: float = 8.0  # the rate falls once less than this many samples a kept segment are owed
+    samples_per_ray: float = 48.0  # by so much each new ray raises the training budget
+    max_budget_samples: int = 24_000_000  # training budget at most, per region
+    cooldown: float = 8.0  # the rate falls once the budget is below so many samples per kept ray
     max_regions: int = 256  # of the map; a scan that would need more is refused
     seed: int = 42
 
@@ -67,13 +67,13 @@ class TrainingSettings:
                 f"beta2 = {self.beta2} is too small for beta1 = {self.beta1}: "
                 f"use at least {self.beta1**2:.6g}"
             )
-        check_range("pool_segments", self.pool_segments, 100, 1_000_000_000)
+        check_range("pool_rays", self.pool_rays, 100, 1_000_000_000)
         check_range("fresh_share", self.fresh_share, 0.0, 1.0)
-        check_range("visits", self.visits, 0.0, 1000.0)
+        check_range("samples_per_ray", self.samples_per_ray, 0.0, 1000.0)
         check_range("cooldown", self.cooldown, 0.001, 1000.0)
         check_range("max_regions", self.max_regions, 1, 1_000_000)
         check_range("seed", self.seed, 0, 2**31)
-        check_range("max_backlog", self.max_backlog, 1, 10_000_000_000)
+        check_range("max_budget_samples", self.max_budget_samples, 1, 10_000_000_000)
 
 
 @dataclass(frozen=True)

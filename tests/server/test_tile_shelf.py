@@ -15,10 +15,12 @@ from triquad_server.mesh.mesher import TileIndex, mesh_tile
 from triquad_server.mesh.tile_cache import TileShelf
 from triquad_server.mesh.tile_lattice import LEVELS, TileLattice, tile_lattice
 from triquad_server.settings import MeshSettings, Settings
+from triquad_server.threads import Teams
 from triquad_tools.simulation.lidar import SimulatedScan
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 MESH = MeshSettings(tile_cells=16)
+TEAM = Teams().meshing
 
 
 def make_all(shelf: TileShelf, level: int = 0) -> list[TileIndex]:
@@ -117,7 +119,7 @@ def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
     """After partial updates, all tiles have the triangles that meshing in one piece gives."""
     chosen = replace(settings(), mesh=replace(MESH, cell_m=0.1 / 2**level, tolerance_m=0.03))
     mapper = Mapper("test", chosen, "cpu")
-    shelf = TileShelf(chosen.mesh)
+    shelf = TileShelf(chosen.mesh, TEAM)
     epochs: dict[int, Epoch] = {}
     some_kept = 0
     for number, scan in enumerate(world(6).scans):
@@ -176,7 +178,7 @@ def ground(height: object) -> Epoch:
 
 @pytest.mark.parametrize("level", range(LEVELS))
 def test_only_tiles_whose_surface_moved_are_made_again(level: int) -> None:
-    shelf = TileShelf(MESH)
+    shelf = TileShelf(MESH, TEAM)
     shelf.look(ground(flat(0.3)))
     first = make_all(shelf, level)
     before = versions(shelf, level)
@@ -195,7 +197,7 @@ def test_only_tiles_whose_surface_moved_are_made_again(level: int) -> None:
 
 
 def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up() -> None:
-    shelf = TileShelf(MESH)
+    shelf = TileShelf(MESH, TEAM)
     shelf.look(ground(flat(0.3)))
     make_all(shelf)
     for height_m in (0.306, 0.302, 0.294):
@@ -210,7 +212,7 @@ def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up(
 @pytest.mark.parametrize(("height_m", "tiles"), [(0.25, set()), (0.39, {-1, 0})])
 def test_a_few_voxels_count_where_the_surface_left_them(height_m: float, tiles: set[int]) -> None:
     """Within one layer of voxels, so that the evidence stays the same."""
-    shelf = TileShelf(MESH)
+    shelf = TileShelf(MESH, TEAM)
     shelf.look(ground(flat(0.21)))
     make_all(shelf)
     shelf.look(ground(table(0.21, height_m, 1.6)))
@@ -224,7 +226,7 @@ def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
     for scan in world(2).scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
     settle(mapper)
-    shelf = TileShelf(MESH)
+    shelf = TileShelf(MESH, TEAM)
     shelf.look(mapper.publish())
     make_all(shelf)
     before = surfaces(shelf)
@@ -242,7 +244,7 @@ def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
 
 
 def test_who_knows_everything_is_told_nothing() -> None:
-    shelf = TileShelf(MESH)
+    shelf = TileShelf(MESH, TEAM)
     shelf.look(ground(flat(0.3)))
     make_all(shelf)
     news = shelf.news(0, *EVERYWHERE, shelf.revision, {})
@@ -257,14 +259,14 @@ def test_who_knows_everything_is_told_nothing() -> None:
 
 
 def test_a_box_has_the_tiles_that_meet_it() -> None:
-    shelf = TileShelf(MESH)
+    shelf = TileShelf(MESH, TEAM)
     shelf.look(ground(flat(0.3)))
     news = shelf.news(0, np.array([0.1, 0.1, 0.1]), np.array([1.7, 0.2, 0.2]), 0, {})
     assert {index[:2] for index in news.to_make} == {(0, 0), (1, 0)}
 
 
 def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
-    shelf = TileShelf(replace(MESH, shelf_bytes=2000))
+    shelf = TileShelf(replace(MESH, shelf_bytes=2000), TEAM)
     epoch = ground(flat(0.3))
     shelf.look(epoch)
     made = make_all(shelf)
@@ -284,7 +286,7 @@ def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
 
 
 def test_when_tiles_changed_is_told_for_any_of_them() -> None:
-    shelf = TileShelf(MESH)
+    shelf = TileShelf(MESH, TEAM)
     first = ground(flat(0.3))
     shelf.look(first)
     second = bump(4.0, 0.05)

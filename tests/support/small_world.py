@@ -39,7 +39,7 @@ def world(scans: int = 6, step_m: float = 1.5) -> World:
 def settings(**training: object) -> Settings:
     """Small regions, so that a street has several."""
     return parse_settings(
-        {"field": {"depth": 8}, "training": {"batch": 4096, "visits": 18.0, **training}}
+        {"field": {"depth": 8}, "training": {"batch": 4096, "samples_per_ray": 18.0, **training}}
     )
 
 

@@ -84,8 +84,8 @@ def test_maps_of_different_places_have_seen_nothing_of_each_other():
 
 
 def test_the_same_scans_give_maps_that_differ_by_their_noise_alone():
-    few = settled_mapper(settings(visits=9.0), world()).changes_since(None).record
-    many = settled_mapper(settings(visits=18.0), world()).changes_since(None).record
+    few = settled_mapper(settings(samples_per_ray=9.0), world()).changes_since(None).record
+    many = settled_mapper(settings(samples_per_ray=18.0), world()).changes_since(None).record
     total = diff(few, many, 6.4).total
     assert total.points_a > 10_000
     assert total.moved_median_m < 0.01

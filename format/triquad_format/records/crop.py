@@ -23,7 +23,7 @@ def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> Ma
     """What a map needs to answer inside a box, to the last bit as before.
 
     Regions whose cube meets the box stay, with the vertices whose hat functions reach into it,
-    the evidence in it, and the replay samples in it with their share of the visits owed.
+    the evidence in it, and the replay samples in it with their share of the training budget.
 
     Args:
         record: the map.
@@ -79,7 +79,7 @@ def _crop_training(
 ) -> TrainingState:
     leaves = leaf_coordinates(settings, training.sample_points)
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))
-    owed = training.visits_owed * len(inside)  # rounded up below, so that none is forgotten
+    owed = training.budget_samples * len(inside)  # rounded up below, so that none is forgotten
     return dataclasses.replace(
         training,
         table_means=_rows(training.table_means, kept),
@@ -89,7 +89,7 @@ def _crop_training(
         ),
         sample_points=training.sample_points[inside],
         sample_labels=training.sample_labels[inside],
-        visits_owed=-(-owed // max(len(leaves), 1)),
+        budget_samples=-(-owed // max(len(leaves), 1)),
     )
 
 

@@ -176,7 +176,7 @@ class ServerStatus(Message):
     points_dropped: dict[str, int]  # by reason, points of scans that were taken
     requests_refused: dict[str, int]  # by error code
     samples_trained: int
-    segments_kept: int  # what so many rays taught is in the replay pool
+    rays_kept: int  # rays whose lessons are in the replay pools
     loss: float  # recent training loss, 0 before any training
     regions: int
     vertices: int

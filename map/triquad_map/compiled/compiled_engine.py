@@ -1,6 +1,6 @@
-"""From the arrays of a field to its compiled form, and from points to its values."""
+"""The field of a region that does not change any more, in compiled code."""
 
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,70 +17,65 @@ from triquad_map.compiled.field.quadtree import TriQuadtree
 Floats = NDArray[np.float32]
 
 
-class RecordedEngine:
-    """The field of a region as a file holds it; it is not for training."""
+class FieldArrays(NamedTuple):
+    """The numbers of a field."""
 
-    def __init__(self, settings: FieldSettings, region: Region) -> None:
-        self._settings = settings
-        tree = TriQuadtree(settings)
-        features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
-        for table in region.tables:
-            h = table.level - settings.levels.start
-            tree.restore(table.plane, h, table.codes.astype(np.int64))
-            features.append(table.vectors())
-        layers = zip(region.mlp.weights, region.mlp.biases, strict=True)
-        self._field = make_field(
-            settings,
-            tree,
-            np.concatenate(features),
-            [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer],
-            np.asarray(region.frequencies, np.float32),
-        )
+    features: (
+        Floats  # [rows, feature_size] by the rows of its tree; row 0, absent vertices, is zero
+    )
+    mlp: tuple[Floats, ...]  # weights [in, out] and bias [out] of each layer in turn
+    frequencies: Floats  # [m] of Fourier features, on coordinates normalised to [-1, 1]
+
+
+class FrozenCompiledField:
+    """A field that answers from arrays, which nothing may change from then on."""
+
+    def __init__(self, settings: FieldSettings, tree: TriQuadtree, arrays: FieldArrays) -> None:
+        self.settings = settings
+        self.tree = tree
+        self.arrays = arrays
+        self._field = make_field(settings, tree, arrays)
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
         """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
-        return field_values(self._field, self._settings, points, gradient)
+        logits = np.empty(len(points), np.float32)
+        gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
+        compiled_field.evaluate(points, self._field, logits, gradients)
+        scale = np.float32(self.settings.logit_scale_m)
+        return FieldValues(logits * scale, gradients * scale)
 
 
-def make_field(
-    settings: FieldSettings,
-    tree: TriQuadtree,
-    features: Floats,
-    mlp: Sequence[Floats],
-    frequencies: Floats,
-) -> CompiledField:
-    """The compiled form of a field; it shares memory with the arrays.
+def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledField:
+    """The field of a region as a file holds it."""
+    tree = TriQuadtree(settings)
+    features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
+    for table in region.tables:
+        h = table.level - settings.levels.start
+        tree.restore(table.plane, h, table.codes.astype(np.int64))
+        features.append(table.vectors())
+    layers = zip(region.mlp.weights, region.mlp.biases, strict=True)
+    arrays = FieldArrays(
+        np.concatenate(features),
+        tuple(np.ascontiguousarray(array, np.float32) for layer in layers for array in layer),
+        np.asarray(region.frequencies, np.float32),
+    )
+    return FrozenCompiledField(settings, tree, arrays)
 
-    Args:
-        settings: of the field.
-        tree: its vertices.
-        features: [rows, feature_size] by the tree's rows; row 0 is zero.
-        mlp: weights and bias of each layer in turn.
-        frequencies: [m] Fourier frequencies, on coordinates normalised to [-1, 1].
-    """
+
+def make_field(settings: FieldSettings, tree: TriQuadtree, arrays: FieldArrays) -> CompiledField:
+    """The form of a field that kernels take; it shares memory with the arrays and the tree."""
     geometry = Geometry(
         np.float32(settings.leaf_m),
         np.float32(1 << (settings.depth - 1)),
         settings.feature_levels if settings.encoding != "fourier" else 0,
         tree.shape,
     )
-    w1, b1, w2, b2, w3, b3 = mlp
-    turns = frequencies / np.float32(settings.region_side_m / 2)
+    w1, b1, w2, b2, w3, b3 = arrays.mlp
+    turns = arrays.frequencies / np.float32(settings.region_side_m / 2)
     return CompiledField(
         geometry,
         tree.vertices,
-        features,
+        arrays.features,
         Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
         turns if settings.encoding != "features" else turns[:0],
     )
-
-
-def field_values(
-    field: CompiledField, settings: FieldSettings, points: Floats, gradient: bool
-) -> FieldValues:
-    """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
-    logits = np.empty(len(points), np.float32)
-    gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
-    compiled_field.evaluate(points, field, logits, gradients)
-    scale = np.float32(settings.logit_scale_m)
-    return FieldValues(logits * scale, gradients * scale)

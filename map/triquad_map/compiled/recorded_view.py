@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord, Region, region_centre
 
-from triquad_map.compiled.compiled_engine import RecordedEngine
+from triquad_map.compiled.compiled_engine import recorded_field
 from triquad_map.compiled.compiled_view import CompiledView, field_samples
 from triquad_map.compiled.evidence.evidence import Evidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, SurfelTask, first_surfels
@@ -22,7 +22,7 @@ class RecordedRegion:
     def __init__(self, settings: FieldSettings, region: Region, epoch: int) -> None:
         self.index = region.index
         self.centre: NDArray[np.float64] = region_centre(settings, region.index)
-        self.engine = RecordedEngine(settings, region)
+        self.engine = recorded_field(settings, region)
         self.evidence = Evidence.recorded(1 << settings.depth, region.evidence)
         self._settings = settings
         self._epoch = epoch

@@ -24,20 +24,12 @@ class ScanRefusedError(Exception):
 
 
 @dataclass(frozen=True)
-class IngestReport:
-    """What became of a scan's points."""
-
-    points_used: int
-    points_dropped: dict[str, int]  # by reason
-
-
-@dataclass(frozen=True)
-class Rays:
+class ScanRays:
     """The usable rays of a scan, in the map frame, metres."""
 
     origin: NDArray[np.float64]  # [3] the sensor
     ends: NDArray[np.float64]  # [N, 3]
-    report: IngestReport
+    points_dropped: dict[str, int]  # points of the scan that are not used, by reason
 
 
 def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
@@ -63,6 +55,17 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
             "outside_world",
             f"the sensor is {far:.0f} m from the map's origin, more than {WORLD_LIMIT_M:.0f} m; "
             "subtract an offset from the poses",
+        )
+
+
+def _check_points(points: NDArray[np.float32], max_points: int) -> None:
+    """Refuse points that are not [N, 3], or more than ``max_points``."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ScanRefusedError("points_shape", f"points are {list(points.shape)}, not [N, 3]")
+    if len(points) > max_points:
+        raise ScanRefusedError(
+            "too_many_points",
+            f"{len(points)} points exceed scan.max_points = {max_points}",
         )
 
 
@@ -96,7 +99,7 @@ def usable_rays(
     points: NDArray[np.float32],
     world_from_sensor: NDArray[np.float64],
     settings: ScanSettings,
-) -> Rays:
+) -> ScanRays:
     """The rays of a scan that are finite, in range and thinned.
 
     Args:
@@ -108,13 +111,7 @@ def usable_rays(
         ScanRefusedError: the pose is bad, or no point can be used.
     """
     check_pose(world_from_sensor)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ScanRefusedError("points_shape", f"points are {list(points.shape)}, not [N, 3]")
-    if len(points) > settings.max_points:
-        raise ScanRefusedError(
-            "too_many_points",
-            f"{len(points)} points exceed scan.max_points = {settings.max_points}",
-        )
+    _check_points(points, settings.max_points)
     kept, not_finite, too_near, too_far = _select(
         np.ascontiguousarray(points),
         settings.range_min_m,
@@ -130,5 +127,5 @@ def usable_rays(
             f"{settings.range_max_m} m from the sensor",
         )
     rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
-    report = IngestReport(len(kept), {reason: n for reason, n in dropped.items() if n})
-    return Rays(origin.copy(), kept @ rotation.T + origin, report)
+    counts = {reason: count for reason, count in dropped.items() if count}
+    return ScanRays(origin.copy(), kept @ rotation.T + origin, counts)

@@ -9,9 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_map.compiled.rows import with_room
+from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
-
-from triquad_server.threads import MAPPING
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
@@ -19,7 +18,7 @@ _MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a p
 _FULL = 65_536  # points of a cell, above which older ones count for less
 _RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
 
-Moments = NDArray[np.float32]
+PointMoments = NDArray[np.float32]
 Normals = NDArray[np.float32]
 Rows = NDArray[np.int32]
 Counts = NDArray[np.float32]
@@ -31,7 +30,7 @@ def _add(
     start: int,
     cell_m: float,
     index: Index,
-    moments: Moments,
+    moments: PointMoments,
     rows: Rows,
     count: int,
 ) -> tuple[int, int]:
@@ -69,7 +68,7 @@ def _gather(
     row: int,
     cell_m: float,
     index: Index,
-    moments: Moments,
+    moments: PointMoments,
     total: NDArray[np.float64],
 ) -> None:
     """Sum the moments of the 27 cells around that of a row, relative to its centre."""
@@ -136,7 +135,9 @@ def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _outdated(rows: Rows, normals: NDArray[np.float64], moments: Moments, basis: Counts) -> Rows:
+def _outdated(
+    rows: Rows, normals: NDArray[np.float64], moments: PointMoments, basis: Counts
+) -> Rows:
     """Cells of points without a normal whose own is of far fewer points than there are.
 
     Their ``basis`` is brought up to date.
@@ -153,7 +154,9 @@ def _outdated(rows: Rows, normals: NDArray[np.float64], moments: Moments, basis:
 
 
 @numba.njit(cache=True, nogil=True)
-def _estimate(rows: Rows, cell_m: float, index: Index, moments: Moments, normals: Normals) -> None:
+def _estimate(
+    rows: Rows, cell_m: float, index: Index, moments: PointMoments, normals: Normals
+) -> None:
     """Set the normals [cells, 3] of cells; NaN where there is no plane."""
     total, normal = np.empty(10), np.empty(3)
     for row in rows:
@@ -175,7 +178,8 @@ def _adopt(rows: Rows, of_cells: Normals, normals: NDArray[np.float64]) -> None:
 class MomentGrid:
     """Moments of points in the cells of a sparse lattice."""
 
-    def __init__(self, cell_m: float) -> None:
+    def __init__(self, cell_m: float, team: Team) -> None:
+        self._team = team
         self._cell_m = cell_m
         self._cells = VoxelIndex(1024)
         self._moments = np.zeros((1024, 10), np.float32)
@@ -211,7 +215,7 @@ class MomentGrid:
             part = outdated[first:last]
             _estimate(part, self._cell_m, self._cells.arrays, self._moments, self._normals)
 
-        MAPPING.split(len(outdated), work)
+        self._team.split(len(outdated), work)
         _adopt(rows, self._normals, normals)
 
     def keep_nearest(self, place: NDArray[np.float64], cells: int) -> None:
@@ -249,11 +253,12 @@ class SurfaceNormals:
 
     def __init__(
         self,
+        team: Team,
         fine_m: float = 0.15,
         coarse_m: float = 0.5,
         max_cells: int = 150_000,  # of each grid, at some 100 bytes
     ) -> None:
-        self._grids = (MomentGrid(fine_m), MomentGrid(coarse_m))
+        self._grids = (MomentGrid(fine_m, team), MomentGrid(coarse_m, team))
         self._max_cells = max_cells
 
     def add(self, points: NDArray[np.float64], sensor: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,10 +18,6 @@ from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
 from triquad_server.mesh.tile_border import TileBorder
 from triquad_server.mesh.tile_lattice import LEVELS, TileLattice, tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import PATIENCE
-
-MESHING = Team("triquad-meshing", PATIENCE)
-"""For tiles that nobody waits for at the moment."""
 
 _AROUND = [
     (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
@@ -91,8 +87,10 @@ class TileShelf:
     One thread makes tiles and looks for news; any thread may ask what changed.
     """
 
-    def __init__(self, settings: MeshSettings) -> None:
+    def __init__(self, settings: MeshSettings, team: Team) -> None:
+        """``team`` shares the work of making tiles."""
         self._lock = threading.Lock()
+        self._team = team
         self._settings = settings
         self._levels = [_Level(tile_lattice(settings, level)) for level in range(LEVELS)]
         self._changes: SurfaceChanges | None = None
@@ -139,7 +137,7 @@ class TileShelf:
                     epoch.field_settings,
                     self._settings.tolerance_m,
                     self._settings.tile_side_m,
-                    MESHING,
+                    self._team,
                 )
             changes = self._changes.since_last(epoch.frozen_regions)
             for level in self._levels:
@@ -147,7 +145,7 @@ class TileShelf:
             self._epoch = epoch
             # Its work is shared by threads that are patient.
             self._view = CompiledView(
-                epoch.number, epoch.field_settings, epoch.frozen_regions, MESHING.split
+                epoch.number, epoch.field_settings, epoch.frozen_regions, self._team.split
             )
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> NDArray[np.int64]:

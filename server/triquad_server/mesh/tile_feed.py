@@ -14,15 +14,15 @@ from triquad_format.wire import keys
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_map.compiled.team import be_patient
 
-from triquad_server.epochs.epochs import EpochShelf
 from triquad_server.epochs.gate import QueryGate
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.bandwidth import BURST_S, Bandwidth
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import ShelvedTile, TileNews, TileShelf
 from triquad_server.net.request import Request
 from triquad_server.net.requests import check_box, check_level
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import PATIENCE
+from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class TileFeed:
     def __init__(
         self,
         shelf: TileShelf,
-        epochs: EpochShelf,
+        epochs: EpochHistory,
         gate: QueryGate,
         server: str,
         settings: MeshSettings,
@@ -97,7 +97,7 @@ class TileFeed:
         self._stopping = False
         self._next_look = 0.0
         self._senders = ThreadPoolExecutor(
-            _SENDERS, "tile-sender", initializer=be_patient, initargs=(PATIENCE,)
+            _SENDERS, "tile-sender", initializer=be_patient, initargs=(NICENESS,)
         )
         self._thread = threading.Thread(target=self._run, name="meshing")
 
@@ -179,7 +179,7 @@ class TileFeed:
             )
 
     def _run(self) -> None:
-        be_patient(PATIENCE)
+        be_patient(NICENESS)
         while True:
             with self._news:
                 if not self._held and not self._stopping:

@@ -11,7 +11,7 @@ import zenoh
 from triquad_format.errors import RefusedError
 from triquad_format.wire import keys
 
-from triquad_server.counter import Tally
+from triquad_server.counter import Counter
 from triquad_server.net.request import Request
 
 _log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ class RequestDesk:
         workers: int,
         limit: int,
         max_bytes: int,
-        refused: Tally,
+        refused: Counter,
     ) -> None:
         """Begin to serve ``operations`` (handlers by operation of :mod:`triquad_format.wire.keys`).
 

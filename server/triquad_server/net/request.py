@@ -10,7 +10,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 
-from triquad_server.counter import Tally
+from triquad_server.counter import Counter
 
 _log = logging.getLogger(__name__)
 
@@ -20,7 +20,7 @@ RequestT = TypeVar("RequestT", bound=Message)
 class Request:
     """A query that waits for its answer."""
 
-    def __init__(self, query: zenoh.Query, key: str, refused: Tally) -> None:
+    def __init__(self, query: zenoh.Query, key: str, refused: Counter) -> None:
         """``key`` is the key of the operation; refusals are counted in ``refused``."""
         self._query = query
         self._key = key

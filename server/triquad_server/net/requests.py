@@ -1,7 +1,6 @@
 """What each request gets: from its message to the answer's message."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
@@ -9,23 +8,19 @@ from numpy.typing import NDArray
 from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import (
-    ResetReply,
-    ResetRequest,
     Tile,
     TileList,
     TileListRequest,
     TileRequest,
 )
 
-from triquad_server.epochs.epoch import Epoch
-from triquad_server.epochs.epochs import EpochShelf
-from triquad_server.epochs.gate import QueryGate
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.epochs.history import EpochHistory
+from triquad_server.mesh.epoch_mesh import EpochMesh
 from triquad_server.mesh.tile_cache import TileShelf
 from triquad_server.mesh.tile_lattice import LEVELS
 from triquad_server.net.handlers import Handler
 from triquad_server.net.request import Request
+from triquad_server.settings import MeshSettings
 
 TILE_INDEX_LIMIT = 1_000_000
 """Tile indices lie in ``[-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT]``."""
@@ -45,26 +40,13 @@ def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Ha
     return handle
 
 
-class EpochViews:
-    """The epochs as questions see them; training gives way while one is asked."""
-
-    def __init__(self, epochs: EpochShelf, gate: QueryGate) -> None:
-        self._epochs = epochs
-        self._gate = gate
-
-    @contextmanager
-    def view(self, number: int) -> Iterator[Epoch]:
-        """The epoch of that number, or the newest for 0."""
-        with self._gate.query():
-            yield self._epochs.get(number)
-
-
 class TileQueries:
     """Answers mesh queries."""
 
-    def __init__(self, epochs: EpochShelf, shelf: TileShelf) -> None:
+    def __init__(self, epochs: EpochHistory, shelf: TileShelf, settings: MeshSettings) -> None:
         """``shelf`` knows when tiles changed."""
         self._epochs = epochs
+        self._settings = settings
         self._shelf = shelf
 
     def tiles(self, request: TileListRequest) -> TileList:
@@ -72,7 +54,8 @@ class TileQueries:
         check_box(request.minimum, request.maximum)
         check_level(request.level)
         epoch = self._epochs.get(request.epoch)
-        tiles = epoch.tiles(request.minimum, request.maximum, request.level)
+        mesh = EpochMesh(epoch, self._settings)
+        tiles = mesh.tiles(request.minimum, request.maximum, request.level)
         if len(tiles) > MAX_TILES:
             raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
         side_m = self._shelf.lattice(request.level).tile_side_m
@@ -90,29 +73,12 @@ class TileQueries:
             )
         check_level(request.level)
         epoch = self._epochs.get(request.epoch)
-        mesh = epoch.mesh(index, request.level)
+        mesh = EpochMesh(epoch, self._settings).tile(index, request.level)
         # What nobody looked for yet shows in a later list: the tile is fetched once more then.
         (changed,) = self._shelf.changed(request.level, np.array([index])).tolist()
         return Tile(
             epoch.number, min(changed, epoch.number), mesh.origin, mesh.vertices, mesh.faces
         )
-
-
-class Resets:
-    """Forgets parts of the map."""
-
-    def __init__(self, mapper: MapperThread) -> None:
-        self._mapper = mapper
-
-    def answer(self, request: ResetRequest) -> ResetReply:
-        """Forget the request's box; answered once an epoch shows it."""
-        check_box(request.minimum, request.maximum)
-
-        def reset(mapper: Mapper) -> int:
-            mapper.reset(request.minimum, request.maximum)
-            return mapper.publish().number
-
-        return ResetReply(self._mapper.call(reset))
 
 
 def check_level(level: int) -> None:

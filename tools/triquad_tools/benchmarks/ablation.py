@@ -35,7 +35,8 @@ class Variant:
 def run_variant(encoding: str, through: SimulatedDrive) -> Variant:
     """Map a drive with one encoding until all is learnt, and score the map."""
     from triquad_server.mapping.mapper import Mapper
-    from triquad_server.settings import parse_settings
+    from triquad_server.mesh.epoch_mesh import EpochMesh
+    from triquad_server.settings import MeshSettings, parse_settings
 
     mapper = Mapper("ablation", parse_settings({"field": {"encoding": encoding}}), "cpu")
     for scan in through:
@@ -43,12 +44,13 @@ def run_variant(encoding: str, through: SimulatedDrive) -> Variant:
     while not mapper.settled:
         mapper.train()
     epoch = mapper.publish()
+    mesh = EpochMesh(epoch, MeshSettings())
     rng = np.random.default_rng(0)
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     count = 0
-    for x, y, z in epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf)).tolist():
-        tile = epoch.mesh((x, y, z))
+    for x, y, z in mesh.tiles(np.full(3, -np.inf), np.full(3, np.inf)).tolist():
+        tile = mesh.tile((x, y, z))
         vertices.append(tile.vertices + tile.origin)
         faces.append(tile.faces + count)
         count += len(tile.vertices)

@@ -11,14 +11,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from triquad_format.records.status import Status
-from triquad_server.engine.adam import Betas
-from triquad_server.engine.engine import CompiledEngine, TorchEngine
+from triquad_server.engine.adam import Rates
+from triquad_server.engine.batch import Batch
+from triquad_server.engine.tensor_field import TensorField
+from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import Epoch
+from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.region_map import RegionMap
-from triquad_server.mapping.sampling import Batch
-from triquad_server.settings import Settings
-from triquad_server.threads import ANSWERS
+from triquad_server.mesh.epoch_mesh import EpochMesh
+from triquad_server.settings import MeshSettings, Settings
+from triquad_server.threads import Teams
 from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.bench_figures import Figure, compare, seconds
@@ -77,16 +79,16 @@ def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> ND
     return np.concatenate(found)[:_QUERY_POINTS]
 
 
-def _training(region: RegionMap, settings: Settings) -> list[Figure]:
+def _training(region: LiveRegion, settings: Settings) -> list[Figure]:
     training = settings.training
-    engine = TorchEngine(region.field)
-    betas = Betas(training.beta1, training.beta2)
+    trainer = TensorTrainer(region.field)
+    rates = Rates(_RATE, training.beta1, training.beta2)
     rng = np.random.default_rng(0)
 
     def baseline() -> None:
         batch = region.pool.draw(training.batch, 0)
         order = torch.from_numpy(rng.permutation(training.batch))  # tensors do not put it in order
-        engine.train(Batch(batch.points[order], batch.labels[order]), _RATE, betas)
+        trainer.train(Batch(batch.points[order], batch.labels[order]), rates)
 
     step = compare(region.train, baseline, _ROUNDS, repeats=15)
     return [
@@ -95,16 +97,17 @@ def _training(region: RegionMap, settings: Settings) -> list[Figure]:
     ]
 
 
-def _queries(epoch: Epoch, region: RegionMap, points: NDArray[np.float64]) -> list[Figure]:
+def _queries(epoch: Epoch, region: LiveRegion, points: NDArray[np.float64]) -> list[Figure]:
     local = (points - region.centre).astype(np.float32)
-    slow, fast = TorchEngine(region.field), CompiledEngine(region.field)
+    field, team = region.field, Teams().answers
+    slow, fast = TensorField(field.settings, field.tree, field.tensors), field.freeze()
 
     def ratio(gradient: bool) -> float:
         def evaluate(first: int, last: int) -> None:
             fast.evaluate(local[first:last], gradient)
 
         return compare(
-            lambda: ANSWERS.split(len(local), evaluate),
+            lambda: team.split(len(local), evaluate),
             lambda: slow.evaluate(local, gradient),
             _ROUNDS,
             repeats=5,
@@ -125,11 +128,12 @@ def _queries(epoch: Epoch, region: RegionMap, points: NDArray[np.float64]) -> li
 
 
 def _mesh_s(epoch: Epoch, made: BenchStreet) -> float:
-    tiles = epoch.tiles(*made.drive.scene.bounds).tolist()
+    mesh = EpochMesh(epoch, MeshSettings())
+    tiles = mesh.tiles(*made.drive.scene.bounds).tolist()
 
     def mesh_all() -> None:
         for x, y, z in tiles:
-            epoch.mesh((x, y, z))
+            mesh.tile((x, y, z))
 
     return statistics.median(seconds(mesh_all) for _ in range(3))
 

@@ -102,7 +102,7 @@ def _written(epoch: Epoch, record: MapRecord, path: Path) -> MapFileInfo:
 def _f_score(record: MapRecord, made: BenchStreet) -> float:
     settings = Settings()
     epoch = Mapper("bench", settings, "cpu", record).publish()
-    mesh = surface_mesh(epoch, made.drive.scene.bounds, settings.mesh.tile_side_m, lambda *_: None)
+    mesh = surface_mesh(epoch, made.drive.scene.bounds, settings.mesh, lambda *_: None)
     scoring = ScoreSettings(samples_max=_MESH_SAMPLES)
     scene, rng = made.drive.scene, np.random.default_rng(0)
     scores = score_against_scene(Mesh(mesh.vertices, mesh.faces), scene, made.visible, scoring, rng)

@@ -15,6 +15,7 @@ from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import TileShelf
 from triquad_server.mesh.tile_lattice import tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings, Settings
+from triquad_server.threads import Teams
 from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.bench_figures import Figure, seconds
@@ -170,7 +171,7 @@ def _work(made: BenchStreet) -> list[Figure]:
     for scan in made.scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
     _settle(mapper)
-    shelf = TileShelf(settings.mesh)
+    shelf = TileShelf(settings.mesh, Teams().meshing)
     shelf.look(mapper.publish())
     _make(shelf)
     whole = shelf.tiles_made
@@ -223,7 +224,7 @@ def _meshes(shelf: TileShelf) -> dict[TileIndex, Mesh]:
 
 def _changed(before: dict[TileIndex, Mesh], epoch: Epoch, settings: MeshSettings) -> set[TileIndex]:
     """Tiles whose surface is another one in an epoch, all meshed anew."""
-    shelf = TileShelf(settings)
+    shelf = TileShelf(settings, Teams().meshing)
     shelf.look(epoch)
     _make(shelf)
     return changed_tiles(before, _meshes(shelf), settings.tolerance_m, settings.cell_m)

@@ -56,7 +56,7 @@ def _row(made: BenchStreet) -> MapRecord:
     (region,) = record.regions
     training = region.training
     assert training is not None
-    settled = dataclasses.replace(region, training=dataclasses.replace(training, visits_owed=0))
+    settled = dataclasses.replace(region, training=dataclasses.replace(training, budget_samples=0))
     return dataclasses.replace(
         record,
         regions=tuple(

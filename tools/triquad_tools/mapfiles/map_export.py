@@ -35,9 +35,9 @@ def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -
         OSError: the file cannot be written.
     """
     settings = MeshSettings(cell_m=cell_m)
-    epoch = _epoch(record, Settings(mesh=settings))
+    epoch = _epoch(record)
     with progress("meshing", 1.0) as report:
-        mesh = surface_mesh(epoch, box, settings.tile_side_m, report)
+        mesh = surface_mesh(epoch, box, settings, report)
     packed = mesh.file_bytes(path.suffix)
     with replacing(path) as stream:
         stream.write(packed)
@@ -49,7 +49,7 @@ def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool,
     filled = box if box is not None else evidence_bounds(record)
     if filled is None:
         raise ToolError("no ray has shown anything of this map: there is no box to fill")
-    epoch = _epoch(record, Settings())
+    epoch = _epoch(record)
     grid: DenseGrid | SparseGrid
     with progress("evaluating", 1.0) as report:
         if sparse:
@@ -63,5 +63,5 @@ def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool,
     return f"{size:,} bytes, distances {shape}"
 
 
-def _epoch(record: MapRecord, settings: Settings) -> Epoch:
-    return Mapper(record.name, settings, "cpu", without_training(record)).publish()
+def _epoch(record: MapRecord) -> Epoch:
+    return Mapper(record.name, Settings(), "cpu", without_training(record)).publish()

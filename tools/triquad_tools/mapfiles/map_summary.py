@@ -40,7 +40,7 @@ class RegionSummary:
     surface_levels: tuple[int, ...] | None  # number of such voxels by level; None: not known
     free_m3: float  # voxels through which rays only passed
     samples: int | None  # for replay; None: no training state
-    visits_owed: int | None
+    budget_samples: int | None
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _print_region(region: RegionSummary) -> None:
         shares = ", ".join(f"{i}: {n / voxels:.0%}" for i, n in enumerate(region.surface_levels))
         print(f"              surface by level of support: {shares}")
     if region.samples is not None:
-        print(f"    training  {region.samples:,} samples, {region.visits_owed:,} visits owed")
+        print(f"    training  {region.samples:,} samples, budget {region.budget_samples:,}")
 
 
 def _precision(region: RegionSummary) -> str:
@@ -166,7 +166,7 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
         surface_levels=None if evidence.levels is None else _by_level(evidence.levels),
         free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
         samples=None if training is None else len(training.sample_points),
-        visits_owed=None if training is None else training.visits_owed,
+        budget_samples=None if training is None else training.budget_samples,
     )
 
 

@@ -139,7 +139,7 @@ class RegionParts:
             mlp_steps=head.mlp_steps,
             sample_points=points,
             sample_labels=labels,
-            visits_owed=head.visits_owed,
+            budget_samples=head.budget_samples,
         )
 
 

@@ -55,7 +55,7 @@ class TrainingHead:
     mlp_means: tuple[NDArray[np.float32], ...]
     mlp_variances: tuple[NDArray[np.float32], ...]
     mlp_steps: int
-    visits_owed: int
+    budget_samples: int
     samples: int
 
 
@@ -80,7 +80,7 @@ def read_training_head(body: PartBody) -> TrainingHead:
         mlp_means=body.arrays("mlp_means", 2 * MLP_LAYERS),
         mlp_variances=body.arrays("mlp_variances", 2 * MLP_LAYERS),
         mlp_steps=body.count("mlp_steps"),
-        visits_owed=body.count("visits_owed"),
+        budget_samples=body.count("visits_owed"),
         samples=body.count("samples"),
     )
 

@@ -1,6 +1,6 @@
 """The field's arithmetic in compiled code, for the CPU.
 
-The same field as the tensors of :mod:`triquad_server.engine.field` compute, which are its
+The same field as the tensors of :mod:`triquad_server.engine.tensor_field` compute, which are its
 reference: values, gradients with respect to the points and to the parameters. A kernel
 runs on one thread and holds no Python lock; callers split the work. Arrays are float32.
 """

@@ -11,21 +11,21 @@ from triquad_server.epochs.epoch import Epoch
 
 
 @dataclass(frozen=True)
-class ShelfLimits:
+class EpochLimits:
     """Which epochs stay."""
 
-    kept: int  # the newest, at least 1
-    pinned: int  # of the older ones, those that were asked for by number last,
-    pin_s: float  # and that for so long after they were
+    kept: int  # so many of the newest stay, at least 1
+    pinned: int  # so many older ones stay at most: those that were asked for by number last
+    pin_s: float  # an older epoch stays for so long after it was last asked for
 
 
-class EpochShelf:
+class EpochHistory:
     """The newest epochs, and older ones while they are asked for by number."""
 
     def __init__(
         self,
         first: Epoch,
-        limits: ShelfLimits,
+        limits: EpochLimits,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """``clock`` tells seconds that never run backwards."""

@@ -1,18 +1,18 @@
-"""Segments: what rays teach of the signed distance.
+"""Ray intervals: what rays teach of the signed distance.
 
 A ray tells the signed distance all along itself: nothing at its end point, more before it, less
 behind it. The published label is the distance to the end point along the ray, which is too large
 where the ray meets the surface at an angle. Where the surface's normal is known, the label here is
 the distance to its plane, so it changes by the cosine of the angle of incidence for each metre.
 
-A table of segments [N, COLUMNS] is float32, metres, relative to the region's centre.
+A table of ray intervals [N, COLUMNS] is float32, metres, relative to the region's centre.
 """
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_server.intake.scan import Rays
+from triquad_server.intake.scan import ScanRays
 from triquad_server.settings import ScanSettings
 
 END = 0  # and the two columns after it: the end point
@@ -25,43 +25,66 @@ COLUMNS = 10
 
 _MIN_COSINE = 0.05
 
+Vectors = NDArray[np.float64]
+
+
+@numba.njit(cache=True, nogil=True)
+def _set_direction(direction: Vectors, origin: Vectors, end: Vectors) -> float:
+    """Set the unit vector [3] from ``origin`` to ``end``; returns how far it is."""
+    squared = 0.0
+    for axis in range(3):
+        direction[axis] = end[axis] - origin[axis]
+        squared += direction[axis] * direction[axis]
+    reach_m: float = np.sqrt(squared)
+    if reach_m > 0:
+        for axis in range(3):
+            direction[axis] /= reach_m
+    return reach_m
+
+
+@numba.njit(cache=True, nogil=True)
+def _clipped(
+    end: Vectors, direction: Vectors, half_side_m: float, first: float, last: float
+) -> tuple[float, float]:
+    """The part of an interval of a ray that lies in the cube; none where it begins after its end.
+
+    It is in metres behind the end point [3]. The cube is centred at the origin.
+    """
+    for axis in range(3):
+        if direction[axis] != 0:  # stay between both faces of the cube on this axis
+            a = (-half_side_m - end[axis]) / direction[axis]
+            b = (half_side_m - end[axis]) / direction[axis]
+            first, last = max(first, min(a, b)), min(last, max(a, b))
+        elif abs(end[axis]) >= half_side_m:
+            first, last = 1.0, 0.0
+    return first, last
+
 
 @numba.njit(cache=True, nogil=True)
 def _fill(
-    origin: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    half_side: float,
+    origin: Vectors,
+    ends: Vectors,
+    normals: Vectors,
+    half_side_m: float,
     free_from: float,
     behind_m: float,
     table: NDArray[np.float32],
 ) -> int:
-    """Fill the table with the segments that pass the cube; returns how many."""
+    """Fill the table with the intervals of rays that pass the cube; returns how many."""
     count = 0
     direction = np.empty(3)
     for i in range(len(ends)):
-        reach = 0.0
-        for axis in range(3):
-            direction[axis] = ends[i, axis] - origin[axis]
-            reach += direction[axis] * direction[axis]
-        reach = np.sqrt(reach)
-        if reach == 0:
+        reach_m = _set_direction(direction, origin, ends[i])
+        if reach_m == 0:
             continue
-        cosine = 0.0
-        first, last = (free_from - 1) * reach, behind_m
-        for axis in range(3):
-            direction[axis] /= reach
-            cosine += direction[axis] * normals[i, axis]
-            if direction[axis] != 0:  # stay between both faces of the cube on this axis
-                a = (-half_side - ends[i, axis]) / direction[axis]
-                b = (half_side - ends[i, axis]) / direction[axis]
-                first, last = max(first, min(a, b)), min(last, max(a, b))
-            elif abs(ends[i, axis]) >= half_side:
-                first, last = 1.0, 0.0
+        nearest = (free_from - 1) * reach_m
+        first, last = _clipped(ends[i], direction, half_side_m, nearest, behind_m)
         if not first <= last:
             continue
         row = table[count]
+        cosine = 0.0
         for axis in range(3):
+            cosine += direction[axis] * normals[i, axis]
             row[END + axis] = ends[i, axis]
             row[DIRECTION + axis] = direction[axis]
         row[LABEL] = 0
@@ -72,14 +95,14 @@ def _fill(
     return count
 
 
-def ray_segments(
-    rays: Rays,
-    normals: NDArray[np.float64],
-    centre: NDArray[np.float64],
+def ray_intervals(
+    rays: ScanRays,
+    normals: Vectors,
+    centre: Vectors,
     half_side_m: float,
     settings: ScanSettings,
 ) -> NDArray[np.float32]:
-    """Segments of the rays that pass a region's cube, cut off at its faces.
+    """Intervals of the rays that pass a region's cube, cut off at its faces.
 
     Args:
         rays: N rays.
@@ -101,10 +124,10 @@ def ray_segments(
     return table[:count]
 
 
-def sample_segments(
+def sample_intervals(
     points: NDArray[np.float32], labels: NDArray[np.floating]
 ) -> NDArray[np.float32]:
-    """Segments without length that teach the signed distances ``labels`` [N] at points [N, 3]."""
+    """Intervals without length that teach the signed distances ``labels`` [N] at points [N, 3]."""
     table = np.zeros((len(points), COLUMNS), np.float32)
     table[:, END : END + 3] = points
     table[:, LABEL] = labels

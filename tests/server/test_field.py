@@ -8,20 +8,24 @@ import torch
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
-from triquad_server.engine.adam import Betas
-from triquad_server.engine.field import Field
-from triquad_server.engine.field_record import field_mlp, field_tables
+from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_server.engine.adam import Rates
+from triquad_server.engine.batch import Batch
+from triquad_server.engine.field_record import field_from_record, region_record
+from triquad_server.engine.live_field import LiveField, initial_field
+from triquad_server.engine.tensor_field import TensorField
+from triquad_server.engine.tensor_trainer import TensorTrainer
 
 CPU = torch.device("cpu")
-BETAS = Betas(0.9, 0.99)
+RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99)
 
 
 def small(encoding: str = "both", depth: int = 8) -> FieldSettings:
     return FieldSettings(depth=depth, frequencies=4, encoding=encoding)
 
 
-def grown(settings: FieldSettings, seed: int = 0, points: int = 300) -> Field:
-    field = Field(settings, CPU, seed)
+def grown(settings: FieldSettings, seed: int = 0, points: int = 300) -> LiveField:
+    field = initial_field(settings, CPU, seed)
     generator = torch.Generator().manual_seed(seed)
     half = settings.region_side_m / 2
     field.grow(
@@ -36,14 +40,23 @@ def leaves(settings: FieldSettings, points: torch.Tensor) -> np.ndarray:
     return np.floor(points.numpy() / settings.leaf_m).astype(np.int64) + 2 ** (settings.depth - 1)
 
 
-def slow_sdf(field: Field, point: np.ndarray) -> float:
+def in_tensors(field: LiveField) -> TensorField:
+    return TensorField(field.settings, field.tree, field.tensors)
+
+
+def train(field: LiveField, points: torch.Tensor, labels: torch.Tensor) -> None:
+    TensorTrainer(field).train(Batch(points, labels), RATES)
+
+
+def slow_sdf(field: LiveField, point: np.ndarray) -> float:
     settings = field.settings
     inputs: list[float] = []
+    record = region_record((0, 0, 0), field, Evidence(1 << settings.depth), training=None)
     tables = {
         (table.plane, table.level): {
             int(code): features for code, features in zip(table.codes, table.features, strict=True)
         }
-        for table in field_tables(field)
+        for table in record.tables
     }
     if settings.encoding != "fourier":
         leaf = point / settings.leaf_m + 2 ** (settings.depth - 1)
@@ -66,7 +79,7 @@ def slow_sdf(field: Field, point: np.ndarray) -> float:
         ]
         inputs.extend([math.sin(a) for a in angles] + [math.cos(a) for a in angles])
     x = np.array(inputs)
-    mlp = field_mlp(field)
+    mlp = record.mlp
     for layer, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
         x = x @ weight + bias
         if layer < 2:
@@ -79,19 +92,20 @@ def test_it_equals_the_slow_reference(encoding: str) -> None:
     field = grown(small(encoding))
     points = (torch.rand((60, 3)) * 2 - 1) * field.settings.region_side_m * 0.2
     expected = [slow_sdf(field, point) for point in points.double().numpy()]
-    np.testing.assert_allclose(field.sdf(points).numpy(), expected, atol=2e-6)
+    np.testing.assert_allclose(in_tensors(field).sdf(points).numpy(), expected, atol=2e-6)
 
 
 def test_the_gradient_is_that_of_the_values() -> None:
     field = grown(small())
     points = (torch.rand((200, 3)) * 2 - 1) * field.settings.region_side_m * 0.2
     # Bilinear cells and ReLUs have kinks; stay within cells and compare the bulk.
-    _, gradient = field.sdf_and_gradient(points)
+    tensors = in_tensors(field)
+    _, gradient = tensors.sdf_and_gradient(points)
     step = 1e-3
     for axis in range(3):
         offset = torch.zeros(3)
         offset[axis] = step
-        slope = (field.sdf(points + offset) - field.sdf(points - offset)) / (2 * step)
+        slope = (tensors.sdf(points + offset) - tensors.sdf(points - offset)) / (2 * step)
         error = (slope - gradient[:, axis]).abs()
         assert error.median() < 2e-3 * gradient.abs().median()
 
@@ -100,13 +114,13 @@ def test_the_field_is_continuous_across_cells() -> None:
     field = grown(small())
     line = torch.linspace(-4, 4, 80_001)
     points = torch.stack([line, 0.37 * line, -0.21 * line + 0.1], 1)
-    steps = field.sdf(points).diff().abs()
+    steps = in_tensors(field).sdf(points).diff().abs()
     assert steps.max() < 20 * steps.median() + 1e-5
 
 
 def test_vertices_are_those_of_the_nodes_that_points_project_into() -> None:
     settings = small()
-    field = Field(settings, CPU, 0)
+    field = initial_field(settings, CPU, 0)
     field.grow(np.array([[70, 80, 90]]))
     assert field.vertices == 3 * settings.feature_levels * 4
     field.grow(np.array([[70, 80, 90]] * 3))
@@ -115,7 +129,7 @@ def test_vertices_are_those_of_the_nodes_that_points_project_into() -> None:
 
 def test_the_tree_holds_the_vertices_of_all_nodes_and_no_others() -> None:
     settings = small(depth=7)
-    field = Field(settings, CPU, 0)
+    field = initial_field(settings, CPU, 0)
     rng = np.random.default_rng(0)
     chosen = rng.integers(0, 2**settings.depth, (3000, 3))
     for part in np.array_split(chosen, 7):
@@ -140,7 +154,7 @@ def test_the_tree_holds_the_vertices_of_all_nodes_and_no_others() -> None:
 def test_growing_keeps_values_and_optimiser_state() -> None:
     field = grown(small())
     points = (torch.rand((2000, 3)) * 2 - 1) * 7
-    field.train(points, points[:, 2], 0.01, BETAS)
+    train(field, points, points[:, 2])
     before = [t.clone() for t in (field.features.values, field.features.means)]
     variances, steps = field.features.variances.clone(), field.features.steps.clone()
     count = len(field.features)
@@ -152,14 +166,14 @@ def test_growing_keeps_values_and_optimiser_state() -> None:
     assert torch.equal(field.features.variances[:count], variances)
     assert torch.equal(field.features.steps[:count], steps)
     assert field.features.steps[count:].max() == 0
-    field.train(points, points[:, 2], 0.01, BETAS)
+    train(field, points, points[:, 2])
     assert field.features.steps.max() == 2, "the grown parameter is the one that is trained"
 
 
 @pytest.mark.parametrize("encoding", ["both", "features", "fourier"])
 def test_training_learns_a_plane(encoding: str) -> None:
     settings = small(encoding, depth=7)
-    field = Field(settings, CPU, 1)
+    field = initial_field(settings, CPU, 1)
     generator = torch.Generator().manual_seed(1)
     ground = (torch.rand((4000, 3), generator=generator) * 2 - 1) * torch.tensor([6.0, 6.0, 0.0])
     field.grow(leaves(settings, ground))
@@ -167,10 +181,10 @@ def test_training_learns_a_plane(encoding: str) -> None:
         chosen = torch.randint(len(ground), (2048,), generator=generator)
         height = (torch.rand(2048, generator=generator) * 2 - 1) * 0.3
         points = ground[chosen] + height[:, None] * torch.tensor([0.0, 0.0, 1.0])
-        field.train(points, height, 0.01, BETAS)
+        train(field, points, height)
     inner = ground[ground.abs().amax(1) < 5][:500]
-    above = field.sdf(inner + torch.tensor([0.0, 0.0, 0.05]))
-    below = field.sdf(inner - torch.tensor([0.0, 0.0, 0.05]))
+    above = in_tensors(field).sdf(inner + torch.tensor([0.0, 0.0, 0.05]))
+    below = in_tensors(field).sdf(inner - torch.tensor([0.0, 0.0, 0.05]))
     assert (above > 0).float().mean() > 0.97
     assert (below < 0).float().mean() > 0.97
 
@@ -178,32 +192,31 @@ def test_training_learns_a_plane(encoding: str) -> None:
 def test_absent_vertices_stay_zero() -> None:
     field = grown(small())
     points = (torch.rand((3000, 3)) * 2 - 1) * field.settings.region_side_m * 0.45
-    field.train(points, points[:, 0], 0.01, BETAS)
+    train(field, points, points[:, 0])
     assert not field.features.values[0].any()
 
 
-def test_a_copy_does_not_change() -> None:
+def test_a_frozen_field_does_not_change() -> None:
     field = grown(small())
     points = (torch.rand((500, 3)) * 2 - 1) * 7
-    before = field.sdf(points)
-    twin = field.copy()
-    field.train(points, points[:, 2], 0.01, BETAS)
+    before = field.freeze().evaluate(points.numpy(), gradient=False).sdf
+    frozen = field.freeze()
+    train(field, points, points[:, 2])
     field.grow(leaves(field.settings, points))
-    assert torch.equal(twin.sdf(points), before)
-    assert not torch.equal(field.sdf(points), before)
+    np.testing.assert_array_equal(frozen.evaluate(points.numpy(), gradient=False).sdf, before)
+    assert (field.freeze().evaluate(points.numpy(), gradient=False).sdf != before).any()
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_the_gpu_gives_the_same_values() -> None:
     field = grown(small())
-    twin = Field(field.settings, torch.device("cuda"), 0)
-    twin.frequencies = field.frequencies.cuda()
-    for plane in range(3):
-        for h in range(field.settings.feature_levels):
-            codes, rows = field.tree.table(plane, h)
-            twin.restore(plane, h, codes, field.features.values[torch.from_numpy(rows)].cuda())
-    for part, other in zip(twin.mlp, field.mlp, strict=True):
-        part.values.copy_(other.values)
-    points = (torch.rand((500, 3)) * 2 - 1) * 7
-    torch.testing.assert_close(twin.sdf(points.cuda()).cpu(), field.sdf(points), atol=1e-5, rtol=0)
+    record = region_record((0, 0, 0), field, Evidence(1 << field.settings.depth), training=None)
+    other = field_from_record(record, field.settings, torch.device("cuda"), seed=0)
+    points = (torch.rand((500, 3)) * 2 - 1).numpy() * 7
+    expected = field.freeze().evaluate(points, gradient=True)
+    values = other.freeze().evaluate(points, gradient=True)
+    np.testing.assert_allclose(values.sdf, expected.sdf, atol=1e-5)
+    again = region_record((0, 0, 0), other.freeze(), Evidence(1 << 8), training=None)
+    for table, same in zip(record.tables, again.tables, strict=True):
+        np.testing.assert_array_equal(table.features, same.features)
