@@ -39,13 +39,15 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
+from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import MeshUpdate
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_tiles import HeldTiles, MeshTile
-from triquad_client.mesh.mesh_watch import AsyncMeshWatch, MeshWatch
+from triquad_client.mesh.mesh_tiles import KnownTiles, MeshTile
+from triquad_client.mesh.mesh_watch import MeshWatch
+from triquad_client.offline.async_synced_map import AsyncSyncedMap
 from triquad_client.offline.local_copy import SyncReport
-from triquad_client.offline.offline import OfflineMap, open_map
-from triquad_client.offline.synced import AsyncSyncedMap, SyncedMap
+from triquad_client.offline.offline_map import OfflineMap, open_map
+from triquad_client.offline.synced_map import SyncedMap
 
 __all__ = [
     "Alignment",
@@ -63,7 +65,7 @@ __all__ = [
     "DownloadError",
     "FlushReport",
     "Grid",
-    "HeldTiles",
+    "KnownTiles",
     "InvalidInputError",
     "InvalidScanError",
     "MapFileError",

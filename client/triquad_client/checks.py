@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_format.wire.messages import LEVELS
+from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
 from triquad_map.questions.pose import RIGID_TOLERANCE
 from triquad_map.unknown import Unknown
 
@@ -92,21 +92,23 @@ def stamp_ns(stamp_s: float) -> int:
     return round(stamp_s * 1e9)
 
 
-def epoch(number: int) -> int:
-    """The number of an epoch.
+def chosen_epoch(at_epoch: int | None) -> int | None:
+    """The number of an epoch, or ``None`` for the newest.
 
     Raises:
-        InvalidInputError: it is none.
+        InvalidInputError: it is neither.
     """
+    if at_epoch is None:
+        return None
     try:
-        if isinstance(number, bool):
+        if isinstance(at_epoch, bool):
             raise TypeError("a truth value")
-        checked = operator.index(number)
+        number = operator.index(at_epoch)
     except TypeError as error:
-        raise InvalidInputError(f"at_epoch = {number!r} is not the number of an epoch") from error
-    if not 0 < checked < 2**63:
-        raise InvalidInputError(f"at_epoch = {number!r}: epochs are numbered from 1 on")
-    return checked
+        raise InvalidInputError(f"at_epoch = {at_epoch!r} is not the number of an epoch") from error
+    if not 0 < number < 2**63:
+        raise InvalidInputError(f"at_epoch = {at_epoch!r}: epochs are numbered from 1 on")
+    return number
 
 
 def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -150,8 +152,8 @@ def bytes_per_second(limit: int | None) -> int:
     return limit or 0
 
 
-def filled_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As :func:`box`, with infinite sides at ``FARTHEST_M``.
+def finite_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The corners [3] of ``bounds``, infinite sides at ``FARTHEST_M``.
 
     Raises:
         InvalidInputError: the box holds nothing.
@@ -160,11 +162,6 @@ def filled_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]
     if not (minimum < maximum).all():
         raise InvalidInputError(f"bounds = {bounds!r} hold nothing")
     return minimum, maximum
-
-
-def chosen_epoch(at_epoch: int | None) -> int | None:
-    """As :func:`epoch`, or ``None`` for the newest."""
-    return None if at_epoch is None else epoch(at_epoch)
 
 
 def unknown_policy(unknown: Unknown | str) -> Unknown:
@@ -180,27 +177,20 @@ def unknown_policy(unknown: Unknown | str) -> Unknown:
         raise InvalidInputError(f"unknown = {unknown!r}: use one of {ways}") from error
 
 
-def positive(name: str, value: float) -> float:
-    """A finite number above 0.
+def within(
+    name: str, value: float, most: float = MAX_DISTANCE_M, *, least: float = MIN_LENGTH_M
+) -> float:
+    """A number from ``least`` to ``most``.
 
     Raises:
         InvalidInputError: it is none.
     """
-    number = _number(name, value)
-    if not number > 0:
-        raise InvalidInputError(f"{name} = {value!r}: give more than 0")
-    return number
-
-
-def not_negative(name: str, value: float) -> float:
-    """A finite number, 0 or more.
-
-    Raises:
-        InvalidInputError: it is none.
-    """
-    number = _number(name, value)
-    if number < 0:
-        raise InvalidInputError(f"{name} = {value!r}: give 0 or more")
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"{name} = {value!r} is not a number") from error
+    if not least <= number <= most:
+        raise InvalidInputError(f"{name} = {value!r}: use {least:g} to {most:g}")
     return number
 
 
@@ -208,16 +198,18 @@ def radii(values: ArrayLike, count: int) -> NDArray[np.float32]:
     """Radii [count], from as many or a single one.
 
     Raises:
-        InvalidInputError: they are not finite numbers, 0 or more.
+        InvalidInputError: they are not numbers from 0 to ``MAX_DISTANCE_M``.
     """
     try:
         array = np.broadcast_to(np.asarray(values, np.float32), (count,))
     except (TypeError, ValueError) as error:
         raise InvalidInputError(f"radii_m are not one number or {count}: {error}") from error
-    bad = ~(np.isfinite(array) & (array >= 0))
+    bad = ~((array >= 0) & (array <= MAX_DISTANCE_M))
     if bad.any():
         index = int(bad.argmax())
-        raise InvalidInputError(f"radius {index} is {array[index]}: give 0 or more, in metres")
+        raise InvalidInputError(
+            f"radius {index} is {array[index]}: use 0 to {MAX_DISTANCE_M:g}, in metres"
+        )
     return array
 
 
@@ -243,16 +235,6 @@ def directions(vectors: ArrayLike) -> NDArray[np.float64]:
         index = int((lengths <= 0).argmax())
         raise InvalidInputError(f"direction {index} is {array[index]}: it has no length")
     return np.asarray(array / lengths[:, None], np.float64)
-
-
-def _number(name: str, value: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"{name} = {value!r} is not a number") from error
-    if not math.isfinite(number):
-        raise InvalidInputError(f"{name} = {value!r} is not finite")
-    return number
 
 
 def _points(points: ArrayLike, dtype: Any, error: type[InvalidInputError]) -> NDArray[Any]:

@@ -56,7 +56,7 @@ class NoIndexError(MapFileError):
 
 
 class UnsupportedMapFileError(MapFileError):
-    """A sound map file that needs a newer reader; the text names what is missing."""
+    """A valid map file that needs a newer reader; the text names what is missing."""
 
 
 class TooLargeMapFileError(MapFileError):

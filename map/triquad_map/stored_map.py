@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from triquad_format.mapfile.file_errors import named
 from triquad_format.mapfile.index import MapIndex, OpenFile, files_in
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.parts.cell import cells_near, extent, vertex_reach
+from triquad_format.mapfile.mcap.random_access import FileBytes, RandomAccess
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     FIELD_TOPICS,
@@ -18,9 +18,12 @@ from triquad_format.mapfile.parts.part import (
     REGION_TOPICS,
     VERTICES,
     PartKey,
+    cells_near,
+    extent,
+    vertex_reach,
 )
-from triquad_format.mapfile.parts.unpack import RegionParts, assemble
-from triquad_format.mapfile.random_access import FileBytes, RandomAccess
+from triquad_format.mapfile.parts.region_parts import RegionParts
+from triquad_format.mapfile.reader import assemble
 from triquad_format.records.leaf_box import SLACK_LEAVES, LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import (
@@ -54,7 +57,7 @@ class StoredMap:
         """The map in a file; other files that it needs lie in the same folder.
 
         Raises:
-            NoIndexError: only :func:`triquad_format.mapfile.mapfile.read_map` can read the file.
+            NoIndexError: only :func:`triquad_format.mapfile.reader.read_map` can read the file.
             MapFileError: it is not a map file, is damaged, or needs a newer reader.
             OSError: it cannot be read.
         """

@@ -4,12 +4,12 @@ import sys
 import pytest
 from support.map_records import random_record
 from support.mapfile_edit import file_bytes, parts_of
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands import pack
 
 CODE = """
 import sys
-import triquad_client, triquad_format.mapfile.mapfile, triquad_map.stored_map
+import triquad_client, triquad_format.mapfile.reader, triquad_map.stored_map
 heavy = {"torch", "numba", "skimage", "scipy", "triquad_server"}
 heavy |= {"google.protobuf", "foxglove_schemas_protobuf"}
 heavy &= set(sys.modules)

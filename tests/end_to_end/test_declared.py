@@ -54,10 +54,10 @@ def imported(folder: str) -> set[str]:
     ("folder", "extras"),
     [
         ("format", ()),
-        ("client", ()),
+        ("client", ("mesh",)),
         ("map", ("fast",)),
         ("server", ("fast", "preview", "server")),
-        ("tools", ("fast", "preview", "server", "tools")),
+        ("tools", ("fast", "mesh", "preview", "server", "tools")),
     ],
 )
 def test_what_is_imported_is_declared(folder, extras):
@@ -67,4 +67,4 @@ def test_what_is_imported_is_declared(folder, extras):
 def test_what_is_declared_is_imported():
     folders = ("format", "map", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
-    assert declared("fast", "preview", "server", "tools") <= used | USED_BY_OTHERS
+    assert declared("fast", "mesh", "preview", "server", "tools") <= used | USED_BY_OTHERS

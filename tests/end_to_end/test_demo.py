@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import servers
 from triquad_client import RequestTimeoutError, SdfResult
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 from triquad_tools.demo import demo, demo_steps
 from triquad_tools.demo.demo_probe import Probe, ProbeError, ProbeReport, ask_until
 from triquad_tools.demo.demo_results import (

@@ -65,7 +65,7 @@ def all_messages() -> list[type[Message]]:
     return [
         kind
         for kind in vars(messages).values()
-        if isinstance(kind, type) and issubclass(kind, Message) and kind is not Message
+        if isinstance(kind, type) and issubclass(kind, Message) and not kind.__subclasses__()
     ]
 
 

@@ -8,10 +8,10 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from support.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.mapfile.history import checkpoint_at, checkpoint_files
-from triquad_format.mapfile.mapfile import read_map, read_map_file
+from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files
+from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.records.region import MapRecord, RegionIndex
-from triquad_format.recovery.recover import recover
+from triquad_format.recovery.recovered_map import recover
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.settings import Settings

@@ -5,7 +5,7 @@ from contextlib import closing
 import pytest
 from support import servers
 from triquad_format.errors import MapFileError, TooLargeMapFileError
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 from triquad_format.records.region import MapRecord
 from triquad_server.errors import StoreError
 from triquad_server.mapping.mapper import MapChanges, Mapper

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from support.exact_maps import SETTINGS, exact_map, flat, table
 from support.small_world import settings, settle, world
-from triquad_format.wire.messages import LEVELS
+from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper

@@ -1,4 +1,4 @@
-"""Small random map records, sound in every field, for any test that needs a map."""
+"""Small random map records, valid in every field, for any test that needs a map."""
 
 import dataclasses
 import math

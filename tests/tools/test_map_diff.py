@@ -6,7 +6,7 @@ import pytest
 from support.exact_maps import exact_map, flat, table
 from support.map_records import random_record
 from support.small_world import settings, settled_mapper, world
-from triquad_format.mapfile.mapfile import write_map
+from triquad_format.mapfile.writer import write_map
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.inspect import main
 from triquad_tools.mapfiles.map_diff import compare, difference

@@ -6,7 +6,8 @@ import trimesh
 from support.map_records import random_record
 from support.mapfile_edit import file_bytes
 from support.small_world import settings, settled_mapper, world
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator

@@ -10,7 +10,8 @@ from support.checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoin
 from support.map_records import SMALL, assert_same, random_record
 from support.mapfile_edit import file_bytes, with_metadata, without_index
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.mapfile import read_map, read_map_file, write_map
+from triquad_format.mapfile.reader import read_map, read_map_file
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record, without_training
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.reference.evaluator import MapEvaluator

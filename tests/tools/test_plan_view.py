@@ -4,7 +4,8 @@ from PIL import Image
 from support.checkpoint_folder import FIRST, SECOND, write_checkpoints
 from support.exact_maps import SEEN_M, exact_map, flat, table
 from support.map_records import random_record
-from triquad_format.mapfile.mapfile import read_map_file, write_map
+from triquad_format.mapfile.reader import read_map_file
+from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands.inspect import main
 from triquad_tools.mapfiles.seen_space import seen_columns, surface_columns
 from triquad_tools.plots.change_ages import latest_epochs

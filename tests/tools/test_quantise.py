@@ -8,7 +8,7 @@ from support.map_records import SMALL, assert_same, random_record
 from support.mapfile_edit import file_bytes, read_bytes
 from support.small_world import settings, settled_mapper, world
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.pack import main

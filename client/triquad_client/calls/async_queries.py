@@ -1,7 +1,5 @@
 """Questions about the map, to be awaited."""
 
-from typing import Protocol
-
 from numpy.typing import ArrayLike
 from triquad_map.questions.align import Alignment, AlignOptions
 from triquad_map.questions.distance import DistanceOptions, Distances
@@ -13,21 +11,16 @@ from triquad_map.questions.spheres import Spheres
 from triquad_map.unknown import Unknown
 
 from triquad_client.calls import alignment, distance, grid, rays, sdf, segments, spheres
+from triquad_client.calls.queries import MapQueries
 from triquad_client.calls.sdf import SdfResult
 from triquad_client.checks import Bounds
-from triquad_client.net.call import Call, ResultT
+from triquad_client.documentation import documented_as
+from triquad_client.net.call import AsyncRun
 
 
-class AsyncRun(Protocol):
-    """Runs calls to their end, without holding up the event loop."""
-
-    async def __call__(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
-        ...
-
-
+@documented_as(MapQueries)
 class AsyncMapQueries:
-    """As :class:`MapQueries`, to be awaited."""
+    """Asks about the map: :class:`MapQueries` to be awaited."""
 
     def __init__(self, run: AsyncRun, epoch: int | None = None) -> None:
         """``run`` answers the calls; ``epoch`` is asked where a query names none."""
@@ -37,12 +30,7 @@ class AsyncMapQueries:
     async def query_sdf(
         self, points: ArrayLike, gradient: bool = False, at_epoch: int | None = None
     ) -> SdfResult:
-        """As :meth:`MapQueries.query_sdf`."""
         return await self._run(sdf.query(points, gradient, self._chosen(at_epoch)))
-
-    async def query_gradient(self, points: ArrayLike, at_epoch: int | None = None) -> SdfResult:
-        """As :meth:`MapQueries.query_gradient`."""
-        return await self.query_sdf(points, gradient=True, at_epoch=at_epoch)
 
     async def query_distance(
         self,
@@ -54,14 +42,12 @@ class AsyncMapQueries:
         unknown_distance: bool = False,
         at_epoch: int | None = None,
     ) -> Distances:
-        """As :meth:`MapQueries.query_distance`."""
         options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
         return await self._run(distance.query(points, options, unknown, self._chosen(at_epoch)))
 
     async def query_spheres(
         self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Spheres:
-        """As :meth:`MapQueries.query_spheres`."""
         return await self._run(spheres.query(centres, radii_m, self._chosen(at_epoch)))
 
     async def query_segments(
@@ -72,7 +58,6 @@ class AsyncMapQueries:
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Segments:
-        """As :meth:`MapQueries.query_segments`."""
         options = SegmentOptions(radius_m, max_distance_m)
         return await self._run(segments.query(starts, ends, options, self._chosen(at_epoch)))
 
@@ -83,7 +68,6 @@ class AsyncMapQueries:
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Polyline:
-        """As :meth:`MapQueries.query_polyline`."""
         options = SegmentOptions(radius_m, max_distance_m)
         return await self._run(segments.query_polyline(points, options, self._chosen(at_epoch)))
 
@@ -95,7 +79,6 @@ class AsyncMapQueries:
         through_unknown: bool = False,
         at_epoch: int | None = None,
     ) -> Rays:
-        """As :meth:`MapQueries.query_rays`."""
         options = RayOptions(max_range_m, through_unknown)
         return await self._run(rays.query(origins, directions, options, self._chosen(at_epoch)))
 
@@ -106,7 +89,6 @@ class AsyncMapQueries:
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Grid:
-        """As :meth:`MapQueries.query_grid`."""
         return await self._run(grid.query(bounds, cell_m, max_distance_m, self._chosen(at_epoch)))
 
     async def align(
@@ -116,7 +98,6 @@ class AsyncMapQueries:
         max_distance_m: float = 6.0,
         at_epoch: int | None = None,
     ) -> Alignment:
-        """As :meth:`MapQueries.align`."""
         options = AlignOptions(max_distance_m)
         call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
         return await self._run(call)
@@ -126,7 +107,7 @@ class AsyncMapQueries:
 
 
 class AsyncPinnedMap(AsyncMapQueries):
-    """As :class:`PinnedMap`, to be awaited."""
+    """The map as it was in one epoch: :class:`PinnedMap` to be awaited."""
 
     def __init__(self, run: AsyncRun, epoch: int) -> None:
         """Use ``AsyncClient.pinned``."""

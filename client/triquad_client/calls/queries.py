@@ -19,9 +19,10 @@ from triquad_client.net.call import Run
 class MapQueries:
     """Asks about the map: of its newest epoch, or always of the same one.
 
-    Positions are metres in the map frame. Questions of any size are answered from one epoch:
-    ``at_epoch`` is its number, ``None`` is the newest; once the server does not keep it any more,
-    :class:`RefusedError` ``epoch_gone`` is raised.
+    Positions are metres in the map frame. Questions of any size are answered from one epoch,
+    a published state of the map that never changes. ``at_epoch`` is its number, ``None`` is the
+    newest; once the server does not keep it any more, :class:`RefusedError` with the code
+    ``epoch_gone`` is raised.
     """
 
     def __init__(self, run: Run, epoch: int | None = None) -> None:
@@ -40,10 +41,6 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         return self._run(sdf.query(points, gradient, self._chosen(at_epoch)))
-
-    def query_gradient(self, points: ArrayLike, at_epoch: int | None = None) -> SdfResult:
-        """As :meth:`query_sdf`, with the gradient."""
-        return self.query_sdf(points, gradient=True, at_epoch=at_epoch)
 
     def query_distance(
         self,

@@ -3,13 +3,14 @@
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_RANGE_M
 from triquad_format.wire.query_messages import RaysReply, RaysRequest
 from triquad_map.questions.rays import RayOptions, Rays
 
 from triquad_client import checks
 from triquad_client.errors import InvalidInputError
 from triquad_client.net.call import Ask, Call
-from triquad_client.net.parts import in_parts, placed
+from triquad_client.net.parts import in_parts, relative
 
 PART_RAYS = 2_000
 """Rays of one request."""
@@ -26,17 +27,17 @@ def query(
             f"{len(places)} origins for {len(ways)} directions: one, or as many"
         )
     starts = np.broadcast_to(places, ways.shape)
-    reach_m = checks.positive("max_range_m", options.max_range_m)
+    reach_m = checks.within("max_range_m", options.max_range_m, MAX_RANGE_M)
 
     def request(part: slice, number: int) -> Ask[RaysReply]:
-        place = placed(starts[part])
+        sent = relative(starts[part])
         message = RaysRequest(
-            place.origin,
-            place.offsets,
-            ways[part].astype(np.float32),
-            reach_m,
-            options.through_unknown,
-            number,
+            origin=sent.origin,
+            starts=sent.offsets,
+            directions=ways[part].astype(np.float32),
+            max_range_m=reach_m,
+            through_unknown=options.through_unknown,
+            epoch=number,
         )
         return Ask(keys.RAYS, message, RaysReply)
 

@@ -74,7 +74,14 @@ class ScanPublisher:
                     f"stamp_s = {stamp_s!r} lies before {state.stamp_ns / 1e9!r}, that of an "
                     f"earlier scan of source {source!r}; publish in order",
                 )
-            scan = Scan(cloud, pose, stamp_ns, source, self._session, state.next_sequence)
+            scan = Scan(
+                points=cloud,
+                world_from_sensor=pose,
+                stamp_ns=stamp_ns,
+                source=source,
+                session=self._session,
+                sequence=state.next_sequence,
+            )
             self._connection.put(key, scan)
             state.next_sequence += 1
             state.stamp_ns = stamp_ns
@@ -88,10 +95,10 @@ class ScanPublisher:
         replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
         refusals = [reply.last_refusal for reply in replies if reply.last_refusal is not None]
         return FlushReport(
-            sum(reply.taken for reply in replies),
-            sum(reply.refused for reply in replies),
-            sum(reply.lost for reply in replies),
-            refusals[-1] if refusals else None,
+            taken=sum(reply.taken for reply in replies),
+            refused=sum(reply.refused for reply in replies),
+            lost=sum(reply.lost for reply in replies),
+            last_refusal=refusals[-1] if refusals else None,
         )
 
     def _source(self, name: str) -> _Source:
@@ -105,9 +112,14 @@ class ScanPublisher:
         for source, sequence in last.items():
             target = sequence - pending // len(last)
             if target >= 0:
-                yield FlushRequest(source, self._session, target, float(timeout_s))
+                yield FlushRequest(
+                    source=source,
+                    session=self._session,
+                    sequence=target,
+                    timeout_s=float(timeout_s),
+                )
 
 
 def _ask_flush(request: FlushRequest) -> Ask[FlushReply]:
     wait_s = request.timeout_s + _REPLY_MARGIN_S
-    return Ask(keys.FLUSH, request, FlushReply, at_least_s=wait_s)
+    return Ask(keys.FLUSH, request, FlushReply, min_timeout_s=wait_s)

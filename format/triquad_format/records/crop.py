@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from triquad_format.records import morton
-from triquad_format.records.evidence_voxels import masked, voxels_felt
+from triquad_format.records.evidence_voxels import masked, status_voxels
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.leaf_box import LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.region import (
@@ -57,7 +57,7 @@ def _crop_region(settings: FieldSettings, region: Region, box: LeafBox) -> Regio
     training = region.training
     if training is not None:
         training = _crop_training(settings, training, kept, box)
-    evidence = masked(region.evidence, voxels_felt(region.evidence, box))
+    evidence = masked(region.evidence, status_voxels(region.evidence, box))
     return dataclasses.replace(region, tables=tables, evidence=evidence, training=training)
 
 

@@ -43,6 +43,13 @@ class Scan(Message):
 
 
 @dataclass(frozen=True)
+class MapReply(Message):
+    """What a question about the map is answered with, all of it from one epoch."""
+
+    epoch: int  # number of the published, immutable state of the map that answered
+
+
+@dataclass(frozen=True)
 class SdfRequest(Message):
     """Signed distance, status and, on request, gradient at points of the map frame."""
 
@@ -53,20 +60,12 @@ class SdfRequest(Message):
 
 
 @dataclass(frozen=True)
-class SdfReply(Message):
-    """Answer to :class:`SdfRequest`, all of it from one epoch."""
+class SdfReply(MapReply):
+    """Answer to :class:`SdfRequest`."""
 
-    epoch: int
     sdf: Values  # [N] metres, positive in free space; NaN where no region is
     status: StatusCodes  # [N] triquad_format.records.status.Status
     gradient: Positions | None  # [N, 3] d(sdf)/dx, map frame
-
-
-LEVELS = 3
-"""Mesh levels of detail: cells of level ``l`` are ``2**l`` times as large as of level 0."""
-
-MAX_HELD_TILES = 100_000
-"""Tiles that a :class:`TileUpdatesRequest` may name as held."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +79,9 @@ class TileListRequest(Message):
 
 
 @dataclass(frozen=True)
-class TileList(Message):
+class TileList(MapReply):
     """Answer to :class:`TileListRequest`."""
 
-    epoch: int
     tile_side_m: float
     tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
     changed: Epochs  # [T] the surface of each tile last changed in this epoch
@@ -101,10 +99,9 @@ class TileRequest(Message):
 
 
 @dataclass(frozen=True)
-class Tile(Message):
+class Tile(MapReply):
     """Answer to :class:`TileRequest`."""
 
-    epoch: int
     changed: int  # as in TileList
     origin: Point  # metres, map frame: the tile's minimum corner
     vertices: Positions  # [V, 3] metres, relative to origin

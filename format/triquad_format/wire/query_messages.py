@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from triquad_format.wire.array import ArraySpec
 from triquad_format.wire.codec import Message
-from triquad_format.wire.messages import Point, Pose, Positions, StatusCodes, Values
+from triquad_format.wire.messages import MapReply, Point, Pose, Positions, StatusCodes, Values
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Volume = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, None, None))]
@@ -34,10 +34,9 @@ class DistanceRequest(Message):
 
 
 @dataclass(frozen=True)
-class DistanceReply(Message):
+class DistanceReply(MapReply):
     """Answer to :class:`DistanceRequest`."""
 
-    epoch: int
     distance_m: Values  # [N] metres, negative behind a surface; at most max_distance_m
     gradient: Positions  # [N, 3] its unit gradient, map frame; zero where nothing was found
     found: Flags  # [N] whether there is a surface within max_distance_m
@@ -59,10 +58,9 @@ class SpheresRequest(Message):
 
 
 @dataclass(frozen=True)
-class SpheresReply(Message):
+class SpheresReply(MapReply):
     """Answer to :class:`SpheresRequest`."""
 
-    epoch: int
     status: StatusCodes  # [N]
 
 
@@ -79,10 +77,9 @@ class SegmentsRequest(Message):
 
 
 @dataclass(frozen=True)
-class SegmentsReply(Message):
+class SegmentsReply(MapReply):
     """Answer to :class:`SegmentsRequest`; places are metres along the segment."""
 
-    epoch: int
     length_m: Values  # [N]
     blocked: Flags  # [N] the ball touches a seen surface
     contact_m: Values  # [N] where it first does; the length where it does not
@@ -105,10 +102,9 @@ class RaysRequest(Message):
 
 
 @dataclass(frozen=True)
-class RaysReply(Message):
+class RaysReply(MapReply):
     """Answer to :class:`RaysRequest`."""
 
-    epoch: int
     range_m: Values  # [N] metres
     status: StatusCodes  # [N] what it ends at: surface, unknown space, or the largest range (free)
 
@@ -125,10 +121,9 @@ class GridRequest(Message):
 
 
 @dataclass(frozen=True)
-class GridReply(Message):
+class GridReply(MapReply):
     """Answer to :class:`GridRequest`."""
 
-    epoch: int
     distance_m: Volume  # [x, y, z] metres, as in DistanceReply
     status: StatusVolume  # [x, y, z]
 
@@ -145,10 +140,9 @@ class AlignRequest(Message):
 
 
 @dataclass(frozen=True)
-class AlignReply(Message):
+class AlignReply(MapReply):
     """Answer to :class:`AlignRequest`."""
 
-    epoch: int
     world_from_sensor: Pose
     covariance: Covariance  # of translation (metres) and rotation vector (radians), map frame
     inlier_share: float

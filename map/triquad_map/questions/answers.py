@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
+from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_ITERATIONS, MAX_RANGE_M, MIN_LENGTH_M
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
     AlignReply,
@@ -36,10 +37,6 @@ from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments, steps_at_most
 from triquad_map.questions.spheres import spheres
 from triquad_map.view import MapView
-
-MAX_DISTANCE_M = 100.0
-MAX_RANGE_M = 1_000.0
-MAX_ITERATIONS = 200
 
 _DECIMALS = 5  # of positions, metres
 _STEPS_EACH = 50
@@ -251,7 +248,7 @@ def _points(
     return points
 
 
-def _within(name: str, value: float, most: float, least: float = 1e-6) -> float:
+def _within(name: str, value: float, most: float, least: float = MIN_LENGTH_M) -> float:
     if not least <= value <= most:
         raise RefusedError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
     return float(value)

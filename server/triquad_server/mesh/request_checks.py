@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
-from triquad_format.wire.messages import LEVELS, MAX_HELD_TILES, TileUpdatesRequest
+from triquad_format.wire.limits import LEVELS, MAX_KNOWN_TILES
+from triquad_format.wire.messages import TileUpdatesRequest
 
 from triquad_server.mesh.mesher import TileIndex
 
@@ -72,7 +73,7 @@ def _check_held(asks: TileUpdatesRequest) -> None:
         raise RefusedError(
             "bad_request", f"{len(asks.held_versions)} versions of {len(asks.held)} held tiles"
         )
-    if len(asks.held) > MAX_HELD_TILES:
+    if len(asks.held) > MAX_KNOWN_TILES:
         raise RefusedError(
-            "too_large", f"{len(asks.held)} held tiles exceed the limit of {MAX_HELD_TILES}"
+            "too_large", f"{len(asks.held)} held tiles exceed the limit of {MAX_KNOWN_TILES}"
         )

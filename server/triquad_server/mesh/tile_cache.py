@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.wire.messages import LEVELS
+from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.compiled.compiled_view import CompiledView
 from triquad_map.compiled.team import Team

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import MapFileError
-from triquad_format.mapfile.history import (
+from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_files,
     newest_of_each,

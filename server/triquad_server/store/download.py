@@ -6,7 +6,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 from triquad_format.errors import RefusedError
-from triquad_format.mapfile.mapfile import write_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
 
 from triquad_server.mapping.mapper_thread import MapperThread

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
-from triquad_format.mapfile.map_facts import MapFacts
+from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.part import MAP, PartKey
 from triquad_format.records.region import RegionIndex
 

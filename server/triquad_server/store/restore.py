@@ -8,9 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import MapFileError, TooLargeMapFileError, UnsupportedMapFileError
-from triquad_format.mapfile.history import CheckpointFile, checkpoint_files, checkpoint_name
+from triquad_format.mapfile.checkpoint_folder import (
+    CheckpointFile,
+    checkpoint_files,
+    checkpoint_name,
+)
 from triquad_format.mapfile.index import DAMAGED_SUFFIX
-from triquad_format.mapfile.mapfile import MapFile, read_map_file
+from triquad_format.mapfile.reader import MapFile, read_map_file
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.messages import CheckpointInfo
 

@@ -9,12 +9,11 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.history import checkpoint_file, checkpoint_name, open_manifest
+from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_name, open_manifest
 from triquad_format.mapfile.index import OtherFiles, files_in
 from triquad_format.mapfile.manifest import FileRef
-from triquad_format.mapfile.map_facts import MapFacts
-from triquad_format.mapfile.writer import write_parts
-from triquad_format.mapfile.written_map import WrittenMap
+from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.writer import WrittenMap, write_parts
 from triquad_format.records.record_check import check_record
 from triquad_format.wire.messages import CheckpointInfo
 
@@ -99,9 +98,9 @@ class Store:
             written = write_parts(
                 path,
                 MapFacts(record.name, record.epoch, record.settings),
-                stamp_ns,
                 checkpoint_parts(changes, known, None if delta else others, stamp_ns),
-                {} if known is None else known.entries if delta else known.stored_here(),
+                stamp_ns=stamp_ns,
+                known={} if known is None else known.entries if delta else known.stored_here(),
                 preview_schema=preview_schema(),
             )
             info = _info(path, written)
@@ -127,9 +126,9 @@ class Store:
                 written = write_parts(
                     path,
                     known.facts,
-                    known.stamp_ns,
                     parts,
-                    known.stored_here(),
+                    stamp_ns=known.stamp_ns,
+                    known=known.stored_here(),
                     preview_schema=preview_schema(),
                 )
                 info = _info(path, written)

@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from triquad_format.mapfile.mapfile import MapFileInfo, read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.region import MapRecord
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper

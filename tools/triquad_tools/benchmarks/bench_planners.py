@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import zenoh
 from triquad_client import Client, connect
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 from triquad_format.wire import keys
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings

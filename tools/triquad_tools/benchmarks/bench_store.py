@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from triquad_client import Client, connect
-from triquad_format.mapfile.history import checkpoint_name
-from triquad_format.mapfile.mapfile import write_map
+from triquad_format.mapfile.checkpoint_folder import checkpoint_name
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings

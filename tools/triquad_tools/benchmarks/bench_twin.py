@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import OfflineMap, open_map
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.reference.recorded_map import RecordedMap
 from triquad_server.epochs.epoch import Epoch

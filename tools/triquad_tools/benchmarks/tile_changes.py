@@ -61,6 +61,6 @@ class _Triangles:
         for rows in candidates.T:
             left = np.flatnonzero(far)
             corners = self._corners[rows[left]]
-            nearest = closest_point(corners, points[left])  # type: ignore[no-untyped-call]
+            nearest = closest_point(corners, points[left])
             far[left] = np.linalg.norm(nearest - points[left], axis=1) > limit_m
         return far

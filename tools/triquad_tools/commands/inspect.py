@@ -11,7 +11,7 @@ from triquad_tools.console.errors import ToolError
 from triquad_tools.console.report import json_text
 
 if TYPE_CHECKING:
-    from triquad_format.mapfile.mapfile import MapFile
+    from triquad_format.mapfile.reader import MapFile
 
 OK, DAMAGED, BAD_INPUT = 0, 1, 2
 

@@ -123,7 +123,7 @@ def _pack(arguments: argparse.Namespace) -> int:
 
 def _tell_set_aside(path: Path) -> None:
     """Name the newer checkpoints beside the newest sound one, which were damaged."""
-    from triquad_format.mapfile.history import set_aside
+    from triquad_format.mapfile.checkpoint_folder import set_aside
 
     for newer in (aside for aside in set_aside(path.parent) if aside.name > path.name):
         print(f"triquad-pack: {newer} is newer, but damaged: --recover saves what is intact of it")
@@ -153,7 +153,7 @@ def _check_usage(arguments: argparse.Namespace) -> None:
 
 def _check_target(source: Path, target: Path, force: bool) -> None:
     """Refuse a target that must not be written."""
-    from triquad_format.mapfile.history import checkpoint_file, checkpoint_files
+    from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files
 
     folder = target.parent
     named_so = checkpoint_file(target) is not None
@@ -214,7 +214,7 @@ def _source(
 
     if not arguments.recover:
         return read_source(path, box, training), True
-    from triquad_format.recovery.recover import recover
+    from triquad_format.recovery.recovered_map import recover
 
     from triquad_tools.mapfiles.recovery_report import print_recovery
 

@@ -30,7 +30,7 @@ _STOP_TIMEOUT_S = 60.0
 
 QUESTIONS: "dict[str, Callable[[Client, NDArray[np.float64]], int]]" = {
     "sdf": lambda client, points: client.query_sdf(points).epoch,
-    "gradient": lambda client, points: client.query_gradient(points).epoch,
+    "gradient": lambda client, points: client.query_sdf(points, gradient=True).epoch,
     "distance": lambda client, points: client.query_distance(points).epoch,
 }
 """What the planner may ask; each returns the epoch that answered."""

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import CheckpointInfo, Client, Mesh, SdfResult, connect
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import without_training
 from triquad_server.mesh.preview import previews_of
 

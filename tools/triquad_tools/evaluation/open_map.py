@@ -57,7 +57,7 @@ def open_map(target: str, map_name: str) -> Iterator[OpenMap]:
 
 
 def _open_file(path: Path) -> OpenMap:
-    from triquad_format.mapfile.mapfile import read_map
+    from triquad_format.mapfile.reader import read_map
     from triquad_map.reference.evaluator import MapEvaluator
 
     try:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from triquad_format.mapfile.mapfile import MapFile
 from triquad_format.mapfile.parts.part import PREFIX, PREVIEW
+from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
 from triquad_format.records.region import BLOCK_VOXELS, MapRecord, region_centre
 from triquad_map.reference.evaluator import MapEvaluator

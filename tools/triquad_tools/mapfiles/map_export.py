@@ -3,8 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from triquad_client.mesh.glb import glb_bytes
-from triquad_client.mesh.ply import ply_bytes
 from triquad_format.mapfile.durable_file import replacing
 from triquad_format.records.crop import without_training
 from triquad_format.records.region import MapRecord
@@ -27,8 +25,6 @@ from triquad_tools.mapfiles.surface_mesh import surface_mesh
 MARGIN_CELLS = 16
 """A map that is exported within a box is needed so far around it."""
 
-_BYTES_OF = {".ply": ply_bytes, ".glb": glb_bytes}
-
 
 def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
     """Write the mesh of a map; returns what was written.
@@ -42,7 +38,7 @@ def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -
     epoch = _epoch(record)
     with progress("meshing", 1.0) as report:
         mesh = surface_mesh(epoch, box, settings, report)
-    packed = _BYTES_OF[path.suffix](mesh.vertices, mesh.faces)
+    packed = mesh.file_bytes(path.suffix)
     with replacing(path) as stream:
         stream.write(packed)
     return f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"

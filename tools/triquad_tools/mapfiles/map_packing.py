@@ -4,8 +4,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.mapfile.mapfile import MapFileInfo, write_map
-from triquad_format.mapfile.writer import Previews
+from triquad_format.mapfile.writer import MapFileInfo, Previews, write_map
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.mapfiles.field_change import FieldChange

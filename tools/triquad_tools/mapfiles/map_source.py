@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import NoIndexError
-from triquad_format.mapfile.history import (
+from triquad_format.mapfile.checkpoint_folder import (
     checkpoint_at,
     checkpoint_file,
     checkpoint_files,

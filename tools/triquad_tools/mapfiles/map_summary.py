@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.mapfile.mapfile import MapFile
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
+from triquad_format.mapfile.reader import MapFile
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_LEVEL, MapRecord, Region, region_centre
 

@@ -1,12 +1,13 @@
 """What ``triquad-pack --recover`` prints."""
 
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
-from triquad_format.recovery.recovery import Loss, Recovery
+from triquad_format.recovery.loss import Loss
+from triquad_format.recovery.recovered_map import RecoveredMap
 
 _PLANES = ("XY", "XZ", "YZ")
 
 
-def print_recovery(recovery: Recovery) -> None:
+def print_recovery(recovery: RecoveredMap) -> None:
     """Print a line for each loss, and how much was saved."""
     for loss in recovery.losses:
         print(f"lost: {_what(loss)}{_where(loss)}")

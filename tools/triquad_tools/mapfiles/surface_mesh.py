@@ -29,9 +29,10 @@ def surface_mesh(epoch: Epoch, box: Box | None, settings: MeshSettings, report: 
     indices = meshed.tiles(low, high).tolist()
     for number, (x, y, z) in enumerate(indices):
         tile = meshed.tile((x, y, z))
-        tiles.append((tile.origin + tile.vertices, tile.faces))
+        tiles.append(Triangles(tile.origin + tile.vertices, tile.faces))
         faces += len(tile.faces)
         if faces > MAX_FACES:
             raise ToolError(f"the mesh has more than {MAX_FACES:,} faces: use --crop or --cell")
         report((number + 1) / len(indices), f"{faces:,} faces")
-    return Mesh(*joined(tiles, settings.tile_side_m, low, high), epoch.number)
+    triangles = joined(tiles, settings.tile_side_m, low, high)
+    return Mesh(triangles.vertices, triangles.faces, epoch.number)

@@ -6,8 +6,8 @@ from pathlib import Path
 from triquad_format.errors import NoIndexError
 from triquad_format.mapfile.file_errors import named
 from triquad_format.mapfile.index import MapIndex, file_in
-from triquad_format.mapfile.mapfile import MapFile, read_map_file
-from triquad_format.mapfile.random_access import FileBytes
+from triquad_format.mapfile.mcap.random_access import FileBytes
+from triquad_format.mapfile.reader import MapFile, read_map_file
 
 from triquad_tools.console.errors import ToolError
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.mapfile.manifest import Manifest
-from triquad_format.mapfile.parts.cell import CELL_LEAVES, extent
-from triquad_format.mapfile.parts.part import EVIDENCE, VERTICES, PartKey
+from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import region_centre, region_corner
 

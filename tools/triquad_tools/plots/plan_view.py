@@ -2,7 +2,7 @@
 
 import numpy as np
 from PIL import Image
-from triquad_format.mapfile.mapfile import MapFile
+from triquad_format.mapfile.reader import MapFile
 
 from triquad_tools.mapfiles.seen_space import Columns, seen_columns, surface_columns
 from triquad_tools.plots.change_ages import ages_panel

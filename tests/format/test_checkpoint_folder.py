@@ -4,7 +4,7 @@ import pytest
 from support.map_records import random_record
 from support.mapfile_edit import without_index, write_record
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
-from triquad_format.mapfile.history import (
+from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_at,
     checkpoint_file,
@@ -14,7 +14,7 @@ from triquad_format.mapfile.history import (
     newest_of_each,
     open_manifest,
 )
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 
 NOON_NS = 1_767_268_800 * 10**9  # 2026-01-01T12:00:00Z
 HOUR_NS = 3600 * 10**9
@@ -24,7 +24,7 @@ def write_checkpoint(folder, epoch, complete=True, hours=0):
     """A checkpoint of so many hours after noon; ``None``: its writer was not given the time."""
     path = folder / checkpoint_name(epoch, complete)
     stamp_ns = None if hours is None else NOON_NS + hours * HOUR_NS
-    write_record(path, random_record(1, points=3, epoch=epoch), stamp_ns, {})
+    write_record(path, random_record(1, points=3, epoch=epoch), stamp_ns=stamp_ns)
     return path
 
 

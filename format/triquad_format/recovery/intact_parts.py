@@ -12,11 +12,13 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.file_metadata import check_readable
 from triquad_format.mapfile.index import file_in
 from triquad_format.mapfile.manifest import Manifest, unpack_manifest
-from triquad_format.mapfile.map_facts import MapFacts, unpack_facts
-from triquad_format.mapfile.mcap.records import Message, total_limit
+from triquad_format.mapfile.mcap.chunks import total_limit
+from triquad_format.mapfile.mcap.random_access import FileBytes
+from triquad_format.mapfile.mcap.records import Message
+from triquad_format.mapfile.metadata import MapFacts, check_readable, unpack_facts
+from triquad_format.mapfile.parts.body import unpack_body
 from triquad_format.mapfile.parts.part import (
     MANIFEST,
     MAP,
@@ -25,15 +27,13 @@ from triquad_format.mapfile.parts.part import (
     TRAINING,
     PartKey,
 )
-from triquad_format.mapfile.parts.part_body import PartBody
-from triquad_format.mapfile.random_access import FileBytes
 from triquad_format.records.region import RegionIndex
-from triquad_format.recovery.chunk_scan import found_metadata, intact_messages
+from triquad_format.recovery.intact_chunks import found_metadata, intact_messages
 
 
 @dataclass(frozen=True)
-class Salvage:
-    """The parts of the field and of training that are intact."""
+class IntactParts:
+    """The parts of the field and of training that are intact, and what is known of the others."""
 
     facts: MapFacts
     payloads: Mapping[PartKey, bytes]
@@ -55,14 +55,33 @@ class Salvage:
         return {key for key in self.missing if key.region == region}
 
 
-def read_messages(path: Path, max_bytes: int) -> Iterator[Message]:
-    """The messages in all intact chunks of a file.
+def intact_parts(path: Path, max_bytes: int) -> IntactParts:
+    """The intact parts of a file, and of those beside it that it needs.
+
+    Args:
+        path: the file.
+        max_bytes: limit on each file's size and, decompressed, on its parts together.
 
     Raises:
         UnsupportedMapFileError: the file needs a newer reader.
         TooLargeMapFileError: it exceeds ``max_bytes``.
+        MapFileError: nothing tells what map this is.
         OSError: it cannot be read.
     """
+    messages = list(_messages(path, max_bytes))
+    manifest = _manifest(messages, path.stat().st_size)
+    if manifest is not None:
+        return _listed_parts(manifest, messages, path.parent, max_bytes=max_bytes)
+    facts = _facts(messages)
+    if facts is None:
+        raise MapFileError("nothing can be saved: neither its first part nor its last is intact")
+    keyed = ((_own_key(message), message.data) for message in messages)
+    payloads = {key: data for key, data in keyed if key is not None}
+    return IntactParts(facts, payloads, missing=frozenset(), parts_listed=None, stamp_ns=0)
+
+
+def _messages(path: Path, max_bytes: int) -> Iterator[Message]:
+    """The messages in all intact chunks of a file."""
     with closing(FileBytes(path)) as file:
         size = file.size
         if size > max_bytes:
@@ -70,23 +89,6 @@ def read_messages(path: Path, max_bytes: int) -> Iterator[Message]:
         data = file.read(0, size)
     _refuse_newer(found_metadata(data))
     return intact_messages(data, min(max_bytes, total_limit(size)))
-
-
-def salvage(messages: list[Message], path: Path, max_bytes: int) -> Salvage:
-    """The parts among the messages of the file at ``path``, and those in files beside it.
-
-    Raises:
-        MapFileError: nothing tells what map this is.
-    """
-    manifest = _manifest(messages, path.stat().st_size)
-    if manifest is not None:
-        return _as_listed(manifest, messages, path.parent, max_bytes)
-    facts = _facts(messages)
-    if facts is None:
-        raise MapFileError("nothing can be saved: neither its first part nor its last is intact")
-    keyed = ((_own_key(message), message.data) for message in messages)
-    payloads = {key: data for key, data in keyed if key is not None}
-    return Salvage(facts, payloads, frozenset(), None, 0)
 
 
 def _refuse_newer(metadata: dict[str, str]) -> None:
@@ -105,7 +107,7 @@ def _refuse_newer(metadata: dict[str, str]) -> None:
 
 def _manifest(messages: Iterable[Message], file_bytes: int) -> Manifest | None:
     for message in messages:
-        if message.topic == MANIFEST:
+        if message.channel.topic == MANIFEST:
             try:
                 return unpack_manifest(message.data, file_bytes)
             except FormatError:
@@ -115,29 +117,35 @@ def _manifest(messages: Iterable[Message], file_bytes: int) -> Manifest | None:
 
 def _facts(messages: Iterable[Message]) -> MapFacts | None:
     for message in messages:
-        if message.topic == MAP:
+        if message.channel.topic == MAP:
             try:
-                return unpack_facts(PartBody(MAP, message.data))
+                return unpack_facts(unpack_body(MAP, message.data))
             except FormatError:
                 return None
     return None
 
 
-def _as_listed(
-    manifest: Manifest, messages: list[Message], folder: Path, max_bytes: int
-) -> Salvage:
+def _listed_parts(
+    manifest: Manifest, messages: list[Message], folder: Path, *, max_bytes: int
+) -> IntactParts:
     """The parts that a manifest lists, known by their digests."""
     entries = [entry for entry in manifest.entries if entry.key.topic in REGION_TOPICS]
     wanted = {entry.sha256 for entry in entries}
     found = _by_digest(messages, wanted)
     for file in manifest.files:
         try:
-            found |= _by_digest(read_messages(file_in(folder, file.name), max_bytes), wanted)
+            found |= _by_digest(_messages(file_in(folder, file.name), max_bytes), wanted)
         except (FormatError, OSError):
             continue
     payloads = {e.key: found[e.sha256] for e in entries if e.sha256 in found}
     missing = frozenset(entry.key for entry in entries if entry.sha256 not in found)
-    return Salvage(manifest.facts, payloads, missing, len(entries), manifest.stamp_ns)
+    return IntactParts(
+        manifest.facts,
+        payloads,
+        missing=missing,
+        parts_listed=len(entries),
+        stamp_ns=manifest.stamp_ns,
+    )
 
 
 def _by_digest(messages: Iterable[Message], wanted: set[bytes]) -> dict[bytes, bytes]:
@@ -147,12 +155,13 @@ def _by_digest(messages: Iterable[Message], wanted: set[bytes]) -> dict[bytes, b
 
 def _own_key(message: Message) -> PartKey | None:
     """What a part says that it is of."""
-    if message.topic not in REGION_TOPICS:
+    topic = message.channel.topic
+    if topic not in REGION_TOPICS:
         return None
     try:
-        body = PartBody(message.topic, message.data)
-        if message.topic in (REGION, TRAINING):
-            return PartKey(message.topic, body.index())
-        return PartKey(message.topic, body.index(), body.count("plane"), body.count("cell"))
+        body = unpack_body(topic, message.data)
+        if topic in (REGION, TRAINING):
+            return PartKey(topic, body.index())
+        return PartKey(topic, body.index(), plane=body.count("plane"), cell=body.count("cell"))
     except FormatError:
         return None

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError, WireError
-from triquad_format.mapfile.parts.part import PREFIX, Part, PartKey
-from triquad_format.mapfile.parts.shuffle import (
+from triquad_format.mapfile.parts.columns import (
     MAX_CODE_BYTES,
     join_integers,
     unshuffle,
     unshuffle_codes,
 )
+from triquad_format.mapfile.parts.part import PREFIX, Part, PartKey
 from triquad_format.records.region import RegionIndex
 from triquad_format.wire.array import ArraySpec, unpack_array
 from triquad_format.wire.structure import MAX_OBJECTS, binary_offsets, check_structure
@@ -29,13 +29,16 @@ _MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
 
 def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
-    """A part with this body; seams lie between its byte planes."""
+    """A part of this body: numbers, strings, lists, maps and packed arrays.
+
+    Its seams lie between the byte planes of its arrays.
+    """
     payload = typing.cast(bytes, msgpack.packb(body))
     return Part(key, payload, _seams(payload, body))
 
 
 def repack_part(key: PartKey, payload: bytes) -> Part:
-    """A part that was read, to be written again."""
+    """A part that was read and checked, to be written again."""
     if not key.topic.startswith(PREFIX):
         return Part(key, payload)
     body = msgpack.unpackb(payload, max_map_len=MAX_ITEMS, max_ext_len=0)
@@ -67,42 +70,51 @@ def _plane_counts(value: object) -> Iterator[int]:
             yield from _plane_counts(item)
 
 
+def unpack_body(topic: str, payload: bytes, max_items: int = MAX_ITEMS) -> "PartBody":
+    """The body of a part.
+
+    Args:
+        topic: of the part.
+        payload: of the part.
+        max_items: limit on the length of its lists.
+
+    Raises:
+        DamagedMapFileError: it is not a msgpack map, or exceeds a limit.
+    """
+    try:
+        check_structure(payload, max(MAX_OBJECTS, _OBJECTS_PER_ITEM * max_items))
+        body = msgpack.unpackb(
+            payload,
+            max_str_len=_MAX_STRING_BYTES,
+            max_array_len=max_items,
+            max_map_len=MAX_ITEMS,
+            max_ext_len=0,
+        )
+    except (WireError, ValueError, msgpack.exceptions.UnpackException) as error:
+        raise DamagedMapFileError(f"{topic}: not a msgpack map: {error}") from error
+    return PartBody(topic, body)
+
+
 class PartBody:
-    """The decoded msgpack map of a part: typed access to its fields."""
+    """A msgpack map in a part, with typed access to its fields.
 
-    def __init__(self, topic: str, payload: bytes, max_items: int = MAX_ITEMS) -> None:
-        try:
-            check_structure(payload, max(MAX_OBJECTS, _OBJECTS_PER_ITEM * max_items))
-            body = msgpack.unpackb(
-                payload,
-                max_str_len=_MAX_STRING_BYTES,
-                max_array_len=max_items,
-                max_map_len=MAX_ITEMS,
-                max_ext_len=0,
-            )
-        except (WireError, ValueError, msgpack.exceptions.UnpackException) as error:
-            raise DamagedMapFileError(f"{topic}: not a msgpack map: {error}") from error
-        self._topic = topic
-        self._body = _checked(topic, body)
+    Every method raises :class:`~triquad_format.errors.FormatError` where a field is missing or
+    malformed; the text names topic, field and value.
+    """
 
-    @property
-    def topic(self) -> str:
-        """The part's topic, for messages."""
-        return self._topic
-
-    @classmethod
-    def of(cls, topic: str, body: object) -> "PartBody":
-        """A map within a part."""
-        nested = cls.__new__(cls)
-        nested._topic, nested._body = topic, _checked(topic, body)
-        return nested
+    def __init__(self, topic: str, body: object) -> None:
+        """Take a decoded body; ``topic`` is for messages."""
+        if not isinstance(body, dict):
+            raise DamagedMapFileError(f"{topic}: not a map but a {type(body).__name__}")
+        self.topic = topic
+        self._body: Mapping[str, object] = body
 
     def value(self, key: str, kind: type) -> Any:
         """The field ``key``, which must be exactly of the type ``kind``."""
         value = self._body.get(key)
         if type(value) is not kind:
             raise DamagedMapFileError(
-                f"{self._topic}: {key} = {reprlib.repr(value)} is not {kind.__name__}",
+                f"{self.topic}: {key} = {reprlib.repr(value)} is not {kind.__name__}",
             )
         return value
 
@@ -110,20 +122,20 @@ class PartBody:
         """Refuse a part whose field ``key`` is not ``wanted``."""
         value = self.value(key, type(wanted))
         if value != wanted:
-            raise DamagedMapFileError(f"{self._topic}: {key} = {value!r}, expected {wanted!r}")
+            raise DamagedMapFileError(f"{self.topic}: {key} = {value!r}, expected {wanted!r}")
 
     def count(self, key: str) -> int:
         """A number in ``[0, 2**63)``."""
         value: int = self.value(key, int)
         if not 0 <= value < 2**63:
-            raise DamagedMapFileError(f"{self._topic}: {key} = {value} is not a count")
+            raise DamagedMapFileError(f"{self.topic}: {key} = {value} is not a count")
         return value
 
     def texts(self, key: str) -> list[str]:
         """A list of strings."""
         values: list[Any] = self.value(key, list)
         if not all(type(value) is str for value in values):
-            raise DamagedMapFileError(f"{self._topic}: {key} is not a list of strings")
+            raise DamagedMapFileError(f"{self.topic}: {key} is not a list of strings")
         return values
 
     def index(self) -> RegionIndex:
@@ -133,51 +145,57 @@ class PartBody:
             type(number) is int and abs(number) <= MAX_REGION_INDEX for number in value
         ):
             raise DamagedMapFileError(
-                f"{self._topic}: region = {reprlib.repr(value)} is not an index"
+                f"{self.topic}: region = {reprlib.repr(value)} is not an index"
             )
         return (value[0], value[1], value[2])
 
-    def array(self, key: str, dtype: str, *shape: int | None) -> NDArray[Any]:
-        """An array of this dtype and shape (``None``: any size)."""
-        return self._array(f"{self._topic}: {key}", self._body.get(key), ArraySpec(dtype, shape))
+    def array(self, key: str, dtype: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+        """An array of this dtype and shape; a size that is ``None`` may be any."""
+        name = f"{self.topic}: {key}"
+        array = unpack_array(name, self._body.get(key))
+        ArraySpec(dtype, shape).check(name, array)
+        return array
 
     def arrays(self, key: str, count: int) -> tuple[NDArray[Any], ...]:
         """``count`` arrays of ``<f4``, each of any shape."""
-        return tuple(
-            self._array(f"{self._topic}: {key}[{i}]", item, None)
-            for i, item in enumerate(self._items(key, count))
-        )
+        arrays = []
+        for i, item in enumerate(self._items(key, count)):
+            name = f"{self.topic}: {key}[{i}]"
+            array = unpack_array(name, item)
+            ArraySpec("<f4", (None,) * array.ndim).check(name, array)
+            arrays.append(array)
+        return tuple(arrays)
 
     def maps(self, key: str, count: int) -> tuple["PartBody", ...]:
         """``count`` nested maps."""
-        return tuple(PartBody.of(self._topic, item) for item in self._items(key, count))
+        return tuple(PartBody(self.topic, item) for item in self._items(key, count))
 
     def codes(self, key: str, most: int) -> NDArray[np.int64]:
-        """Morton codes [V]; no more than ``most`` are decoded: they take eight bytes each."""
-        planes = self.array(key, "|u1", None, None)
+        """Morton codes [V], of which no more than ``most`` are decoded: each takes eight bytes."""
+        planes = self.array(key, "|u1", (None, None))
         self.limit(key, planes.shape[1], most)
         if not 1 <= len(planes) <= MAX_CODE_BYTES:
-            raise DamagedMapFileError(f"{self._topic}: {key} has {len(planes)} bytes per code")
+            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per code")
         return unshuffle_codes(planes)
 
     def floats(self, key: str, *shape: int | None) -> NDArray[Any]:
         """A shuffled array of ``<f2`` or ``<f4``."""
-        planes = self.array(key, "|u1", None, *shape)
+        planes = self.array(key, "|u1", (None, *shape))
         if len(planes) not in (2, 4):
-            raise DamagedMapFileError(f"{self._topic}: {key} has {len(planes)} bytes per value")
+            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
         return unshuffle(planes, f"<f{len(planes)}")
 
     def integers(self, key: str, count: int, size: int) -> NDArray[np.int16]:
         """Integers [count, size] of one or two bytes."""
-        planes = self.array(key, "|i1", None, size, count)
+        planes = self.array(key, "|i1", (None, size, count))
         if len(planes) not in (1, 2):
-            raise DamagedMapFileError(f"{self._topic}: {key} has {len(planes)} bytes per value")
+            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
         return join_integers(planes)
 
     def limit(self, key: str, count: int, most: int) -> None:
         """Refuse a field of more than ``most`` rows."""
         if count > most:
-            raise DamagedMapFileError(f"{self._topic}: {key} has {count} rows, above {most}")
+            raise DamagedMapFileError(f"{self.topic}: {key} has {count} rows, above {most}")
 
     def has(self, key: str) -> bool:
         """Whether there is a field ``key``."""
@@ -191,17 +209,5 @@ class PartBody:
     def _items(self, key: str, count: int) -> list[Any]:
         items: list[Any] = self.value(key, list)
         if len(items) != count:
-            raise DamagedMapFileError(f"{self._topic}: {key} holds {len(items)} items, not {count}")
+            raise DamagedMapFileError(f"{self.topic}: {key} holds {len(items)} items, not {count}")
         return items
-
-    @staticmethod
-    def _array(name: str, packed: object, spec: ArraySpec | None) -> NDArray[Any]:
-        array = unpack_array(name, packed)
-        (spec or ArraySpec("<f4", (None,) * array.ndim)).check(name, array)
-        return array
-
-
-def _checked(topic: str, body: object) -> Mapping[str, object]:
-    if not isinstance(body, dict):
-        raise DamagedMapFileError(f"{topic}: not a map but a {type(body).__name__}")
-    return body

@@ -1,19 +1,20 @@
 """What is intact in a damaged map file, as a valid map.
 
-Every chunk is looked for on its own (:mod:`triquad_format.recovery.chunk_scan`). Where the manifest
-is intact, it tells what each part is and what is missing; else the parts tell of themselves.
+Every chunk is searched for on its own (:mod:`triquad_format.recovery.intact_chunks`). Where the
+manifest is intact, it tells what each part is and what is missing; else the parts tell of
+themselves.
 """
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.container import MAX_MAP_BYTES
 from triquad_format.mapfile.file_errors import named
-from triquad_format.mapfile.parts.cell import cells_at
+from triquad_format.mapfile.metadata import MAX_MAP_BYTES
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
     REGION,
@@ -22,9 +23,10 @@ from triquad_format.mapfile.parts.part import (
     TRAINING_TOPICS,
     VERTICES,
     PartKey,
+    cells_at,
 )
-from triquad_format.mapfile.parts.unpack import RegionParts
-from triquad_format.records.evidence_voxels import masked, seen_voxels, voxels_felt
+from triquad_format.mapfile.parts.region_parts import RegionParts
+from triquad_format.records.evidence_voxels import masked, seen_voxels, status_voxels
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.leaf_box import LeafBox
 from triquad_format.records.record_check import check_record
@@ -36,11 +38,27 @@ from triquad_format.records.region import (
     leaf_coordinates,
     region_centre,
 )
-from triquad_format.recovery.recovery import Loss, Recovery, felt_box, loss_of
-from triquad_format.recovery.salvage import Salvage, read_messages, salvage
+from triquad_format.recovery.intact_parts import IntactParts, intact_parts
+from triquad_format.recovery.loss import Loss, effect_box, loss_of
 
 
-def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> Recovery:
+@dataclass(frozen=True)
+class RecoveredMap:
+    """What was saved of a map, and what was not."""
+
+    record: MapRecord
+    losses: tuple[Loss, ...]  # those that are known
+    parts_intact: int  # parts of regions that could be read
+    parts_listed: int | None  # how many there were; None: not known, for the manifest is lost
+    stamp_ns: int  # when the epoch was written, nanoseconds since 1970; 0 if not known
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing was lost."""
+        return not self.losses and self.parts_intact == self.parts_listed
+
+
+def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> RecoveredMap:
     """All that is intact in a map file, and in the files of its folder that it needs.
 
     The result is valid. It answers as the whole map did wherever no loss reaches. Where vertices
@@ -56,20 +74,19 @@ def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> Recovery:
         OSError: it cannot be read.
     """
     with named(str(path)):
-        messages = list(read_messages(path, max_bytes))
-        recovery = _recover(salvage(messages, path, max_bytes))
-        if not recovery.record.regions and not recovery.complete:
+        recovered = _recovered(intact_parts(path, max_bytes))
+        if not recovered.record.regions and not recovered.complete:
             raise MapFileError("nothing can be saved: no region is intact")
-        return recovery
+        return recovered
 
 
-def _recover(found: Salvage) -> Recovery:
+def _recovered(found: IntactParts) -> RecoveredMap:
     settings = found.facts.settings
     regions: list[Region] = []
     lost: set[PartKey] = set()
     for index in found.regions:
         payloads, missing = found.found_of(index), found.missing_of(index)
-        region = _region(index, settings, payloads, missing)
+        region = _region(index, settings, payloads, missing=missing)
         if region is None:
             lost.add(PartKey(REGION, index))
             continue
@@ -81,9 +98,15 @@ def _recover(found: Salvage) -> Recovery:
             lost.add(PartKey(TRAINING, index))
         regions.append(region)
     losses = tuple(loss_of(key, settings) for key in sorted(lost, key=_place))
-    regions = [_silenced(settings, region, losses) for region in regions]
+    regions = [_masked_where_lost(settings, region, losses) for region in regions]
     record = MapRecord(found.facts.name, found.facts.epoch, settings, tuple(regions))
-    return Recovery(record, losses, len(found.payloads), found.parts_listed, found.stamp_ns)
+    return RecoveredMap(
+        record,
+        losses,
+        parts_intact=len(found.payloads),
+        parts_listed=found.parts_listed,
+        stamp_ns=found.stamp_ns,
+    )
 
 
 def _place(key: PartKey) -> tuple[RegionIndex, PartKey]:
@@ -94,6 +117,7 @@ def _region(
     index: RegionIndex,
     settings: FieldSettings,
     payloads: Mapping[PartKey, bytes],
+    *,
     missing: set[PartKey],
 ) -> Region | None:
     """The region of these parts, with its training state where that is complete."""
@@ -127,17 +151,19 @@ def _missing_squares(
         nodes = np.unique(voxels[:, list(AXES[table.plane])] >> shift, axis=0)
         for corner in np.ndindex(2, 2):
             squares = cells_at((nodes + corner) << shift)
-            needed |= {PartKey(VERTICES, region.index, table.plane, cell) for cell in squares}
+            needed |= {
+                PartKey(VERTICES, region.index, plane=table.plane, cell=cell) for cell in squares
+            }
     return needed - payloads.keys()
 
 
-def _silenced(settings: FieldSettings, region: Region, losses: Iterable[Loss]) -> Region:
+def _masked_where_lost(settings: FieldSettings, region: Region, losses: Iterable[Loss]) -> Region:
     """The region without evidence where vertices are lost, be they its own or a neighbour's."""
     evidence = region.evidence
     centre = region_centre(settings, region.index)
     for loss in losses:
         if loss.key.topic == VERTICES and loss.meets(centre, settings.region_side_m):
-            corners = felt_box(loss.key, settings)
+            corners = effect_box(loss.key, settings)
             box = LeafBox(*leaf_coordinates(settings, corners - centre))
-            evidence = masked(evidence, ~voxels_felt(evidence, box))
+            evidence = masked(evidence, ~status_voxels(evidence, box))
     return dataclasses.replace(region, evidence=evidence)

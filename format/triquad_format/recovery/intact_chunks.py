@@ -1,7 +1,7 @@
 """The intact chunks of an MCAP file of which anything else may be damaged or missing.
 
-Nothing in the file tells where a chunk is: each is found by how it begins, and believed by its
-checksum. So nothing that is damaged hides what lies behind it.
+Nothing in the file tells where a chunk is: each is found by how it begins, and told from chance by
+its checksum. So nothing that is damaged hides what lies behind it.
 """
 
 import contextlib
@@ -9,19 +9,20 @@ import re
 from collections.abc import Iterator
 
 from triquad_format.errors import FormatError, TooLargeMapFileError
-from triquad_format.mapfile.container import ENCODINGS, METADATA_NAME
+from triquad_format.mapfile.mcap.chunks import chunk_messages, declared_size
 from triquad_format.mapfile.mcap.records import (
+    Channel,
     Message,
     Record,
-    chunk_messages,
-    declared_size,
     metadata_entries,
 )
+from triquad_format.mapfile.metadata import METADATA_NAME
+from triquad_format.mapfile.parts.part import ENCODINGS
 
 _HEAD_BYTES = 9  # of a record: opcode and length
 
 _LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
-"""Bytes of all supposed chunks that are looked at, and so many times the file's size."""
+"""Bytes of all places that are tried: a constant, and a multiple of the file's size."""
 
 # A record below 4 GiB; in a chunk then times, size and checksum, and the name of its compression.
 _CHUNK = re.compile(rb"\x06.{4}\x00{4}.{28}(?:\x04\x00{3}zstd|\x00{4})", re.DOTALL)
@@ -78,14 +79,15 @@ def _record(data: bytes, start: int) -> Record | None:
     return Record(data[start], start, memoryview(data)[first : first + length])
 
 
-def _channels(data: bytes) -> dict[int, tuple[str, str]]:
-    """Topic and encoding by number: as records in the file say, else as files are written.
+def _channels(data: bytes) -> dict[int, Channel]:
+    """Channels by number: as records in the file say, else as files are written.
 
     The records stand twice in a file, and have no checksum of their own.
     """
-    channels = dict(enumerate(ENCODINGS.items(), start=1))
+    usual = [Channel(topic, encoding) for topic, encoding in ENCODINGS.items()]
+    channels = dict(enumerate(usual, start=1))
     for match in _CHANNEL.finditer(data):
-        channel = (match[2].decode(), match[3].decode())
-        if channel in ENCODINGS.items():
+        channel = Channel(match[2].decode(), match[3].decode())
+        if channel in usual:
             channels[int.from_bytes(match[1], "little")] = channel
     return channels

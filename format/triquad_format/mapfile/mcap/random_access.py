@@ -1,4 +1,4 @@
-"""Bytes that can be read from any place: of a file, of memory, or of a file elsewhere."""
+"""Bytes that can be read from any place: of a file here, or elsewhere."""
 
 import io
 import os
@@ -25,7 +25,7 @@ class RandomAccess(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the source."""
+        """Close the source."""
         ...
 
 
@@ -67,23 +67,6 @@ class FileBytes:
     def close(self) -> None:
         """Close the file."""
         self._stream.close()
-
-
-class MemoryBytes:
-    """Bytes in memory."""
-
-    def __init__(self, data: bytes | bytearray | memoryview, name: str = "map file") -> None:
-        self.name = name
-        self.size = len(data)
-        self._data = memoryview(data)
-
-    def read(self, offset: int, length: int) -> bytes:
-        """As :meth:`RandomAccess.read`."""
-        check_range(offset, length, self.size)
-        return bytes(self._data[offset : offset + length])
-
-    def close(self) -> None:
-        """Nothing is held but memory."""
 
 
 def check_range(offset: int, length: int, size: int) -> None:

@@ -1,7 +1,12 @@
-"""Columns of numbers as bytes that compress well: byte planes, and differences of codes."""
+"""Columns of numbers as bytes that compress well: byte planes, bit planes, differences of codes."""
 
 import numpy as np
 from numpy.typing import NDArray
+
+from triquad_format.records.region import MAX_LEVEL
+
+LEVEL_BITS = MAX_LEVEL.bit_length()
+"""Planes of bits that hold levels of evidence."""
 
 MAX_CODE_BYTES = 6
 """Bytes of the widest difference between two neighbouring Morton codes."""
@@ -70,3 +75,25 @@ def join_integers(planes: NDArray[np.int8]) -> NDArray[np.int16]:
     for plane in planes[1:]:
         integers += plane.astype(np.int32) << 8
     return np.ascontiguousarray(integers.T).astype(np.int16)
+
+
+def split_levels(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Bits [LEVEL_BITS, N] of levels [S], highest bits first, ``N`` being ``S / 8`` rounded up.
+
+    Each plane but the first is stored as its difference (xor) from the one above. Levels of
+    neighbours are alike: two that differ by one differ in one stored bit, so that the planes shrink
+    to a tenth less than bytes of one level each do.
+    """
+    bits = np.arange(LEVEL_BITS, dtype=np.uint8)[::-1, None]
+    planes = np.packbits(levels >> bits & 1, axis=1, bitorder="little")
+    planes[1:] ^= planes[:-1].copy()
+    return planes
+
+
+def join_levels(planes: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
+    """``count`` levels; the inverse of :func:`split_levels`."""
+    levels = np.zeros(count, np.uint8)
+    for plane in np.bitwise_xor.accumulate(planes, axis=0):
+        levels <<= 1
+        levels |= np.unpackbits(plane, count=count, bitorder="little")
+    return levels

@@ -1,16 +1,14 @@
 """A map file that answers as a server does, without one."""
 
 from pathlib import Path
-from types import TracebackType
 
-from triquad_format.mapfile.history import checkpoint_files, map_folder
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.reader import MapFile, read_map_file
 
 from triquad_client.calls.queries import MapQueries
 from triquad_client.errors import ClosedError
 from triquad_client.net.call import Call, ResultT
-from triquad_client.net.local_driver import LocalDriver
-from triquad_client.offline.view import is_compiled, view_of
+from triquad_client.offline.local_driver import LocalDriver
 
 
 class OfflineMap(MapQueries):
@@ -22,25 +20,20 @@ class OfflineMap(MapQueries):
 
     def __init__(self, file: MapFile) -> None:
         """Use :func:`open_map`."""
-        view = view_of(file.record)
         super().__init__(self._answer)
-        self._driver: LocalDriver | None = LocalDriver(view)
+        driver = LocalDriver(file.record)
+        self._driver: LocalDriver | None = driver
         self.name = file.record.name
         self.epoch = file.record.epoch
         self.stamp_ns = file.manifest.stamp_ns
         """When its epoch was written, nanoseconds since 1970; 0: the file does not tell."""
-        self.compiled = is_compiled(view)
+        self.compiled = driver.compiled
         """Whether compiled code answers, as in the server; else numpy, which is far slower."""
 
     def __enter__(self) -> "OfflineMap":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -1,0 +1,53 @@
+"""Runs calls on a map that this process holds: each request is answered on the spot."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from triquad_format.errors import RefusedError
+from triquad_format.records.region import MapRecord
+from triquad_map.questions.answers import Answers, QuestionLimits
+from triquad_map.reference.recorded_map import RecordedMap
+from triquad_map.view import MapView
+
+from triquad_client.net.call import Batch
+from triquad_client.net.driver import BlockingDriver
+
+_NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
+"""Nobody else waits."""
+
+
+class LocalDriver(BlockingDriver):
+    """Runs calls over the map in a record, as fast as this installation can; for several threads.
+
+    The only place where the client meets compiled code.
+    """
+
+    def __init__(self, record: MapRecord) -> None:
+        self._view = _view_of(record)
+        self._answers = Answers(self._epoch, _NO_LIMITS)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled code answers, as in a server; else numpy, which is far slower."""
+        return not isinstance(self._view, RecordedMap)
+
+    async def _replies(self, batch: Batch) -> list[Any]:
+        return [self._answers.answer(batch.request(item).message) for item in batch.items]
+
+    @contextmanager
+    def _epoch(self, number: int) -> Iterator[MapView]:
+        """The view, where its epoch is asked for, or the newest."""
+        if number not in (0, self._view.number):
+            raise RefusedError(
+                "epoch_gone", f"epoch {number} is not kept; kept is [{self._view.number}]"
+            )
+        yield self._view
+
+
+def _view_of(record: MapRecord) -> MapView:
+    try:
+        from triquad_map.compiled.recorded_view import recorded_view
+    except ImportError:  # no numba, or one that does not go with this numpy
+        return RecordedMap(record)
+    return recorded_view(record)
