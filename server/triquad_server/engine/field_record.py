@@ -1,6 +1,6 @@
 """Between the field of a region and the plain arrays of its record."""
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,28 +15,10 @@ from triquad_format.records.region import (
     TrainingState,
     VertexTable,
 )
-from triquad_map.compiled.compiled_engine import FieldArrays
 from triquad_map.compiled.evidence.evidence import Evidence
-from triquad_map.compiled.field.quadtree import TriQuadtree
 
 from triquad_server.engine.batch import Batch
-from triquad_server.engine.live_field import LiveField
-
-
-class StoredField(Protocol):
-    """A field that can be recorded: a live one, or a frozen one."""
-
-    @property
-    def settings(self) -> FieldSettings:
-        """Its shape."""
-
-    @property
-    def tree(self) -> TriQuadtree:
-        """Its vertices."""
-
-    @property
-    def arrays(self) -> FieldArrays:
-        """Its numbers."""
+from triquad_server.engine.live_field import LiveField, StoredField
 
 
 def region_record(

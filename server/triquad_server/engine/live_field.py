@@ -16,8 +16,8 @@ from triquad_server.engine.parameter import Parameter
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
 
 
-class FrozenField(FieldEngine, Protocol):
-    """A field that does not change any more. Safe for any thread."""
+class StoredField(Protocol):
+    """What a field consists of, whether it is live or frozen."""
 
     @property
     def settings(self) -> FieldSettings:
@@ -30,6 +30,10 @@ class FrozenField(FieldEngine, Protocol):
     @property
     def arrays(self) -> FieldArrays:
         """Its numbers; not to be written to."""
+
+
+class FrozenField(FieldEngine, StoredField, Protocol):
+    """A field that does not change any more. Safe for any thread."""
 
 
 class LiveField:
