@@ -6,7 +6,7 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_tools.commands import evaluate, replay
-from triquad_tools.evaluation.kitti import write_folder
+from triquad_tools.recordings.kitti import write_folder
 from triquad_tools.simulation.street_drive import street_drive
 
 SCANS = 9

@@ -9,7 +9,7 @@ from triquad_tools.console.errors import (
     StampError,
     ToolError,
 )
-from triquad_tools.evaluation.kitti import KittiFolder, read_folder, write_folder
+from triquad_tools.recordings.kitti import KittiFolder, read_folder, write_folder
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"

@@ -9,7 +9,7 @@ from support.small_world import settings, settled_mapper, world
 from triquad_format.mapfile.mapfile import write_map
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.inspect import main
-from triquad_tools.mapfiles.map_diff import compare, difference
+from triquad_tools.mapfiles.diff import compare, difference
 from triquad_tools.mapfiles.surface_points import surface_points
 
 GROUND = exact_map(flat(0.1))

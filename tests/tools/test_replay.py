@@ -6,7 +6,7 @@ import triquad_client
 from support import servers
 from triquad_client import FlushReport
 from triquad_tools.commands.replay import Pace, ReplayReport, due_times, main
-from triquad_tools.evaluation.kitti import write_folder
+from triquad_tools.recordings.kitti import write_folder
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,12 @@ import sys
 
 def bench() -> int:
     """``triquad-bench``."""
-    return _run("triquad-bench", "triquad_tools.benchmarks.bench")
+    return _run("triquad-bench", "triquad_tools.commands.bench")
 
 
 def demo() -> int:
     """``triquad-demo``."""
-    return _run("triquad-demo", "triquad_tools.demo.demo")
+    return _run("triquad-demo", "triquad_tools.commands.demo")
 
 
 def evaluate() -> int:

@@ -97,10 +97,10 @@ def _on_street(options: argparse.Namespace) -> Results:
 
 
 def _at_withheld(options: argparse.Namespace) -> Results:
-    from triquad_tools.evaluation.cloud import is_withheld, world_points
-    from triquad_tools.evaluation.kitti import read_folder
     from triquad_tools.evaluation.map_scores import score_withheld
     from triquad_tools.evaluation.open_map import open_map
+    from triquad_tools.recordings.cloud import is_withheld, world_points
+    from triquad_tools.recordings.kitti import read_folder
 
     folder = read_folder(options.withheld)
     every = options.skip_every
@@ -118,9 +118,9 @@ def _at_withheld(options: argparse.Namespace) -> Results:
 
 def _reference(path: Path, voxel_m: float, range_min_m: float) -> Any:
     """The points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
-    from triquad_tools.evaluation.cloud import world_points
-    from triquad_tools.evaluation.kitti import read_folder
     from triquad_tools.evaluation.meshfile import read_mesh
+    from triquad_tools.recordings.cloud import world_points
+    from triquad_tools.recordings.kitti import read_folder
     from triquad_tools.simulation.voxel import merged
 
     if path.is_dir():

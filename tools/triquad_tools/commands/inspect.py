@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_intermixed_args(argv)
     from triquad_format.errors import DamagedMapFileError, FormatError
 
-    from triquad_tools.mapfiles.map_checks import FailedCheckError
+    from triquad_tools.mapfiles.checks import FailedCheckError
     from triquad_tools.mapfiles.whole_map import MissingFilesError
 
     try:
@@ -103,8 +103,8 @@ def _show(options: argparse.Namespace) -> int:
     """One map file."""
     import dataclasses
 
-    from triquad_tools.mapfiles.map_checks import verify
-    from triquad_tools.mapfiles.map_summary import print_summary, summarise
+    from triquad_tools.mapfiles.checks import verify
+    from triquad_tools.mapfiles.summary import print_summary, summarise
     from triquad_tools.mapfiles.whole_map import read_whole
 
     path = options.files[0]
@@ -143,7 +143,7 @@ def _log(options: argparse.Namespace) -> int:
 def _diff(options: argparse.Namespace) -> int:
     """Two map files."""
     from triquad_tools.console.progress import progress
-    from triquad_tools.mapfiles.map_diff import compare, difference, print_diff
+    from triquad_tools.mapfiles.diff import compare, difference, print_diff
     from triquad_tools.mapfiles.whole_map import read_whole
 
     a, b = (read_whole(path) for path in options.files)

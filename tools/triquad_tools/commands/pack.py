@@ -11,7 +11,7 @@ from triquad_tools.console.arguments import error_limit, positive
 from triquad_tools.console.errors import ToolError
 
 if TYPE_CHECKING:
-    from triquad_tools.mapfiles.map_source import Box, SourceMap
+    from triquad_tools.mapfiles.source import Box, SourceMap
 
 OK, DAMAGED, BAD_INPUT = 0, 1, 2
 
@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     from triquad_format.errors import DamagedMapFileError, FormatError
 
-    from triquad_tools.mapfiles.map_source import NothingLeftError
+    from triquad_tools.mapfiles.source import NothingLeftError
 
     try:
         return _pack(arguments)
@@ -107,7 +107,7 @@ def _add_target(add: _Add) -> None:
 
 
 def _pack(arguments: argparse.Namespace) -> int:
-    from triquad_tools.mapfiles.map_source import chosen_file, epoch_of
+    from triquad_tools.mapfiles.source import chosen_file, epoch_of
 
     _check_usage(arguments)
     path = chosen_file(arguments.input, arguments.at)
@@ -171,7 +171,7 @@ def _check_target(source: Path, target: Path, force: bool) -> None:
 
 
 def _pack_map(arguments: argparse.Namespace, path: Path) -> int:
-    from triquad_tools.mapfiles.map_packing import chosen_precision, pack_map, print_packed
+    from triquad_tools.mapfiles.packing import chosen_precision, pack_map, print_packed
 
     precision = chosen_precision(arguments.precision, arguments.max_error)
     training = not arguments.no_training and precision.max_error_m is None
@@ -184,7 +184,7 @@ def _pack_map(arguments: argparse.Namespace, path: Path) -> int:
 def _export(arguments: argparse.Namespace, path: Path) -> int:
     from triquad_format.records.field_settings import check_range
 
-    from triquad_tools.mapfiles.map_export import MARGIN_CELLS, export_grid, export_mesh
+    from triquad_tools.mapfiles.export import MARGIN_CELLS, export_grid, export_mesh
 
     box, output = _box(arguments.crop), arguments.output
     grid = output.suffix == _GRID
@@ -210,7 +210,7 @@ def _source(
     arguments: argparse.Namespace, path: Path, box: "Box | None", training: bool
 ) -> "tuple[SourceMap, bool]":
     """The map, and whether nothing of it is lost."""
-    from triquad_tools.mapfiles.map_source import SourceMap, cropped, read_source
+    from triquad_tools.mapfiles.source import SourceMap, cropped, read_source
 
     if not arguments.recover:
         return read_source(path, box, training), True

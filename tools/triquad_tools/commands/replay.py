@@ -16,7 +16,7 @@ from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wa
 if TYPE_CHECKING:
     from triquad_client import Client, FlushReport
 
-    from triquad_tools.evaluation.kitti import KittiFolder
+    from triquad_tools.recordings.kitti import KittiFolder
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -71,8 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     from triquad_client import connect
 
-    from triquad_tools.evaluation.cloud import is_withheld
-    from triquad_tools.evaluation.kitti import read_folder
+    from triquad_tools.recordings.cloud import is_withheld
+    from triquad_tools.recordings.kitti import read_folder
 
     folder = read_folder(options.folder)
     indices = [i for i in range(len(folder)) if not is_withheld(i, options.skip_every)]
@@ -132,7 +132,7 @@ class _Publisher:
 
     def _publish(self, folder: "KittiFolder", index: int, range_min_m: float) -> bool:
         """Publish one scan; False where no point of it is left."""
-        from triquad_tools.evaluation.cloud import points_in_range
+        from triquad_tools.recordings.cloud import points_in_range
 
         points = points_in_range(folder.read_points(index), range_min_m)
         if not len(points):

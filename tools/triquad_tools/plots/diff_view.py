@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 from triquad_format.records.status import Status
 
-from triquad_tools.mapfiles.map_diff import Comparison
+from triquad_tools.mapfiles.diff import Comparison
 from triquad_tools.plots.colour_scale import HEAT, WHITE, ColourScale, rgb
 from triquad_tools.plots.plan_grid import PlanGrid
 from triquad_tools.plots.plan_sheet import Panel, Swatch, draw_sheet

@@ -8,8 +8,8 @@ from triquad_format.mapfile.mapfile import MapFileInfo, write_map
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.mapfiles.field_change import FieldChange
-from triquad_tools.mapfiles.map_source import SourceMap
 from triquad_tools.mapfiles.quantise import dequantised, quantise
+from triquad_tools.mapfiles.source import SourceMap
 
 DTYPES = {"fp16": "<f2", "fp32": "<f4"}
 INTEGERS = "int8"

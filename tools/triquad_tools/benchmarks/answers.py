@@ -11,7 +11,7 @@ from triquad_map.surface.confidence import level_confidence
 from triquad_map.view import MapView
 
 from triquad_tools.benchmarks.answer_probes import AnswerProbes, answer_probes
-from triquad_tools.benchmarks.bench_figures import Figure
+from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.evaluation.driven_street import DrivenStreet
 from triquad_tools.simulation.scene import Scene
 

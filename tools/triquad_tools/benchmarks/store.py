@@ -20,11 +20,11 @@ from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.benchmarks.bench_figures import Figure
-from triquad_tools.benchmarks.bench_street import RATE_HZ, BenchStreet
+from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.street import RATE_HZ, BenchStreet
 from triquad_tools.console.progress import progress
-from triquad_tools.demo.demo_probe import Probe, ProbeReport
-from triquad_tools.demo.demo_server import DemoServer, ServerOptions, free_endpoint
+from triquad_tools.demo.probe import Probe, ProbeReport
+from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 
 _MAP = "bench"
 _REGIONS = 16

@@ -14,11 +14,11 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.benchmarks.bench_figures import Figure
-from triquad_tools.benchmarks.bench_street import BenchStreet
+from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.cloud import is_withheld, points_in_range
-from triquad_tools.evaluation.kitti import read_folder
+from triquad_tools.recordings.cloud import is_withheld, points_in_range
+from triquad_tools.recordings.kitti import read_folder
 
 _SKIP_EVERY = 7
 _RANGE_MIN_M = 2.0  # nearer is the vehicle's own body

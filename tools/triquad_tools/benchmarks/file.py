@@ -15,15 +15,15 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.benchmarks.bench_figures import Figure
-from triquad_tools.benchmarks.bench_street import BenchStreet
+from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.meshfile import Mesh
 from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
 from triquad_tools.mapfiles.field_change import field_change
-from triquad_tools.mapfiles.map_packing import INTEGER_ERROR_M
+from triquad_tools.mapfiles.mesh import surface_mesh
+from triquad_tools.mapfiles.packing import INTEGER_ERROR_M
 from triquad_tools.mapfiles.quantise import quantise
-from triquad_tools.mapfiles.surface_mesh import surface_mesh
 
 _LARGE_BYTES = 100_000_000
 _MESH_SAMPLES = 3_000_000

@@ -16,8 +16,8 @@ from triquad_map.reference.evaluator import Answer
 
 from triquad_tools.console.errors import ToolError
 from triquad_tools.console.progress import Report
-from triquad_tools.mapfiles.map_source import Box
 from triquad_tools.mapfiles.seen_space import evidence_box, surface_voxels
+from triquad_tools.mapfiles.source import Box
 
 MAX_CELLS = 200_000_000
 

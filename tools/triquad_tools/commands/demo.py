@@ -15,7 +15,7 @@ from triquad_tools.console.errors import ToolError
 from triquad_tools.console.interruption import sigterm_interrupts
 
 if TYPE_CHECKING:
-    from triquad_tools.demo.demo_results import DemoResults
+    from triquad_tools.demo.results import DemoResults
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -48,9 +48,9 @@ def run_demo(out: Path, scans: int, street_seed: int) -> "DemoResults":
         ToolError, TriquadError, FormatError, OSError: a step failed; the server is stopped.
     """
     from triquad_tools.console.report import json_text
-    from triquad_tools.demo import demo_steps as steps
-    from triquad_tools.demo.demo_results import DemoResults
-    from triquad_tools.demo.demo_server import DemoServer, ServerOptions, free_endpoint
+    from triquad_tools.demo import steps
+    from triquad_tools.demo.results import DemoResults
+    from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 
     laps = _Laps()
     server_options = ServerOptions(free_endpoint(), steps.MAP, out / "store", out / "server.log")
@@ -99,7 +99,7 @@ class _Laps:
 
 def _prepare(out: Path) -> None:
     """Make the folder; forget what an earlier demonstration left in its store and log."""
-    from triquad_tools.demo.demo_steps import MAP
+    from triquad_tools.demo.steps import MAP
 
     out.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(out / "store" / MAP, ignore_errors=True)
@@ -113,7 +113,7 @@ def _say_if_unsettled(settled: bool) -> None:
 
 def _present(out: Path, results: "DemoResults") -> int:
     from triquad_tools.console.report import print_table
-    from triquad_tools.demo.demo_results import broken_promises, table_rows
+    from triquad_tools.demo.results import broken_promises, table_rows
 
     print_table(f"Street {results.seed}, {results.intake.scans} scans", table_rows(results))
     print(f"In {out}: map.triquad, street.glb, street.ply, street.png, results.json, server.log")

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_tools.evaluation.kitti import KittiFolder
+from triquad_tools.recordings.kitti import KittiFolder
 
 
 def is_withheld(index: int, every: int) -> bool:

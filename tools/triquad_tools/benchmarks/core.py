@@ -21,8 +21,8 @@ from triquad_server.settings import Settings
 from triquad_server.threads import ANSWERS
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.benchmarks.bench_figures import Figure, compare, seconds
-from triquad_tools.benchmarks.bench_street import BenchStreet
+from triquad_tools.benchmarks.figures import Figure, compare, seconds
+from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.progress import progress
 
 _QUERY_POINTS = 100_000

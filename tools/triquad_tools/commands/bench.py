@@ -17,7 +17,7 @@ from triquad_tools.console.errors import ToolError
 from triquad_tools.console.interruption import sigterm_interrupts
 
 if TYPE_CHECKING:
-    from triquad_tools.benchmarks.bench_figures import Figure
+    from triquad_tools.benchmarks.figures import Figure
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -45,15 +45,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measure(parts: Sequence[str], street_seed: int, recorded: Path | None = None) -> "list[Figure]":
     """The figures of some parts on one street, and of ``align`` on a recorded folder, too."""
-    from triquad_tools.benchmarks.bench_align import measure_align
-    from triquad_tools.benchmarks.bench_core import measure_core
-    from triquad_tools.benchmarks.bench_file import measure_file
-    from triquad_tools.benchmarks.bench_mesh import measure_mesh
-    from triquad_tools.benchmarks.bench_planners import measure_planners
-    from triquad_tools.benchmarks.bench_server import measure_server
-    from triquad_tools.benchmarks.bench_store import measure_store
-    from triquad_tools.benchmarks.bench_street import bench_street
-    from triquad_tools.benchmarks.bench_twin import measure_twin
+    from triquad_tools.benchmarks.align import measure_align
+    from triquad_tools.benchmarks.core import measure_core
+    from triquad_tools.benchmarks.file import measure_file
+    from triquad_tools.benchmarks.mesh import measure_mesh
+    from triquad_tools.benchmarks.offline import measure_twin
+    from triquad_tools.benchmarks.planners import measure_planners
+    from triquad_tools.benchmarks.server import measure_server
+    from triquad_tools.benchmarks.store import measure_store
+    from triquad_tools.benchmarks.street import bench_street
 
     figures: list[Figure] = []
     if set(parts) - {"growth"}:
@@ -81,9 +81,9 @@ def measure(parts: Sequence[str], street_seed: int, recorded: Path | None = None
 
 def _growth(street_seed: int) -> "list[Figure]":
     """Measured in a process of its own, whose memory nothing else has used."""
-    from triquad_tools.benchmarks.bench_figures import Figure
+    from triquad_tools.benchmarks.figures import Figure
 
-    command = [sys.executable, "-m", "triquad_tools.benchmarks.bench_growth", str(street_seed)]
+    command = [sys.executable, "-m", "triquad_tools.benchmarks.growth", str(street_seed)]
     result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if result.returncode != 0:
         raise ToolError(f"the part growth ended with exit code {result.returncode}")
@@ -103,7 +103,7 @@ def machine() -> str:
 
 
 def _present(figures: "list[Figure]", options: argparse.Namespace) -> None:
-    from triquad_tools.benchmarks.bench_figures import markdown
+    from triquad_tools.benchmarks.figures import markdown
     from triquad_tools.console.report import Row, json_text, print_table
 
     title = f"{datetime.date.today().isoformat()}, {machine()}, street {options.seed}"

@@ -15,13 +15,13 @@ from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
-from triquad_tools.benchmarks.bench_core import seen_points
-from triquad_tools.benchmarks.bench_figures import Figure, seconds
-from triquad_tools.benchmarks.bench_street import RATE_HZ, BenchStreet
+from triquad_tools.benchmarks.core import seen_points
+from triquad_tools.benchmarks.figures import Figure, seconds
+from triquad_tools.benchmarks.street import RATE_HZ, BenchStreet
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, wait_until_settled
-from triquad_tools.demo.demo_probe import Probe, ProbeReport
-from triquad_tools.demo.demo_server import DemoServer, ServerOptions, free_endpoint
+from triquad_tools.demo.probe import Probe, ProbeReport
+from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 from triquad_tools.evaluation.map_scores import StreetScores, score_street
 from triquad_tools.evaluation.meshfile import Mesh
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene

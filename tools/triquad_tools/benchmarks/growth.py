@@ -1,6 +1,6 @@
 """``triquad-bench`` as the map grows: from 1 to 16 regions, far apart, in a process of its own.
 
-Run as ``python -m triquad_tools.benchmarks.bench_growth SEED``; prints its figures as JSON.
+Run as ``python -m triquad_tools.benchmarks.growth SEED``; prints its figures as JSON.
 """
 
 import json
@@ -15,7 +15,7 @@ from triquad_server.memory import resident_bytes
 from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.benchmarks.bench_figures import Figure, seconds
+from triquad_tools.benchmarks.figures import Figure, seconds
 from triquad_tools.simulation.street_drive import street_drive
 
 _REGIONS = 16

@@ -7,7 +7,7 @@ from triquad_server.epochs.epoch import Epoch
 
 from triquad_tools.console.errors import ToolError
 from triquad_tools.console.progress import Report
-from triquad_tools.mapfiles.map_source import Box
+from triquad_tools.mapfiles.source import Box
 
 MAX_FACES = 50_000_000
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from triquad_tools.console.report import Row, centimetres, percent
 
 if TYPE_CHECKING:
-    from triquad_tools.demo.demo_probe import ProbeReport
+    from triquad_tools.demo.probe import ProbeReport
     from triquad_tools.evaluation.map_scores import StreetScores
     from triquad_tools.evaluation.metrics import MeshScores
 

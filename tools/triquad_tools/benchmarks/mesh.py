@@ -17,13 +17,13 @@ from triquad_server.mesh.tile_lattice import tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings, Settings
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.benchmarks.bench_figures import Figure, seconds
-from triquad_tools.benchmarks.bench_street import BenchStreet
+from triquad_tools.benchmarks.figures import Figure, seconds
+from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.benchmarks.tile_changes import changed_tiles
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
-from triquad_tools.demo.demo_probe import ask_until
-from triquad_tools.demo.demo_server import DemoServer, ServerOptions, free_endpoint
+from triquad_tools.demo.probe import ask_until
+from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 from triquad_tools.evaluation.meshfile import Mesh
 from triquad_tools.simulation.lidar import SimulatedScan
 

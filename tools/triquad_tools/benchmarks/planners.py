@@ -18,13 +18,13 @@ from triquad_format.wire import keys
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
-from triquad_tools.benchmarks.bench_answers import REACH_M, measure_answers
-from triquad_tools.benchmarks.bench_figures import Figure
-from triquad_tools.benchmarks.bench_street import RATE_HZ, BenchStreet
+from triquad_tools.benchmarks.answers import REACH_M, measure_answers
+from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.street import RATE_HZ, BenchStreet
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import wait_until_settled
-from triquad_tools.demo.demo_probe import Probe, ProbeReport
-from triquad_tools.demo.demo_server import DemoServer, ServerOptions, free_endpoint
+from triquad_tools.demo.probe import Probe, ProbeReport
+from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 
 _MAP = "bench"
 _ASKED = 1_000

@@ -13,8 +13,8 @@ from triquad_format.records.crop import without_training
 
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
-from triquad_tools.demo.demo_probe import Probe, ProbeReport
-from triquad_tools.demo.demo_results import Intake, MapSize, Restart
+from triquad_tools.demo.probe import Probe, ProbeReport
+from triquad_tools.demo.results import Intake, MapSize, Restart
 from triquad_tools.evaluation import meshfile
 from triquad_tools.evaluation.driven_street import DrivenStreet, driven_street
 from triquad_tools.evaluation.map_scores import StreetScores, score_street

@@ -13,10 +13,10 @@ from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.reference.recorded_map import RecordedMap
 from triquad_server.epochs.epoch import Epoch
 
-from triquad_tools.benchmarks.bench_core import seen_points
-from triquad_tools.benchmarks.bench_figures import Figure, compare, seconds
-from triquad_tools.benchmarks.bench_file import settled_mapper
-from triquad_tools.benchmarks.bench_street import BenchStreet
+from triquad_tools.benchmarks.core import seen_points
+from triquad_tools.benchmarks.figures import Figure, compare, seconds
+from triquad_tools.benchmarks.file import settled_mapper
+from triquad_tools.benchmarks.street import BenchStreet
 
 Work = Callable[[], object]
 

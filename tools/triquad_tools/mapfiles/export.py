@@ -14,15 +14,15 @@ from triquad_server.settings import MeshSettings, Settings
 
 from triquad_tools.console.errors import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.mapfiles.map_source import Box
-from triquad_tools.mapfiles.sdf_grid import (
+from triquad_tools.mapfiles.grid import (
     DenseGrid,
     SparseGrid,
     dense_grid,
     evidence_bounds,
     sparse_grid,
 )
-from triquad_tools.mapfiles.surface_mesh import surface_mesh
+from triquad_tools.mapfiles.mesh import surface_mesh
+from triquad_tools.mapfiles.source import Box
 
 MARGIN_CELLS = 16
 """A map that is exported within a box is needed so far around it."""
