@@ -22,7 +22,7 @@ class DamagedMapFileError(MapFileError):
 
 
 class NoIndexError(MapFileError):
-    """A map file that can only be read as a whole: of version 1, or rewritten by another tool."""
+    """A map file that can only be read as a whole: another tool rewrote it."""
 
 
 class UnsupportedMapFileError(MapFileError):

@@ -35,7 +35,7 @@ from triquad_map.reference.evaluator import Answer, MapEvaluator, check_points
 
 
 class StoredMap:
-    """A map file of version 2, open for reading. One thread at a time may use it."""
+    """A map file, open for reading. One thread at a time may use it."""
 
     def __init__(self, source: RandomAccess, open_file: OpenFile | None = None) -> None:
         """Read the manifest; arguments and errors are those of :class:`MapIndex`."""

@@ -24,7 +24,6 @@ from triquad_client.calls.queries import MapQueries
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.mapfile import write_map
 
-GOLDEN = Path(__file__).parents[1] / "golden"
 POSE = np.eye(4)
 BOX = ((-5.0, -5.0, -1.0), (5.0, 5.0, 1.0))
 POINTS = np.random.default_rng(0).uniform(-6, 6, (2000, 3))
@@ -178,13 +177,8 @@ def test_of_a_store_the_newest_checkpoint_is_opened(tmp_path):
     want = write_map(map_at(8), tmp_path / "whole.triquad")
     whole, delta = open_map(tmp_path / "whole.triquad"), open_map(folder)
     assert whole.epoch == want.epoch
+    assert whole.stamp_ns == 0
     np.testing.assert_array_equal(whole.query_sdf(POINTS).sdf, delta.query_sdf(POINTS).sdf)
-
-
-def test_files_of_version_1_are_opened():
-    offline = open_map(GOLDEN / "map_v1.triquad")
-    assert np.isfinite(offline.query_sdf([[0.0, 0, 0]]).sdf).all()
-    assert offline.stamp_ns == 0
 
 
 def test_damaged_and_foreign_files_are_refused_by_name(tmp_path):

@@ -1,10 +1,9 @@
-import shutil
 from pathlib import Path
 
 import pytest
+from fuzz.mapfile_edit import without_index, write_record
 from support.map_records import random_record
-from support.mapfile_surgery import write_record
-from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
 from triquad_format.mapfile.history import (
     CheckpointFile,
     checkpoint_at,
@@ -17,15 +16,15 @@ from triquad_format.mapfile.history import (
 )
 from triquad_format.mapfile.mapfile import read_map
 
-VERSION_1 = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 NOON_NS = 1_767_268_800 * 10**9  # 2026-01-01T12:00:00Z
 HOUR_NS = 3600 * 10**9
 
 
 def write_checkpoint(folder, epoch, complete=True, hours=0):
-    """A checkpoint of so many hours after noon."""
+    """A checkpoint of so many hours after noon; ``None``: its writer was not given the time."""
     path = folder / checkpoint_name(epoch, complete)
-    write_record(path, random_record(1, points=3, epoch=epoch), NOON_NS + hours * HOUR_NS, {})
+    stamp_ns = None if hours is None else NOON_NS + hours * HOUR_NS
+    write_record(path, random_record(1, points=3, epoch=epoch), stamp_ns, {})
     return path
 
 
@@ -112,7 +111,7 @@ def test_an_empty_folder(tmp_path):
 def test_by_time_damaged_and_unstamped_files_are_passed_over(folder):
     (folder / checkpoint_name(8, False)).write_bytes(b"damaged")
     assert checkpoint_at(folder, "2030-01-01T00:00:00Z").epoch == 5
-    shutil.copy(VERSION_1, folder / checkpoint_name(42, True))
+    write_checkpoint(folder, 42, hours=None)
     assert checkpoint_at(folder, "2030-01-01T00:00:00Z").epoch == 5
     assert checkpoint_at(folder, "42").epoch == 42
 
@@ -121,8 +120,10 @@ def test_open_manifest(folder):
     manifest = open_manifest(checkpoint_at(folder, "5"))
     assert manifest.facts.epoch == 5
     assert manifest.stamp_ns == NOON_NS + HOUR_NS
-    shutil.copy(VERSION_1, folder / checkpoint_name(42, True))
-    assert open_manifest(checkpoint_at(folder, "42")) is None
+    rewritten = write_checkpoint(folder, 42)
+    rewritten.write_bytes(without_index(rewritten.read_bytes()))
+    with pytest.raises(NoIndexError, match=rewritten.name):
+        open_manifest(checkpoint_at(folder, "42"))
     broken = folder / checkpoint_name(3, True)
     broken.write_bytes(broken.read_bytes()[:-50])
     with pytest.raises(DamagedMapFileError, match=broken.name):

@@ -6,9 +6,7 @@ import os
 import shutil
 
 import pytest
-from mcap.writer import CompressionType, IndexType, Writer
-from support.map_records import assert_same, random_record, with_integers
-from support.mapfile_surgery import (
+from fuzz.mapfile_edit import (
     file_bytes,
     metadata_of,
     parts_of,
@@ -17,6 +15,8 @@ from support.mapfile_surgery import (
     write_pair,
     write_record,
 )
+from mcap.writer import CompressionType, IndexType, Writer
+from support.map_records import assert_same, random_record, with_integers
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
 from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import FileRef

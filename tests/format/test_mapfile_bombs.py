@@ -9,9 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import IndexType
-from support.map_records import SMALL, random_record, with_levels
-from support.mapfile_surgery import (
+from fuzz.mapfile_edit import (
     RawPart,
     edited,
     file_bytes,
@@ -26,6 +24,8 @@ from support.mapfile_surgery import (
     stored,
     with_manifest,
 )
+from mcap.writer import IndexType
+from support.map_records import SMALL, random_record, with_levels
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.manifest import FileRef
 from triquad_format.mapfile.mcap.records import MAX_CHUNK_BYTES

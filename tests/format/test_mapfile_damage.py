@@ -5,11 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import CompressionType
-from support.map_records import assert_same, random_record
-from support.mapfile_surgery import (
+from fuzz.mapfile_edit import (
     RawPart,
-    altered,
     file_bytes,
     listed,
     manifest_of,
@@ -17,10 +14,11 @@ from support.mapfile_surgery import (
     parts_of,
     read_bytes,
     rebuild,
-    sound_or_refused,
     stored,
     with_metadata,
 )
+from mcap.writer import CompressionType
+from support.map_records import assert_same, random_record
 from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,
@@ -32,7 +30,7 @@ from triquad_format.errors import (
 from triquad_format.mapfile import reader
 from triquad_format.mapfile.mapfile import read_map
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "map_v2.triquad"
+GOLDEN = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 
 
 @pytest.fixture(scope="module")
@@ -139,18 +137,6 @@ def test_bit_flips_without_crcs_are_found_by_digests():
         stored(plain)
 
 
-def test_altered_parts_with_right_digests():
-    """Hostile files: only errors of the family come out, or sound records."""
-    data = file_bytes(random_record(5, points=3))
-    metadata, manifest, parts = metadata_of(data), manifest_of(data), parts_of(data)[:-1]
-    read_back = 0
-    for spoilt in altered(parts, 600, np.random.default_rng(3)):
-        mutant = rebuild(listed(spoilt, manifest), metadata, compression=CompressionType.NONE)
-        found = [sound_or_refused(read, mutant) for read in (read_bytes, stored_record)]
-        read_back += sum(record is not None for record in found)
-    assert 0 < read_back < 1200
-
-
 def test_parts_missing_reordered_doubled_swapped():
     data = file_bytes(random_record(6, indices=((0, 0, 0), (1, 0, 0))))
     parts, metadata = parts_of(data), metadata_of(data)
@@ -220,7 +206,7 @@ def test_another_mcap_file():
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
-        ({"min_reader_version": "3"}, UnsupportedMapFileError, "version 3"),
+        ({"min_reader_version": "2"}, UnsupportedMapFileError, "version 2"),
         ({"required_features": "colour"}, UnsupportedMapFileError, "colour"),
         ({"required_features": "zeta, base-files, alpha"}, UnsupportedMapFileError, "alpha, zeta"),
         ({"required_features": None}, DamagedMapFileError, "required_features"),

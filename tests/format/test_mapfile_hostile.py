@@ -5,8 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from support.map_records import random_record, with_integers, with_levels
-from support.mapfile_surgery import (
+from fuzz.mapfile_edit import (
     RawPart,
     all_of,
     edited,
@@ -24,6 +23,7 @@ from support.mapfile_surgery import (
     stored,
     with_manifest,
 )
+from support.map_records import random_record, with_integers, with_levels
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.mapfile.manifest import FileRef
 

@@ -3,8 +3,8 @@ import os
 
 import numpy as np
 import pytest
+from fuzz.mapfile_edit import write_pair, write_record
 from support.map_records import SMALL, assert_same, random_record, with_integers
-from support.mapfile_surgery import write_pair, write_record
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.records import morton

@@ -5,10 +5,10 @@ import io
 
 import numpy as np
 import pytest
+from fuzz.mapfile_edit import RawPart, file_bytes, metadata_of, parts_of, read_bytes, rebuild
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from support.map_records import SMALL, random_record
-from support.mapfile_surgery import RawPart, file_bytes, metadata_of, parts_of, read_bytes, rebuild
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.preview import CLUSTER_CELLS, NET_LEAVES
 from triquad_format.records import morton

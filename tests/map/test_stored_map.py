@@ -1,13 +1,12 @@
 import dataclasses
 import itertools
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
 from support.map_records import SMALL, assert_same, random_record, with_integers
-from support.mapfile_surgery import edited, file_bytes, set_array, stored, write_pair, write_record
-from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError, NoIndexError
+from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.mapfile.random_access import FileBytes
 from triquad_format.records import morton
@@ -17,7 +16,6 @@ from triquad_format.records.region import AXES
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.stored_map import StoredMap
 
-VERSION_1 = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 WIDE = dataclasses.replace(SMALL, depth=11, feature_levels=4)
 """A region of 512 m: 8 squares of 64 m along each side."""
@@ -177,11 +175,6 @@ def test_outside_of_all_regions_nothing_is_known():
         assert np.isnan(answer.sdf).all()
         assert not answer.status.any()
         assert len(map_file.query(np.zeros((0, 3))).sdf) == 0
-
-
-def test_version_1_has_no_index():
-    with pytest.raises(NoIndexError, match="version 1"):
-        StoredMap.open(VERSION_1)
 
 
 # A file that changes while it is open

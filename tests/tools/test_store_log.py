@@ -1,14 +1,14 @@
 import json
 import shutil
-from pathlib import Path
 
 import pytest
+from fuzz.mapfile_edit import file_bytes, without_index
 from support.checkpoint_folder import write_checkpoints
+from support.map_records import random_record
 from triquad_format.mapfile.mapfile import read_map_file
 from triquad_tools.commands.inspect import main
 from triquad_tools.commands.pack import main as pack
 
-VERSION_1 = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 EPOCHS = (9, 12, 15)
 
 
@@ -95,8 +95,9 @@ def test_damaged_ones_are_listed_beside_sound_ones(folder, capsys):
     assert all(found["problem"] is None for found in sound)
 
 
-def test_version_1_is_listed_without_its_parts(folder, capsys):
-    shutil.copy(VERSION_1, folder / "epoch-000000003.triquad")
+def test_a_file_without_index_is_listed_without_its_parts(folder, capsys):
+    whole = (folder / "epoch-000000009.triquad").read_bytes()
+    (folder / "epoch-000000003.triquad").write_bytes(without_index(whole))
     assert main([str(folder), "--log"]) == 0
     assert capsys.readouterr().out.splitlines()[-1].split()[-2:] == ["no", "index"]
     _, log = log_of(folder, capsys)
@@ -106,7 +107,7 @@ def test_version_1_is_listed_without_its_parts(folder, capsys):
 @pytest.mark.parametrize("name", ["empty", "none", "file.triquad"])
 def test_what_is_no_folder_of_checkpoints_is_one_line(tmp_path, name, capsys):
     (tmp_path / "empty").mkdir()
-    shutil.copy(VERSION_1, tmp_path / "file.triquad")
+    (tmp_path / "file.triquad").write_bytes(file_bytes(random_record(1)))
     assert main([str(tmp_path / name), "--log"]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""

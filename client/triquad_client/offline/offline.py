@@ -27,7 +27,7 @@ class OfflineMap(MapQueries):
         self._driver: LocalDriver | None = LocalDriver(view)
         self.name = file.record.name
         self.epoch = file.record.epoch
-        self.stamp_ns = 0 if file.manifest is None else file.manifest.stamp_ns
+        self.stamp_ns = file.manifest.stamp_ns
         """When its epoch was written, nanoseconds since 1970; 0: the file does not tell."""
         self.compiled = is_compiled(view)
         """Whether compiled code answers, as in the server; else numpy, which is far slower."""

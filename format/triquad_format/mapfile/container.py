@@ -2,8 +2,8 @@
 
 from triquad_format.mapfile.parts.part import MANIFEST, MAP, PREVIEW, REGION_TOPICS
 
-FORMAT_VERSION = 2
-MIN_READER_VERSION = 2
+FORMAT_VERSION = 1
+MIN_READER_VERSION = 1
 METADATA_NAME = "triquad"
 MESSAGE_ENCODING = "msgpack"
 PREVIEW_ENCODING = "protobuf"

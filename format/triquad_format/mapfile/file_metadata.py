@@ -18,11 +18,11 @@ def one_metadata(found: list[dict[str, str]]) -> dict[str, str]:
     return found[0]
 
 
-def reader_version(metadata: dict[str, str]) -> int:
-    """The version that is needed to read the file.
+def check_readable(metadata: dict[str, str]) -> None:
+    """Refuse a file that this reader does not understand.
 
     Raises:
-        UnsupportedMapFileError: it is newer than this reader; the text names what is missing.
+        UnsupportedMapFileError: it needs a newer reader; the text names what is missing.
         DamagedMapFileError: the metadata does not tell.
     """
     needed = metadata.get("min_reader_version", "")
@@ -42,7 +42,6 @@ def reader_version(metadata: dict[str, str]) -> int:
         raise UnsupportedMapFileError(
             f"it requires {unknown:.200}, which this reader does not know: install a newer triquad"
         )
-    return int(needed)
 
 
 def _required(metadata: dict[str, str]) -> set[str]:

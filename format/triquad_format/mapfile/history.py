@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from triquad_format.errors import MapFileError, NoIndexError
+from triquad_format.errors import MapFileError
 from triquad_format.mapfile.file_errors import named
 from triquad_format.mapfile.index import DAMAGED_SUFFIX, MapIndex, files_in
 from triquad_format.mapfile.manifest import Manifest
@@ -85,10 +85,11 @@ def map_folder(store: Path) -> Path:
     return maps[0]
 
 
-def open_manifest(file: CheckpointFile) -> Manifest | None:
-    """The manifest of a checkpoint; ``None`` for a file of version 1, which has no such list.
+def open_manifest(file: CheckpointFile) -> Manifest:
+    """The manifest of a checkpoint, found by the file's index.
 
     Raises:
+        NoIndexError: another tool rewrote the file without one.
         MapFileError: the file is damaged, or needs a newer reader.
         OSError: it cannot be read.
     """
@@ -96,8 +97,6 @@ def open_manifest(file: CheckpointFile) -> Manifest | None:
     try:
         with named(str(file.path)):
             return MapIndex(source, files_in(file.path.parent)).manifest
-    except NoIndexError:
-        return None
     finally:
         source.close()
 
@@ -143,4 +142,4 @@ def _is_by(file: CheckpointFile, when: str) -> bool:
     except MapFileError:
         return False
     # Times are shown in whole seconds: what is shown must find its checkpoint.
-    return manifest is not None and 0 < manifest.stamp_ns // 10**9 <= limit_s
+    return 0 < manifest.stamp_ns // 10**9 <= limit_s

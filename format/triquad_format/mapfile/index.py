@@ -14,8 +14,8 @@ from triquad_format.mapfile.container import METADATA_NAME
 from triquad_format.mapfile.file_metadata import (
     check_agreement,
     check_features,
+    check_readable,
     one_metadata,
-    reader_version,
 )
 from triquad_format.mapfile.manifest import Entry, FileRef, unpack_manifest
 from triquad_format.mapfile.map_facts import check_map_part
@@ -112,8 +112,7 @@ class MapIndex:
         self._others = OtherFiles(open_file)
         self._mcap = McapIndex(source)
         self.metadata = one_metadata(self._mcap.metadata(METADATA_NAME))
-        if reader_version(self.metadata) < 2:
-            raise NoIndexError("a map file of version 1 has no index: triquad-pack rewrites it")
+        check_readable(self.metadata)
         last = self._mcap.chunks - 1
         message = self._mcap.message(last) if last >= 0 else None
         if message is None or message.topic != MANIFEST:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from triquad_format import version_1
 from triquad_format.errors import DamagedMapFileError, TooLargeMapFileError
 from triquad_format.mapfile.container import (
     MAX_MAP_BYTES,
@@ -18,8 +17,8 @@ from triquad_format.mapfile.file_errors import named
 from triquad_format.mapfile.file_metadata import (
     check_agreement,
     check_features,
+    check_readable,
     one_metadata,
-    reader_version,
 )
 from triquad_format.mapfile.index import OtherFiles, files_in
 from triquad_format.mapfile.manifest import DIGEST_BYTES, Entry, Manifest, unpack_manifest
@@ -39,7 +38,6 @@ class StoredPart:
     """A part as it lies in the file."""
 
     topic: str
-    size: int  # bytes of its payload
     stored_size: int  # bytes that it takes in the file, compressed
 
 
@@ -51,8 +49,8 @@ class MapFile:
     metadata: dict[str, str]  # of the record "triquad"
     parts: tuple[StoredPart, ...]  # of this file, without the manifest
     size: int  # bytes
-    manifest: Manifest | None  # None: a file of version 1, which has another
-    manifest_sha256: bytes  # of the manifest's payload; empty for a file of version 1
+    manifest: Manifest
+    manifest_sha256: bytes  # of the manifest's payload
 
 
 def read_map(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYTES) -> MapRecord:
@@ -95,30 +93,26 @@ def _read(name: str, stream: BinaryIO, max_bytes: int, folder: Path | None) -> M
 def _parse(data: memoryview, max_bytes: int, folder: Path | None) -> MapFile:
     mcap = McapFile(data)
     metadata = one_metadata([entries for name, entries in mcap.metadata if name == METADATA_NAME])
-    version = reader_version(metadata)
-    messages = _parts(mcap.messages(max_bytes), version, len(data) // DIGEST_BYTES)
-    if version < 2:
-        parts: list[StoredPart] = []
-        record = version_1.read_record(_noted(messages, parts))
-        manifest, digest = None, b""
-    else:
-        found = list(messages)
-        parts = [_stored(message) for message in found]
-        digest = hashlib.sha256(found[-1].data).digest() if found else b""
-        record, manifest = _assemble(found, len(data), folder)
-        check_features(metadata, manifest)
+    check_readable(metadata)
+    messages = list(_parts(mcap.messages(max_bytes), len(data) // DIGEST_BYTES))
+    if not messages or messages[-1].topic != MANIFEST:
+        raise DamagedMapFileError(f"the part {MANIFEST} is missing at the end")
+    packed = messages.pop().data
+    manifest = unpack_manifest(packed, len(data))
+    parts = tuple(StoredPart(message.topic, message.stored_bytes) for message in messages)
+    record = _assemble(manifest, messages, folder)
+    check_features(metadata, manifest)
     check_agreement(metadata, MapFacts(record.name, record.epoch, record.settings))
     check_record(record)
-    return MapFile(record, metadata, tuple(parts[:-1]), len(data), manifest, digest)
+    return MapFile(record, metadata, parts, len(data), manifest, hashlib.sha256(packed).digest())
 
 
-def _parts(messages: Iterator[Message], version: int, most: int) -> Iterator[Message]:
+def _parts(messages: Iterator[Message], most: int) -> Iterator[Message]:
     """The messages that are parts, known or not; a file with more than ``most`` is refused."""
     after = False
     count = 0
     for message in messages:
-        preview = version >= 2 and message.topic == PREVIEW
-        if not (preview or message.topic.startswith(PREFIX)):
+        if message.topic != PREVIEW and not message.topic.startswith(PREFIX):
             continue
         count += 1
         if count > most:
@@ -126,44 +120,27 @@ def _parts(messages: Iterator[Message], version: int, most: int) -> Iterator[Mes
         if after:
             raise DamagedMapFileError(f"the part {message.topic:.80} follows the manifest")
         after = message.topic == MANIFEST
-        limit = MAX_PART_BYTES if version >= 2 else version_1.MAX_PART_BYTES
-        if len(message.data) > limit:
-            raise DamagedMapFileError(f"a part {message.topic:.80} exceeds {limit} bytes")
+        if len(message.data) > MAX_PART_BYTES:
+            raise DamagedMapFileError(f"a part {message.topic:.80} exceeds {MAX_PART_BYTES} bytes")
         if message.topic in TOPICS and message.encoding != MESSAGE_ENCODING:
             raise DamagedMapFileError(f"{message.topic} is encoded in {message.encoding!r:.40}")
         yield message
 
 
-def _stored(message: Message) -> StoredPart:
-    return StoredPart(message.topic, len(message.data), message.stored_bytes)
-
-
-def _noted(messages: Iterator[Message], parts: list[StoredPart]) -> Iterator[Message]:
-    for message in messages:
-        parts.append(_stored(message))
-        yield message
-
-
-def _assemble(
-    messages: list[Message], file_bytes: int, folder: Path | None
-) -> tuple[MapRecord, Manifest]:
-    """The record of all parts, those in other files included, and their list."""
-    if not messages or messages[-1].topic != MANIFEST:
-        raise DamagedMapFileError(f"the part {MANIFEST} is missing at the end")
-    manifest = unpack_manifest(messages[-1].data, file_bytes)
+def _assemble(manifest: Manifest, messages: list[Message], folder: Path | None) -> MapRecord:
+    """The record of all parts, those in other files included; empties ``messages``."""
     own = manifest.own
-    if len(own) != len(messages) - 1:
-        raise DamagedMapFileError(f"{len(messages) - 1} parts, but its manifest lists {len(own)}")
+    if len(own) != len(messages):
+        raise DamagedMapFileError(f"{len(messages)} parts, but its manifest lists {len(own)}")
     payloads: dict[Entry, bytes] = {}
-    for number, (entry, message) in enumerate(zip(own, messages[:-1], strict=True)):
+    for number, (entry, message) in enumerate(zip(own, messages, strict=True)):
         entry.check(number, message.topic, message.data)
         payloads[entry] = message.data
     messages.clear()
     others = OtherFiles(None if folder is None else files_in(folder))
     try:
-        record = assemble(
+        return assemble(
             manifest, lambda e: payloads.pop(e) if e.file is None else others.payload(e)
         )
     finally:
         others.close()
-    return record, manifest

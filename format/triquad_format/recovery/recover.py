@@ -1,4 +1,4 @@
-"""What is intact in a damaged map file, as a sound map.
+"""What is intact in a damaged map file, as a valid map.
 
 Every chunk is looked for on its own (:mod:`triquad_format.recovery.chunk_scan`). Where the manifest
 is intact, it tells what each part is and what is missing; else the parts tell of themselves.
@@ -36,7 +36,6 @@ from triquad_format.records.region import (
     leaf_coordinates,
     region_centre,
 )
-from triquad_format.recover_version_1 import is_version_1, recover_version_1
 from triquad_format.recovery.recovery import Loss, Recovery, felt_box, loss_of
 from triquad_format.recovery.salvage import Salvage, read_messages, salvage
 
@@ -44,7 +43,7 @@ from triquad_format.recovery.salvage import Salvage, read_messages, salvage
 def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> Recovery:
     """All that is intact in a map file, and in the files of its folder that it needs.
 
-    The result is sound. It answers as the whole map did wherever no loss reaches. Where vertices
+    The result is valid. It answers as the whole map did wherever no loss reaches. Where vertices
     are lost, evidence goes with them: so nothing there passes for known. Training state stays
     where all of a region's is intact.
 
@@ -58,10 +57,7 @@ def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> Recovery:
     """
     with named(str(path)):
         messages = list(read_messages(path, max_bytes))
-        if is_version_1(messages):
-            recovery = recover_version_1(messages)
-        else:
-            recovery = _recover(salvage(messages, path, max_bytes))
+        recovery = _recover(salvage(messages, path, max_bytes))
         if not recovery.record.regions and not recovery.complete:
             raise MapFileError("nothing can be saved: no region is intact")
         return recovery

@@ -42,7 +42,7 @@ class Recovery:
     losses: tuple[Loss, ...]  # those that are known
     parts_intact: int  # parts of regions that could be read
     parts_listed: int | None  # how many there were; None: not known, for the manifest is lost
-    stamp_ns: int = 0  # when the epoch was written, nanoseconds since 1970; 0 if not known
+    stamp_ns: int  # when the epoch was written, nanoseconds since 1970; 0 if not known
 
     @property
     def complete(self) -> bool:

@@ -12,7 +12,7 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.file_metadata import reader_version
+from triquad_format.mapfile.file_metadata import check_readable
 from triquad_format.mapfile.index import file_in
 from triquad_format.mapfile.manifest import Manifest, unpack_manifest
 from triquad_format.mapfile.map_facts import MapFacts, unpack_facts
@@ -91,7 +91,7 @@ def salvage(messages: list[Message], path: Path, max_bytes: int) -> Salvage:
 
 def _refuse_newer(metadata: dict[str, str]) -> None:
     try:
-        reader_version(metadata)
+        check_readable(metadata)
     except UnsupportedMapFileError:
         follows, needed = (
             metadata.get(key, "") for key in ("format_version", "min_reader_version")

@@ -4,6 +4,7 @@ A checkpoint holds what changed since the one before and refers to older files f
 and then all is folded into one file. How far back they reach, the retention decides.
 """
 
+import contextlib
 import hashlib
 import itertools
 import logging
@@ -212,13 +213,10 @@ class Store:
 
     def _remember(self, checkpoint: CheckpointFile, file: MapFile) -> None:
         """Note what a checkpoint that was read consists of."""
-        if file.manifest is None:
-            return
         held = {}
         for other in file.manifest.files:
             base = checkpoint_file(self.folder / other.name)
-            manifest = None if base is None else open_manifest(base)
-            held[other] = 0 if manifest is None else own_bytes(manifest)
+            held[other] = 0 if base is None else own_bytes(open_manifest(base))
         own = FileRef(checkpoint.path.name, file.manifest_sha256)
         self._known = known_parts(file.manifest, own, held)
         for name in self._known.files:
@@ -253,12 +251,9 @@ class Store:
         """Names of the files that a checkpoint consists of."""
         if file.path not in self._files:
             names = {file.path.name}
-            try:
-                manifest = open_manifest(file)
-            except MapFileError:
-                manifest = None  # damaged: it needs nothing any more
-            if manifest is not None:
-                names |= {other.name for other in manifest.files}
+            # One that does not open needs nothing any more.
+            with contextlib.suppress(MapFileError):
+                names |= {other.name for other in open_manifest(file).files}
             self._files[file.path] = frozenset(names)
         return self._files[file.path]
 

@@ -39,8 +39,7 @@ def verify(path: Path, file: MapFile) -> tuple[str, ...]:
 
 def _other_files(file: MapFile) -> str:
     """Reading has compared each part with its digest, wherever it lies."""
-    entries = file.manifest.entries if file.manifest else ()
-    elsewhere = sum(entry.file is not None for entry in entries)
+    elsewhere = sum(entry.file is not None for entry in file.manifest.entries)
     return f"{elsewhere} parts in other files" if elsewhere else ""
 
 
@@ -51,9 +50,7 @@ def _mcap_library(path: Path, file: MapFile) -> str:
             topics = [channel.topic for _, channel, _ in reader.iter_messages()]
     except (McapError, ValueError, KeyError, struct.error, OSError) as error:
         raise FailedCheckError(f"{path}: the mcap library refuses it: {error}") from error
-    # A file of version 1 has no preview of ours.
-    shown = PREVIEW if file.manifest is not None else None
-    parts = sum(topic.startswith(PREFIX) or topic == shown for topic in topics)
+    parts = sum(topic.startswith(PREFIX) or topic == PREVIEW for topic in topics)
     wanted = len(file.parts) + 1  # with the manifest
     if parts != wanted:
         raise FailedCheckError(f"{path}: the mcap library finds {parts} parts of {wanted}")

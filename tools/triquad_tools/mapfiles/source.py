@@ -1,7 +1,6 @@
 """Where ``triquad-pack`` takes its map from: a file, or a folder of checkpoints."""
 
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -94,9 +93,7 @@ def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
 
 def _whole(path: Path) -> SourceMap:
     file = read_whole(path)
-    if file.manifest is not None:
-        return SourceMap(file.record, file.manifest.stamp_ns or None)
-    return SourceMap(file.record, _stamp_ns(file.metadata.get("created", "")))
+    return SourceMap(file.record, file.manifest.stamp_ns or None)
 
 
 def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
@@ -108,12 +105,4 @@ def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
                 return None
             return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
     except NoIndexError:
-        return None
-
-
-def _stamp_ns(created: str) -> int | None:
-    """The time that a file of version 1 says that it was written."""
-    try:
-        return int(datetime.fromisoformat(created.replace("Z", "+00:00")).timestamp()) * 10**9
-    except ValueError:
         return None

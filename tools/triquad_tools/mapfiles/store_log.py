@@ -102,7 +102,7 @@ def _logged(file: CheckpointFile, indices: "_Indices") -> LoggedCheckpoint:
         size = file.path.stat().st_size
         parts = indices.parts(file.path.name)
     except NoIndexError:
-        pass  # of version 1: nothing is known against it, short of reading all of it
+        pass  # another tool rewrote it: only reading all of it shows whether it is intact
     except (FormatError, OSError) as error:
         problem = str(error)
     return LoggedCheckpoint(file.path.name, file.epoch, file.complete, size, parts, problem)

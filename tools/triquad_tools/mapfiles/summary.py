@@ -71,7 +71,7 @@ def summarise(file: MapFile) -> MapSummary:
     regions = tuple(_summarise_region(record, region) for region in record.regions)
     parts = _summarise_parts(file)
     parameters = sum(region.parameters for region in regions)
-    other_files = tuple(ref.name for ref in file.manifest.files) if file.manifest else ()
+    other_files = tuple(ref.name for ref in file.manifest.files)
     training_bytes = sum(parts[t].stored_bytes for t in TRAINING_TOPICS if t in parts)
     whole = parameters > 0 and not other_files
     return MapSummary(
@@ -184,14 +184,12 @@ def _rounded(place: NDArray[np.float64]) -> tuple[float, ...]:
 
 
 def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
-    """The parts by topic; those of other files only if the manifest, which lists them, is there."""
+    """The parts by topic, those in other files included."""
     sizes: dict[str, list[int]] = {}
     stored: dict[str, list[int]] = {}
     for part in file.parts:
         stored.setdefault(part.topic, []).append(part.stored_size)
-        if file.manifest is None:
-            sizes.setdefault(part.topic, []).append(part.size)
-    for entry in file.manifest.entries if file.manifest else ():
+    for entry in file.manifest.entries:
         sizes.setdefault(entry.key.topic, []).append(entry.size)
     return {
         topic: TopicSummary(len(own), sum(own), len(here := stored.get(topic, [])), sum(here))

@@ -1,4 +1,4 @@
-"""When each place of a map last changed, as far as the manifest of its file tells."""
+"""When each place of a map last changed, as the manifest of its file tells."""
 
 from dataclasses import dataclass
 
@@ -37,11 +37,9 @@ class _Age:
         return ", ".join(filter(None, (epochs, utc_time(self.stamp_ns))))
 
 
-def ages_panel(grid: PlanGrid, manifest: Manifest | None, seen: Columns, surface: Columns) -> Panel:
+def ages_panel(grid: PlanGrid, manifest: Manifest, seen: Columns, surface: Columns) -> Panel:
     """A plan of the epochs in which places last changed, square by square."""
     heading = "Last changed"
-    if manifest is None:
-        return Panel(heading, None, note="a file of version 1 keeps no record of changes")
     epochs = np.where(grid.marked(seen.middles), latest_epochs(grid, manifest), _NEVER)
     ages = _ages(epochs, manifest)
     shares = np.arange(1, len(ages) + 1) / max(len(ages), 1)

@@ -119,17 +119,6 @@ class PartBody:
             raise DamagedMapFileError(f"{self._topic}: {key} = {value} is not a count")
         return value
 
-    def counts(self, key: str, length: int) -> list[int]:
-        """A list of ``length`` numbers in ``[0, 2**63)``."""
-        values: list[Any] = self.value(key, list)
-        if len(values) != length or not all(
-            type(value) is int and 0 <= value < 2**63 for value in values
-        ):
-            raise DamagedMapFileError(
-                f"{self._topic}: {key} = {reprlib.repr(values)} is not a list of {length} counts",
-            )
-        return values
-
     def texts(self, key: str) -> list[str]:
         """A list of strings."""
         values: list[Any] = self.value(key, list)

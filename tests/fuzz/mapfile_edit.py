@@ -1,4 +1,4 @@
-"""Map files taken apart and put together again, so that tests can spoil them anywhere."""
+"""Map files taken apart and put together again, so that tests can change them anywhere."""
 
 import dataclasses
 import hashlib
@@ -9,14 +9,12 @@ import msgpack
 import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from triquad_format.errors import MapFileError
 from triquad_format.mapfile.manifest import FileRef, pack_manifest, unpack_manifest
 from triquad_format.mapfile.map_facts import MapFacts
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.mapfile.parts.part import MANIFEST
 from triquad_format.mapfile.random_access import MemoryBytes
 from triquad_format.mapfile.writer import record_parts, write_parts
-from triquad_format.records.record_check import check_record
 from triquad_format.wire.array import pack_array, unpack_array
 from triquad_map.stored_map import StoredMap
 
@@ -77,6 +75,11 @@ def rebuild(parts, metadata, *, encoding="msgpack", chunk_size=1, **options):
     return stream.getvalue()
 
 
+def without_index(data):
+    """The map with all parts in one chunk, as other tools write it: it can only be read whole."""
+    return rebuild(parts_of(data), metadata_of(data), chunk_size=1 << 30)
+
+
 def listed(parts, manifest):
     """Parts and a manifest with their sizes and digests; keys are those of ``manifest``."""
     own = tuple(
@@ -90,15 +93,22 @@ def listed(parts, manifest):
     return [*parts, RawPart(MANIFEST, packed.payload)]
 
 
+def with_part(data, at, payload, **options):
+    """The file with another payload in one of its parts; digests fit."""
+    parts = parts_of(data)
+    parts[at] = parts[at]._replace(payload=payload)
+    is_manifest = at in (-1, len(parts) - 1)
+    whole = parts if is_manifest else listed(parts[:-1], manifest_of(data))
+    return rebuild(whole, metadata_of(data), **options)
+
+
 def edited(data, topic, edit, number=0):
     """The file with the body of the ``number``-th part of a topic edited; digests fit."""
     parts = parts_of(data)
     at = [i for i, part in enumerate(parts) if part.topic == topic][number]
     body = msgpack.unpackb(parts[at].payload)
     edit(body)
-    parts[at] = RawPart(topic, msgpack.packb(body))
-    whole = parts if topic == MANIFEST else listed(parts[:-1], manifest_of(data))
-    return rebuild(whole, metadata_of(data))
+    return with_part(data, at, msgpack.packb(body))
 
 
 def with_manifest(data, edit):
@@ -141,27 +151,6 @@ def all_of(*edits):
 def in_level(number, edit):
     """Edit the rows of one level of a part."""
     return lambda body: edit(body["levels"][number])
-
-
-def altered(parts, count, rng):
-    """``count`` times the parts, with some bits of one flipped."""
-    for _ in range(count):
-        at = int(rng.integers(len(parts)))
-        payload = bytearray(parts[at].payload)
-        # Most flips hit the heads, where lengths, shapes and keys are.
-        for _ in range(int(rng.integers(1, 4))):
-            payload[int(len(payload) * rng.random() ** 3)] ^= 1 << int(rng.integers(8))
-        yield [*parts[:at], RawPart(parts[at].topic, bytes(payload)), *parts[at + 1 :]]
-
-
-def sound_or_refused(read, data):
-    """The record of a hostile file, which must be sound; ``None`` where the file is refused."""
-    try:
-        record = read(data)
-    except MapFileError:
-        return None
-    check_record(record)
-    return record
 
 
 def write_pair(

@@ -1,0 +1,92 @@
+"""Small valid map files of every kind, from which mutants are made."""
+
+import dataclasses
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from fuzz.mapfile_edit import write_pair
+from support.map_records import random_record, with_integers, with_levels
+from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import MapRecord
+from triquad_map.stored_map import StoredMap
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+TINY = FieldSettings(
+    depth=6, feature_levels=1, feature_size=2, frequencies=1, hidden=2, logit_scale_m=0.5
+)
+POINT = np.array([[0.3, 0.2, 0.1]])
+BOX = ([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0])
+
+Results = tuple[object, ...]
+"""What a reader made of a map."""
+
+Reader = Callable[[Path], Results]
+
+
+def read_whole(path: Path) -> Results:
+    return (read_map(path),)
+
+
+def read_indexed(path: Path) -> Results:
+    with StoredMap.open(path) as stored:
+        return stored.query(POINT, gradient=True), stored.box(*BOX)
+
+
+READERS: tuple[Reader, ...] = (read_whole, read_indexed)
+
+
+@dataclass(frozen=True)
+class ValidMap:
+    """A map file and those that it needs, in a folder of their own."""
+
+    path: Path  # of the file that is opened
+    files: dict[str, bytes]  # of the folder, by their names
+    results: tuple[Results, ...]  # of each reader
+
+    def __repr__(self) -> str:
+        return self.path.parent.name
+
+
+def valid_maps(folder: Path) -> list[ValidMap]:
+    """Maps of every kind, each written into a folder of its own."""
+    plain = random_record(settings=TINY, points=3, training=False)
+    complete = {
+        "plain": plain,
+        "training": random_record(settings=TINY, points=3),
+        "integers": with_integers(plain),
+        "levels": with_levels(plain),
+    }
+    maps = [_written(folder / kind, record) for kind, record in complete.items()]
+    maps.append(_written_pair(folder / "delta", plain))
+    maps.append(_copied(folder / "golden", "map_v1_next.triquad", "map_v1.triquad"))
+    maps.append(_copied(folder / "golden-levels", "map_v1_levels.triquad"))
+    return maps
+
+
+def _written(folder: Path, record: MapRecord) -> ValidMap:
+    folder.mkdir()
+    write_map(record, folder / "map.triquad", preview=folder.name == "plain")
+    return _found(folder / "map.triquad")
+
+
+def _written_pair(folder: Path, base: MapRecord) -> ValidMap:
+    folder.mkdir()
+    later = dataclasses.replace(with_integers(base), epoch=base.epoch + 1)
+    write_pair(folder, base, later, stamps=(10**9, 2 * 10**9))
+    return _found(folder / "next.triquad")
+
+
+def _copied(folder: Path, *names: str) -> ValidMap:
+    folder.mkdir()
+    for name in names:
+        shutil.copy(GOLDEN / name, folder)
+    return _found(folder / names[0])
+
+
+def _found(path: Path) -> ValidMap:
+    files = {file.name: file.read_bytes() for file in path.parent.iterdir()}
+    return ValidMap(path, files, tuple(read(path) for read in READERS))
