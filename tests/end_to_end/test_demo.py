@@ -22,8 +22,8 @@ from triquad_tools.demo.results import (
 )
 from triquad_tools.demo.server import DemoServer, DemoServerError, ServerOptions
 from triquad_tools.evaluation.map_scores import StreetScores
-from triquad_tools.evaluation.meshfile import read_mesh
 from triquad_tools.evaluation.metrics import MeshScores
+from triquad_tools.mapfiles.meshfile import read_mesh
 
 GOOD = DemoResults(
     seed=1,

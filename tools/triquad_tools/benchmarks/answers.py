@@ -12,7 +12,7 @@ from triquad_map.view import MapView
 
 from triquad_tools.benchmarks.answer_probes import AnswerProbes, answer_probes
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.evaluation.driven_street import DrivenStreet
+from triquad_tools.evaluation.map_scores import DrivenStreet
 from triquad_tools.simulation.scene import Scene
 
 REACH_M = 5.0

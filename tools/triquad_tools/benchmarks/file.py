@@ -18,7 +18,6 @@ from triquad_server.warm_up import warm_up
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.meshfile import Mesh
 from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
 from triquad_tools.mapfiles.field_change import field_change
 from triquad_tools.mapfiles.mesh import surface_mesh
@@ -93,12 +92,10 @@ def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> 
 
 
 def _f_score(record: MapRecord, made: BenchStreet) -> float:
-    settings = Settings()
-    epoch = Mapper("bench", settings, "cpu", record).publish()
-    mesh = surface_mesh(epoch, made.drive.scene.bounds, settings.mesh.tile_side_m, lambda *_: None)
+    scene = made.drive.scene
+    mesh = surface_mesh(record, scene.bounds, Settings().mesh.cell_m)
     scoring = ScoreSettings(samples_max=_MESH_SAMPLES)
-    scene, rng = made.drive.scene, np.random.default_rng(0)
-    scores = score_against_scene(Mesh(mesh.vertices, mesh.faces), scene, made.visible, scoring, rng)
+    scores = score_against_scene(mesh, scene, made.visible, scoring, np.random.default_rng(0))
     return 100 * scores.f_score
 
 

@@ -16,7 +16,7 @@ from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure, seconds
-from triquad_tools.simulation.street_drive import street_drive
+from triquad_tools.simulation.street import street_drive
 
 _REGIONS = 16
 _SCANS = 25

@@ -24,7 +24,7 @@ from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.demo.probe import ask_until
 from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
-from triquad_tools.evaluation.meshfile import Mesh
+from triquad_tools.mapfiles.meshfile import Mesh
 from triquad_tools.simulation.lidar import SimulatedScan
 
 _MAP = "bench"

@@ -24,7 +24,7 @@ _ROUNDS = 7
 _SEED = 4  # of the points
 
 
-def measure_twin(made: BenchStreet) -> list[Figure]:
+def measure_offline(made: BenchStreet) -> list[Figure]:
     """Figures of the street's map, opened offline, against the settled server's epoch."""
     epoch = settled_mapper(made).publish()
     points = seen_points(epoch, made, np.random.default_rng(_SEED))

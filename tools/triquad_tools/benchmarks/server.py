@@ -23,8 +23,8 @@ from triquad_tools.console.settling import FLUSH_TIMEOUT_S, wait_until_settled
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 from triquad_tools.evaluation.map_scores import StreetScores, score_street
-from triquad_tools.evaluation.meshfile import Mesh
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
+from triquad_tools.mapfiles.meshfile import Mesh
 
 _MAP = "bench"
 _ASKED = 1_000

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_tools.evaluation.driven_street import DrivenStreet, driven_street
+from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 

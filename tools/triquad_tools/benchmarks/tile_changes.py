@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_server.mesh.mesher import TileIndex
 
-from triquad_tools.evaluation.meshfile import Mesh
+from triquad_tools.mapfiles.meshfile import Mesh
 
 _CANDIDATES = 8  # triangles that are looked at for each point: those of the nearest centroids
 

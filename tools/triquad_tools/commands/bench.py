@@ -7,21 +7,31 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from triquad_tools.console.arguments import seed
-from triquad_tools.console.errors import ToolError
-from triquad_tools.console.interruption import sigterm_interrupts
+from triquad_tools.console.arguments import count, positive, seed
+from triquad_tools.console.command import (
+    BAD_INPUT,
+    OK,
+    ToolError,
+    complain,
+    run,
+    sigterm_interrupts,
+)
+from triquad_tools.console.report import Row, json_text, print_rows
 
 if TYPE_CHECKING:
     from triquad_tools.benchmarks.figures import Figure
+    from triquad_tools.benchmarks.street import BenchStreet
 
-OK, FAILED, BAD_INPUT = 0, 1, 2
-
-PARTS = ("core", "server", "growth", "file", "store", "mesh", "answers", "align", "twin")
+_COMMAND = "triquad-bench"
+_ON_STREET = ("core", "server", "file", "store", "mesh", "answers", "align", "offline")
+USUAL_PARTS = (*_ON_STREET, "growth")
+PARTS = (*USUAL_PARTS, "ablation")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,54 +39,51 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     for path in (options.json, options.record):
         if path is not None and not os.access(path.parent, os.W_OK):
-            return _complain(f"{path}: cannot be written: choose another folder", BAD_INPUT)
-    from triquad_client import TriquadError
+            message = f"{path}: cannot be written: choose another folder"
+            return complain(_COMMAND, message, BAD_INPUT)
+    with sigterm_interrupts():
+        return run(_COMMAND, partial(_bench, options), failures=(ToolError, OSError))
 
-    try:
-        with sigterm_interrupts():
-            figures = measure(options.parts or list(PARTS), options.seed, options.recorded)
-        _present(figures, options)
-    except (ToolError, TriquadError, OSError) as error:
-        return _complain(str(error), FAILED)
-    except KeyboardInterrupt:
-        return _complain("interrupted", FAILED)
+
+def _bench(options: argparse.Namespace) -> int:
+    parts = options.parts or USUAL_PARTS
+    figures = _on_street([part for part in _ON_STREET if part in parts], options)
+    if "growth" in parts:
+        figures += _growth(options.seed)
+    if "ablation" in parts:
+        from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
+
+        figures += measure_ablation(options.seed, options.scans, options.step)
+    _present(figures, options)
     return OK
 
 
-def measure(parts: Sequence[str], street_seed: int, recorded: Path | None = None) -> "list[Figure]":
-    """The figures of some parts on one street, and of ``align`` on a recorded folder, too."""
-    from triquad_tools.benchmarks.align import measure_align
+def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
+    """The figures of parts that are measured on one drive, each after the other."""
+    if not parts:
+        return []
+    from triquad_tools.benchmarks.align import measure_align  # slow to import
     from triquad_tools.benchmarks.core import measure_core
     from triquad_tools.benchmarks.file import measure_file
     from triquad_tools.benchmarks.mesh import measure_mesh
-    from triquad_tools.benchmarks.offline import measure_twin
+    from triquad_tools.benchmarks.offline import measure_offline
     from triquad_tools.benchmarks.planners import measure_planners
     from triquad_tools.benchmarks.server import measure_server
     from triquad_tools.benchmarks.store import measure_store
     from triquad_tools.benchmarks.street import bench_street
 
-    figures: list[Figure] = []
-    if set(parts) - {"growth"}:
-        made = bench_street(street_seed)
-        if "server" in parts:
-            figures += measure_server(made)
-        if "core" in parts:
-            figures += measure_core(made)
-        if "file" in parts:
-            figures += measure_file(made)
-        if "store" in parts:
-            figures += measure_store(made)
-        if "mesh" in parts:
-            figures += measure_mesh(made)
-        if "answers" in parts:
-            figures += measure_planners(made)
-        if "align" in parts:
-            figures += measure_align(made, recorded)
-        if "twin" in parts:
-            figures += measure_twin(made)
-    if "growth" in parts:
-        figures += _growth(street_seed)
-    return figures
+    measures: dict[str, Callable[[BenchStreet], list[Figure]]] = {
+        "core": measure_core,
+        "server": measure_server,
+        "file": measure_file,
+        "store": measure_store,
+        "mesh": measure_mesh,
+        "answers": measure_planners,
+        "align": partial(measure_align, folder=options.recorded),
+        "offline": measure_offline,
+    }
+    made = bench_street(options.seed)
+    return [figure for part in parts for figure in measures[part](made)]
 
 
 def _growth(street_seed: int) -> "list[Figure]":
@@ -104,11 +111,10 @@ def machine() -> str:
 
 def _present(figures: "list[Figure]", options: argparse.Namespace) -> None:
     from triquad_tools.benchmarks.figures import markdown
-    from triquad_tools.console.report import Row, json_text, print_table
 
     title = f"{datetime.date.today().isoformat()}, {machine()}, street {options.seed}"
     rows = [Row(figure.name, figure.shown, _note(figure)) for figure in figures]
-    print_table(title, rows)
+    print_rows(title, rows)
     if options.json is not None:
         result = {"title": title, "figures": [asdict(figure) for figure in figures]}
         options.json.write_text(json_text(result) + "\n", encoding="utf-8")
@@ -123,11 +129,6 @@ def _note(figure: "Figure") -> str:
     return f"{figure.wanted}: {'yes' if figure.kept else 'NO'}"
 
 
-def _complain(message: str, code: int) -> int:
-    print(f"triquad-bench: {message}", file=sys.stderr)
-    return code
-
-
 def _part(name: str) -> str:
     if name not in PARTS:
         raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(PARTS)}")
@@ -136,19 +137,25 @@ def _part(name: str) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="triquad-bench",
+        prog=_COMMAND,
         description="Measure triquad on this machine, on a simulated street: a server under a "
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
-        "file, checkpoints, mesh tiles, answers to planners, and scans put back in place. Takes "
-        "a quarter of an hour; nothing else should run meanwhile.",
+        "file, checkpoints, mesh tiles, answers to planners, scans put back in place, and maps "
+        "opened offline. Takes a quarter of an hour; nothing else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument
     add(
-        "parts", nargs="*", type=_part, metavar="PART", help=f"of {', '.join(PARTS)} (default: all)"
+        "parts",
+        nargs="*",
+        type=_part,
+        metavar="PART",
+        help=f"of {', '.join(PARTS)} (default: all but the ablation)",
     )
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
     add("--recorded", type=Path, metavar="FOLDER", help="KITTI-style scans to align, too")
+    add("--scans", type=count, default=60, metavar="N", help="of the ablation (default: 60)")
+    add("--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)")
     add("--json", type=Path, metavar="FILE", help="write the figures there, too")
     add("--record", type=Path, metavar="FILE.md", help="add a table to this page")
     return parser

@@ -1,57 +1,53 @@
 """``triquad-demo``: the whole of triquad on one simulated street."""
 
 import argparse
-import importlib.util
 import os
 import shutil
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from triquad_tools.console.arguments import count, seed
-from triquad_tools.console.errors import ToolError
-from triquad_tools.console.interruption import sigterm_interrupts
+from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, sigterm_interrupts
+from triquad_tools.console.report import json_text, print_rows
+from triquad_tools.demo import steps
+from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
+from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 
-if TYPE_CHECKING:
-    from triquad_tools.demo.results import DemoResults
-
-OK, FAILED, BAD_INPUT = 0, 1, 2
-
-_NEEDED = ("torch", "numba", "scipy", "rich", "PIL")
+_COMMAND = "triquad-demo"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 all is as promised, 1 something is not or failed, 2 wrong usage."""
-    options = _parser().parse_args(argv)
-    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        return _complain(f"{', '.join(missing)} is missing: install triquad[tools]", BAD_INPUT)
-    from triquad_client import TriquadError
-    from triquad_format.errors import FormatError
-
-    try:
-        with sigterm_interrupts():
-            results = run_demo(options.out, options.scans, options.seed)
-    except KeyboardInterrupt:
-        return _complain("interrupted; the server is stopped", FAILED)
-    except (ToolError, TriquadError, FormatError, OSError) as error:
-        return _complain(str(error), FAILED)
-    return _present(options.out, results)
+    work = partial(_demo, _parser().parse_args(argv))
+    with sigterm_interrupts():
+        return run(
+            _COMMAND,
+            work,
+            failures=(ToolError, OSError),
+            interrupted="interrupted; the server is stopped",
+        )
 
 
-def run_demo(out: Path, scans: int, street_seed: int) -> "DemoResults":
+def _demo(options: argparse.Namespace) -> int:
+    results = run_demo(options.out, options.scans, options.seed)
+    print_rows(f"Street {results.seed}, {results.intake.scans} scans", table_rows(results))
+    files = "map.triquad, street.glb, street.ply, street.png, results.json, server.log"
+    print(f"In {options.out}: {files}")
+    broken = broken_promises(results)
+    for line in broken:
+        complain(_COMMAND, line, FAILED)
+    return FAILED if broken else OK
+
+
+def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
     """Map a street of ``scans`` scans, and leave all results in the folder ``out``.
 
     Raises:
         ToolError, TriquadError, FormatError, OSError: a step failed; the server is stopped.
     """
-    from triquad_tools.console.report import json_text
-    from triquad_tools.demo import steps
-    from triquad_tools.demo.results import DemoResults
-    from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
-
     laps = _Laps()
     server_options = ServerOptions(free_endpoint(), steps.MAP, out / "store", out / "server.log")
     _prepare(out)
@@ -99,10 +95,8 @@ class _Laps:
 
 def _prepare(out: Path) -> None:
     """Make the folder; forget what an earlier demonstration left in its store and log."""
-    from triquad_tools.demo.steps import MAP
-
     out.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(out / "store" / MAP, ignore_errors=True)
+    shutil.rmtree(out / "store" / steps.MAP, ignore_errors=True)
     (out / "server.log").unlink(missing_ok=True)
 
 
@@ -111,30 +105,13 @@ def _say_if_unsettled(settled: bool) -> None:
         _say("the server is still learning; it is scored as it is now")
 
 
-def _present(out: Path, results: "DemoResults") -> int:
-    from triquad_tools.console.report import print_table
-    from triquad_tools.demo.results import broken_promises, table_rows
-
-    print_table(f"Street {results.seed}, {results.intake.scans} scans", table_rows(results))
-    print(f"In {out}: map.triquad, street.glb, street.ply, street.png, results.json, server.log")
-    broken = broken_promises(results)
-    for line in broken:
-        _complain(line, FAILED)
-    return FAILED if broken else OK
-
-
 def _say(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
 
 
-def _complain(message: str, code: int) -> int:
-    print(f"triquad-demo: {message}", file=sys.stderr)
-    return code
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="triquad-demo",
+        prog=_COMMAND,
         description="Map a simulated street with a real server, ask it while it learns, score the "
         "map against the exact street, restart the server and ask again. Takes some minutes.",
         epilog="Exit status: 0 all is as the README promises, 1 something is not or failed, "

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_tools.console.errors import ToolError
+from triquad_tools.console.command import ToolError
 
 if TYPE_CHECKING:
     from triquad_client import Client

@@ -15,13 +15,17 @@ from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.results import Intake, MapSize, Restart
-from triquad_tools.evaluation import meshfile
-from triquad_tools.evaluation.driven_street import DrivenStreet, driven_street
-from triquad_tools.evaluation.map_scores import StreetScores, score_street
+from triquad_tools.evaluation.map_scores import (
+    DrivenStreet,
+    StreetScores,
+    driven_street,
+    score_street,
+)
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
+from triquad_tools.mapfiles import meshfile
 from triquad_tools.plots.camera import Camera
 from triquad_tools.plots.render import height_colours, render_mesh, write_png
-from triquad_tools.simulation.street_drive import street_drive
+from triquad_tools.simulation.street import street_drive
 
 MAP = "demo"
 

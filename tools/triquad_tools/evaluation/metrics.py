@@ -1,4 +1,4 @@
-"""Scores of a mesh and of a field, as the literature on neural mapping defines them.
+"""Scores of a mesh, as the literature on neural mapping defines them.
 
 Accuracy goes from the mesh to the truth, completion from the truth to the mesh. The mesh is
 sampled densely; samples and truth are thinned to one point per voxel. Samples beside the truth's
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from triquad_tools.evaluation.meshfile import Mesh
+from triquad_tools.mapfiles.meshfile import Mesh
+from triquad_tools.recordings.cloud import thin
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.voxel import thin
 
 
 @dataclass(frozen=True)
@@ -41,16 +41,6 @@ class MeshScores:
     outlier_ratio: float  # share of samples beyond the accuracy's cut
     samples: int  # of the mesh, in the truth's bounding box
     references: int  # points of the truth
-
-
-@dataclass(frozen=True)
-class FieldScores:
-    """How well a field agrees with the exact one at some points."""
-
-    mean_error_m: float  # of the absolute difference of distances
-    median_error_m: float
-    median_angle_deg: float  # between gradients
-    points: int
 
 
 def score_against_cloud(
@@ -90,23 +80,12 @@ def score_against_scene(
     return _scores(np.abs(scene.sdf(samples)), samples, visible, settings)
 
 
-def field_scores(
-    sdf: NDArray[np.floating],
-    gradient: NDArray[np.floating],
-    exact_sdf: NDArray[np.floating],
-    exact_gradient: NDArray[np.floating],
-) -> FieldScores:
-    """Scores of distances ``[N]`` (metres) and gradients ``[N, 3]`` at the same points."""
-    errors = np.abs(np.asarray(sdf, np.float64) - exact_sdf)
-    lengths = np.linalg.norm(gradient, axis=1) * np.linalg.norm(exact_gradient, axis=1)
-    cosines = np.einsum("ni,ni->n", gradient, exact_gradient) / np.maximum(lengths, 1e-12)
+def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    """Median of the angles between vectors ``[N, 3]``; NaN where there are none."""
+    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    cosines = np.einsum("ni,ni->n", one, other) / np.maximum(lengths, 1e-12)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return FieldScores(
-        mean_error_m=float(np.mean(errors)),
-        median_error_m=float(np.median(errors)),
-        median_angle_deg=float(np.median(angles)),
-        points=len(errors),
-    )
+    return float(np.median(angles)) if len(angles) else float("nan")
 
 
 def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from triquad_format.records import morton
 from triquad_format.records.region import BLOCK_VOXELS, MapRecord, region_centre
 from triquad_map.reference.evaluator import MapEvaluator
 
-from triquad_tools.console.errors import ToolError
+from triquad_tools.console.command import ToolError
 
 _READER_CHECKS = (
     "records and checksums",

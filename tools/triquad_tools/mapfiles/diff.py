@@ -1,5 +1,6 @@
 """Where and by how much two maps differ; ``docs/tools.md`` defines every figure."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,13 +11,19 @@ from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import print_columns
-from triquad_tools.mapfiles.surface_points import surface_points
+from triquad_tools.mapfiles.seen_space import surface_voxels
+
+NEAR_ENOUGH_M = 1e-4
+"""A point this near to the zero of the field is on the surface."""
 
 STILL_M = 1e-3
 """What moved by less has not moved: several times the error of a surface point."""
 
 NOISE_M = 0.02
 """Two maps that learnt the same differ by up to this; it does not make a change great."""
+
+_STEPS = 8
+_LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
 
 
 @dataclass(frozen=True)
@@ -102,18 +109,54 @@ def difference(comparison: Comparison, tile_m: float) -> MapDiff:
     return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
 
 
+def surface_points(record: MapRecord) -> NDArray[np.float64]:
+    """Points ``[N, 3]`` where the field is zero, at most one for each voxel where rays ended.
+
+    The middles of these voxels are moved along the gradient by Newton's method. Those that have
+    not come to a zero within a voxel's diagonal, at which the map says ``SURFACE``, are left out.
+    """
+    evaluator = MapEvaluator(record)
+    leaf_m = record.settings.leaf_m
+    middles = surface_voxels(record)
+    points = middles.copy()
+    arrived = np.zeros(len(points), np.bool_)
+    under_way = np.arange(len(points))
+    for _ in range(_STEPS):
+        answer = evaluator.query(points[under_way], gradient=True)
+        assert answer.gradient is not None
+        there = np.abs(answer.sdf) <= NEAR_ENOUGH_M
+        arrived[under_way[there & (answer.status == Status.SURFACE)]] = True
+        steps = _newton_steps(answer.sdf[~there], answer.gradient[~there], leaf_m / 2)
+        under_way = under_way[~there]
+        points[under_way] += steps
+        distance = np.linalg.norm(points[under_way] - middles[under_way], axis=1)
+        under_way = under_way[distance <= math.sqrt(3) * leaf_m]
+    found: NDArray[np.float64] = points[arrived]
+    return found
+
+
 def print_diff(diff: MapDiff, limit: int) -> None:
     """Print the totals, and a table of the ``limit`` tiles that changed most."""
     if not diff.tiles:
         print(f"  no difference at {diff.total.points_a:,} surface points")
         return
-    titles = ("x m", "y m", "z m", "points A", "in B", "added %", "newly seen %", "gone %",
+    titles = ("from x m", "y m", "z m", "points A", "in B", "added %", "newly seen %", "gone %",
               "not seen %", "moved cm", "95 % cm")  # fmt: skip
-    rows = [(*_bounds(tile), *_cells(tile.change)) for tile in diff.tiles[:limit]]
+    rows = [(*_corner(tile), *_cells(tile.change)) for tile in diff.tiles[:limit]]
     print_columns(titles, [*rows, ("all", "", "", *_cells(diff.total))])
     left = len(diff.tiles) - len(rows)
     if left > 0:
         print(f"  and {left} more: --limit {len(diff.tiles)} shows all")
+
+
+def _newton_steps(
+    sdf: NDArray[np.float32], gradient: NDArray[np.float32], longest_m: float
+) -> NDArray[np.float64]:
+    """Steps ``[N, 3]`` towards the zero, metres, none longer than ``longest_m``."""
+    slope = np.maximum(np.linalg.norm(gradient, axis=1), _LEAST_SLOPE)
+    length = np.minimum(np.abs(sdf) / slope, longest_m)
+    steps: NDArray[np.float64] = (-np.sign(sdf) * length / slope)[:, None] * gradient
+    return steps
 
 
 def _sighting(of: MapRecord, by: MapRecord) -> Sighting:
@@ -165,8 +208,8 @@ def _change(old: Sighting, new: Sighting) -> Change:
     )
 
 
-def _bounds(tile: TileChange) -> tuple[str, ...]:
-    return tuple(f"{low:g} to {high:g}" for low, high in zip(tile.low_m, tile.high_m, strict=True))
+def _corner(tile: TileChange) -> tuple[str, ...]:
+    return tuple(f"{low:g}" for low in tile.low_m)
 
 
 def _cells(change: Change) -> tuple[str, ...]:

@@ -3,46 +3,36 @@
 from pathlib import Path
 
 import numpy as np
-from triquad_client.mesh.glb import glb_bytes
-from triquad_client.mesh.ply import ply_bytes
 from triquad_format.mapfile.durable_file import replacing
-from triquad_format.records.crop import without_training
 from triquad_format.records.region import MapRecord
-from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import MeshSettings, Settings
 
-from triquad_tools.console.errors import ToolError
+from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.grid import (
     DenseGrid,
     SparseGrid,
     dense_grid,
     evidence_bounds,
+    open_record,
     sparse_grid,
 )
 from triquad_tools.mapfiles.mesh import surface_mesh
+from triquad_tools.mapfiles.meshfile import mesh_bytes
 from triquad_tools.mapfiles.source import Box
 
 MARGIN_CELLS = 16
 """A map that is exported within a box is needed so far around it."""
-
-_BYTES_OF = {".ply": ply_bytes, ".glb": glb_bytes}
 
 
 def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
     """Write the mesh of a map; returns what was written.
 
     Raises:
-        ToolError: the mesh is too large.
-        FormatError: ``cell_m`` is out of range.
+        ToolError: the mesh is too large, or its regions are too far away.
         OSError: the file cannot be written.
     """
-    settings = MeshSettings(cell_m=cell_m)
-    epoch = _epoch(record, Settings(mesh=settings))
-    with progress("meshing", 1.0) as report:
-        mesh = surface_mesh(epoch, box, settings.tile_side_m, report)
-    packed = _BYTES_OF[path.suffix](mesh.vertices, mesh.faces)
+    mesh = surface_mesh(record, box, cell_m)
+    packed = mesh_bytes(mesh, path.suffix)
     with replacing(path) as stream:
         stream.write(packed)
     return f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
@@ -53,19 +43,15 @@ def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool,
     filled = box if box is not None else evidence_bounds(record)
     if filled is None:
         raise ToolError("no ray has shown anything of this map: there is no box to fill")
-    epoch = _epoch(record, Settings())
+    query = open_record(record).query
     grid: DenseGrid | SparseGrid
     with progress("evaluating", 1.0) as report:
         if sparse:
-            grid = sparse_grid(epoch.query, record, box, cell_m, report)
+            grid = sparse_grid(query, record, box, cell_m, report)
         else:
-            grid = dense_grid(epoch.query, filled, cell_m, report)
+            grid = dense_grid(query, filled, cell_m, report)
     with replacing(path) as stream:
         np.savez(stream, epoch=record.epoch, **vars(grid))
         size = stream.tell()
     shape = " x ".join(str(count) for count in grid.sdf.shape)
     return f"{size:,} bytes, distances {shape}"
-
-
-def _epoch(record: MapRecord, settings: Settings) -> Epoch:
-    return Mapper(record.name, settings, "cpu", without_training(record)).publish()

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.region import MapRecord
+from triquad_client.offline.view import view_of
+from triquad_format.records.region import MapRecord, region_centre
 from triquad_map.reference.evaluator import Answer
+from triquad_map.view import MapView
 
-from triquad_tools.console.errors import ToolError
+from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import Report
 from triquad_tools.mapfiles.seen_space import evidence_box, surface_voxels
 from triquad_tools.mapfiles.source import Box
@@ -55,6 +57,19 @@ class SparseGrid:
     sdf: NDArray[np.float32]  # [B, 8, 8, 8] metres
     status: NDArray[np.uint8]  # [B, 8, 8, 8] Status values
     cell_m: float
+
+
+def open_record(record: MapRecord) -> MapView:
+    """The map in a record as something to ask, compiled where numba is installed.
+
+    Raises:
+        ToolError: it has regions that compiled code does not reach.
+    """
+    view = view_of(record)
+    centres = [region_centre(record.settings, region.index) for region in record.regions]
+    if centres and np.isnan(view.query(np.stack(centres)).sdf).any():
+        raise ToolError("its regions lie too far from the origin: use --crop")
+    return view
 
 
 def evidence_bounds(record: MapRecord) -> Box | None:

@@ -1,27 +1,35 @@
-"""Where ``triquad-pack`` takes its map from: a file, or a folder of checkpoints."""
+"""Where a map is read from: a file with those that it needs, or a folder of checkpoints."""
 
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import NoIndexError
+from triquad_format.mapfile.file_errors import named
 from triquad_format.mapfile.history import (
     checkpoint_at,
     checkpoint_file,
     checkpoint_files,
     map_folder,
 )
+from triquad_format.mapfile.index import MapIndex, file_in
+from triquad_format.mapfile.mapfile import MapFile, read_map_file
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
+from triquad_format.mapfile.random_access import FileBytes
 from triquad_format.records.crop import crop_record, without_training
 from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
 
-from triquad_tools.console.errors import ToolError
-from triquad_tools.mapfiles.whole_map import read_whole
+from triquad_tools.console.command import ToolError
 
 Box = NDArray[np.float64]
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
+
+
+class MissingFilesError(ToolError):
+    """A map file whose parts lie in files that are not there."""
 
 
 class NothingLeftError(ToolError):
@@ -60,6 +68,25 @@ def epoch_of(path: Path) -> int | None:
     """The epoch in the name of a checkpoint; ``None`` for another file."""
     checkpoint = checkpoint_file(path)
     return None if checkpoint is None else checkpoint.epoch
+
+
+def read_whole(path: Path) -> MapFile:
+    """The map in a file, checked.
+
+    Raises:
+        MissingFilesError: it needs other files that are not in its folder; the text names them.
+        ToolError: it is a folder.
+        MapFileError: it is not a map file, is damaged, or needs a newer reader.
+        OSError: it cannot be read.
+    """
+    if path.is_dir():
+        raise ToolError(f"{path} is a folder: --log lists the checkpoints in it")
+    missing = [name for name in _needed_files(path) if not file_in(path.parent, name).exists()]
+    if missing:
+        raise MissingFilesError(
+            f"{path} needs {', '.join(missing)}: not in its folder, copy what is missing there"
+        )
+    return read_map_file(path)
 
 
 def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
@@ -106,3 +133,11 @@ def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
             return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
     except NoIndexError:
         return None
+
+
+def _needed_files(path: Path) -> list[str]:
+    with closing(FileBytes(path)) as source, named(str(path)):
+        try:
+            return [file.name for file in MapIndex(source).manifest.files]
+        except NoIndexError:
+            return []

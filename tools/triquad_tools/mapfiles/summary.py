@@ -1,6 +1,6 @@
 """What a map file holds, in figures."""
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_LEVEL, MapRecord, Region, region_centre
 
-from triquad_tools.console.report import print_columns
+from triquad_tools.console.report import Row, print_columns, print_rows
 from triquad_tools.mapfiles.seen_space import evidence_box, owned_evidence
 
 
@@ -94,11 +94,11 @@ def summarise(file: MapFile) -> MapSummary:
 
 def print_summary(name: str, summary: MapSummary) -> None:
     """Print the figures of the file ``name``."""
-    print(f"{name}: map {summary.map!r}, epoch {summary.epoch}, {summary.bytes:,} bytes")
-    for label, text in _facts(summary):
-        print(f"  {label:<14}  {text}")
+    title = f"{name}: map {summary.map!r}, epoch {summary.epoch}, {summary.bytes:,} bytes"
+    print_rows(title, list(_facts(summary)), align="left")
     for region in summary.regions:
-        _print_region(region)
+        title = f"region {region.index} at {list(region.centre_m)} m"
+        print_rows(title, list(_region_facts(region)), align="left")
     rows = [
         (topic, f"{p.parts:,}", f"{p.bytes:,}", f"{p.stored_parts:,}", f"{p.stored_bytes:,}")
         for topic, p in summary.parts.items()
@@ -108,35 +108,40 @@ def print_summary(name: str, summary: MapSummary) -> None:
         print(f"  ok: {check}")
 
 
-def _facts(summary: MapSummary) -> Iterable[tuple[str, str]]:
+def _facts(summary: MapSummary) -> Iterator[Row]:
     for key in ("format_version", "producer", "created"):
-        yield key.replace("_", " "), summary.metadata.get(key, "not given")
+        yield Row(key.replace("_", " "), summary.metadata.get(key, "not given"))
     files = ", ".join(summary.other_files)
-    yield "other files", f"{files}: needed, and there" if files else "none needed"
-    yield "regions", str(len(summary.regions))
-    yield "vertices", f"{summary.vertices:,}"
+    yield Row("other files", f"{files}: needed, and there" if files else "none needed")
+    yield Row("regions", str(len(summary.regions)))
+    yield Row("vertices", f"{summary.vertices:,}")
     share = summary.bytes_per_parameter
-    yield "parameters", f"{summary.parameters:,}" + (f", {share:.2f} bytes each" if share else "")
-    yield "evidence", f"{summary.surface_m3:,.1f} m3 surface, {summary.free_m3:,.1f} m3 free"
-    yield "training state", "yes" if summary.training else "no"
+    each = f", {share:.2f} bytes each" if share else ""
+    yield Row("parameters", f"{summary.parameters:,}{each}")
+    yield Row("evidence", _evidence(summary))
+    yield Row("training state", "yes" if summary.training else "no")
     settings = vars(summary.settings).items()
-    yield "settings", ", ".join(f"{name} {value}" for name, value in settings)
+    yield Row("settings", ", ".join(f"{name} {value}" for name, value in settings))
 
 
-def _print_region(region: RegionSummary) -> None:
+def _region_facts(region: RegionSummary) -> Iterator[Row]:
     levels = ", ".join(f"level {level}: {count:,}" for level, count in region.vertices.items())
-    print(f"  region {region.index} at {list(region.centre_m)} m")
-    print(f"    vertices  {levels} ({_precision(region)})")
+    yield Row("vertices", f"{levels} ({_precision(region)})")
     if region.evidence_box_m is not None:
         low, high = map(list, region.evidence_box_m)
-        print(f"    evidence  {region.evidence_blocks:,} blocks in {low} to {high} m")
-        print(f"              {region.surface_m3:,.1f} m3 surface, {region.free_m3:,.1f} m3 free")
+        yield Row("evidence", f"{region.evidence_blocks:,} blocks in {low} to {high} m")
+        yield Row("", _evidence(region))
     if region.surface_levels is not None:
         voxels = max(sum(region.surface_levels), 1)
         shares = ", ".join(f"{i}: {n / voxels:.0%}" for i, n in enumerate(region.surface_levels))
-        print(f"              surface by level of support: {shares}")
+        yield Row("", f"surface by level of support: {shares}")
     if region.samples is not None:
-        print(f"    training  {region.samples:,} samples, {region.visits_owed:,} visits owed")
+        owed = f"{region.visits_owed:,} visits owed"
+        yield Row("training", f"{region.samples:,} samples, {owed}")
+
+
+def _evidence(summary: MapSummary | RegionSummary) -> str:
+    return f"{summary.surface_m3:,.1f} m3 surface, {summary.free_m3:,.1f} m3 free"
 
 
 def _precision(region: RegionSummary) -> str:

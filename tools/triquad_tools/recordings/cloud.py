@@ -1,9 +1,13 @@
-"""Points of recorded scans in the world frame."""
+"""Clouds of points: those of recorded scans in the world frame, and thinner ones."""
+
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from triquad_tools.recordings.kitti import KittiFolder
+
+_MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 
 
 def is_withheld(index: int, every: int) -> bool:
@@ -34,3 +38,24 @@ def world_points(
     pose = folder.poses[index]
     world: NDArray[np.float64] = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     return world
+
+
+def thin(points: NDArray[np.float64], voxel_m: float) -> NDArray[np.float64]:
+    """The first of the points ``[N, 3]`` in each voxel of side ``voxel_m``, in their order."""
+    if len(points) == 0:
+        return points
+    cells = np.floor(points / voxel_m).astype(np.int64)
+    cells -= cells.min(axis=0)
+    sizes = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    return points[np.sort(np.unique(keys, return_index=True)[1])]
+
+
+def merged(clouds: Iterable[NDArray[np.float64]], voxel_m: float) -> NDArray[np.float64]:
+    """All clouds as one ``[N, 3]``, one point per voxel of side ``voxel_m``."""
+    kept = [np.empty((0, 3))]  # the first is what is merged so far
+    for cloud in clouds:
+        kept.append(thin(cloud, voxel_m))
+        if sum(map(len, kept[1:])) > max(len(kept[0]), _MERGED_POINTS):
+            kept = [thin(np.concatenate(kept), voxel_m)]
+    return thin(np.concatenate(kept), voxel_m)

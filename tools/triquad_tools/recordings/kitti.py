@@ -9,7 +9,6 @@ turned into poses of the lidar.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -17,12 +16,28 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_tools.console.errors import PoseError, ScanFileError, ScanFolderError, StampError
+from triquad_tools.console.command import ToolError
 
 SCAN_FOLDERS = (".", "scans", "velodyne", "velodyne_points/data")
 DEFAULT_PERIOD_NS = 100_000_000  # between scans of a folder without times
 _RIGID_TOLERANCE = 1e-3  # files of 6 digits are that far from orthonormal
 _POINT_BYTES = 16
+
+
+class ScanFolderError(ToolError):
+    """A folder of scans that is missing, incomplete or contradicts itself."""
+
+
+class ScanFileError(ToolError):
+    """A scan file that does not hold whole points."""
+
+
+class PoseError(ToolError):
+    """A pose or calibration that is not 12 finite numbers of a rigid motion."""
+
+
+class StampError(ToolError):
+    """A time stamp that is not a number of seconds, or that runs backwards."""
 
 
 @dataclass(frozen=True)
@@ -70,35 +85,6 @@ def read_folder(folder: Path) -> KittiFolder:
         stamps = _read_stamps(times)
         _check_count(times, "times", len(stamps), len(scans))
     return KittiFolder(scans, poses, stamps)
-
-
-def write_folder(
-    folder: Path,
-    scans: Sequence[NDArray[np.float32]],
-    poses: NDArray[np.float64],
-    stamps_ns: Sequence[int] | NDArray[np.int64],
-) -> None:
-    """Write scans as a folder that :func:`read_folder` reads back unchanged.
-
-    Args:
-        folder: made where it is missing.
-        scans: per scan points ``[N, 3]``, metres, lidar frame.
-        poses: ``[n, 4, 4]`` world_from_lidar.
-        stamps_ns: ``[n]`` nanoseconds.
-    """
-    if not len(scans) == len(poses) == len(stamps_ns):
-        raise ScanFolderError(
-            f"{folder}: {len(scans)} scans, {len(poses)} poses and {len(stamps_ns)} times differ"
-        )
-    (folder / "scans").mkdir(parents=True, exist_ok=True)
-    for index, points in enumerate(scans):
-        rows = np.zeros((len(points), 4), "<f4")
-        rows[:, :3] = points
-        rows.tofile(folder / "scans" / f"{index:06d}.bin")
-    lines = (" ".join(repr(float(x)) for x in pose[:3].reshape(-1)) for pose in poses)
-    (folder / "poses.txt").write_text("".join(f"{line}\n" for line in lines))
-    times = (f"{int(ns) // 10**9}.{int(ns) % 10**9:09d}\n" for ns in stamps_ns)
-    (folder / "times.txt").write_text("".join(times))
 
 
 def _scan_paths(folder: Path) -> tuple[Path, ...]:

@@ -1,13 +1,29 @@
-"""Area-uniform random points on the surface of a solid."""
+"""Area-uniform random points on the surface of a scene of solids."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-
+from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import BOX, CYLINDER, GABLE, HALF_SPACE, Solid
 
 Points = NDArray[np.float64]
+
+_ON_SURFACE_M = 1e-7
+
+
+def surface_samples(scene: Scene, spacing_m: float, rng: np.random.Generator) -> Points:
+    """Random points ``[M, 3]`` exactly on the surface, within the bounds.
+
+    Their density is uniform: one per ``spacing_m ** 2`` of area on average. What lies hidden
+    inside another solid is no surface and gets none.
+    """
+    density = 1.0 / spacing_m**2
+    parts = [sample_surface(solid, density, scene.bounds, rng) for solid in scene.solids]
+    points = np.concatenate(parts)
+    inside = np.all((points >= scene.bounds[0]) & (points <= scene.bounds[1]), axis=1)
+    points = points[inside]
+    return np.asarray(points[scene.sdf(points) > -_ON_SURFACE_M])
 
 
 def sample_surface(
