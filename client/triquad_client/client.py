@@ -176,7 +176,8 @@ class Client(MapQueries):
     def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
         """Write to a file what the newest map needs to answer within ``bounds``.
 
-        Only the file's index and the parts that the box needs are sent.
+        Only the file's index and the parts that the box needs are sent. The file has no preview
+        for MCAP viewers: ``triquad-pack`` adds one.
 
         Args:
             path: the file; an older one is replaced.

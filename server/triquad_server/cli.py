@@ -25,7 +25,7 @@ exit codes:
      or the newest needs a newer release or more memory
 """
 
-_NEEDED = ("torch", "numba")
+_NEEDED = ("torch", "numba", "foxglove_schemas_protobuf")
 
 _log = logging.getLogger("triquad_server")
 

@@ -210,7 +210,7 @@ def removed(index: int, revision: int) -> bytes:
     return codec.encode(
         TileUpdates(
             "s", revision, revision, True, False, side_m, 0.1, np.zeros((0, 3), np.int32), none,
-            none.astype(np.uint8), none, b"", np.array([[index, 0, 0]], np.int32),
+            none, b"", np.array([[index, 0, 0]], np.int32),
         )
     )  # fmt: skip
 

@@ -1,10 +1,18 @@
 import subprocess
 import sys
 
+import pytest
+from support.map_records import random_record
+from support.mapfile_edit import file_bytes, parts_of
+from triquad_format.mapfile.mapfile import read_map
+from triquad_tools.commands import pack
+
 CODE = """
 import sys
-import triquad_client
-heavy = {"torch", "numba", "skimage", "scipy", "triquad_server"} & set(sys.modules)
+import triquad_client, triquad_format.mapfile.mapfile, triquad_map.stored_map
+heavy = {"torch", "numba", "skimage", "scipy", "triquad_server"}
+heavy |= {"google.protobuf", "foxglove_schemas_protobuf"}
+heavy &= set(sys.modules)
 sys.exit(f"importing the client brought in {heavy}" if heavy else 0)
 """
 
@@ -14,17 +22,58 @@ def test_client_comes_without_the_server_and_its_libraries():
     assert done.returncode == 0, done.stderr
 
 
-PREVIEW_CODE = """
+WITHOUT_HEAVY = """
 import sys
-import triquad_client, triquad_map.stored_map
-loaded = [name for name in sys.modules if name.startswith(("google.", "foxglove"))]
-sys.exit(f"reading a map brought in {loaded}" if loaded else 0)
+heavy = ("google", "foxglove_schemas_protobuf", "torch", "numba", "scipy", "skimage", "trimesh")
+for name in (*heavy, "matplotlib"):
+    sys.modules[name] = None
+from triquad_tools.commands import entry_points
+command, *sys.argv[1:] = sys.argv[1:]
+sys.exit(getattr(entry_points, command)())
 """
 
 
-def test_reading_a_map_comes_without_what_previews_are_written_with():
-    done = subprocess.run([sys.executable, "-c", PREVIEW_CODE], capture_output=True, text=True)
+def run_without_heavy_libraries(command, *arguments):
+    """Run a tool where only the base is installed, and rich."""
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT_HEAVY, command, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture
+def map_with_preview(tmp_path):
+    path = tmp_path / "map.triquad"
+    path.write_bytes(file_bytes(random_record(1), preview=True))
+    return path
+
+
+def test_a_map_with_a_preview_is_verified_without_heavy_libraries(map_with_preview):
+    done = run_without_heavy_libraries("inspect", map_with_preview)
     assert done.returncode == 0, done.stderr
+    assert "/preview/mesh" in done.stdout
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("crop", [(), ("--crop", -9, -9, -9, 9, 9, 9)])
+def test_a_map_with_a_preview_is_rewritten_without_heavy_libraries(
+    map_with_preview, tmp_path, crop
+):
+    """Without the preview, and the user is told so."""
+    copy = tmp_path / "copy.triquad"
+    done = run_without_heavy_libraries("pack", map_with_preview, copy, *crop)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert "install triquad[preview]" in done.stderr
+    assert read_map(copy).has_evidence
+    assert "/preview/mesh" not in {part.topic for part in parts_of(copy.read_bytes())}
+
+
+def test_a_map_file_is_written_with_previews_where_they_can_be_made(map_with_preview, tmp_path):
+    copy = tmp_path / "copy.triquad"
+    assert pack.main([str(map_with_preview), str(copy)]) == 0
+    assert "/preview/mesh" in {part.topic for part in parts_of(copy.read_bytes())}
 
 
 def test_all_public_names_exist():
@@ -34,13 +83,22 @@ def test_all_public_names_exist():
         assert getattr(triquad_client, name) is not None
 
 
-def test_a_tool_whose_libraries_are_missing_says_what_to_install():
-    code = (
-        "import sys; sys.modules['numba'] = None; sys.argv = ['triquad-demo']\n"
-        "from triquad_tools.commands import entry_points\n"
-        "sys.exit(entry_points.demo())"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+@pytest.mark.parametrize(
+    ("command", "arguments", "missing", "extra"),
+    [
+        ("demo", (), "torch", "demo"),
+        ("bench", (), "torch", "demo"),
+        ("evaluate", (), "scipy", "tools"),
+        ("inspect", ("MAP", "--plot", "plan.png"), "matplotlib", "tools"),
+        ("pack", ("MAP", "mesh.ply"), "skimage", "tools"),
+    ],
+)
+def test_a_tool_whose_libraries_are_missing_says_what_to_install(
+    map_with_preview, tmp_path, command, arguments, missing, extra
+):
+    places = {"MAP": map_with_preview, "mesh.ply": tmp_path / "mesh.ply"}
+    given = [places.get(argument, argument) for argument in arguments]
+    done = run_without_heavy_libraries(command, *given)
     assert done.returncode == 2
-    assert "is missing: install triquad[tools]" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert f"{missing} is missing: install triquad[{extra}]\n" in done.stderr
+    assert len(done.stderr.splitlines()) == 1

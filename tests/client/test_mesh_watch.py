@@ -16,7 +16,7 @@ import triquad_client
 import zenoh
 from support import servers
 from triquad_client import Client, InvalidInputError, MeshWatch
-from triquad_format.wire import codec, draco, keys
+from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,
     ServerStatus,
@@ -77,7 +77,6 @@ def request(**changes: object) -> TileUpdatesRequest:
         timeout_s=0.0,
         client="test",
         max_bytes_per_s=0,
-        draco=False,
     )
     return replace(good, **changes)  # type: ignore[arg-type]
 
@@ -350,11 +349,8 @@ def test_the_protocol_by_hand(client: Client, endpoint: str) -> None:
             for index, data in known.items():
                 surface = decode_tile(data)
                 tile = watch.tiles[index]
-                if draco.AVAILABLE:  # which leaves out faces that quantising made lines
-                    assert 0.9 * len(surface.faces) < len(tile.faces) <= len(surface.faces)
-                else:
-                    np.testing.assert_array_equal(surface.positions(0.1), tile.vertices)
-                    np.testing.assert_array_equal(surface.faces, tile.faces)
+                np.testing.assert_array_equal(surface.positions(0.1), tile.vertices)
+                np.testing.assert_array_equal(surface.faces, tile.faces)
         later = tiles_by_hand(peer, server=reply.server, revision=reply.revision)
         assert (later.complete, len(later.tiles), later.restart) == (True, 0, False)
         strange = tiles_by_hand(peer, server="another", revision=10**6)
@@ -401,7 +397,7 @@ from triquad_format.wire.messages import TileUpdatesRequest, TileUpdates
 everywhere = np.full(3, np.inf)
 with triquad_client.connect(sys.argv[1]) as client:
     asks = TileUpdatesRequest(-everywhere, everywhere, 0, "", 0, np.zeros((0, 3), np.int32),
-        np.zeros(0, np.int64), 100_000_000, 60.0, "frozen", 0, False)
+        np.zeros(0, np.int64), 100_000_000, 60.0, "frozen", 0)
     ask = Ask(keys.TILE_UPDATES, asks, TileUpdates, background=True)
     pending = [client._connection.send(ask) for _ in range(24)]
     print(len(client._connection.read(ask, next(iter(pending[0]))).data), flush=True)
@@ -477,14 +473,3 @@ def test_iteration_ends_with_the_watch(client: Client) -> None:
         assert seen.wait(servers.WAIT_S)
         watch.close()
         assert following.result(servers.WAIT_S) > 0
-
-
-@pytest.mark.skipif(not draco.AVAILABLE, reason="DracoPy is not installed")
-def test_where_both_have_draco_it_is_used(client: Client, endpoint: str) -> None:
-    learn(client)
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        compact = tiles_by_hand(peer, draco=True)
-        plain = tiles_by_hand(peer)
-        assert set(compact.codecs.tolist()) == {1}
-        assert set(plain.codecs.tolist()) == {0}

@@ -15,10 +15,19 @@ ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DISTRIBUTIONS = {
     "zenoh": "eclipse-zenoh",
-    "PIL": "pillow",
     "google": "protobuf",
+    "skimage": "scikit-image",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
 }
+WITHOUT_TORCH = (
+    "commands",
+    "console",
+    "evaluation",
+    "mapfiles",
+    "plots",
+    "recordings",
+    "simulation",
+)
 
 
 def declared(*extras: str) -> set[str]:
@@ -50,11 +59,12 @@ def imported(folder: str) -> set[str]:
 @pytest.mark.parametrize(
     ("folder", "extras"),
     [
-        ("format", ("draco",)),
+        ("format", ()),
         ("client", ()),
         ("map", ("fast",)),
-        ("server", ("fast", "server")),
-        ("tools", ("fast", "server", "tools")),
+        ("server", ("fast", "preview", "server")),
+        ("tools", ("fast", "preview", "server", "tools")),
+        *((f"tools/triquad_tools/{room}", ("fast", "preview", "tools")) for room in WITHOUT_TORCH),
     ],
 )
 def test_what_is_imported_is_declared(folder, extras):
@@ -64,4 +74,4 @@ def test_what_is_imported_is_declared(folder, extras):
 def test_what_is_declared_is_imported():
     folders = ("format", "map", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
-    assert declared("fast", "server", "tools", "draco") <= used
+    assert declared("fast", "preview", "server", "tools") <= used

@@ -1,8 +1,8 @@
 from pathlib import Path
 
 import pytest
-from fuzz.mapfile_edit import without_index, write_record
 from support.map_records import random_record
+from support.mapfile_edit import without_index, write_record
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
 from triquad_format.mapfile.history import (
     CheckpointFile,

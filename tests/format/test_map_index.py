@@ -6,7 +6,9 @@ import os
 import shutil
 
 import pytest
-from fuzz.mapfile_edit import (
+from mcap.writer import CompressionType, IndexType, Writer
+from support.map_records import assert_same, random_record, with_integers
+from support.mapfile_edit import (
     file_bytes,
     metadata_of,
     parts_of,
@@ -15,8 +17,6 @@ from fuzz.mapfile_edit import (
     write_pair,
     write_record,
 )
-from mcap.writer import CompressionType, IndexType, Writer
-from support.map_records import assert_same, random_record, with_integers
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
 from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import FileRef

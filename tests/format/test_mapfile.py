@@ -8,7 +8,12 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
-from fuzz.mapfile_edit import (
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from support.map_records import SMALL, assert_same, random_record, with_integers, with_levels
+from support.mapfile_edit import (
     edited,
     file_bytes,
     manifest_of,
@@ -19,12 +24,8 @@ from fuzz.mapfile_edit import (
     stored,
     write_pair,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap.writer import CompressionType
-from support.map_records import SMALL, assert_same, random_record, with_integers, with_levels
 from triquad_format.errors import FormatError
+from triquad_format.mapfile.map_facts import MapFacts
 from triquad_format.mapfile.mapfile import MapFileInfo, read_map, read_map_file, write_map
 from triquad_format.mapfile.parts.shuffle import (
     join_integers,
@@ -34,9 +35,11 @@ from triquad_format.mapfile.parts.shuffle import (
     unshuffle,
     unshuffle_codes,
 )
+from triquad_format.mapfile.writer import Previews, record_parts, write_parts
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
+from triquad_server.mesh.preview import preview_schema, previews_of
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 GOLDEN_NAMES = ("map_v1.triquad", "map_v1_next.triquad")
@@ -64,10 +67,12 @@ def golden_levels():
 
 
 def write_golden(folder):
-    """The golden files: a complete one, and what changed after it."""
+    """The golden files: a complete one, and what changed after it. None has a preview."""
+    schema = preview_schema()
     stamps = (1_700_000_000 * 10**9, 1_700_000_060 * 10**9)
-    write_pair(folder, *golden_records(), names=GOLDEN_NAMES, stamps=stamps)
-    write_map(golden_levels(), folder / GOLDEN_LEVELS, stamp_ns=stamps[0], preview=False)
+    write_pair(folder, *golden_records(), names=GOLDEN_NAMES, stamps=stamps, preview_schema=schema)
+    previews = Previews(schema, {})
+    write_map(golden_levels(), folder / GOLDEN_LEVELS, stamp_ns=stamps[0], previews=previews)
 
 
 # Round trips
@@ -285,6 +290,21 @@ def test_stock_reader_sees_an_ordinary_file():
     assert set(encodings.values()) == {"msgpack"}
     assert {chunk.compression for chunk in summary.chunk_indexes} <= {"zstd", ""}
     assert parts_of(data)[-1].topic == "/triquad/manifest"
+
+
+def test_a_file_without_previews_has_no_protobuf_in_it():
+    summary = make_reader(io.BytesIO(file_bytes(random_record(6)))).get_summary()
+    assert not summary.schemas
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"msgpack"}
+
+
+def test_previews_are_written_with_their_schema_only():
+    record = random_record(6)
+    previews = previews_of(record)
+    facts = MapFacts(record.name, record.epoch, record.settings)
+    parts = record_parts(record, "<f2", previews.parts)
+    with pytest.raises(FormatError, match="give preview_schema"):
+        write_parts(io.BytesIO(), facts, None, parts, {})
 
 
 @pytest.mark.parametrize(

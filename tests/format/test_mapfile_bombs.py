@@ -9,7 +9,9 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
-from fuzz.mapfile_edit import (
+from mcap.writer import IndexType
+from support.map_records import SMALL, random_record, with_levels
+from support.mapfile_edit import (
     RawPart,
     edited,
     file_bytes,
@@ -24,8 +26,6 @@ from fuzz.mapfile_edit import (
     stored,
     with_manifest,
 )
-from mcap.writer import IndexType
-from support.map_records import SMALL, random_record, with_levels
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.manifest import FileRef
 from triquad_format.mapfile.mcap.records import MAX_CHUNK_BYTES
@@ -60,6 +60,18 @@ def test_bombs_are_not_allocated():
         read_bytes(chunk_file(1000, b"no zstd"))
     with pytest.raises(MapFileError):
         read_bytes(chunk_file(10 * 2**20, zstandard.compress(bytes(10 * 2**20)) + b"more"))
+
+
+def test_what_follows_a_frame_is_refused_before_the_frame_is_decompressed():
+    """Four bytes at the end are a checksum only where the frame's head says so."""
+    content = np.random.default_rng(0).bytes(10 * 2**20)
+    mutant = chunk_file(len(content), zstandard.compress(content) + b"more")
+    tracemalloc.start()
+    with pytest.raises(DamagedMapFileError, match="does not end with its zstd frame"):
+        read_bytes(mutant)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < len(mutant) + len(content)
 
 
 def bomb_of(payload):

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import (
+from mcap.writer import CompressionType
+from support.map_records import assert_same, random_record
+from support.mapfile_edit import (
     RawPart,
     file_bytes,
     listed,
@@ -17,8 +19,6 @@ from fuzz.mapfile_edit import (
     stored,
     with_metadata,
 )
-from mcap.writer import CompressionType
-from support.map_records import assert_same, random_record
 from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,

@@ -5,7 +5,8 @@ import re
 
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import (
+from support.map_records import random_record, with_integers, with_levels
+from support.mapfile_edit import (
     RawPart,
     all_of,
     edited,
@@ -23,7 +24,6 @@ from fuzz.mapfile_edit import (
     stored,
     with_manifest,
 )
-from support.map_records import random_record, with_integers, with_levels
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.mapfile.manifest import FileRef
 

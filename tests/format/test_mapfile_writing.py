@@ -3,8 +3,8 @@ import os
 
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import write_pair, write_record
 from support.map_records import SMALL, assert_same, random_record, with_integers
+from support.mapfile_edit import write_pair, write_record
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.records import morton
@@ -185,5 +185,5 @@ def test_what_shrinks_more_than_readers_believe_is_stored_as_it_is(tmp_path):
     zeros = np.zeros((len(codes), 64), np.float32)
     record = with_table(record, codes=codes, features=zeros)
     path = tmp_path / "map.triquad"
-    write_map(record, path, feature_dtype="<f4", preview=False)
+    write_map(record, path, feature_dtype="<f4")
     assert_same(read_map(path), record)

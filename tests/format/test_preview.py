@@ -5,15 +5,15 @@ import io
 
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import RawPart, file_bytes, metadata_of, parts_of, read_bytes, rebuild
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from support.map_records import SMALL, random_record
+from support.mapfile_edit import RawPart, file_bytes, metadata_of, parts_of, read_bytes, rebuild
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.mapfile.preview import CLUSTER_CELLS, NET_LEAVES
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, Evidence
+from triquad_server.mesh.coarse_mesh import CLUSTER_CELLS, NET_LEAVES
 
 SETTINGS = FieldSettings()
 GROUND_M = 1.3

@@ -6,10 +6,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import file_bytes, manifest_of, rebuild, with_metadata
 from mcap.reader import make_reader
 from support.checkpoint_folder import FIRST, SECOND, map_at, write_checkpoints
 from support.map_records import SMALL, assert_same, random_record
+from support.mapfile_edit import file_bytes, manifest_of, rebuild, with_metadata
 from triquad_format.errors import MapFileError, UnsupportedMapFileError
 from triquad_format.mapfile.mapfile import read_map
 from triquad_format.mapfile.parts.part import (

@@ -212,7 +212,7 @@ def test_another_base_with_the_same_parts_is_refused(tmp_path: Path) -> None:
     record = read_map(GOLDEN / "map_v1.triquad")
     later = dataclasses.replace(record, epoch=record.epoch + 1)
     stamp_ns = base.values["created_ns"]
-    write_map(later, tmp_path / "map_v1.triquad", stamp_ns=stamp_ns, preview=False)
+    write_map(later, tmp_path / "map_v1.triquad", stamp_ns=stamp_ns)
     same = spec_reader.read_whole(tmp_path / "map_v1.triquad")[0]
     assert [row.digest for row in same.rows[1:]] == [row.digest for row in base.rows[1:]]
     assert_both_refuse(path)

@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from triquad_format.errors import WireError
-from triquad_format.wire import draco
 from triquad_format.wire.tile_codec import MAX_CELLS, TileSurface, decode_tile, encode_tile
 
 
@@ -96,43 +94,3 @@ def with_header(vertices: int, faces: int) -> bytes:
 def test_hostile_bytes_are_refused(data: bytes) -> None:
     with pytest.raises(WireError, match="tile"):
         decode_tile(data)
-
-
-needs_draco = pytest.mark.skipif(not draco.AVAILABLE, reason="DracoPy is not installed")
-
-
-def grid() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """A sheet across a tile of 6.4 m, from face to face."""
-    x, y = np.meshgrid(np.linspace(0, 6.4, 20), np.linspace(0, 6.4, 20))
-    positions = np.stack([x, y, 3 + np.sin(x + y)], -1).reshape(-1, 3).astype(np.float32)
-    corner = (np.arange(19)[:, None] * 20 + np.arange(19)).ravel()
-    faces = [corner, corner + 1, corner + 20], [corner + 1, corner + 21, corner + 20]
-    return positions, np.concatenate([np.stack(half, 1) for half in faces]).astype(np.int32)
-
-
-@needs_draco
-def test_draco_keeps_a_tile_to_a_fifth_of_a_millimetre() -> None:
-    positions, faces = grid()
-    data = draco.encode_draco(positions, faces, 6.4)
-    assert data == draco.encode_draco(positions, faces, 6.4)
-    assert data is not None
-    found, triangles = draco.decode_draco(data)
-    assert len(triangles) == len(faces)
-    nearest = np.abs(found[:, None] - positions).max(axis=2).min(axis=1)
-    assert nearest.max() < 2e-4
-    assert {0.0, np.float32(6.4)} <= set(found[:, 0].tolist())
-
-
-@needs_draco
-@pytest.mark.parametrize("data", [b"", b"DRACO" + bytes(40), b"\xff" * 100])
-def test_what_is_not_draco_is_refused(data: bytes) -> None:
-    with pytest.raises(WireError, match="Draco"):
-        draco.decode_draco(data)
-
-
-def test_without_draco_its_bytes_are_refused_with_the_remedy(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(draco, "DracoPy", None)
-    with pytest.raises(WireError, match=r"pip install 'triquad\[draco\]'"):
-        draco.decode_draco(b"DRACO")

@@ -12,9 +12,9 @@ from fuzz.choices import (
     place,
     shuffle,
 )
-from fuzz.mapfile_edit import RawPart, metadata_of, parts_of, rebuild
 from fuzz.mcap_edit import RawRecord, checksummed, chunk, chunk_records, packed, records_of
 from hypothesis import strategies as st
+from support.mapfile_edit import RawPart, metadata_of, parts_of, rebuild
 from triquad_format.mapfile.mcap.records import CHUNK, MAGIC
 
 CHUNK_HEAD = ((16, 8), (24, 4), (28, 4), (32, 8), (36, 8), (40, 8))

@@ -10,9 +10,9 @@ from typing import Any
 import msgpack
 import numpy as np
 from fuzz.choices import NUMBERS, Draw, Mutation, bomb_bytes, chance, flipped, place, shuffle
-from fuzz.mapfile_edit import parts_of, with_part
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
+from support.mapfile_edit import parts_of, with_part
 
 VALUES: tuple[Any, ...] = (
     *NUMBERS, -1, -(2**31), -(2**63), 0.5, -1.0, 1e300, math.nan, math.inf, True, None, "", "x",

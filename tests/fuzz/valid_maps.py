@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from fuzz.mapfile_edit import write_pair
 from support.map_records import random_record, with_integers, with_levels
+from support.mapfile_edit import write_pair
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
+from triquad_server.mesh.preview import previews_of
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 TINY = FieldSettings(
@@ -69,7 +70,8 @@ def valid_maps(folder: Path) -> list[ValidMap]:
 
 def _written(folder: Path, record: MapRecord) -> ValidMap:
     folder.mkdir()
-    write_map(record, folder / "map.triquad", preview=folder.name == "plain")
+    previews = previews_of(record) if folder.name == "plain" else None
+    write_map(record, folder / "map.triquad", previews=previews)
     return _found(folder / "map.triquad")
 
 

@@ -4,8 +4,8 @@ import os
 
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
 from support.map_records import SMALL, assert_same, random_record, with_integers
+from support.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.mapfile.random_access import FileBytes
@@ -39,7 +39,7 @@ def near_borders(settings, count, seed):
 def test_opening_and_asking_at_one_place_reads_index_and_tile_alone(tmp_path):
     record = random_record(40, settings=FieldSettings(), points=20_000)
     path = tmp_path / "map.triquad"
-    write_map(record, path, preview=False)
+    write_map(record, path)
     source = FileBytes(path)
     with StoredMap(source) as map_file:
         opened = source.bytes_read
@@ -95,7 +95,7 @@ def test_far_from_the_centre_rounding_does_not_leave_a_square(tmp_path):
     record = dataclasses.replace(record, regions=(covering(region, settings, leaves),))
     whole = MapEvaluator(record)
     path = tmp_path / "map.triquad"
-    write_map(record, path, feature_dtype="<f4", preview=False)
+    write_map(record, path, feature_dtype="<f4")
     for point in points:
         with StoredMap.open(path) as map_file:
             answer = map_file.query(point[None], gradient=True)
@@ -127,7 +127,7 @@ BOXES = [
 def test_a_box_holds_what_it_needs(tmp_path, low, high):
     record = random_record(44, settings=WIDE, points=3000)
     path = tmp_path / "map.triquad"
-    write_map(record, path, preview=False)
+    write_map(record, path)
     with StoredMap.open(path) as map_file:
         cropped = crop_record(map_file.box(low, high), low, high)
     wanted = without_training(crop_record(read_map(path), low, high))
@@ -148,7 +148,7 @@ def assert_same_places(have, want):
 
 def test_a_small_box_is_read_from_few_parts(tmp_path):
     path = tmp_path / "map.triquad"
-    write_map(random_record(44, settings=WIDE, points=3000), path, preview=False)
+    write_map(random_record(44, settings=WIDE, points=3000), path)
     source = FileBytes(path)
     with StoredMap(source) as map_file:
         map_file.box([-1, -1, -1], [1, 1, 1])
@@ -203,7 +203,7 @@ def test_a_replaced_file_answers_as_before(tmp_path):
 def test_a_file_cut_meanwhile_is_named(tmp_path):
     record = random_record(46, indices=((0, 0, 0), (3, 0, 0)))
     path = tmp_path / "map.triquad"
-    write_map(record, path, preview=False)
+    write_map(record, path)
     far = np.array([[36.0, 0.0, 0.0]])
     with StoredMap.open(path) as map_file:
         near = map_file.query(np.zeros((1, 3)))

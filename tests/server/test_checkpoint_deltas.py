@@ -4,6 +4,8 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 from support.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.history import checkpoint_at, checkpoint_files
@@ -252,6 +254,17 @@ def test_folding_puts_all_into_one_file(store):
     assert [file.name for file in manifest.files] == [Path(info.path).name]
     for epoch, record in records.items():
         assert_same(read_map(checkpoint_at(store.folder, str(epoch)).path), record)
+
+
+def test_viewers_see_every_region_in_a_folded_checkpoint(store):
+    drive(store, 9)
+    info = store.fold(lambda: False)
+    assert info is not None
+    with Path(info.path).open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        scenes = [found[3] for found in reader.iter_decoded_messages(topics=["/preview/mesh"])]
+    names = {entity.id for scene in scenes for entity in scene.entities}
+    assert names == {"region {} {} {}".format(*index) for index in ROW}
 
 
 def test_folding_ends_when_the_server_does(store):

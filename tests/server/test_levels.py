@@ -5,7 +5,10 @@ import dataclasses
 import msgpack
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import (
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.map_records import SMALL, assert_same, random_record, with_levels
+from support.mapfile_edit import (
     edited,
     file_bytes,
     manifest_of,
@@ -14,9 +17,6 @@ from fuzz.mapfile_edit import (
     stored,
     write_pair,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from support.map_records import SMALL, assert_same, random_record, with_levels
 from triquad_format.mapfile.mapfile import read_map
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.records.crop import crop_record

@@ -30,7 +30,7 @@ def write_checkpoints(folder: Path, epochs: tuple[int, ...]) -> list[Path]:
         stamp_ns = START_NS + hours * HOUR_NS
         path = folder / checkpoint_name(epoch, complete=not known)
         facts = MapFacts(record.name, epoch, record.settings)
-        parts = record_parts(record, "<f2", None, stamp_ns)
+        parts = record_parts(record, "<f2", {})
         written = write_parts(path, facts, stamp_ns, parts, known)
         known = written.manifest.elsewhere(FileRef(path.name, written.manifest_sha256))
         paths.append(path)

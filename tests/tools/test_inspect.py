@@ -154,7 +154,7 @@ def test_verify_finds_a_field_that_is_not_finite(tmp_path, capsys):
         table.features[:] = np.finfo(np.float16).max
     for weight in record.regions[0].mlp.weights:
         weight[:] = 1e30
-    write_map(record, path, preview=False)
+    write_map(record, path)
     assert main([str(path)]) == 0
     assert main([str(path), "--verify"]) == 1
     assert "is not finite" in capsys.readouterr().err

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
-from fuzz.mapfile_edit import file_bytes
 from scipy.spatial import cKDTree
 from support.map_records import random_record
+from support.mapfile_edit import file_bytes
 from support.small_world import settings, settled_mapper, world
 from triquad_client.mesh.welding import joined
 from triquad_format.mapfile.mapfile import read_map, write_map
@@ -174,7 +174,7 @@ def test_refusals(map_file, tmp_path, capsys):
 @pytest.mark.parametrize("suffix", [".ply", ".npz"])
 def test_regions_too_far_for_compiled_code_are_told(tmp_path, capsys, suffix):
     source, out = tmp_path / "far.triquad", tmp_path / f"far{suffix}"
-    write_map(random_record(0, indices=((2**31 - 1, 0, 0),)), source, preview=False)
+    write_map(random_record(0, indices=((2**31 - 1, 0, 0),)), source)
     assert main([str(source), str(out), "--cell", "1"]) == 2
     assert "too far from the origin" in capsys.readouterr().err
     assert not out.exists()

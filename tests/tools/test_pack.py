@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import with_metadata, without_index
 from mcap.reader import make_reader
 from support.checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoints
 from support.map_records import SMALL, assert_same, random_record
+from support.mapfile_edit import file_bytes, with_metadata, without_index
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.mapfile import read_map, read_map_file, write_map
 from triquad_format.records.crop import crop_record, without_training
@@ -23,7 +23,7 @@ CUBE = tuple(itertools.product((0, 1), repeat=3))
 @pytest.fixture
 def map_file(tmp_path):
     path = tmp_path / "in.triquad"
-    write_map(random_record(1, indices=CUBE, points=200), path)
+    path.write_bytes(file_bytes(random_record(1, indices=CUBE, points=200), preview=True))
     return path
 
 
@@ -133,7 +133,7 @@ def test_tool_packs(map_file, tmp_path, capsys):
 def test_tool_changes_precision(tmp_path):
     record = random_record(7, feature_dtype="<f4")
     fine, coarse = tmp_path / "fine.triquad", tmp_path / "coarse.triquad"
-    write_map(record, fine, feature_dtype="<f4")
+    fine.write_bytes(file_bytes(record, preview=True, feature_dtype="<f4"))
     assert main([str(fine), str(coarse), "--precision", "fp16"]) == 0
     assert read_map(coarse).regions[0].tables[0].features.dtype == np.float16
     again = tmp_path / "again.triquad"
@@ -175,7 +175,7 @@ def test_tool_reads_only_what_the_box_needs(tmp_path, capsys):
     wide = dataclasses.replace(SMALL, depth=10)
     source, out = tmp_path / "in.triquad", tmp_path / "out.triquad"
     record = random_record(2, settings=wide, points=2000, training=False)
-    write_map(record, source, preview=False)
+    write_map(record, source)
     box = ["--crop", "-60", "-60", "-60", "-40", "-40", "-40"]
     assert main([str(source), str(out), *box]) == 0
     assert_same(read_map(out), crop_record(record, [-60] * 3, [-40] * 3))

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from fuzz.mapfile_edit import file_bytes, read_bytes
 from support.map_records import SMALL, assert_same, random_record
+from support.mapfile_edit import file_bytes, read_bytes
 from support.small_world import settings, settled_mapper, world
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.mapfile import read_map

@@ -2,9 +2,9 @@ import json
 import shutil
 
 import pytest
-from fuzz.mapfile_edit import file_bytes, without_index
 from support.checkpoint_folder import write_checkpoints
 from support.map_records import random_record
+from support.mapfile_edit import file_bytes, without_index
 from triquad_format.mapfile.mapfile import read_map_file
 from triquad_tools.commands.inspect import main
 from triquad_tools.commands.pack import main as pack

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.writer import write_map
 from triquad_format.mapfile.written_map import MapFileInfo
 from triquad_format.records.crop import crop_record
 from triquad_format.wire import keys
@@ -58,9 +59,6 @@ def _fetch(run: Run, path: Path, training: bool) -> MapInfo:
 def _fetch_box(
     run: Run, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
 ) -> MapFileInfo:
-    # Most clients fetch no box: they need none of what previews take.
-    from triquad_format.mapfile.writer import write_map
-
     try:
         stored = StoredMap(RemoteBytes(run, run(newest_file(training=False))))
         record = crop_record(stored.box(minimum, maximum), minimum, maximum)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.wire import draco
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 
 from triquad_client import checks
@@ -93,7 +92,6 @@ class FollowedMesh:
             wait_s,
             self.name,
             self.max_bytes_per_s,
-            draco.AVAILABLE,
         )
 
     def after(self, reply: TileUpdates, changed: Mapping[TileIndex, MeshTile]) -> "FollowedMesh":

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import WireError
-from triquad_format.wire import draco
 from triquad_format.wire.messages import TileUpdates
-from triquad_format.wire.tile_codec import Codec, decode_tile
+from triquad_format.wire.tile_codec import decode_tile
 
 from triquad_client.errors import BadReplyError
 
@@ -53,7 +52,7 @@ def unpacked(updates: TileUpdates) -> list[MeshTile]:
         raise BadReplyError(f"tiles of side {updates.tile_side_m}")
     count = len(updates.tiles)
     sizes = updates.sizes
-    lengths = {len(updates.versions), len(updates.codecs), len(sizes)}
+    lengths = {len(updates.versions), len(sizes)}
     if lengths != {count} or (sizes < 0).any() or int(sizes.sum()) != len(updates.data):
         raise BadReplyError(f"a reply of {count} tiles has parts of other lengths")
     ends = np.cumsum(sizes).tolist()
@@ -61,7 +60,7 @@ def unpacked(updates: TileUpdates) -> list[MeshTile]:
     for row, (x, y, z) in enumerate(updates.tiles.tolist()):
         data = updates.data[ends[row] - int(sizes[row]) : ends[row]]
         try:
-            vertices, faces = _decoded(int(updates.codecs[row]), data, updates.cell_m)
+            surface = decode_tile(data)
         except WireError as error:
             raise BadReplyError(f"tile {(x, y, z)}: {error}") from error
         tiles.append(
@@ -71,20 +70,8 @@ def unpacked(updates: TileUpdates) -> list[MeshTile]:
                 hashlib.sha256(data).hexdigest(),
                 len(data),
                 np.array((x, y, z)) * updates.tile_side_m,
-                vertices,
-                faces,
+                surface.positions(updates.cell_m),
+                surface.faces,
             )
         )
     return tiles
-
-
-def _decoded(
-    codec: int, data: bytes, cell_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices [V, 3] and faces [F, 3] of a tile's bytes."""
-    if codec == Codec.DRACO:
-        return draco.decode_draco(data)
-    if codec != Codec.TRIQUAD:
-        raise WireError(f"codec {codec} is not known here")
-    surface = decode_tile(data)
-    return surface.positions(cell_m), surface.faces

@@ -13,6 +13,7 @@ from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.parts.part import PartKey
 from triquad_format.mapfile.parts.part_body import repack_part
 from triquad_format.mapfile.parts.unpack import assemble
+from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
@@ -168,9 +169,6 @@ class _Parts:
 
     def write(self, path: Path) -> None:
         """Replace the file at ``path``, all of it or nothing."""
-        # Most clients keep no copy: they need none of what previews take.
-        from triquad_format.mapfile.writer import write_parts
-
         manifest = self._stored.manifest
         own = {entry.key: dataclasses.replace(entry, file=None) for entry in self.wanted}
         parts = (repack_part(entry.key, self._payloads[entry.key]) for entry in self.wanted)

@@ -7,6 +7,7 @@ MIN_READER_VERSION = 1
 METADATA_NAME = "triquad"
 MESSAGE_ENCODING = "msgpack"
 PREVIEW_ENCODING = "protobuf"
+PREVIEW_SCHEMA = "foxglove.SceneUpdate"
 
 ENCODINGS = {
     **dict.fromkeys((MAP, *REGION_TOPICS), MESSAGE_ENCODING),

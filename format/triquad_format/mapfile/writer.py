@@ -1,12 +1,11 @@
 """Writing map files: the same record gives the same bytes, and a path gets all of them or none."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import BinaryIO
-
-from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_format import __version__
 from triquad_format.errors import FormatError
@@ -19,6 +18,7 @@ from triquad_format.mapfile.container import (
     METADATA_NAME,
     MIN_READER_VERSION,
     PREVIEW_ENCODING,
+    PREVIEW_SCHEMA,
 )
 from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
@@ -39,11 +39,10 @@ from triquad_format.mapfile.parts.part import (
     Part,
     PartKey,
 )
-from triquad_format.mapfile.preview import SCHEMA_NAME, Distances, pack_preview, schema_data
 from triquad_format.mapfile.written_map import MapFileInfo, WrittenMap
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.region import MapRecord, Region, RegionIndex
 
 # Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
 # good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
@@ -59,9 +58,17 @@ _LEVELS = {
     MANIFEST: 3,
 }
 _CHANNELS = tuple(
-    ChannelSpec(topic, encoding, _LEVELS[topic], SCHEMA_NAME if topic == PREVIEW else "")
-    for topic, encoding in ENCODINGS.items()
+    ChannelSpec(number, topic, encoding, _LEVELS[topic], PREVIEW_SCHEMA if topic == PREVIEW else "")
+    for number, (topic, encoding) in enumerate(ENCODINGS.items(), start=1)
 )
+
+
+@dataclass(frozen=True)
+class Previews:
+    """What MCAP viewers show of a map. Map files carry it as it is handed in."""
+
+    schema: bytes  # of foxglove.SceneUpdate, a FileDescriptorSet
+    parts: Mapping[RegionIndex, Part]  # of the topic PREVIEW
 
 
 def write_map(
@@ -70,8 +77,7 @@ def write_map(
     *,
     feature_dtype: str = "<f2",
     stamp_ns: int | None = None,
-    distances: Distances | None = None,
-    preview: bool = True,
+    previews: Previews | None = None,
 ) -> MapFileInfo:
     """Write a map file that needs no other.
 
@@ -83,8 +89,7 @@ def write_map(
         file: a path, or a binary stream at the place where the file begins.
         feature_dtype: ``"<f2"`` or ``"<f4"``, the precision of features that are not int8.
         stamp_ns: time of creation, nanoseconds since 1970; left out, the file holds no time.
-        distances: a faster way to the map's signed distances than numpy, for the preview.
-        preview: whether the file holds a coarse mesh for MCAP viewers.
+        previews: what MCAP viewers are to show; left out, the file holds nothing of the kind.
 
     Raises:
         FormatError: the record is not sound, or exceeds a limit of the format.
@@ -95,9 +100,9 @@ def write_map(
         raise FormatError(f"stamp_ns = {stamp_ns} is out of range")
     check_record(record)
     facts = MapFacts(record.name, record.epoch, record.settings)
-    shown = distances or (lambda points: MapEvaluator(record).query(points).sdf)
-    parts = record_parts(record, feature_dtype, shown if preview else None, stamp_ns or 0)
-    return write_parts(file, facts, stamp_ns, parts, {}).info
+    parts = record_parts(record, feature_dtype, {} if previews is None else previews.parts)
+    schema = None if previews is None else previews.schema
+    return write_parts(file, facts, stamp_ns, parts, {}, preview_schema=schema).info
 
 
 def _check_dtype(feature_dtype: str) -> None:
@@ -106,21 +111,17 @@ def _check_dtype(feature_dtype: str) -> None:
 
 
 def record_parts(
-    record: MapRecord, feature_dtype: str, distances: Distances | None, stamp_ns: int
+    record: MapRecord, feature_dtype: str, previews: Mapping[RegionIndex, Part]
 ) -> Iterator[Part]:
-    """The parts of all regions of a checked record, with previews where there are distances."""
+    """The parts of all regions of a checked record, each region's preview after them."""
     for region in record.regions:
-        yield from region_parts(region, record.settings, feature_dtype, distances, stamp_ns)
+        yield from region_parts(region, record.settings, feature_dtype)
+        if region.index in previews:
+            yield previews[region.index]
 
 
-def region_parts(
-    region: Region,
-    settings: FieldSettings,
-    feature_dtype: str,
-    distances: Distances | None,
-    stamp_ns: int,
-) -> Iterator[Part]:
-    """The parts of a checked region, with its preview where there are distances.
+def region_parts(region: Region, settings: FieldSettings, feature_dtype: str) -> Iterator[Part]:
+    """The parts of a checked region.
 
     Raises:
         FormatError: features do not fit ``feature_dtype``.
@@ -129,8 +130,6 @@ def region_parts(
         yield from pack_region(region, settings, feature_dtype)
     except FormatError as error:
         raise FormatError(f"region {region.index}: {error}") from error
-    if distances is not None:
-        yield pack_preview(region, settings, distances, stamp_ns)
 
 
 def write_parts(
@@ -139,6 +138,8 @@ def write_parts(
     stamp_ns: int | None,
     parts: Iterable[Part | Entry],
     known: Mapping[PartKey, Entry],
+    *,
+    preview_schema: bytes | None = None,
 ) -> WrittenMap:
     """Write a map file from parts.
 
@@ -150,15 +151,16 @@ def write_parts(
             and is one of ``known``.
         known: parts of earlier epochs: an equal one keeps its epoch and time, and is not stored
             again where the entry names a file.
+        preview_schema: that of :class:`Previews`; needed where there are previews among ``parts``.
 
     Raises:
-        FormatError: a limit of the format is exceeded.
+        FormatError: a limit of the format is exceeded, or there are previews without their schema.
         OSError: the file cannot be written.
     """
     if isinstance(file, (str, Path)):
         with replacing(Path(file)) as stream:
-            return _PartsWriter(stream, facts, stamp_ns, known).write(parts)
-    return _PartsWriter(file, facts, stamp_ns, known).write(parts)
+            return _PartsWriter(stream, facts, stamp_ns, known, preview_schema).write(parts)
+    return _PartsWriter(file, facts, stamp_ns, known, preview_schema).write(parts)
 
 
 class _PartsWriter:
@@ -170,14 +172,16 @@ class _PartsWriter:
         facts: MapFacts,
         stamp_ns: int | None,
         known: Mapping[PartKey, Entry],
+        preview_schema: bytes | None,
     ) -> None:
         self._facts = facts
         self._stamp_ns = stamp_ns
         self._known = known
         self._entries: list[Entry] = []
         self._total = 0
-        schema = SchemaSpec(SCHEMA_NAME, PREVIEW_ENCODING, schema_data())
-        self._mcap = McapWriter(stream, f"triquad {__version__}", [schema], _CHANNELS)
+        self._has_previews = preview_schema is not None
+        schemas, channels = _described(preview_schema)
+        self._mcap = McapWriter(stream, f"triquad {__version__}", schemas, channels)
 
     def write(self, parts: Iterable[Part | Entry]) -> WrittenMap:
         # Where parts of other files are known, some of them are needed as good as always.
@@ -221,6 +225,8 @@ class _PartsWriter:
         return Entry(part.key, len(part.payload), digest, self._facts.epoch, stamp_ns)
 
     def _put(self, part: Part, stamp_ns: int) -> None:
+        if part.key.topic == PREVIEW and not self._has_previews:
+            raise FormatError(f"{part.key} comes without its schema: give preview_schema as well")
         if len(part.payload) > MAX_PART_BYTES:
             raise FormatError(
                 f"the part {part.key.topic} has {len(part.payload)} bytes; "
@@ -245,6 +251,15 @@ class _PartsWriter:
             created = datetime.fromtimestamp(self._stamp_ns // 10**9, timezone.utc)
             entries["created"] = created.strftime("%Y-%m-%dT%H:%M:%SZ")
         return entries
+
+
+def _described(
+    preview_schema: bytes | None,
+) -> tuple[Sequence[SchemaSpec], Sequence[ChannelSpec]]:
+    """What describes the messages of a file: of previews only where there are any."""
+    if preview_schema is None:
+        return [], [channel for channel in _CHANNELS if channel.topic != PREVIEW]
+    return [SchemaSpec(PREVIEW_SCHEMA, PREVIEW_ENCODING, preview_schema)], _CHANNELS
 
 
 def _check_total(size: int) -> None:

@@ -21,7 +21,6 @@ Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
 Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Epochs = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
-Codecs = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Sizes = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 Faces = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 
@@ -120,7 +119,6 @@ class TileUpdatesRequest(Message):
     timeout_s: float
     client: str  # a name, on which max_bytes_per_s is counted
     max_bytes_per_s: int  # 0: whatever the server allows
-    draco: bool  # whether the client can decode Draco
 
 
 @dataclass(frozen=True)
@@ -136,9 +134,8 @@ class TileUpdates(Message):
     cell_m: float
     tiles: TileIndices  # [T, 3] that changed
     versions: Epochs  # [T] epoch of which each is
-    codecs: Codecs  # [T] triquad_format.wire.tile_codec.Codec
     sizes: Sizes  # [T] bytes of each
-    data: bytes  # of all, one behind the other
+    data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
     removed: TileIndices  # [R, 3] that have no faces any more
 
 

@@ -1,11 +1,10 @@
-"""The compact form of a mesh tile: what ``docs/wire-protocol.md`` calls the codec ``triquad``.
+"""The compact form of a mesh tile, as ``docs/wire-protocol.md`` specifies it.
 
 Every vertex lies on an edge of the tile's lattice, so it is a lattice point, an axis and a byte
 that says how far along the edge it is. Neighbouring tiles of a level name vertices on their common
 face by the same edge and the same byte: they meet exactly.
 """
 
-import enum
 import struct
 from dataclasses import dataclass
 
@@ -14,14 +13,6 @@ import zstandard
 from numpy.typing import NDArray
 
 from triquad_format.errors import WireError
-
-
-class Codec(enum.IntEnum):
-    """How the bytes of a tile are to be read."""
-
-    TRIQUAD = 0  # by this module
-    DRACO = 1  # by triquad_format.wire.draco
-
 
 STEPS = 255
 """Parts into which an edge of the lattice is divided."""

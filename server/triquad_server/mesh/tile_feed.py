@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from triquad_format.errors import FormatError
-from triquad_format.wire import draco, keys
+from triquad_format.wire import keys
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
-from triquad_format.wire.tile_codec import Codec, decode_tile
 from triquad_map.compiled.team import be_patient
 
 from triquad_server.epochs.epochs import EpochShelf
@@ -64,7 +63,6 @@ class _Reply:
     complete: bool
     revision: int
     tiles: list[ShelvedTile] = field(default_factory=list)
-    codecs: list[Codec] = field(default_factory=list)
     data: list[bytes] = field(default_factory=list)
     removed: list[TileIndex] = field(default_factory=list)
 
@@ -272,7 +270,7 @@ class TileFeed:
                 reply.removed.append(tile.index)
                 reply.revision = tile.revision
                 continue
-            codec, data = self._encoded(entry, tile)
+            data = self._encoded(entry.asks.level, tile)
             if data is None:  # it came out different: it is news again
                 reply.complete = False
                 continue
@@ -280,7 +278,6 @@ class TileFeed:
                 reply.complete = False
                 break
             reply.tiles.append(tile)
-            reply.codecs.append(codec)
             reply.data.append(data)
             reply.revision = tile.revision
         if reply.complete:
@@ -288,23 +285,15 @@ class TileFeed:
             reply.complete = self._shelf.epoch >= entry.needs
         return reply
 
-    def _encoded(self, entry: _Held, tile: ShelvedTile) -> tuple[Codec, bytes | None]:
+    def _encoded(self, level: int, tile: ShelvedTile) -> bytes | None:
         """The bytes of a tile; None where they were gone and the tile has others now."""
-        level = entry.asks.level
         data = self._shelf.data(level, tile)
         if data is None:
             self._gate.give_way(_GIVE_WAY_S)
             if self._shelf.make(level, tile.index).revision != tile.revision:
-                return Codec.TRIQUAD, None
+                return None
             data = self._shelf.data(level, tile)
-        if data is not None and entry.asks.draco and draco.AVAILABLE:
-            surface = decode_tile(data)
-            lattice = self._shelf.lattice(level)
-            positions = surface.positions(lattice.cell_m)
-            compact = draco.encode_draco(positions, surface.faces, lattice.tile_side_m)
-            if compact is not None:
-                return Codec.DRACO, compact
-        return Codec.TRIQUAD, data
+        return data
 
     def _send(self, entry: _Held, reply: _Reply) -> None:
         """Hand a reply to the senders: a client that does not read would hold up this thread."""
@@ -327,7 +316,6 @@ class TileFeed:
                     lattice.cell_m,
                     _indices([tile.index for tile in reply.tiles]),
                     np.array([tile.version for tile in reply.tiles], np.int64),
-                    np.array(reply.codecs, np.uint8),
                     np.array([len(data) for data in reply.data], np.int64),
                     b"".join(reply.data),
                     _indices(reply.removed),

@@ -10,6 +10,7 @@ from triquad_format.mapfile.parts.part_body import repack_part
 from triquad_format.mapfile.writer import region_parts
 
 from triquad_server.mapping.mapper import MapChanges
+from triquad_server.mesh.preview import preview_part
 from triquad_server.store.known_parts import KnownParts
 
 _FEATURE_DTYPE = "<f2"
@@ -28,9 +29,8 @@ def checkpoint_parts(
     for index in changes.regions:
         region = changed.get(index)
         if region is not None:
-            yield from region_parts(
-                region, settings, _FEATURE_DTYPE, changes.epoch.distances, stamp_ns
-            )
+            yield from region_parts(region, settings, _FEATURE_DTYPE)
+            yield preview_part(region, settings, changes.epoch.distances, stamp_ns)
         elif known is not None:
             entries = known.of_region(index)
             yield from entries if others is None else copied_parts(entries, others)

@@ -10,6 +10,7 @@ from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, Map
 
 from triquad_server.errors import RequestError
 from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.mesh.preview import previews_of
 from triquad_server.store.stamp import stamp_now_ns
 
 CHUNK_BYTES = 2**20
@@ -46,8 +47,9 @@ class MapDownloads:
             record, newest = changes.record, changes.epoch
         else:
             record = newest.record()
-        buffer = io.BytesIO()
-        written = write_map(record, buffer, stamp_ns=stamp_now_ns(), distances=newest.distances)
+        buffer, stamp_ns = io.BytesIO(), stamp_now_ns()
+        previews = previews_of(record, distances=newest.distances, stamp_ns=stamp_ns)
+        written = write_map(record, buffer, stamp_ns=stamp_ns, previews=previews)
         info = MapInfo(written.epoch, written.bytes, written.sha256, CHUNK_BYTES)
         with self._lock:
             self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())

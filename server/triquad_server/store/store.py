@@ -41,6 +41,7 @@ from triquad_format.wire.messages import CheckpointInfo
 
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges
+from triquad_server.mesh.preview import preview_schema
 from triquad_server.store.checkpoint_parts import (
     StoppedError,
     checkpoint_parts,
@@ -156,6 +157,7 @@ class Store:
                     stamp_ns,
                     checkpoint_parts(changes, known, None if delta else others, stamp_ns),
                     {} if known is None else known.entries if delta else known.stored_here(),
+                    preview_schema=preview_schema(),
                 )
             info = _written_info(path, written)
         except MapFileError as error:
@@ -186,7 +188,9 @@ class Store:
             with closing(OtherFiles(files_in(self.folder))) as others:
                 parts = unless(stopping, copied_parts(known.entries.values(), others))
                 here = known.stored_here()
-                written = write_parts(path, known.facts, known.stamp_ns, parts, here)
+                written = write_parts(
+                    path, known.facts, known.stamp_ns, parts, here, preview_schema=preview_schema()
+                )
             info = _written_info(path, written)
         except StoppedError:
             return None

@@ -8,10 +8,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.mapfile import MapFileInfo, read_map, write_map
 from triquad_format.records.region import MapRecord
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.preview import previews_of
 from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
 
@@ -66,11 +67,11 @@ def settled_mapper(made: BenchStreet) -> Mapper:
 
 
 def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> list[Figure]:
-    plain = write_map(record, folder / "fp16.triquad", distances=epoch.distances)
+    plain = _written(epoch, record, folder / "fp16.triquad")
     stored = read_map(folder / "fp16.triquad")
     eighth, tight = quantise(stored, INTEGER_ERROR_M), quantise(stored, 0.002)
-    small = write_map(eighth.record, folder / "int8.triquad", distances=epoch.distances)
-    least = write_map(tight.record, folder / "2mm.triquad", distances=epoch.distances)
+    small = _written(epoch, eighth.record, folder / "int8.triquad")
+    least = _written(epoch, tight.record, folder / "2mm.triquad")
     live = field_change(record, stored, _SEED)
     count = epoch.parameters
     scores = [_f_score(one, made) for one in (stored, tight.record)]
@@ -91,6 +92,11 @@ def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> 
     ]
 
 
+def _written(epoch: Epoch, record: MapRecord, path: Path) -> MapFileInfo:
+    """Write a map as a server does, with its previews."""
+    return write_map(record, path, previews=previews_of(record, distances=epoch.distances))
+
+
 def _f_score(record: MapRecord, made: BenchStreet) -> float:
     scene = made.drive.scene
     mesh = surface_mesh(record, scene.bounds, Settings().mesh.cell_m)
@@ -103,10 +109,10 @@ def _opening(record: MapRecord, folder: Path) -> list[Figure]:
     """The street's region, side by side until the file is large."""
     path = folder / "large.triquad"
     first = record.regions[0]
-    bytes_each = write_map(record, folder / "one.triquad", preview=False).bytes
+    bytes_each = write_map(record, folder / "one.triquad").bytes
     copies = -(-_LARGE_BYTES // bytes_each)
     row = tuple(dataclasses.replace(first, index=(number, 0, 0)) for number in range(copies))
-    size = write_map(dataclasses.replace(record, regions=row), path, preview=False).bytes
+    size = write_map(dataclasses.replace(record, regions=row), path).bytes
     started = time.perf_counter()
     answered = subprocess.run(
         [sys.executable, "-c", _OPEN, str(path)], stdout=subprocess.PIPE, text=True, check=True

@@ -30,7 +30,7 @@ def measure_offline(made: BenchStreet) -> list[Figure]:
     points = seen_points(epoch, made, np.random.default_rng(_SEED))
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         path = Path(name) / "street.triquad"
-        write_map(epoch.record(), path, distances=epoch.distances)
+        write_map(epoch.record(), path)
         open_map(path).query_distance(points[:10])  # compiled code is loaded
         opening_s = seconds(lambda: open_map(path))
         with open_map(path) as offline:

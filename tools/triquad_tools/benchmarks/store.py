@@ -107,7 +107,7 @@ def _latencies(record: MapRecord, made: BenchStreet, root: Path) -> list[Figure]
     """Replies while the robot drives on in one region, without and with checkpoints."""
     folder = root / _MAP
     folder.mkdir(parents=True)
-    write_map(record, folder / checkpoint_name(record.epoch, complete=True), preview=False)
+    write_map(record, folder / checkpoint_name(record.epoch, complete=True))
     asked = root / "points.npy"
     np.save(asked, np.random.default_rng(0).permutation(made.probes.near)[:_ASKED])
     options = ServerOptions(free_endpoint(), _MAP, root, root / "server.log")

@@ -4,15 +4,17 @@ import importlib
 import importlib.util
 import sys
 
+_SERVER_NEEDS = ("torch", "foxglove_schemas_protobuf")
+
 
 def bench() -> int:
     """``triquad-bench``."""
-    return _run("triquad-bench", "triquad_tools.commands.bench", extra="demo", needs=("torch",))
+    return _run("triquad-bench", "triquad_tools.commands.bench", extra="demo", needs=_SERVER_NEEDS)
 
 
 def demo() -> int:
     """``triquad-demo``."""
-    return _run("triquad-demo", "triquad_tools.commands.demo", extra="demo", needs=("torch",))
+    return _run("triquad-demo", "triquad_tools.commands.demo", extra="demo", needs=_SERVER_NEEDS)
 
 
 def evaluate() -> int:
@@ -45,5 +47,6 @@ def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, .
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("triquad"):
             raise
-        print(f"{command}: {error.name} is missing: install triquad[{extra}]", file=sys.stderr)
+        library = error.name.partition(".")[0]
+        print(f"{command}: {library} is missing: install triquad[{extra}]", file=sys.stderr)
         return 2

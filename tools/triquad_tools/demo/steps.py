@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.image import imsave
 from numpy.typing import NDArray
 from triquad_client import CheckpointInfo, Client, Mesh, SdfResult, connect
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_format.records.crop import without_training
+from triquad_server.mesh.preview import previews_of
 
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
@@ -24,7 +26,7 @@ from triquad_tools.evaluation.map_scores import (
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
 from triquad_tools.mapfiles import meshfile
 from triquad_tools.plots.camera import Camera
-from triquad_tools.plots.render import height_colours, render_mesh, write_png
+from triquad_tools.plots.render import height_colours, render_mesh
 from triquad_tools.simulation.street import street_drive
 
 MAP = "demo"
@@ -142,7 +144,8 @@ def compare(endpoint: str, scored: Scored) -> Restart:
 
 def pack(scored: Scored, path: Path) -> MapSize:
     """Write the map without the state that only training needs."""
-    packed = write_map(without_training(read_map(scored.checkpoint.path)), path)
+    record = without_training(read_map(scored.checkpoint.path))
+    packed = write_map(record, path, previews=previews_of(record))
     return MapSize(packed.bytes, scored.checkpoint.bytes, scored.parameters)
 
 
@@ -156,4 +159,4 @@ def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
         camera = Camera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
         colours = height_colours(surface.vertices)
         image = render_mesh(surface.vertices, surface.faces, camera=camera, colours=colours)
-        write_png(picture, image)
+        imsave(picture, image)

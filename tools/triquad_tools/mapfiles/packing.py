@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.mapfile.mapfile import MapFileInfo, write_map
+from triquad_format.mapfile.writer import Previews
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.mapfiles.field_change import FieldChange
@@ -59,7 +60,9 @@ def pack_map(source: SourceMap, precision: Precision, path: Path) -> PackedMap:
     elif precision.dtype is not None:
         record = dequantised(record)
     dtype = precision.dtype or _dtype(record)
-    info = write_map(record, path, feature_dtype=dtype, stamp_ns=source.stamp_ns)
+    stamp_ns = source.stamp_ns
+    previews = _previews(record, stamp_ns)
+    info = write_map(record, path, feature_dtype=dtype, stamp_ns=stamp_ns, previews=previews)
     return PackedMap(info, sum(region.parameters for region in record.regions), change)
 
 
@@ -78,6 +81,22 @@ def print_packed(path: Path, packed: PackedMap, bytes_before: int) -> None:
         f"the most by {_mm(change.largest_m)}"
     )
     print("  without training state: it does not fit rounded features")
+
+
+def _previews(record: MapRecord, stamp_ns: int | None) -> Previews | None:
+    """What MCAP viewers show; nothing where the libraries for it are not installed."""
+    try:
+        from triquad_server.mesh.preview import previews_of
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("triquad"):
+            raise
+        print(
+            f"triquad-pack: without a preview for MCAP viewers, as {error.name} is missing: "
+            "install triquad[preview]",
+            file=sys.stderr,
+        )
+        return None
+    return previews_of(record, stamp_ns=stamp_ns)
 
 
 def _warn_of_integers(record: MapRecord) -> None:

@@ -314,7 +314,9 @@ def _most_decompressed(where: str, stored: memoryview) -> int:
             raise DamagedMapFileError(f"{where} holds a zstd block of an unknown kind")
         most += _MAX_BLOCK_BYTES if kind == _COMPRESSED_BLOCK else length
         at += 3 + (1 if kind == _RLE_BLOCK else length)
-    if at not in (len(stored), len(stored) - _CHECKSUM_BYTES):
+    if zstandard.get_frame_parameters(stored).has_checksum:
+        at += _CHECKSUM_BYTES
+    if at != len(stored):
         raise DamagedMapFileError(f"{where} does not end with its zstd frame")
     return most
 

@@ -37,6 +37,7 @@ from triquad_format.mapfile.mcap.records import MAGIC, chunk_limit
 class ChannelSpec:
     """A channel, and how the chunks of its messages are compressed."""
 
+    number: int
     topic: str
     encoding: str
     level: int  # of zstd
@@ -78,7 +79,7 @@ class McapWriter:
         self._summary = _Summary()
         self._schemas = _schema_records(schemas)
         self._channels = _channel_records(channels, self._schemas)
-        self._specs = {spec.topic: (i + 1, spec) for i, spec in enumerate(channels)}
+        self._specs = {spec.topic: spec for spec in channels}
         self._write(MAGIC)
         self._record(Header("", library))
         for record in (*self._schemas, *self._channels):
@@ -100,7 +101,8 @@ class McapWriter:
 
         ``seams`` are offsets in the payload where bytes of another kind begin.
         """
-        number, spec = self._specs[topic]
+        spec = self._specs[topic]
+        number = spec.number
         chunk = _chunk(number, payload, time_ns, seams, spec.level)
         start = self.size
         self._record(chunk)
@@ -174,13 +176,13 @@ def _channel_records(specs: Sequence[ChannelSpec], schemas: Sequence[Schema]) ->
     numbers = {schema.name: schema.id for schema in schemas}
     return [
         Channel(
-            id=number,
+            id=spec.number,
             topic=spec.topic,
             message_encoding=spec.encoding,
             metadata={},
             schema_id=numbers.get(spec.schema, 0),
         )
-        for number, spec in enumerate(specs, start=1)
+        for spec in specs
     ]
 
 

@@ -17,6 +17,7 @@ from triquad_format.mapfile.random_access import MemoryBytes
 from triquad_format.mapfile.writer import record_parts, write_parts
 from triquad_format.wire.array import pack_array, unpack_array
 from triquad_map.stored_map import StoredMap
+from triquad_server.mesh.preview import previews_of
 
 
 class RawPart(NamedTuple):
@@ -26,10 +27,12 @@ class RawPart(NamedTuple):
     payload: bytes
 
 
-def file_bytes(record, *, preview=False, **options):
+def file_bytes(record, *, preview=False, distances=None, stamp_ns=None, **options):
     """A complete map file."""
     stream = io.BytesIO()
-    write_map(record, stream, preview=preview, **options)
+    if preview:
+        options["previews"] = previews_of(record, distances=distances, stamp_ns=stamp_ns)
+    write_map(record, stream, stamp_ns=stamp_ns, **options)
     return stream.getvalue()
 
 
@@ -154,16 +157,23 @@ def in_level(number, edit):
 
 
 def write_pair(
-    folder, base, record, *, names=("base.triquad", "next.triquad"), stamps=(None, None)
+    folder,
+    base,
+    record,
+    *,
+    names=("base.triquad", "next.triquad"),
+    stamps=(None, None),
+    preview_schema=None,
 ):
     """A complete file of ``base``, and one of what ``record`` changes of it."""
-    first = write_record(folder / names[0], base, stamps[0], {})
+    options = {"preview_schema": preview_schema}
+    first = write_record(folder / names[0], base, stamps[0], {}, **options)
     known = first.manifest.elsewhere(FileRef(names[0], first.manifest_sha256))
-    return first, write_record(folder / names[1], record, stamps[1], known)
+    return first, write_record(folder / names[1], record, stamps[1], known, **options)
 
 
-def write_record(path, record, stamp_ns, known):
+def write_record(path, record, stamp_ns, known, *, preview_schema=None):
     """A file of all parts of a record that no file of ``known`` holds."""
     facts = MapFacts(record.name, record.epoch, record.settings)
-    parts = record_parts(record, "<f2", None, stamp_ns or 0)
-    return write_parts(path, facts, stamp_ns, parts, known)
+    parts = record_parts(record, "<f2", {})
+    return write_parts(path, facts, stamp_ns, parts, known, preview_schema=preview_schema)

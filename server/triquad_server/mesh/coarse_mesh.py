@@ -1,35 +1,20 @@
-"""A coarse mesh of a region for MCAP viewers, as a ``foxglove.SceneUpdate``.
-
-The schema is at https://docs.foxglove.dev/docs/sdk/schemas/scene-update. Nothing reads it back:
-answers come from the field.
-"""
+"""A coarse mesh of a region's surface, where it was seen."""
 
 from collections.abc import Callable
 
 import numpy as np
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from google.protobuf.descriptor import FileDescriptor
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from numpy.typing import NDArray
-
-from triquad_format.mapfile.map_facts import FRAME_ID
-from triquad_format.mapfile.parts.part import PREVIEW, Part, PartKey
 from triquad_format.records import morton
 from triquad_format.records.evidence_voxels import seen_voxels
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import Evidence, Region, region_corner
+from triquad_format.records.region import Region, region_corner
 
-SCHEMA_NAME = "foxglove.SceneUpdate"
 NET_LEAVES = 2
 """Side of the cells in which the surface is looked for, in leaves: 0.4 m."""
 
 CLUSTER_CELLS = 3
 """Side of the cubes of cells whose vertices become one: 1.2 m."""
 
-_STEP_M = 2.0**-5
-"""Positions are rounded to 3 cm: zeros compress."""
-
-_COLOUR = (0.62, 0.66, 0.72, 1.0)
 _CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 _EDGES = tuple(
     (a, b)
@@ -42,55 +27,18 @@ Distances = Callable[[NDArray[np.float64]], NDArray[np.floating]]
 """Signed distances [N] at points [N, 3] of the map frame."""
 
 
-def schema_data() -> bytes:
-    """The schema as MCAP wants it: a ``FileDescriptorSet``, dependencies first."""
-    files: dict[str, FileDescriptor] = {}
-
-    def collect(file: FileDescriptor) -> None:
-        for dependency in file.dependencies:
-            collect(dependency)
-        files.setdefault(file.name, file)
-
-    collect(SceneUpdate.DESCRIPTOR.file)
-    described = FileDescriptorSet()
-    for file in files.values():
-        file.CopyToProto(described.file.add())
-    data: bytes = described.SerializeToString(deterministic=True)
-    return data
-
-
-def pack_preview(
-    region: Region, settings: FieldSettings, distances: Distances, stamp_ns: int
-) -> Part:
-    """The preview of a region: its surface, where it was seen, clustered to some thousand faces."""
-    vertices, faces = _coarse_mesh(region.evidence, settings, region.index, distances)
-    update = SceneUpdate()
-    entity = update.entities.add()
-    entity.timestamp.FromNanoseconds(stamp_ns)
-    entity.frame_id = FRAME_ID
-    entity.id = "region {} {} {}".format(*region.index)
-    triangles = entity.triangles.add()
-    triangles.pose.orientation.w = 1.0
-    triangles.color.r, triangles.color.g, triangles.color.b, triangles.color.a = _COLOUR
-    for x, y, z in (np.round(vertices / _STEP_M) * _STEP_M).tolist():
-        triangles.points.add(x=x, y=y, z=z)
-    triangles.indices.extend(faces.ravel().tolist())
-    payload: bytes = update.SerializeToString(deterministic=True)
-    return Part(PartKey(PREVIEW, region.index), payload)
-
-
-def _coarse_mesh(
-    evidence: Evidence,
-    settings: FieldSettings,
-    index: tuple[int, int, int],
-    distances: Distances,
+def coarse_mesh(
+    region: Region, settings: FieldSettings, distances: Distances
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices [V, 3], map frame, and faces [F, 3]: surface nets (Gibson 1998), clustered."""
+    """Vertices [V, 3], metres, map frame, and faces [F, 3], counter-clockwise from free space.
+
+    The method is surface nets (Gibson 1998), with vertices clustered: some thousand faces a region.
+    """
     # By codes: numpy holds Python's lock while it sorts rows.
-    seen = morton.encode(seen_voxels(evidence, evidence.surface) // NET_LEAVES)
+    seen = morton.encode(seen_voxels(region.evidence, region.evidence.surface) // NET_LEAVES)
     cells = morton.decode(np.unique(seen), 3)
     side_m = settings.leaf_m * NET_LEAVES
-    origin = region_corner(settings, index)
+    origin = region_corner(settings, region.index)
     corners = morton.encode(cells[:, None] + _CORNERS)  # [C, 8]
     codes, where = np.unique(corners, return_inverse=True)
     values = distances(morton.decode(codes, 3) * side_m + origin)
