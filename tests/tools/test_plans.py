@@ -98,7 +98,10 @@ def test_a_legend_names_every_colour():
     layers = [Layer("wall", "#ff0000", np.eye(2, dtype=bool))]
     draw_layers(figure.subplots(), layers)
     (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["wall", "nothing was seen"]
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "wall",
+        "nothing was seen (UNKNOWN)",
+    ]
 
 
 # What the plans show

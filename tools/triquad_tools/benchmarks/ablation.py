@@ -6,10 +6,10 @@ samples, in this process.
 
 import numpy as np
 from triquad_format.records.field_settings import ENCODINGS
-from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import parse_settings
 
 from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.street import settled_mapper
 from triquad_tools.evaluation.map_scores import score_street, street_probes
 from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
 from triquad_tools.mapfiles.mesh import surface_mesh
@@ -29,18 +29,15 @@ def measure_ablation(seed: int, scans: int, step_m: float) -> list[Figure]:
 
 def _variant(encoding: str, drive: SimulatedDrive) -> list[Figure]:
     """Map a drive with one encoding until all is learnt, and score the map."""
-    mapper = Mapper("ablation", parse_settings({"field": {"encoding": encoding}}), "cpu")
-    for scan in drive:
-        mapper.ingest(scan.points, scan.world_from_sensor)
-    while not mapper.settled:
-        mapper.train()
+    settings = parse_settings({"field": {"encoding": encoding}})
+    mapper = settled_mapper(f"with {encoding}", list(drive), settings)
     epoch = mapper.publish()
     rng = np.random.default_rng(0)
     field = score_street(epoch.query, street_probes(drive, rng))
-    settings = ScoreSettings(samples_max=_SAMPLES_MAX)
+    scoring = ScoreSettings(samples_max=_SAMPLES_MAX)
     visible = drive.true_hits(_REFERENCE_M)
     surface = surface_mesh(epoch.record(), None, _CELL_M)
-    mesh = score_against_scene(surface, drive.scene, visible, settings, rng)
+    mesh = score_against_scene(surface, drive.scene, visible, scoring, rng)
     return [
         Figure(f"{encoding}: parameters", epoch.parameters / 1e6, "M"),
         Figure(f"{encoding}: training samples", mapper.samples_trained / 1e6, "M"),

@@ -10,13 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_map.questions.align import Alignment, AlignOptions, align
 from triquad_map.view import MapView
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import BenchStreet
-from triquad_tools.console.progress import progress
+from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.kitti import read_folder
 
@@ -41,7 +37,7 @@ OFFSETS = (Offset(0.5, 5.0), Offset(1.0, 10.0), Offset(2.0, 15.0))
 
 @dataclass(frozen=True)
 class PlacedScan:
-    """A scan that the map has not seen, and where it was taken."""
+    """A scan, and where it was taken."""
 
     points: NDArray[np.float64]  # [N, 3] metres, sensor frame
     world_from_sensor: NDArray[np.float64]  # [4, 4]
@@ -81,14 +77,13 @@ def measure_align(made: BenchStreet, folder: Path | None) -> list[Figure]:
         print("align: recorded scans are left out: give --recorded FOLDER", file=sys.stderr)
     else:
         read_folder(folder)  # before all else, which takes minutes
-    warm_up(Settings(), "cpu")
     figures = _figures("street", on_street(made))
     return figures if folder is None else figures + _figures(folder.name, recorded(folder))
 
 
 def on_street(made: BenchStreet) -> PlacedScans:
     """The street's map, and scans from beside the drive."""
-    view = _mapped("the street", [(scan.points, scan.world_from_sensor) for scan in made.scans])
+    view = settled_mapper("the street", made.scans).publish()
     rng = np.random.default_rng(_SEED)
     drive = made.drive
     scans: list[PlacedScan] = []
@@ -102,15 +97,13 @@ def on_street(made: BenchStreet) -> PlacedScans:
 def recorded(path: Path, scans: int | None = None) -> PlacedScans:
     """The map of a recorded folder (of its first ``scans``) without every 7th, and those."""
     folder = read_folder(path)
-    mapped: list[tuple[NDArray[np.float32], NDArray[np.float64]]] = []
+    mapped: list[PlacedScan] = []
     withheld: list[PlacedScan] = []
     for index, pose in enumerate(folder.poses[:scans]):
         points = points_in_range(folder.read_points(index), _RANGE_MIN_M)
-        if is_withheld(index, _SKIP_EVERY):
-            withheld.append(PlacedScan(points.astype(np.float64), pose))
-        else:
-            mapped.append((points, pose))
-    return PlacedScans(_mapped(path.name, mapped), tuple(withheld))
+        scan = PlacedScan(points.astype(np.float64), pose)
+        (withheld if is_withheld(index, _SKIP_EVERY) else mapped).append(scan)
+    return PlacedScans(settled_mapper(path.name, mapped).publish(), tuple(withheld))
 
 
 def attempts(placed: PlacedScans, offset: Offset, tries: int = _TRIES) -> list[Attempt]:
@@ -136,18 +129,6 @@ def displaced(
     moved[:3, :3] = turn @ pose[:3, :3]
     moved[:3, 3] += offset.metres * shift
     return moved
-
-
-def _mapped(name: str, scans: Sequence[tuple[NDArray[np.float32], NDArray[np.float64]]]) -> MapView:
-    mapper = Mapper("bench", Settings(), "cpu")
-    with progress(f"mapping {name}", len(scans) + 1) as report:
-        for number, (points, pose) in enumerate(scans):
-            mapper.ingest(points, pose)
-            report(number, f"scan {number}")
-        while not mapper.settled:
-            mapper.train()
-        report(len(scans) + 1, "settled")
-    return mapper.publish()
 
 
 def _attempt(view: MapView, scan: PlacedScan, guess: NDArray[np.float64]) -> Attempt:

@@ -11,14 +11,11 @@ import numpy as np
 from triquad_format.mapfile.mapfile import MapFileInfo, read_map, write_map
 from triquad_format.records.region import MapRecord
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.preview import previews_of
 from triquad_server.settings import Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import BenchStreet
-from triquad_tools.console.progress import progress
+from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
 from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
 from triquad_tools.mapfiles.field_change import field_change
 from triquad_tools.mapfiles.mesh import surface_mesh
@@ -42,28 +39,12 @@ print(time.perf_counter() - started)
 
 def measure_file(made: BenchStreet) -> list[Figure]:
     """Figures of the street's map as a file."""
-    mapper = settled_mapper(made)
-    epoch = mapper.publish()
+    epoch = settled_mapper("the street", made.scans).publish()
     record = epoch.record()
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         folder = Path(name)
         figures = _sizes(epoch, record, made, folder)
         return figures + _opening(record, folder)
-
-
-def settled_mapper(made: BenchStreet) -> Mapper:
-    """A mapper that has learnt the street."""
-    settings = Settings()
-    warm_up(settings, "cpu")
-    mapper = Mapper("bench", settings, "cpu")
-    with progress("mapping the street", len(made.scans) + 1) as report:
-        for number, scan in enumerate(made.scans):
-            mapper.ingest(scan.points, scan.world_from_sensor)
-            report(number, f"scan {number}")
-        while not mapper.settled:
-            mapper.train()
-        report(len(made.scans) + 1, "settled")
-    return mapper
 
 
 def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> list[Figure]:

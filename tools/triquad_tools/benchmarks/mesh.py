@@ -10,15 +10,13 @@ import numpy as np
 from triquad_client import Client, MeshWatch, connect
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import TileShelf
 from triquad_server.mesh.tile_lattice import tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings, Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure, seconds
-from triquad_tools.benchmarks.street import BenchStreet
+from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
 from triquad_tools.benchmarks.tile_changes import changed_tiles
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
@@ -165,11 +163,7 @@ def _one_more(made: BenchStreet) -> SimulatedScan:
 def _work(made: BenchStreet) -> list[Figure]:
     """What is meshed again for one more scan, in process, once it is learnt."""
     settings = Settings()
-    warm_up(settings, "cpu")
-    mapper = Mapper(_MAP, settings, "cpu")
-    for scan in made.scans:
-        mapper.ingest(scan.points, scan.world_from_sensor)
-    _settle(mapper)
+    mapper = settled_mapper("the street", made.scans, settings)
     shelf = TileShelf(settings.mesh)
     shelf.look(mapper.publish())
     _make(shelf)
@@ -181,7 +175,8 @@ def _work(made: BenchStreet) -> list[Figure]:
     epoch = mapper.publish()
     look_s = seconds(lambda: shelf.look(epoch))
     evidence = len(shelf.news(0, *_EVERYWHERE, shelf.revision, {}).to_make)
-    _settle(mapper)
+    while not mapper.settled:
+        mapper.train()
     epoch = mapper.publish()
     shelf.look(epoch)
     touched = len(shelf.news(0, *_EVERYWHERE, shelf.revision, {}).to_make)
@@ -227,13 +222,6 @@ def _changed(before: dict[TileIndex, Mesh], epoch: Epoch, settings: MeshSettings
     shelf.look(epoch)
     _make(shelf)
     return changed_tiles(before, _meshes(shelf), settings.tolerance_m, settings.cell_m)
-
-
-def _settle(mapper: Mapper) -> None:
-    with progress("training", None) as report:
-        while not mapper.settled:
-            mapper.train()
-            report(0, f"{mapper.samples_trained / 1e6:.1f} M samples")
 
 
 def _make(shelf: TileShelf) -> set[TileIndex]:

@@ -15,8 +15,7 @@ from triquad_server.epochs.epoch import Epoch
 
 from triquad_tools.benchmarks.core import seen_points
 from triquad_tools.benchmarks.figures import Figure, compare, seconds
-from triquad_tools.benchmarks.file import settled_mapper
-from triquad_tools.benchmarks.street import BenchStreet
+from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
 
 Work = Callable[[], object]
 
@@ -26,7 +25,7 @@ _SEED = 4  # of the points
 
 def measure_offline(made: BenchStreet) -> list[Figure]:
     """Figures of the street's map, opened offline, against the settled server's epoch."""
-    epoch = settled_mapper(made).publish()
+    epoch = settled_mapper("the street", made.scans).publish()
     points = seen_points(epoch, made, np.random.default_rng(_SEED))
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         path = Path(name) / "street.triquad"

@@ -20,8 +20,7 @@ from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.answers import REACH_M, measure_answers
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import RATE_HZ, BenchStreet
-from triquad_tools.console.progress import progress
+from triquad_tools.benchmarks.street import BenchStreet, stream
 from triquad_tools.console.settling import wait_until_settled
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
@@ -68,19 +67,12 @@ class _Drive:
     def __init__(self, client: Client, made: BenchStreet) -> None:
         self._client = client
         self._made = made
-        self._rounds = 0
 
     def stream(self, name: str) -> float:
         """Stream all scans; returns how many samples were trained each second meanwhile."""
         before = self._client.status().samples_trained
-        started, stamp_s = time.monotonic(), time.time()
-        scans = self._made.scans
-        with progress(name, len(scans)) as report:
-            for index, scan in enumerate(scans):
-                due_s = index / RATE_HZ
-                time.sleep(max(0.0, started + due_s - time.monotonic()))
-                self._client.publish_scan(scan.points, scan.world_from_sensor, stamp_s + due_s)
-                report(index + 1, f"{index + 1} of {len(scans)} scans")
+        started = time.monotonic()
+        stream(self._client, self._made.scans, name)
         trained = self._client.status().samples_trained - before
         return trained / (time.monotonic() - started)
 
@@ -98,7 +90,7 @@ def _planner_points(made: BenchStreet, folder: Path) -> list[Path]:
 
 
 def _one(drive: _Drive, endpoint: str, points: Sequence[Path]) -> list[Figure]:
-    drive.stream("streaming alone, to begin with")
+    drive.stream("streaming alone at first")
     with Probe(endpoint, _MAP, points[0], "distance") as probe:
         time.sleep(_WARM_S)
         drive.stream("streaming beside one planner")

@@ -17,8 +17,7 @@ from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.core import seen_points
 from triquad_tools.benchmarks.figures import Figure, seconds
-from triquad_tools.benchmarks.street import RATE_HZ, BenchStreet
-from triquad_tools.console.progress import progress
+from triquad_tools.benchmarks.street import BenchStreet, stream
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, wait_until_settled
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
@@ -68,13 +67,7 @@ def _stream(client: Client, endpoint: str, made: BenchStreet, folder: Path) -> P
     asked = folder / "points.npy"
     np.save(asked, rng.permutation(made.probes.near)[:_ASKED])
     with Probe(endpoint, _MAP, asked, question="gradient") as probe:
-        started, stamp_s = time.monotonic(), time.time()
-        with progress("streaming at 10 Hz", len(made.scans)) as report:
-            for index, scan in enumerate(made.scans):
-                due_s = index / RATE_HZ
-                time.sleep(max(0.0, started + due_s - time.monotonic()))
-                client.publish_scan(scan.points, scan.world_from_sensor, stamp_s + due_s)
-                report(index + 1, f"{index + 1} of {len(made.scans)} scans")
+        stream(client, made.scans)
         return probe.finish()
 
 

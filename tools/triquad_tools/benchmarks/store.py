@@ -21,8 +21,7 @@ from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import RATE_HZ, BenchStreet
-from triquad_tools.console.progress import progress
+from triquad_tools.benchmarks.street import BenchStreet, stream
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 
@@ -143,13 +142,11 @@ def _drive_on(
     checkpoints: Executor | None,
 ) -> ProbeReport:
     """Publish scans as a lidar does while another process asks."""
+
+    def published(number: int) -> None:
+        if checkpoints is not None and number % _EVERY_SCANS == 0:
+            checkpoints.submit(client.checkpoint)
+
     with Probe(endpoint, _MAP, asked, question="gradient") as probe:
-        started = time.monotonic()
-        with progress("streaming at 10 Hz", len(made.scans)) as report:
-            for number, scan in enumerate(made.scans):
-                time.sleep(max(0.0, started + number / RATE_HZ - time.monotonic()))
-                client.publish_scan(scan.points, scan.world_from_sensor)
-                if checkpoints is not None and number % _EVERY_SCANS == 0:
-                    checkpoints.submit(client.checkpoint)
-                report(number + 1, f"{number + 1} of {len(made.scans)} scans")
+        stream(client, made.scans, published=published)
         return probe.finish()

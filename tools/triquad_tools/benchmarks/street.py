@@ -1,10 +1,18 @@
-"""The drive that everything in ``triquad-bench`` is measured on."""
+"""The drive that everything in ``triquad-bench`` is measured on, learnt and streamed."""
 
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_client import Client
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
 
+from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
@@ -14,6 +22,18 @@ RATE_HZ = 10.0
 _LENGTH_M = 110.0  # so that the map has some 2 million parameters
 _COLUMNS = 1024  # some 60,000 points a scan
 _VISIBLE_VOXEL_M = 0.05
+
+
+class PosedScan(Protocol):
+    """A scan and where it was taken."""
+
+    @property
+    def points(self) -> NDArray[np.floating]:
+        """``[N, 3]`` metres, sensor frame."""
+
+    @property
+    def world_from_sensor(self) -> NDArray[np.float64]:
+        """``[4, 4]``."""
 
 
 @dataclass(frozen=True)
@@ -32,3 +52,37 @@ def bench_street(seed: int) -> BenchStreet:
     low, high = scene.bounds  # to which meshes are cut
     visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
     return BenchStreet(driven.drive, driven.scans, driven.probes, visible)
+
+
+def settled_mapper(
+    name: str, scans: Sequence[PosedScan], settings: Settings | None = None
+) -> Mapper:
+    """A mapper that has learnt all it can of some scans; ``name`` is told while one waits."""
+    settings = settings or Settings()
+    warm_up(settings, "cpu")
+    mapper = Mapper("bench", settings, "cpu")
+    with progress(f"mapping {name}", len(scans) + 1) as report:
+        for number, scan in enumerate(scans):
+            mapper.ingest(scan.points, scan.world_from_sensor)
+            report(number, f"scan {number}")
+        while not mapper.settled:
+            mapper.train()
+        report(len(scans) + 1, "settled")
+    return mapper
+
+
+def stream(
+    client: Client,
+    scans: Sequence[PosedScan],
+    title: str = "streaming at 10 Hz",
+    published: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Publish scans as a lidar does; ``published`` is told the number of each."""
+    started, stamp_s = time.monotonic(), time.time()
+    with progress(title, len(scans)) as report:
+        for number, scan in enumerate(scans):
+            due_s = number / RATE_HZ
+            time.sleep(max(0.0, started + due_s - time.monotonic()))
+            client.publish_scan(scan.points, scan.world_from_sensor, stamp_s + due_s)
+            published(number)
+            report(number + 1, f"{number + 1} of {len(scans)} scans")

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import sys
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -12,6 +13,7 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
+_GAP = 2  # spaces before each column
 _PIPE_WIDTH = 10_000  # characters: nothing is broken where a program reads
 
 
@@ -42,14 +44,12 @@ def print_columns(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     Where the terminal is too narrow, titles are broken, but no cell is.
     """
     table = _table(show_header=True)
-    for number, (title, *cells) in enumerate(zip(titles, *rows, strict=True)):
-        widest = max(map(len, cells), default=0)
-        table.add_column(
-            title,
-            justify="right" if number else "left",
-            min_width=widest,
-            no_wrap=widest >= len(title),
-        )
+    columns = list(zip(titles, *rows, strict=True))
+    narrow = sum(_GAP + max(map(len, column)) for column in columns) > _console().width
+    for number, (title, *cells) in enumerate(columns):
+        widest = max(map(len, cells), default=1)
+        shown = textwrap.fill(title, widest, break_long_words=False) if narrow else title
+        table.add_column(shown, justify="right" if number else "left", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     _print(table)
@@ -57,13 +57,20 @@ def print_columns(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 def _table(show_header: bool = False) -> Table:
     """A table without rules or colours: each line can be searched for and cut up."""
-    return Table(box=None, show_header=show_header, header_style="", padding=(0, 0, 0, 2))
+    return Table(box=None, show_header=show_header, header_style="", padding=(0, 0, 0, _GAP))
+
+
+def _console() -> Console:
+    """As wide as the terminal; elsewhere so wide that lines are whole."""
+    width = None if sys.stdout.isatty() else _PIPE_WIDTH
+    return Console(markup=False, highlight=False, width=width)
 
 
 def _print(table: Table) -> None:
-    """Print within the terminal's width; elsewhere in lines as long as they need to be."""
-    width = None if sys.stdout.isatty() else _PIPE_WIDTH
-    console = Console(markup=False, highlight=False, width=width)
+    """Print within the terminal's width, if nothing is cut by that."""
+    console = _console()
+    unbounded = console.options.update(width=_PIPE_WIDTH)
+    console.width = max(console.width, console.measure(table, options=unbounded).minimum)
     with console.capture() as captured:
         console.print(table)
     for line in captured.get().splitlines():

@@ -8,7 +8,6 @@ import threading
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 from triquad_tools.console.command import ToolError
 
@@ -68,12 +67,7 @@ class DemoServer:
     def __enter__(self) -> "DemoServer":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._end()
 
     def stop(self) -> None:

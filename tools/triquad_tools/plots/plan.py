@@ -28,9 +28,9 @@ MOST_CELLS = 1200
 
 _LEAST_CELLS = 40  # along each side
 _LEAST_SIDE = 0.25  # the shorter side's share of the longer one
-_WIDE = 1.4  # the plans of a map that is wider stand below each other
+_WIDE = 2.0  # the plans of a map that is wider stand below each other
 _LONGEST_IN, _LONGEST_BESIDE_IN = 11.0, 6.5  # longer side of a plan
-_ROOM_IN = (2.3, 2.2)  # beside a plan for its scale, below it for its legend
+_ROOM_IN = (2.3, 1.7)  # beside a plan for its scale, below it for its legend
 _DPI = 110
 _LETTERS_PT = 13  # can be read in half the size, too
 
@@ -179,7 +179,10 @@ def draw_layers(axes: Axes, layers: Sequence[Layer]) -> None:
             extent=(*axes.get_xlim(), *axes.get_ylim()),
             interpolation="none",
         )
-    named = [*((layer.colour, layer.label) for layer in layers), (UNKNOWN, "nothing was seen")]
+    named = [
+        *((layer.colour, layer.label) for layer in layers),
+        (UNKNOWN, "nothing was seen (UNKNOWN)"),
+    ]
     handles = [Patch(facecolor=colour, edgecolor="black", label=label) for colour, label in named]
     axes.figure.legend(handles=handles, loc="outside lower left", frameon=False, ncols=2)
 
