@@ -32,12 +32,11 @@ def _variant(encoding: str, drive: SimulatedDrive) -> list[Figure]:
     settings = parse_settings({"field": {"encoding": encoding}})
     mapper = settled_mapper(f"with {encoding}", list(drive), settings)
     epoch = mapper.publish()
-    rng = np.random.default_rng(0)
-    field = score_street(epoch.query, street_probes(drive, rng))
+    field = score_street(epoch.query, street_probes(drive, np.random.default_rng(0)))
     scoring = ScoreSettings(samples_max=_SAMPLES_MAX)
     visible = drive.true_hits(_REFERENCE_M)
     surface = surface_mesh(epoch.record(), None, _CELL_M)
-    mesh = score_against_scene(surface, drive.scene, visible, scoring, rng)
+    mesh = score_against_scene(surface, drive.scene, visible, scoring)
     return [
         Figure(f"{encoding}: parameters", epoch.parameters / 1e6, "M"),
         Figure(f"{encoding}: training samples", mapper.samples_trained / 1e6, "M"),

@@ -7,7 +7,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
 from triquad_format.mapfile.mapfile import MapFileInfo, read_map, write_map
 from triquad_format.records.region import MapRecord
 from triquad_server.epochs.epoch import Epoch
@@ -82,7 +81,7 @@ def _f_score(record: MapRecord, made: BenchStreet) -> float:
     scene = made.drive.scene
     mesh = surface_mesh(record, scene.bounds, Settings().mesh.cell_m)
     scoring = ScoreSettings(samples_max=_MESH_SAMPLES)
-    scores = score_against_scene(mesh, scene, made.visible, scoring, np.random.default_rng(0))
+    scores = score_against_scene(mesh, scene, made.visible, scoring)
     return 100 * scores.f_score
 
 

@@ -1,13 +1,11 @@
 """``triquad-bench`` of the mesh: fetched, followed while one more scan comes, and joined later."""
 
-import tempfile
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
-from triquad_client import Client, MeshWatch, connect
+from triquad_client import Client, MeshWatch
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.mesher import TileIndex
@@ -16,16 +14,15 @@ from triquad_server.mesh.tile_lattice import tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings, Settings
 
 from triquad_tools.benchmarks.figures import Figure, seconds
+from triquad_tools.benchmarks.served import served
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
 from triquad_tools.benchmarks.tile_changes import changed_tiles
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.demo.probe import ask_until
-from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
 from triquad_tools.mapfiles.meshfile import Mesh
 from triquad_tools.simulation.lidar import SimulatedScan
 
-_MAP = "bench"
 _SETTLE_LIMIT_S = 600.0
 _FETCH_LIMIT_S = 300.0
 _ASKED = 1_000
@@ -40,27 +37,19 @@ def measure_mesh(made: BenchStreet) -> list[Figure]:
 
 
 def _network(made: BenchStreet) -> list[Figure]:
-    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
-        folder = Path(name)
-        options = ServerOptions(free_endpoint(), _MAP, folder / "store", folder / "server.log")
-        with (
-            DemoServer(options) as server,
-            connect(server.endpoint, _MAP, timeout_s=60.0) as client,
-            connect(server.endpoint, _MAP, timeout_s=60.0) as other,
-        ):
-            _teach(client, made.scans)
-            figures = _fetched(client)
-            with client.watch_mesh() as early:
-                early.catch_up(_FETCH_LIMIT_S)
-                figures += _sizes(early)
-                figures += _followed(client, early, _one_more(made))
-                with other.watch_mesh() as late:
-                    late.catch_up(_FETCH_LIMIT_S)
-                    figures.append(
-                        Figure("tiles that a late joiner holds otherwise", _differ(early, late), "",
-                               at_most=0)
-                    )  # fmt: skip
-            figures += _levels(client, other, made)
+    with served() as server, server.another_client() as other:
+        client = server.client
+        _teach(client, made.scans)
+        figures = _fetched(client)
+        with client.watch_mesh() as early:
+            early.catch_up(_FETCH_LIMIT_S)
+            figures += _sizes(early)
+            figures += _followed(client, early, _one_more(made))
+            with other.watch_mesh() as late:
+                late.catch_up(_FETCH_LIMIT_S)
+                different = _differ(early, late)
+        figures.append(Figure("tiles that a late joiner has otherwise", different, "", at_most=0))
+        figures += _levels(client, other, made)
     return figures
 
 

@@ -3,16 +3,14 @@
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 import numpy as np
 import zenoh
-from triquad_client import Client, connect
+from numpy.typing import NDArray
 from triquad_format.mapfile.mapfile import read_map
 from triquad_format.wire import keys
 from triquad_server.mapping.mapper import Mapper
@@ -20,12 +18,13 @@ from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.answers import REACH_M, measure_answers
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import BenchStreet, stream
+from triquad_tools.benchmarks.served import MAP, Served, served, stream
+from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.settling import wait_until_settled
-from triquad_tools.demo.probe import Probe, ProbeReport
-from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
+from triquad_tools.demo.probe import ProbeReport
 
-_MAP = "bench"
+Points = NDArray[np.float64]
+
 _ASKED = 1_000
 _CLIENTS = 16
 _SETTLE_LIMIT_S = 600.0
@@ -42,58 +41,39 @@ with triquad_client.connect(sys.argv[1], sys.argv[2], timeout_s=60.0) as client:
 
 def measure_planners(made: BenchStreet) -> list[Figure]:
     """Figures of answers, and of how soon they come."""
-    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
-        folder = Path(name)
-        options = ServerOptions(free_endpoint(), _MAP, folder / "store", folder / "server.log")
-        with (
-            DemoServer(options) as server,
-            connect(server.endpoint, _MAP, timeout_s=60.0) as client,
-        ):
-            drive = _Drive(client, made)
-            points = _planner_points(made, folder)
-            figures = _one(drive, server.endpoint, points)
-            figures += _sixteen(drive, server.endpoint, points)
-            figures += _beside_frozen(client, server.endpoint, points)
-            wait_until_settled(client, _SETTLE_LIMIT_S)
-            client.download_map(folder / "map.triquad")
-        record = read_map(folder / "map.triquad")
-        view = Mapper(_MAP, Settings(), "cpu", record).publish()
-        return measure_answers(made, record, view) + figures
+    with served() as server:
+        points = _planner_points(made)
+        figures = _one(server, made, points[0])
+        figures += _sixteen(server, made, points)
+        figures += _beside_frozen(server, points[0])
+        wait_until_settled(server.client, _SETTLE_LIMIT_S)
+        server.client.download_map(server.folder / "map.triquad")
+        record = read_map(server.folder / "map.triquad")
+    view = Mapper(MAP, Settings(), "cpu", record).publish()
+    return measure_answers(made, record, view) + figures
 
 
-class _Drive:
-    """The drive, streamed at the lidar's rate, again and again."""
-
-    def __init__(self, client: Client, made: BenchStreet) -> None:
-        self._client = client
-        self._made = made
-
-    def stream(self, name: str) -> float:
-        """Stream all scans; returns how many samples were trained each second meanwhile."""
-        before = self._client.status().samples_trained
-        started = time.monotonic()
-        stream(self._client, self._made.scans, name)
-        trained = self._client.status().samples_trained - before
-        return trained / (time.monotonic() - started)
-
-
-def _planner_points(made: BenchStreet, folder: Path) -> list[Path]:
-    """Files of what each planner asks: points around one place of the drive each."""
+def _planner_points(made: BenchStreet) -> list[Points]:
+    """What each planner asks: points around one place of the drive each."""
     rng = np.random.default_rng(0)
-    paths = []
-    for number in range(_CLIENTS):
-        pose = made.drive.poses[number * len(made.drive.poses) // _CLIENTS]
-        points = pose[:3, 3] + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (_ASKED, 3))
-        paths.append(folder / f"points-{number}.npy")
-        np.save(paths[-1], points)
-    return paths
+    poses = made.drive.poses[np.arange(_CLIENTS) * len(made.drive.poses) // _CLIENTS]
+    return [pose[:3, 3] + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (_ASKED, 3)) for pose in poses]
 
 
-def _one(drive: _Drive, endpoint: str, points: Sequence[Path]) -> list[Figure]:
-    drive.stream("streaming alone at first")
-    with Probe(endpoint, _MAP, points[0], "distance") as probe:
+def _trained_per_s(server: Served, made: BenchStreet, title: str) -> float:
+    """Stream all scans; returns how many samples were trained each second meanwhile."""
+    before = server.client.status().samples_trained
+    started = time.monotonic()
+    stream(server.client, made.scans, title)
+    trained = server.client.status().samples_trained - before
+    return trained / (time.monotonic() - started)
+
+
+def _one(server: Served, made: BenchStreet, points: Points) -> list[Figure]:
+    stream(server.client, made.scans, "streaming alone at first")
+    with server.planner(points, "distance") as probe:
         time.sleep(_WARM_S)
-        drive.stream("streaming beside one planner")
+        stream(server.client, made.scans, "streaming beside one planner")
         met = probe.finish()
     name = f"{_ASKED} distances to {REACH_M:g} m with gradient while streaming"
     return [
@@ -104,22 +84,19 @@ def _one(drive: _Drive, endpoint: str, points: Sequence[Path]) -> list[Figure]:
     ]
 
 
-def _sixteen(drive: _Drive, endpoint: str, points: Sequence[Path]) -> list[Figure]:
-    alone = drive.stream("streaming alone")
+def _sixteen(server: Served, made: BenchStreet, points: Sequence[Points]) -> list[Figure]:
+    alone = _trained_per_s(server, made, "streaming alone")
     figures = [Figure("samples trained while streaming alone", alone / 1e6, "M/s")]
     for question in ("gradient", "distance"):
         with ExitStack() as probes:
-            asking = [
-                probes.enter_context(Probe(endpoint, _MAP, path, question)) for path in points
-            ]
+            asking = [probes.enter_context(server.planner(each, question)) for each in points]
             time.sleep(2 * _WARM_S)
-            trained = drive.stream(f"streaming beside {_CLIENTS} planners ({question})")
+            title = f"streaming beside {_CLIENTS} planners ({question})"
+            trained = _trained_per_s(server, made, title)
             met = [probe.finish() for probe in asking]
-        figures += _met_together(f"{_CLIENTS} clients, {question}", met)
-        figures.append(
-            Figure(f"{_CLIENTS} clients, {question}: training keeps", trained / alone, "",
-                   at_least=0.5)
-        )  # fmt: skip
+        name = f"{_CLIENTS} clients, {question}"
+        figures += _met_together(name, met)
+        figures.append(Figure(f"{name}: training keeps", trained / alone, "", at_least=0.5))
     return figures
 
 
@@ -134,19 +111,16 @@ def _met_together(name: str, met: Sequence[ProbeReport]) -> list[Figure]:
     ]  # fmt: skip
 
 
-def _beside_frozen(client: Client, endpoint: str, points: Sequence[Path]) -> list[Figure]:
+def _beside_frozen(server: Served, points: Points) -> list[Figure]:
     """What a client that freezes in the middle of a mesh does to the others."""
-    wait_until_settled(client, _SETTLE_LIMIT_S)
+    wait_until_settled(server.client, _SETTLE_LIMIT_S)
 
     def ask() -> tuple[ProbeReport, int]:
-        with (
-            Probe(endpoint, _MAP, points[0], "distance") as probe,
-            _samples(endpoint) as count,
-        ):
+        with server.planner(points, "distance") as probe, _samples(server.endpoint) as count:
             time.sleep(15.0)
             return probe.finish(), count()
 
-    with _mesh_reader(endpoint) as reader:
+    with _mesh_reader(server.endpoint) as reader:
         beside, samples = ask()
         reader.send_signal(signal.SIGSTOP)
         frozen, frozen_samples = ask()
@@ -164,7 +138,7 @@ def _beside_frozen(client: Client, endpoint: str, points: Sequence[Path]) -> lis
 @contextmanager
 def _mesh_reader(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
     """A process that fetches meshes all the time."""
-    command = [sys.executable, "-c", _FROZEN, endpoint, _MAP]
+    command = [sys.executable, "-c", _FROZEN, endpoint, MAP]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -192,7 +166,7 @@ def _samples(endpoint: str) -> Iterator[Callable[[], int]]:
 
     with zenoh.open(config) as session:
         subscriber = session.declare_subscriber(
-            keys.status_key(_MAP), zenoh.handlers.Callback(take, indirect=False)
+            keys.status_key(MAP), zenoh.handlers.Callback(take, indirect=False)
         )
         yield lambda: received
         subscriber.undeclare()

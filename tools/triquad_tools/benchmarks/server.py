@@ -1,15 +1,12 @@
 """``triquad-bench`` through the network: a server process, a lidar at 10 Hz and a planner."""
 
 import statistics
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_client import Client, connect
+from triquad_client import Client
 from triquad_format.mapfile.mapfile import read_map
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
@@ -17,16 +14,14 @@ from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.core import seen_points
 from triquad_tools.benchmarks.figures import Figure, seconds
-from triquad_tools.benchmarks.street import BenchStreet, stream
+from triquad_tools.benchmarks.served import served, stream_beside_planner
+from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, wait_until_settled
-from triquad_tools.demo.probe import Probe, ProbeReport
-from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
+from triquad_tools.demo.probe import ProbeReport
 from triquad_tools.evaluation.map_scores import StreetScores, score_street
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
 from triquad_tools.mapfiles.meshfile import Mesh
 
-_MAP = "bench"
-_ASKED = 1_000
 _SOON_S = 2.0  # after the last scan
 _SETTLE_LIMIT_S = 300.0
 _MESH_SAMPLES = 6_000_000
@@ -35,12 +30,9 @@ _REPEATS = 15
 
 def measure_server(made: BenchStreet) -> list[Figure]:
     """Figures of a whole server: what a robot would meet."""
-    with (
-        tempfile.TemporaryDirectory(prefix="triquad-bench-") as folder,
-        _server(Path(folder)) as endpoint,
-        connect(endpoint, _MAP, timeout_s=60.0) as client,
-    ):
-        met = _stream(client, endpoint, made, Path(folder))
+    with served() as server:
+        client = server.client
+        met = stream_beside_planner(server, made)
         time.sleep(_SOON_S)
         figures = _latency(met) + _early(client, made)
         started = time.monotonic()
@@ -48,27 +40,10 @@ def measure_server(made: BenchStreet) -> list[Figure]:
         settled_s = time.monotonic() - started
         figures.append(Figure("from then until settled", settled_s, "s", at_most=300))
         figures += _converged(client, made)
-        figures += _network(client, made, Path(folder))
+        figures += _network(client, made, server.folder)
         resident = client.status().memory_bytes / 1e6
     figures.append(Figure("resident memory of the server", resident, "MB", at_most=600))
     return figures
-
-
-@contextmanager
-def _server(folder: Path) -> Iterator[str]:
-    options = ServerOptions(free_endpoint(), _MAP, folder / "store", folder / "server.log")
-    with DemoServer(options) as server:
-        yield server.endpoint
-
-
-def _stream(client: Client, endpoint: str, made: BenchStreet, folder: Path) -> ProbeReport:
-    """Publish the scans as a lidar does, while another process asks."""
-    rng = np.random.default_rng(0)
-    asked = folder / "points.npy"
-    np.save(asked, rng.permutation(made.probes.near)[:_ASKED])
-    with Probe(endpoint, _MAP, asked, question="gradient") as probe:
-        stream(client, made.scans)
-        return probe.finish()
 
 
 def _latency(met: ProbeReport) -> list[Figure]:
@@ -145,6 +120,5 @@ def _mesh_scores(
     vertices: NDArray[np.float64], faces: NDArray[np.int32], made: BenchStreet
 ) -> MeshScores:
     settings = ScoreSettings(samples_max=_MESH_SAMPLES)
-    rng = np.random.default_rng(0)
     mesh = Mesh(vertices, faces)
-    return score_against_scene(mesh, made.drive.scene, made.visible, settings, rng)
+    return score_against_scene(mesh, made.drive.scene, made.visible, settings)

@@ -1,13 +1,11 @@
-"""The drive that everything in ``triquad-bench`` is measured on, learnt and streamed."""
+"""The drive that everything in ``triquad-bench`` is measured on."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_client import Client
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
@@ -18,7 +16,6 @@ from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
 SCANS = 100
-RATE_HZ = 10.0
 _LENGTH_M = 110.0  # so that the map has some 2 million parameters
 _COLUMNS = 1024  # some 60,000 points a scan
 _VISIBLE_VOXEL_M = 0.05
@@ -69,20 +66,3 @@ def settled_mapper(
             mapper.train()
         report(len(scans) + 1, "settled")
     return mapper
-
-
-def stream(
-    client: Client,
-    scans: Sequence[PosedScan],
-    title: str = "streaming at 10 Hz",
-    published: Callable[[int], None] = lambda _: None,
-) -> None:
-    """Publish scans as a lidar does; ``published`` is told the number of each."""
-    started, stamp_s = time.monotonic(), time.time()
-    with progress(title, len(scans)) as report:
-        for number, scan in enumerate(scans):
-            due_s = number / RATE_HZ
-            time.sleep(max(0.0, started + due_s - time.monotonic()))
-            client.publish_scan(scan.points, scan.world_from_sensor, stamp_s + due_s)
-            published(number)
-            report(number + 1, f"{number + 1} of {len(scans)} scans")

@@ -14,7 +14,7 @@ from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, 
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo import steps
 from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
-from triquad_tools.demo.server import DemoServer, ServerOptions, free_endpoint
+from triquad_tools.demo.server import DemoServer, ServerOptions
 
 _COMMAND = "triquad-demo"
 
@@ -49,7 +49,7 @@ def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
         ToolError, TriquadError, FormatError, OSError: a step failed; the server is stopped.
     """
     laps = _Laps()
-    server_options = ServerOptions(free_endpoint(), steps.MAP, out / "store", out / "server.log")
+    server_options = ServerOptions.within(out, steps.MAP)
     _prepare(out)
     street = steps.simulate(scans, street_seed)
     laps.end("simulate")

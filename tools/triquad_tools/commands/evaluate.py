@@ -68,13 +68,12 @@ def evaluate_mesh(options: argparse.Namespace) -> Results:
         completion_cut_m=options.completion_cut,
         voxel_m=options.voxel,
     )
-    rng = np.random.default_rng(_SEED)
     if options.street is None:
         reference = _reference(options.reference, settings.voxel_m, options.range_min)
-        return {"mesh": score_against_cloud(mesh, reference, settings, rng)}
+        return {"mesh": score_against_cloud(mesh, reference, settings)}
     drive = street_drive(options.street, options.scans, options.step)
     visible = drive.true_hits(settings.voxel_m)
-    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings, rng)}
+    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings)}
 
 
 def evaluate_map(options: argparse.Namespace) -> Results:
@@ -84,8 +83,7 @@ def evaluate_map(options: argparse.Namespace) -> Results:
 
 def _on_street(options: argparse.Namespace) -> Results:
     drive = street_drive(options.street, options.scans, options.step)
-    rng = np.random.default_rng(_SEED)
-    probes = street_probes(drive, rng)
+    probes = street_probes(drive, np.random.default_rng(_SEED))
     with open_map(options.target, options.map) as opened:
         results: Results = {"street": score_street(opened.query_sdf, probes)}
         if isinstance(opened, Client):  # a file has no mesh
@@ -94,7 +92,7 @@ def _on_street(options: argparse.Namespace) -> Results:
             visible = drive.true_hits(_STREET_VOXEL_M)
             settings = ScoreSettings(samples_max=_SERVER_SAMPLES_MAX)
             mesh = Mesh(found.vertices, found.faces)
-            results["mesh"] = score_against_scene(mesh, drive.scene, visible, settings, rng)
+            results["mesh"] = score_against_scene(mesh, drive.scene, visible, settings)
     return results
 
 

@@ -28,8 +28,13 @@ class ServerOptions:
     store: Path
     log: Path  # its log is added to this file
 
+    @classmethod
+    def within(cls, folder: Path, map_name: str) -> "ServerOptions":
+        """On a free port, with store and log in a folder."""
+        return cls(_free_endpoint(), map_name, folder / "store", folder / "server.log")
 
-def free_endpoint() -> str:
+
+def _free_endpoint() -> str:
     """An endpoint on a port of the loopback that nothing uses."""
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))

@@ -125,7 +125,7 @@ def score(endpoint: str, street: DrivenStreet) -> Scored:
         settings = ScoreSettings(samples_max=_MESH_SAMPLES)
         visible = street.drive.true_hits(_VISIBLE_VOXEL_M)
         mesh = meshfile.Mesh(surface.vertices, surface.faces)
-        scores = score_against_scene(mesh, scene, visible, settings, rng)
+        scores = score_against_scene(mesh, scene, visible, settings)
         report(0.0, f"{scores.samples:,} samples of the mesh")
     return Scored(field, scores, surface, parameters, checkpoint, points, answers)
 

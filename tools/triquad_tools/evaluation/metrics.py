@@ -26,6 +26,7 @@ class ScoreSettings:
     completion_cut_m: float = 2.0  # greater distances count as this
     voxel_m: float = 0.02  # samples and truth are thinned to this
     samples_max: int = 10_000_000  # drawn from the mesh before thinning
+    seed: int = 0  # of these samples: scores can be repeated
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class MeshScores:
 
 
 def score_against_cloud(
-    mesh: Mesh, reference: NDArray[np.float64], settings: ScoreSettings, rng: np.random.Generator
+    mesh: Mesh, reference: NDArray[np.float64], settings: ScoreSettings
 ) -> MeshScores:
     """Scores of a mesh against a cloud ``[M, 3]`` of true surface points, metres, same frame.
 
@@ -52,7 +53,7 @@ def score_against_cloud(
     mesh as better than about 1.5 cm.
     """
     reference = _thinned_reference(reference, settings)
-    samples = _samples(mesh, reference, settings, rng)
+    samples = _samples(mesh, reference, settings)
     cut = settings.accuracy_cut_m
     distances = _tree(reference).query(samples, distance_upper_bound=cut, workers=-1)[0]
     return _scores(distances, samples, reference, settings)
@@ -63,7 +64,6 @@ def score_against_scene(
     scene: Scene,
     visible: NDArray[np.float64],
     settings: ScoreSettings,
-    rng: np.random.Generator,
 ) -> MeshScores:
     """Scores of a mesh against an exact scene.
 
@@ -73,10 +73,9 @@ def score_against_scene(
         visible: ``[M, 3]`` exact surface points that the sensor has seen, which completion
             asks for (see :meth:`triquad_tools.simulation.lidar.SimulatedDrive.true_hits`).
         settings: thresholds.
-        rng: draws the samples.
     """
     visible = _thinned_reference(visible, settings)
-    samples = _samples(mesh, visible, settings, rng)
+    samples = _samples(mesh, visible, settings)
     return _scores(np.abs(scene.sdf(samples)), samples, visible, settings)
 
 
@@ -122,7 +121,6 @@ def _samples(
     mesh: Mesh,
     reference: NDArray[np.float64],
     settings: ScoreSettings,
-    rng: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Thinned samples of the mesh in the truth's bounding box.
 
@@ -134,7 +132,7 @@ def _samples(
     count = min(wanted, settings.samples_max)
     if count == 0:
         return np.empty((0, 3))
-    samples = sample_mesh(mesh, count, rng)
+    samples = sample_mesh(mesh, count, np.random.default_rng(settings.seed))
     low = reference.min(axis=0) - settings.accuracy_cut_m
     high = reference.max(axis=0) + settings.accuracy_cut_m
     samples = samples[np.all((samples >= low) & (samples <= high), axis=1)]

@@ -153,11 +153,20 @@ def _blocks_near_surface(record: MapRecord, box: Box | None, cell_m: float) -> N
     reach = record.settings.leaf_m / 2 + BAND_CELLS * cell_m
     first = np.floor(np.ceil((middles - reach) / cell_m) / BLOCK_CELLS).astype(np.int64)
     last = np.floor(np.floor((middles + reach) / cell_m) / BLOCK_CELLS).astype(np.int64)
-    blocks = [np.zeros((0, 3), np.int64)]
-    for offset in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
-        block = first + offset
-        blocks.append(np.unique(block[(block <= last).all(axis=1)], axis=0))
-    return np.unique(np.concatenate(blocks), axis=0)
+    return np.unique(cells_of_boxes(first, last)[0], axis=0)
+
+
+def cells_of_boxes(
+    first: NDArray[np.int64], last: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """All cells [C, 3] from ``first`` to ``last`` [N, 3] of each box, and the boxes' rows [C]."""
+    cells, rows = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.intp)]
+    for step in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
+        cell = first + step
+        inside = np.flatnonzero((cell <= last).all(axis=1))
+        cells.append(cell[inside])
+        rows.append(inside)
+    return np.concatenate(cells), np.concatenate(rows)
 
 
 def _too_many(what: str, count: float, remedies: str) -> ToolError:

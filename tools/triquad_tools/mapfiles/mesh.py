@@ -17,7 +17,7 @@ from triquad_map.view import MapView
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.mapfiles.grid import open_record
+from triquad_tools.mapfiles.grid import cells_of_boxes, open_record
 from triquad_tools.mapfiles.meshfile import Mesh
 from triquad_tools.mapfiles.seen_space import surface_voxels
 from triquad_tools.mapfiles.source import Box
@@ -85,16 +85,11 @@ def _voxels(
 def _blocks(voxels: _Voxels) -> Iterator[tuple[Cells, _Voxels]]:
     """The blocks of cells [3] that voxels reach into, each with these voxels."""
     first, last = voxels.first // _BLOCK_CELLS, voxels.last // _BLOCK_CELLS
-    blocks, rows = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.intp)]
-    for step in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
-        block = first + step
-        reached = np.flatnonzero((block <= last).all(axis=1))
-        blocks.append(block[reached])
-        rows.append(reached)
-    each, numbers = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)
+    blocks, rows = cells_of_boxes(first, last)
+    each, numbers = np.unique(blocks, axis=0, return_inverse=True)
     order = np.argsort(numbers.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(numbers.reshape(-1), minlength=len(each)))
-    groups = np.split(np.concatenate(rows)[order], ends)
+    groups = np.split(rows[order], ends)
     return ((block, voxels[group]) for block, group in zip(each, groups, strict=False))
 
 
