@@ -9,7 +9,7 @@ from triquad_server.mesh.mesher import TileIndex
 
 from triquad_tools.mapfiles.meshfile import Mesh
 
-_CANDIDATES = 8  # triangles that are looked at for each point: those of the nearest centroids
+_CANDIDATES = 8  # triangles that are tried for each point: those of the nearest centroids
 
 
 def changed_tiles(

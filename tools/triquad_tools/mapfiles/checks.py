@@ -68,7 +68,7 @@ def _field(record: MapRecord) -> str:
     if not centres:
         return ""
     points = np.concatenate(centres)
-    with np.errstate(all="ignore"):  # an overflow is what is looked for
+    with np.errstate(all="ignore"):  # an overflow is what this checks for
         answer = MapEvaluator(record).query(points)
     if not np.isfinite(answer.sdf).all():
         first = points[int(np.argmin(np.isfinite(answer.sdf)))]

@@ -136,8 +136,8 @@ def _region_facts(region: RegionSummary) -> Iterator[Row]:
         shares = ", ".join(f"{i}: {n / voxels:.0%}" for i, n in enumerate(region.surface_levels))
         yield Row("", f"surface by level of support: {shares}")
     if region.samples is not None:
-        owed = f"{region.visits_owed:,} visits owed"
-        yield Row("training", f"{region.samples:,} samples, {owed}")
+        left = f"{region.visits_owed:,} training visits still to be made"
+        yield Row("training", f"{region.samples:,} samples, {left}")
 
 
 def _evidence(summary: MapSummary | RegionSummary) -> str:
