@@ -9,8 +9,7 @@ from support.small_world import settings, settled_mapper, world
 from triquad_format.mapfile.writer import write_map
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.inspect import main
-from triquad_tools.mapfiles.map_diff import compare, difference
-from triquad_tools.mapfiles.surface_points import surface_points
+from triquad_tools.mapfiles.diff import compare, difference, surface_points
 
 GROUND = exact_map(flat(0.1))
 RAISED = exact_map(table(0.1, 0.15))  # by 5 cm, in a square of 4 m
@@ -111,7 +110,7 @@ def test_table(files, capsys):
     assert lines[:2] == [
         f"{letter}  {path}: map 'ground', epoch 1" for letter, path in zip("AB", files, strict=True)
     ]
-    assert lines[2].split()[:3] == ["x", "m", "y"]
+    assert lines[2].split()[:3] == ["from", "x", "m"]
     assert len(lines) == 7
     assert lines[5].startswith("  all")
     assert "more: --limit" in lines[6]

@@ -13,7 +13,7 @@ from triquad_format.records.crop import crop_record
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.field_change import draw_probes, field_change
-from triquad_tools.mapfiles.map_packing import INTEGER_ERROR_M
+from triquad_tools.mapfiles.packing import INTEGER_ERROR_M
 from triquad_tools.mapfiles.quantise import dequantised, quantise
 from triquad_tools.mapfiles.region_probes import RegionProbes
 

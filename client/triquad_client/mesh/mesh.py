@@ -25,7 +25,7 @@ class Mesh:
 
     vertices: NDArray[np.float64]  # [V, 3] metres
     faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
-    epoch: int  # number of the published state of the map that it shows
+    epoch: int = 0  # number of the published state of the map that it shows; 0: of none
 
     def save(self, path: str | Path) -> None:
         """Write the mesh to a file: ``.ply``, or ``.glb``, ``.obj`` or ``.stl`` with trimesh.

@@ -7,7 +7,7 @@ from typing import Any
 from triquad_format.errors import RefusedError
 from triquad_format.records.region import MapRecord
 from triquad_map.questions.answers import Answers, QuestionLimits
-from triquad_map.reference.recorded_map import RecordedMap
+from triquad_map.record_view import is_compiled, record_view
 from triquad_map.view import MapView
 
 from triquad_client.net.call import Batch
@@ -18,19 +18,16 @@ _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
 
 
 class LocalDriver(BlockingDriver):
-    """Runs calls over the map in a record, as fast as this installation can; for several threads.
-
-    The only place where the client meets compiled code.
-    """
+    """Runs calls over the map in a record, as fast as possible here; for several threads."""
 
     def __init__(self, record: MapRecord) -> None:
-        self._view = _view_of(record)
+        self._view = record_view(record)
         self._answers = Answers(self._epoch, _NO_LIMITS)
 
     @property
     def compiled(self) -> bool:
         """Whether compiled code answers, as in a server; else numpy, which is far slower."""
-        return not isinstance(self._view, RecordedMap)
+        return is_compiled(self._view)
 
     async def _replies(self, batch: Batch) -> list[Any]:
         return [self._answers.answer(batch.request(item).message) for item in batch.items]
@@ -43,11 +40,3 @@ class LocalDriver(BlockingDriver):
                 "epoch_gone", f"epoch {number} is not kept; kept is [{self._view.number}]"
             )
         yield self._view
-
-
-def _view_of(record: MapRecord) -> MapView:
-    try:
-        from triquad_map.compiled.recorded_view import recorded_view
-    except ImportError:  # no numba, or one that does not go with this numpy
-        return RecordedMap(record)
-    return recorded_view(record)

@@ -1,6 +1,7 @@
-"""Pictures of meshes: shaded in software, with a sun, its shadows and a soft sky."""
+"""Pictures of meshes: shaded in software, with a sun, its shadows and a soft sky.
 
-from pathlib import Path
+Own code, as the libraries that do this want a display, a GPU driver or hundreds of megabytes.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,13 +73,6 @@ def height_colours(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
     place = (vertices[:, 2] - low) / max(float(high - low), 1e-6)
     stops = np.linspace(0.0, 1.0, len(_HEIGHT_STOPS))
     return np.stack([np.interp(place, stops, channel) for channel in _HEIGHT_STOPS.T], axis=1)
-
-
-def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture ``[H, W, 3]`` as a PNG file."""
-    from PIL import Image
-
-    Image.fromarray(picture).save(path, optimize=True)
 
 
 def _shade(
