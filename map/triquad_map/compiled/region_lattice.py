@@ -7,18 +7,18 @@ nearest; in its core, away from the overlap with others, it is the only one that
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import RegionIndex
 
-from triquad_map.compiled.voxel_index import CELL_LIMIT, Index, VoxelIndex, find_row, pack
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, Index, VoxelIndex, find_row, pack
 
 _NOBODY = -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _find_owners(
     points: NDArray[np.float64],
     pitch_m: float,
@@ -40,7 +40,7 @@ def _find_owners(
         shared[i] = off > core_m
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _sorted_by(
     regions: NDArray[np.int32], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

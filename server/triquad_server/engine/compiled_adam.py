@@ -3,11 +3,11 @@
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
 from triquad_map.compiled.field.field import Touched
+from triquad_map.compiled.kernel import kernel
 
 from triquad_server.engine.adam import EPSILON, Betas
 
@@ -54,7 +54,7 @@ def _corrections(betas: Betas) -> tuple[Floats, Floats]:
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
+@kernel(fastmath=True, error_model="numpy", inline="always")
 def step_row(row: int, gradients: Floats, moments: Moments, rates: Rates) -> None:
     """One step of a row along its gradient, which is cleared."""
     moments.steps[row] += 1
@@ -71,7 +71,7 @@ def step_row(row: int, gradients: Floats, moments: Moments, rates: Rates) -> Non
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def step_touched(
     part: int,
     count: int,

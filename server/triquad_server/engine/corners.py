@@ -8,7 +8,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.field import morton
 from triquad_map.compiled.field.quadtree import PLANE_BITS, TriQuadtree
-from triquad_map.compiled.voxel_index import MULTIPLIER, longest_probe
+from triquad_map.compiled.sparse.voxel_index import MULTIPLIER, longest_probe
 
 
 @dataclass(frozen=True)

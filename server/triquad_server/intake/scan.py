@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
-from triquad_map.compiled.voxel_index import Keys, empty_keys, enter
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_index import Keys, empty_keys, enter
 
 from triquad_server.settings import ScanSettings
 
@@ -66,7 +66,7 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
         )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _select(
     points: NDArray[np.float32],
     range_min_m: float,

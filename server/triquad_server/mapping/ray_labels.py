@@ -8,9 +8,9 @@ the distance to its plane, so it changes by the cosine of the angle of incidence
 A table of segments [N, COLUMNS] is float32, metres, relative to the region's centre.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_map.compiled.kernel import kernel
 
 from triquad_server.intake.scan import Rays
 from triquad_server.settings import ScanSettings
@@ -26,7 +26,7 @@ COLUMNS = 10
 _MIN_COSINE = 0.05
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _fill(
     origin: NDArray[np.float64],
     ends: NDArray[np.float64],

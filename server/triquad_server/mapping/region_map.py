@@ -16,7 +16,7 @@ from triquad_format.records.region import (
 )
 from triquad_map.compiled.evidence.evidence import Evidence
 from triquad_map.compiled.evidence.observations import Sighting
-from triquad_map.compiled.voxel_index import thin
+from triquad_map.compiled.sparse.voxel_index import thin
 
 from triquad_server.engine.adam import Betas
 from triquad_server.engine.engine import GradientSums, Loss, make_engine

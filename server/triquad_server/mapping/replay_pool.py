@@ -6,13 +6,13 @@ candidates, so that places seen long ago keep theirs and places seen for long do
 
 import math
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_map.compiled.field.feature_rows import prefetch_row
-from triquad_map.compiled.rows import with_room
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.rows import with_room
 
 from triquad_server.mapping.ray_labels import COLUMNS, END
 from triquad_server.mapping.sampling import Batch, Placement, draw_ordered_samples, draw_samples
@@ -26,7 +26,7 @@ Ints = NDArray[np.int32]
 Places = NDArray[np.int64]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _bin(segment: Floats) -> int:
     mixed: int = np.int64(0)
     for axis, prime in enumerate((73856093, 19349663, 83492791)):
@@ -34,7 +34,7 @@ def _bin(segment: Floats) -> int:
     return mixed & (_BINS - 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _crowded(
     size: int, count: int, first: int, stride: int, offset: int, bins: Ints, crowd: Ints
 ) -> Places:
@@ -51,7 +51,7 @@ def _crowded(
     return chosen
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _put(new: Floats, places: Places, used: int, segments: Floats, bins: Ints, crowd: Ints) -> None:
     """Put new segments into places; those below ``used`` hold one that is pushed out."""
     for i in range(len(places)):

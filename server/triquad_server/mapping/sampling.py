@@ -6,13 +6,13 @@ Every draw makes new ones: a segment that is trained on again teaches other poin
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.morton import encode
+from triquad_map.compiled.kernel import kernel
 
 from triquad_server.mapping.ray_labels import DIRECTION, END, FREE_FROM, FREE_TO, LABEL, SLOPE
 from triquad_server.threads import MAPPING
@@ -58,7 +58,7 @@ def draw_samples(segments: Tensor, placement: Placement, generator: torch.Genera
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _draw(
     segments: Floats,
     chosen: NDArray[np.int64],
@@ -90,7 +90,7 @@ def _draw(
         cells[i] = encode(u, v)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _in_order(samples: Floats, cells: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Points [B, 3] and labels [B] in the order of their cells (a counting sort)."""
     starts = np.zeros((2 * _CELLS) ** 2 + 1, np.int32)

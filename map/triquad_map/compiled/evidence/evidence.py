@@ -8,7 +8,6 @@ All coordinates here are voxel coordinates of the region (see :mod:`triquad_form
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
@@ -19,8 +18,9 @@ from triquad_format.records.status import Status
 
 from triquad_map.compiled.evidence.observations import Observations, Sighting
 from triquad_map.compiled.evidence.unknown_search import SeenSpace, find_unknown
-from triquad_map.compiled.rows import with_room
-from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, make_row, pack
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.rows import with_room
+from triquad_map.compiled.sparse.voxel_index import Index, VoxelIndex, find_row, make_row, pack
 
 Masks = NDArray[np.uint8]
 
@@ -32,7 +32,7 @@ _FREE = np.uint8(Status.FREE)
 _UNKNOWN = np.uint8(Status.UNKNOWN)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _mark(
     voxels: NDArray[np.float64],
     start: int,
@@ -66,7 +66,7 @@ def _mark(
     return len(voxels), count, found
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _crossing(origin: float, direction: float) -> tuple[int, float, float]:
     """Which way a ray steps on an axis, how far apart its crossings are, and how far the first."""
     if direction == 0:
@@ -77,7 +77,7 @@ def _crossing(origin: float, direction: float) -> tuple[int, float, float]:
     return -1, -1 / direction, -fraction / direction
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _inside(origin: float, direction: float, side: int) -> tuple[float, float]:
     """How far along a ray it enters and leaves the region on an axis."""
     if direction == 0:
@@ -86,7 +86,7 @@ def _inside(origin: float, direction: float, side: int) -> tuple[float, float]:
     return min(a, b), max(a, b)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _carve(
     origin: NDArray[np.float64],
     ends: NDArray[np.float64],
@@ -154,7 +154,7 @@ def _carve(
     return len(ends), count
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _block_of(index: Index, x: int, y: int, z: int, side: int) -> int:
     """Row of the block that holds a voxel, -1 where there is none."""
     if min(x, y, z) < 0 or max(x, y, z) >= side:
@@ -162,7 +162,7 @@ def _block_of(index: Index, x: int, y: int, z: int, side: int) -> int:
     return find_row(index, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _bit(masks: Masks, row: int, x: int, y: int, z: int) -> int:
     """Whether the bit of a voxel is set in the block ``row``: 0 or 1."""
     byte = masks[row, ((x & _LOW) << _SHIFT) | (y & _LOW)]
@@ -170,7 +170,7 @@ def _bit(masks: Masks, row: int, x: int, y: int, z: int) -> int:
     return bit
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _status(
     voxels: NDArray[np.float64],
     reach: float,
@@ -210,7 +210,7 @@ def _status(
             status[i] = _FREE
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _ended_in(
     voxels: NDArray[np.int64], side: int, index: Index, surface: Masks, ended: NDArray[np.bool_]
 ) -> None:

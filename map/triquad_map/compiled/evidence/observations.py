@@ -2,14 +2,14 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.rows import with_room
-from triquad_map.compiled.voxel_index import Index, find_row, pack
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.rows import with_room
+from triquad_map.compiled.sparse.voxel_index import Index, find_row, pack
 from triquad_map.surface.confidence import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
 
 _SHIFT = BLOCK_VOXELS.bit_length() - 1
@@ -38,7 +38,7 @@ class Sighting(NamedTuple):
     stamp_s: int  # seconds since 1970
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _sector(x: float, y: float) -> int:
     """Which eighth of the horizon a direction lies in."""
     eighth = 0 if y >= 0 else 4
@@ -47,7 +47,7 @@ def _sector(x: float, y: float) -> int:
     return eighth + (1 if abs(y) > abs(x) else 0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _note(
     voxels: NDArray[np.float64],
     start: int,
@@ -84,7 +84,7 @@ def _note(
     return len(voxels), count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _levels(surface: Masks, observed: Observed, levels: Masks) -> None:
     at = 0
     for row in range(len(surface)):
@@ -108,7 +108,7 @@ def _levels(surface: Masks, observed: Observed, levels: Masks) -> None:
                 at += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _restore(surface: Masks, levels: Masks, observed: Observed) -> None:
     """Give the voxels of ``surface`` the least strength of their levels, seen from one sector."""
     at = 0

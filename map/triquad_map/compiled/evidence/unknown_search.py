@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.voxel_index import CELL_LIMIT, Index, find_row, pack
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, Index, find_row, pack
 
 _SHIFT = BLOCK_VOXELS.bit_length() - 1
 _SIDE = float(BLOCK_VOXELS)
@@ -29,20 +29,20 @@ class SeenSpace(NamedTuple):
     free: Masks  # [blocks, BLOCK_BYTES]
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _nearest(x: float, low: float, side: float) -> float:
     """The place in ``[low, low + side]`` that is nearest to ``x``."""
     return min(max(x, low), low + side)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _square_gap(x: float, low: float, side: float) -> float:
     """Square of how far ``x`` lies outside of ``[low, low + side]``."""
     gap = x - _nearest(x, low, side)
     return gap * gap
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _take(at: Place, low: Place, side: float, square: float, state: Doubles) -> None:
     """Note an unknown cube as the nearest so far."""
     state[_SQUARE] = square
@@ -51,7 +51,7 @@ def _take(at: Place, low: Place, side: float, square: float, state: Doubles) -> 
     state[_Z] = _nearest(at[2], low[2], side)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _search_block(
     row: int,
     corner: Place,
@@ -77,7 +77,7 @@ def _search_block(
                     _take(at, (x, y, z), 1.0, square, state)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _search(at: Place, seen: SeenSpace, cells: tuple[int, int], state: Doubles) -> None:
     """Look at the blocks around a point, shell by shell."""
     home_x = int(np.floor(at[0])) >> _SHIFT
@@ -108,7 +108,7 @@ def _search(at: Place, seen: SeenSpace, cells: tuple[int, int], state: Doubles) 
         shell += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def find_unknown(
     points: Doubles,
     seen: SeenSpace,

@@ -10,7 +10,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import RegionIndex, leaf_coordinates, owned_blocks
 
 from triquad_map.compiled.evidence.evidence import Evidence
-from triquad_map.compiled.voxel_index import CELL_LIMIT
+from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT
 from triquad_map.nearest import NearestUnknown
 
 

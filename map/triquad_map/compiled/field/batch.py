@@ -6,9 +6,10 @@ of vector instructions; and a tile is small enough to stay in the cache nearest 
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from triquad_map.compiled.kernel import kernel
 
 TILE = 64
 """Points of a tile."""
@@ -40,7 +41,7 @@ class Tile(NamedTuple):
     gradient: Floats  # [3, T] of the logits with respect to the points, per metre
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def new_tile(levels: int, size: int, inputs: int, hidden: int) -> Tile:
     """Room for a tile: ``levels`` of features of length ``size``, an MLP's inputs and width."""
     return Tile(
@@ -65,7 +66,7 @@ def new_tile(levels: int, size: int, inputs: int, hidden: int) -> Tile:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def load(tile: Tile, points: Floats, first: int) -> int:
     """Take up points [N, 3] from ``first`` on; returns how many, the last fills up the rest."""
     count: int = min(TILE, len(points) - first)

@@ -7,7 +7,6 @@ Fourier phases are counted in turns, not radians, which makes their reduction ex
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import AXES
@@ -15,7 +14,8 @@ from triquad_format.records.region import AXES
 from triquad_map.compiled.field.batch import TILE, Tile
 from triquad_map.compiled.field.feature_rows import add_rows, add_to_row, prefetch_row
 from triquad_map.compiled.field.quadtree import Shape, Vertices, block_key
-from triquad_map.compiled.voxel_index import EMPTY, find_row
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_index import EMPTY, find_row
 
 Floats = NDArray[np.float32]
 
@@ -33,7 +33,7 @@ class Geometry(NamedTuple):
     shape: Shape  # of the trees
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def locate(tile: Tile, geometry: Geometry, vertices: Vertices, features: Floats) -> None:
     """The cells around the tile's points, and the rows of their vertices."""
     for plane in range(3):
@@ -52,7 +52,7 @@ def locate(tile: Tile, geometry: Geometry, vertices: Vertices, features: Floats)
                     prefetch_row(features, row)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _find_blocks(tile: Tile, plane: int, geometry: Geometry, vertices: Vertices) -> None:
     first, second = _AXES[plane, 0], _AXES[plane, 1]
     scale = np.float32(1 << (geometry.levels - 1))
@@ -73,7 +73,7 @@ def _find_blocks(tile: Tile, plane: int, geometry: Geometry, vertices: Vertices)
         prefetch_row(vertices.rows, number)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _find_cells(tile: Tile, plane: int, geometry: Geometry) -> None:
     for h in range(geometry.levels):
         at = plane * geometry.levels + h
@@ -88,7 +88,7 @@ def _find_cells(tile: Tile, plane: int, geometry: Geometry) -> None:
             tile.corners[at, t] = start + cell_u * side + cell_v
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _weights(tile: Tile, at: int, t: int) -> tuple[float, float, float, float]:
     """Bilinear weights of the 4 vertices, in the order of their rows."""
     a, b = tile.across[at, t], tile.along[at, t]
@@ -96,7 +96,7 @@ def _weights(tile: Tile, at: int, t: int) -> tuple[float, float, float, float]:
     return np.float32(1) - a - b + both, a - both, b - both, both
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def interpolate(tile: Tile, levels: int, features: Floats) -> None:
     """The first inputs of the MLP: features summed over the planes, level by level."""
     size = features.shape[1]
@@ -122,7 +122,7 @@ def interpolate(tile: Tile, levels: int, features: Floats) -> None:
             tile.x[k, t] = tile.features[t, k]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def add_feature_gradient(
     tile: Tile,
     count: int,
@@ -142,7 +142,7 @@ def add_feature_gradient(
             add_to_row(sums, tile.rows[t, 4 * at + 3], weights[3], tile.features, t, start)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def add_feature_slopes(tile: Tile, geometry: Geometry, features: Floats) -> None:
     """Add what the features contribute to the gradient with respect to the points."""
     levels = geometry.levels
@@ -166,7 +166,7 @@ def add_feature_slopes(tile: Tile, geometry: Geometry, features: Floats) -> None
             tile.gradient[_AXES[plane, 1], t] += along * per_m
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _turn_over(tile: Tile, count: int) -> None:
     """The gradient of the first ``count`` inputs, point by point, into ``tile.features``."""
     for k in range(count):
@@ -174,7 +174,7 @@ def _turn_over(tile: Tile, count: int) -> None:
             tile.features[t, k] = tile.gx[k, t]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _cosine(turns: float) -> float:
     """Cosine of an angle in turns; a polynomial, which compiles to vector instructions."""
     t = turns - np.floor(turns + np.float32(0.5))
@@ -190,7 +190,7 @@ def _cosine(turns: float) -> float:
     return cosine
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def wave(tile: Tile, first: int, turns_per_m: Floats) -> None:
     """Fourier features, from input ``first`` on: sines of all axes, then cosines."""
     m = len(turns_per_m)
@@ -203,7 +203,7 @@ def wave(tile: Tile, first: int, turns_per_m: Floats) -> None:
                 tile.x[sine, t] = _cosine(turns - np.float32(0.25))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def add_wave_slopes(tile: Tile, first: int, turns_per_m: Floats) -> None:
     """Add what the Fourier features contribute to the gradient with respect to the points."""
     m = len(turns_per_m)

@@ -8,12 +8,13 @@ spelt out here; rows of another length are loops.
 from collections.abc import Callable
 from typing import Any, cast
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from triquad_map.compiled.kernel import kernel
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -176,7 +177,7 @@ def _move_row_of_8(
     return types.void(*arrays, row, blends, scales, epsilon), generate
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def add_rows(
     out: Floats,
     point: int,
@@ -194,7 +195,7 @@ def add_rows(
                 out[point, start + k] += weights[corner] * table[rows[corner], k]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def add_to_row(
     table: Floats, row: int, weight: float, values: Floats, point: int, start: int
 ) -> None:
@@ -206,7 +207,7 @@ def add_to_row(
             table[row, k] += weight * values[point, start + k]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
+@kernel(fastmath=True, error_model="numpy", inline="always")
 def move_row(
     gradients: Floats,
     values: Floats,

@@ -7,7 +7,6 @@ runs on one thread and holds no Python lock; callers split the work. Arrays are 
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +22,7 @@ from triquad_map.compiled.field.encoding import (
 )
 from triquad_map.compiled.field.mlp import Mlp, add_weight_gradient, backward, forward, turned
 from triquad_map.compiled.field.quadtree import Vertices
+from triquad_map.compiled.kernel import kernel
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -45,13 +45,13 @@ class Touched(NamedTuple):
     rows: Ints  # [rows] those touched in this step, in the order in which they were
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _tile_for(field: CompiledField) -> Tile:
     inputs, hidden = field.mlp.w1.shape
     return new_tile(field.geometry.levels, field.features.shape[1], inputs, hidden)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _forward(tile: Tile, field: CompiledField) -> None:
     levels = field.geometry.levels
     if levels > 0:
@@ -61,7 +61,7 @@ def _forward(tile: Tile, field: CompiledField) -> None:
     forward(tile, field.mlp)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def evaluate(points: Floats, field: CompiledField, logits: Floats, gradients: Floats) -> None:
     """Fill ``logits`` [N] and, where not empty, ``gradients`` [N, 3] (per metre)."""
     learnt = field.geometry.levels * field.features.shape[1]
@@ -85,7 +85,7 @@ def evaluate(points: Floats, field: CompiledField, logits: Floats, gradients: Fl
                 gradients[first + t, axis] = tile.gradient[axis, t]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _note_touched(tile: Tile, count: int, touched: Touched, step: int, known: int) -> int:
     """Add the rows of the first ``count`` points to the ``known`` ones; returns how many now."""
     for t in range(count):
@@ -98,7 +98,7 @@ def _note_touched(tile: Tile, count: int, touched: Touched, step: int, known: in
     return known
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _cross_entropy(tile: Tile, targets: Floats, share: float) -> float:
     """Sets the slopes of the tile's logits; returns the sum of the losses."""
     loss = 0.0
@@ -112,7 +112,7 @@ def _cross_entropy(tile: Tile, targets: Floats, share: float) -> float:
     return loss
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def accumulate(
     points: Floats,
     targets: Floats,

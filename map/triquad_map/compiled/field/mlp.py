@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from triquad_map.compiled.field.batch import TILE, Tile
+from triquad_map.compiled.kernel import kernel
 
 Floats = NDArray[np.float32]
 
@@ -24,7 +24,7 @@ class Mlp(NamedTuple):
     b3: Floats  # [1]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
     """``out += weights.T @ x`` for weights [K, J], x [K, T], out [J, T]."""
     inputs, outputs = weights.shape
@@ -53,7 +53,7 @@ def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
         k += 1
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
     """``sums += x @ g.T`` for x [K, T], g [J, T], sums [K, J]."""
     inputs, outputs = sums.shape
@@ -84,7 +84,7 @@ def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
             sums[k, j] += _dot(x[k], g[j])
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _dot(a: Floats, b: Floats) -> float:
     total: float = _ZERO
     for t in range(TILE):
@@ -92,7 +92,7 @@ def _dot(a: Floats, b: Floats) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _add_row_sums(g: Floats, sums: Floats) -> None:
     """``sums += g.sum(1)`` for g [J, T]."""
     for j in range(len(g)):
@@ -102,7 +102,7 @@ def _add_row_sums(g: Floats, sums: Floats) -> None:
         sums[j] += total
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
     for j in range(len(biases)):
         for t in range(TILE):
@@ -113,7 +113,7 @@ def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
             out[j, t] = max(out[j, t], _ZERO)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def forward(tile: Tile, mlp: Mlp) -> None:
     """Both hidden layers and the logits of the tile's inputs."""
     _layer(mlp.w1, mlp.b1, tile.x, tile.h1)
@@ -125,7 +125,7 @@ def forward(tile: Tile, mlp: Mlp) -> None:
             tile.logits[t] += mlp.w3[j] * tile.h2[j, t]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def turned(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
     """The first two layers' weights as :func:`backward` needs them.
 
@@ -134,7 +134,7 @@ def turned(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
     return np.ascontiguousarray(mlp.w1[:inputs].T), np.ascontiguousarray(mlp.w2.T)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def backward(tile: Tile, mlp: Mlp, w1_turned: Floats, w2_turned: Floats) -> None:
     """Gradients of the hidden layers and of the inputs, from ``tile.slopes``."""
     for j in range(len(mlp.w3)):
@@ -150,7 +150,7 @@ def backward(tile: Tile, mlp: Mlp, w1_turned: Floats, w2_turned: Floats) -> None
     _add_product(w1_turned, tile.g1, gx)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def add_weight_gradient(tile: Tile, sums: Mlp) -> None:
     """Add the gradient of the weights, after :func:`backward`; points of no slope add nothing."""
     _add_outer_product(tile.x, tile.g1, sums.w1)

@@ -9,7 +9,6 @@ all blocks that it touches.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
@@ -17,8 +16,9 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 
 from triquad_map.compiled.field.morton import encode
-from triquad_map.compiled.rows import with_room
-from triquad_map.compiled.voxel_index import Index, VoxelIndex, make_row
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.rows import with_room
+from triquad_map.compiled.sparse.voxel_index import Index, VoxelIndex, make_row
 
 _AXES = np.array(AXES)
 PLANE_BITS = 40
@@ -50,14 +50,14 @@ class Shape(NamedTuple):
     starts: Codes  # [H] first vertex of each level within a block
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def block_key(plane: int, u: int, v: int) -> int:
     """Key of the block ``(u, v)`` on a plane."""
     key: int = encode(u, v) | (plane << PLANE_BITS)
     return key
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _enter(
     shape: Shape,
     vertices: Vertices,
@@ -83,7 +83,7 @@ def _enter(
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _grow(
     shape: Shape,
     vertices: Vertices,
@@ -113,7 +113,7 @@ def _grow(
     return len(leaves), blocks, rows
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _restore(
     shape: Shape,
     vertices: Vertices,

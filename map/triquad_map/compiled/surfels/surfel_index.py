@@ -8,14 +8,14 @@ nothing.
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
 from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.voxel_index import Index, VoxelIndex
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_index import Index, VoxelIndex
 from triquad_map.surface.surfels import SurfelKind, Surfels
 
 _SHIFT = BLOCK_VOXELS.bit_length() - 1
@@ -89,7 +89,7 @@ def surfel_starts(surface: Masks) -> Ints:
     return np.concatenate([[0], np.cumsum(surface_counts(surface))]).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def surfel_voxels(cells: NDArray[np.int64], surface: Masks, count: int) -> NDArray[np.int64]:
     """The voxels [count, 3] of surfels, given the blocks' ``cells`` [blocks, 3]."""
     voxels = np.empty((count, 3), np.int64)
@@ -106,7 +106,7 @@ def surfel_voxels(cells: NDArray[np.int64], surface: Masks, count: int) -> NDArr
     return voxels
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def moved_rows(
     before: Masks, before_starts: NDArray[np.int32], now: Masks, count: int
 ) -> NDArray[np.int32]:
@@ -131,7 +131,7 @@ def moved_rows(
     return rows
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _block_boxes(cells: NDArray[np.int64], surface: Masks, rows: NDArray[np.int64]) -> Ints:
     """The boxes [M, 6] around the seen surface of some blocks."""
     boxes = np.empty((len(rows), 6), np.int32)

@@ -8,13 +8,13 @@ uses them: to pass them on, or to reach into tuples for them, takes longer than 
 import itertools
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import BLOCK_VOXELS
 
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, find_row, pack, unpack
 from triquad_map.compiled.surfels.surfel_index import GROUP_SHIFT, GROUP_VOXELS, SurfelIndex
-from triquad_map.compiled.voxel_index import CELL_LIMIT, find_row, pack, unpack
 from triquad_map.nearest import NearestSurfels
 from triquad_map.surface.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
 
@@ -54,7 +54,7 @@ class Search(NamedTuple):
     away: Floats  # [blocks of a group] and for those of blocks
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _wider(square: float, by: float) -> float:
     """Square of a distance that is larger ``by`` so much."""
     reach = np.sqrt(square) + np.float32(by)
@@ -62,7 +62,7 @@ def _wider(square: float, by: float) -> float:
     return wider
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _sifted(search: Search, limit: float) -> int:
     """Keep the candidates that are nearer than the root of ``limit``; how many they are."""
     candidates, nearness = search.candidates, search.nearness
@@ -75,7 +75,7 @@ def _sifted(search: Search, limit: float) -> int:
     return count
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) -> None:
     """Look at the surfels of a block. All is relative to its corner, in single precision."""
     row, boxes = index.groups.members[member], index.groups.member_boxes
@@ -124,7 +124,7 @@ def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) ->
     search.best[0], search.found[_COUNT] = best, noted
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _search_group(index: SurfelIndex, group: int, at: Place, search: Search) -> None:
     """Look at the blocks of a group, the nearest first."""
     first, last = index.groups.starts[group], index.groups.starts[group + 1]
@@ -150,7 +150,7 @@ def _search_group(index: SurfelIndex, group: int, at: Place, search: Search) -> 
             limit = _wider(search.best[0], SMOOTHING + OUTSIDE)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _reaches(index: SurfelIndex, group: int, at: Place, search: Search) -> bool:
     """Whether a group may hold a surfel that counts."""
     boxes = index.groups.boxes
@@ -160,7 +160,7 @@ def _reaches(index: SurfelIndex, group: int, at: Place, search: Search) -> bool:
     return bool(a * a + b * b + c * c <= _wider(search.best[0], SMOOTHING + OUTSIDE))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _search(index: SurfelIndex, at: Place, search: Search) -> None:
     """Look at the groups around a point, then at all others."""
     places = index.groups.places
@@ -182,7 +182,7 @@ def _search(index: SurfelIndex, at: Place, search: Search) -> None:
             _search_group(index, group, at, search)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _foot(index: SurfelIndex, surfel: int, member: int, at: Place) -> Place:
     """The point of a surfel that is nearest to a place."""
     boxes = index.groups.member_boxes
@@ -199,7 +199,7 @@ def _foot(index: SurfelIndex, surfel: int, member: int, at: Place) -> Place:
     return qx + share * a, qy + share * b, qz + share * c
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _note_found(
     index: SurfelIndex, at: Place, search: Search, i: int, nearest: NearestSurfels
 ) -> None:
@@ -223,7 +223,7 @@ def _note_found(
     nearest.means[i, 2] = z / total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def find_nearest(points: Doubles, index: SurfelIndex, nearest: NearestSurfels) -> None:
     """Improve ``nearest`` where a surfel of the region lies nearer to ``points`` [N, 3].
 

@@ -5,9 +5,10 @@ Everything that is sparse in space is kept in rows that such an index finds.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from triquad_map.compiled.kernel import kernel
 
 EMPTY = np.int64(-1)
 MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed number
@@ -37,13 +38,13 @@ def _new_index(capacity: int) -> Index:
     return Index(keys, np.zeros(len(keys), np.int32), np.zeros(capacity, np.int64))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def pack(x: int, y: int, z: int) -> int:
     """Key of a cell."""
     return int(((x + CELL_LIMIT) << 42) | ((y + CELL_LIMIT) << 21) | (z + CELL_LIMIT))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def unpack(key: int) -> tuple[int, int, int]:
     """The cell of a key."""
     low = (1 << 21) - 1
@@ -54,7 +55,7 @@ def unpack(key: int) -> tuple[int, int, int]:
     )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def find_slot(keys: Keys, key: int) -> int:
     """Slot that holds ``key``, or the empty slot where it belongs."""
     mask = len(keys) - 1
@@ -64,14 +65,14 @@ def find_slot(keys: Keys, key: int) -> int:
     return slot
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def find_row(index: Index, key: int) -> int:
     """Row of ``key``, -1 where it has none."""
     slot = find_slot(index.keys, key)
     return -1 if index.keys[slot] == EMPTY else int(index.rows[slot])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def make_row(index: Index, count: int, key: int) -> int:
     """Row of ``key``; a new one is row ``count``, or -1 where there is no more room."""
     slot = find_slot(index.keys, key)
@@ -84,7 +85,7 @@ def make_row(index: Index, count: int, key: int) -> int:
     return int(index.rows[slot])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _reindex(index: Index, count: int) -> None:
     for row in range(count):
         slot = find_slot(index.keys, index.row_keys[row])
@@ -92,7 +93,7 @@ def _reindex(index: Index, count: int) -> None:
         index.rows[slot] = row
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def longest_probe(index: Index) -> int:
     """Slots that the look-up of any key in the index may have to read."""
     mask = len(index.keys) - 1
@@ -104,7 +105,7 @@ def longest_probe(index: Index) -> int:
     return longest
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _cells(keys: Keys) -> NDArray[np.int64]:
     cells = np.empty((len(keys), 3), np.int64)
     for i in range(len(keys)):
@@ -158,7 +159,7 @@ class VoxelIndex:
         _reindex(self.arrays, self.count)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def enter(keys: Keys, x: float, y: float, z: float, cell_m: float) -> bool:
     """Put the cell of a point into a set; False where it is there already."""
     key = pack(int(np.floor(x / cell_m)), int(np.floor(y / cell_m)), int(np.floor(z / cell_m)))
@@ -169,7 +170,7 @@ def enter(keys: Keys, x: float, y: float, z: float, cell_m: float) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Keys) -> NDArray[np.bool_]:
     chosen = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
