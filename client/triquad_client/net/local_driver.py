@@ -43,8 +43,8 @@ class LocalDriver:
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:
         """The view, where its epoch is asked for, or the newest."""
-        if number not in (0, self._view.number):
+        if number not in (0, self._view.epoch):
             raise QuestionError(
-                "epoch_gone", f"epoch {number} is not kept; kept is [{self._view.number}]"
+                "epoch_gone", f"epoch {number} is not kept; kept is [{self._view.epoch}]"
             )
         yield self._view

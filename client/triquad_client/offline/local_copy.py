@@ -24,7 +24,7 @@ from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError
 from triquad_client.net.call import Call, ResultT, Run, retried, worked
 from triquad_client.net.local_driver import LocalDriver
-from triquad_client.offline.view import view_of
+from triquad_client.offline.view import OpenView, open_view
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ class _State:
     """What a copy is, as a whole: threads see one or the next."""
 
     sha256: str  # of the file on the server that it was made from
-    driver: LocalDriver
+    opened: OpenView
+    driver: LocalDriver  # over it
     epoch: int
     checked_s: float  # of the monotonic clock, when the server had nothing newer
     report: SyncReport  # of the last update
@@ -119,8 +120,11 @@ class LocalCopy:
                 raise DownloadError(str(error)) from error
             received = len(parts.wanted) - parts.kept
             report = SyncReport(info.epoch, remote.bytes_read, received, parts.kept)
-            driver = LocalDriver(view_of(record))
-            self._state = _State(info.sha256, driver, info.epoch, asked_s, report)
+            opened = open_view(record)
+            driver = LocalDriver(opened.view)
+            self._state = _State(info.sha256, opened, driver, info.epoch, asked_s, report)
+            if known is not None:
+                known.opened.close()
             return report
 
 

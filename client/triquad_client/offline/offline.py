@@ -10,7 +10,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_client.errors import ClosedError
 from triquad_client.net.call import Call, ResultT
 from triquad_client.net.local_driver import LocalDriver
-from triquad_client.offline.view import is_compiled, view_of
+from triquad_client.offline.view import open_view
 
 
 class OfflineMap(MapQueries):
@@ -22,14 +22,14 @@ class OfflineMap(MapQueries):
 
     def __init__(self, file: MapFile) -> None:
         """Use :func:`open_map`."""
-        view = view_of(file.record)
+        self._open = open_view(file.record)
         super().__init__(self._answer)
-        self._driver: LocalDriver | None = LocalDriver(view)
+        self._driver: LocalDriver | None = LocalDriver(self._open.view)
         self.name = file.record.name
         self.epoch = file.record.epoch
         self.stamp_ns = 0 if file.manifest is None else file.manifest.stamp_ns
         """When its epoch was written, nanoseconds since 1970; 0: the file does not tell."""
-        self.compiled = is_compiled(view)
+        self.compiled = self._open.compiled
         """Whether compiled code answers, as in the server; else numpy, which is far slower."""
 
     def __enter__(self) -> "OfflineMap":
@@ -46,6 +46,7 @@ class OfflineMap(MapQueries):
     def close(self) -> None:
         """Let go of the map; later queries raise :class:`ClosedError`."""
         self._driver = None
+        self._open.close()
 
     def _answer(self, call: Call[ResultT]) -> ResultT:
         driver = self._driver

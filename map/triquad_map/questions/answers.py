@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
@@ -89,7 +89,7 @@ class Answers:
         points = _points("point", request.origin, request.points, self._limits.points)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
-            return SdfReply(view.number, answer.sdf, answer.status, answer.gradient)
+            return SdfReply(view.epoch, answer.sdf, answer.status, answer.gradient)
 
     def distance(self, request: DistanceRequest) -> DistanceReply:
         """Distances to the nearest surface."""
@@ -213,9 +213,7 @@ class Answers:
             answer.points,
         )
 
-    def _searched(
-        self, what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
+    def _searched(self, what: str, origin: Doubles, offsets: Floats) -> Doubles:
         return _points(what, origin, offsets, self._limits.searches)
 
     def _check_count(self, count: float, what: str) -> None:
@@ -237,9 +235,7 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
 }
 
 
-def _points(
-    what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32], most: int
-) -> NDArray[np.float64]:
+def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
     """Points [N, 3] of the map frame.
 
     Raises:
@@ -264,7 +260,7 @@ def _within(name: str, value: float, most: float, least: float = 1e-6) -> float:
     return float(value)
 
 
-def _short(what: str, lengths: NDArray[np.float64]) -> None:
+def _short(what: str, lengths: Doubles) -> None:
     """Refuse ways [N] that are too long: each of their steps waits for the one before."""
     if lengths.max(initial=0.0) > MAX_RANGE_M:
         worst = int(lengths.argmax())
@@ -274,12 +270,10 @@ def _short(what: str, lengths: NDArray[np.float64]) -> None:
         )
 
 
-def _same_length(first: NDArray[np.float32], name: str, second: NDArray[np.float32]) -> None:
+def _same_length(first: Floats, name: str, second: Floats) -> None:
     if len(first) != len(second):
         raise QuestionError("bad_request", f"{len(second)} {name} for {len(first)} points")
 
 
-def _relative(
-    points: NDArray[np.float64] | None, origin: NDArray[np.float64]
-) -> NDArray[np.float32] | None:
+def _relative(points: Doubles | None, origin: Doubles) -> Floats | None:
     return None if points is None else (points - origin).astype(np.float32)

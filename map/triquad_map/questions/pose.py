@@ -3,13 +3,13 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 
 RIGID_TOLERANCE = 1e-3
 """By how much an element of R R^T may be off."""
 
 
-def is_rigid(pose: NDArray[np.float64]) -> bool:
+def is_rigid(pose: Doubles) -> bool:
     """Whether a matrix [4, 4] is a rotation and a translation, and finite."""
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         return False
@@ -19,7 +19,7 @@ def is_rigid(pose: NDArray[np.float64]) -> bool:
     return bool(proper and (pose[3] == (0, 0, 0, 1)).all())
 
 
-def orthonormal(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def orthonormal(pose: Doubles) -> Doubles:
     """A rigid pose as a new array, its rotation without the tolerance.
 
     Raises:
@@ -33,22 +33,20 @@ def orthonormal(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return exact
 
 
-def moved(
-    pose: NDArray[np.float64], translation: NDArray[np.float64], rotation: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def moved(pose: Doubles, translation: Doubles, rotation: Doubles) -> Doubles:
     """A pose moved [3], and turned about itself by a rotation vector [3], both in the map frame."""
-    result: NDArray[np.float64] = pose.copy()
+    result: Doubles = pose.copy()
     result[:3, :3] = _rotation(rotation) @ pose[:3, :3]
     result[:3, 3] += translation
     return result
 
 
-def _rotation(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotation(vector: Doubles) -> Doubles:
     """The rotation [3, 3] about a vector [3] by its length (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     first = float(np.sinc(angle / math.pi))
     second = 0.5 * float(np.sinc(angle / (2 * math.pi))) ** 2
-    rotation: NDArray[np.float64] = np.eye(3) + first * cross + second * (cross @ cross)
+    rotation: Doubles = np.eye(3) + first * cross + second * (cross @ cross)
     return rotation

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_map.questions.distance import DistanceOptions, distances
@@ -35,15 +35,15 @@ class Rays:
     largest range, through space that was seen to be free (or, where asked for, unknown).
     """
 
-    range: NDArray[np.float32]  # [N]
-    status: NDArray[np.uint8]  # [N] Status
+    range: Floats  # [N]
+    status: Bytes  # [N] Status
     epoch: int
 
 
 def rays(
     view: MapView,
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
+    origins: Doubles,
+    directions: Doubles,
     options: RayOptions,
 ) -> Rays:
     """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach."""
@@ -53,15 +53,15 @@ def rays(
     status[hit] = Status.SURFACE
     if not options.through_unknown:
         _stop_at_unknown(view, origins, directions, ranges, status)
-    return Rays(ranges.astype(np.float32), status, view.number)
+    return Rays(ranges.astype(np.float32), status, view.epoch)
 
 
 def _trace(
     view: MapView,
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-) -> NDArray[np.bool_]:
+    origins: Doubles,
+    directions: Doubles,
+    ranges: Doubles,
+) -> Bools:
     """Shorten ``ranges`` [N] to the first surface (Hart 1996); whether each ray meets one."""
     hit = np.zeros(len(origins), np.bool_)
     at = np.zeros(len(origins))
@@ -87,10 +87,10 @@ def _trace(
 
 def _stop_at_unknown(
     view: MapView,
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    status: NDArray[np.uint8],
+    origins: Doubles,
+    directions: Doubles,
+    ranges: Doubles,
+    status: Bytes,
 ) -> None:
     """Shorten the rays that enter unknown space."""
     step_m = STEP_VOXELS * view.voxel_m

@@ -5,12 +5,12 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from triquad_map.compiled.blended_field import FieldEngine, FieldValues
-from triquad_map.compiled.compiled_engine import field_values, make_field
 from triquad_map.compiled.field import field as compiled_field
 from triquad_map.compiled.field.field import CompiledField, Touched
+from triquad_map.compiled.field.frozen_field import field_values, make_field
 from triquad_map.compiled.field.mlp import Mlp
 from triquad_map.compiled.team import THREADS, share
+from triquad_map.composition.region import FieldEngine, FieldValues
 
 from triquad_server.engine.adam import Betas, Parameter
 from triquad_server.engine.compiled_adam import Moments, Rates, rates, step_row, step_touched

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.quadtree import TriQuadtree
+from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
 
 from triquad_server.engine.adam import Betas, Parameter
 from triquad_server.engine.corners import CornerIndex, Corners
@@ -30,7 +30,8 @@ class Field:
         self.settings = settings
         self._generator = torch.Generator(device).manual_seed(seed)
         self.device = device
-        self.tree = TriQuadtree(settings)
+        self._growing = LiveQuadtree(settings)
+        self.tree: LiveQuadtree | FrozenQuadtree = self._growing
         self._corners: CornerIndex | None = None
         self.features = Parameter(torch.zeros((1, settings.feature_size), device=device))
         self.frequencies = self._normal(settings.frequencies) * math.sqrt(
@@ -56,7 +57,7 @@ class Field:
         """
         if not self._has_features:
             return
-        added = self.tree.grow(leaves)
+        added = self._growing.grow(leaves)
         self._corners = None
         size = (added, self.settings.feature_size)
         self.features.append(self._normal(*size) * self.settings.feature_std)
@@ -106,7 +107,7 @@ class Field:
 
     def restore(self, plane: int, h: int, codes: NDArray[np.int64], features: Tensor) -> None:
         """Add the vertices ``codes`` [V] of one level with their ``features`` [V, d]."""
-        self.tree.restore(plane, h, codes)
+        self._growing.restore(plane, h, codes)
         self.features.append(features)
         self._corners = None
 
@@ -115,7 +116,7 @@ class Field:
         twin = Field.__new__(Field)
         twin.settings, twin.device = self.settings, self.device
         twin._generator = self._generator
-        twin.tree = self.tree.copy()
+        twin.tree = self._growing.freeze()
         twin._corners = None
         twin.features = self.features.snapshot()
         twin.frequencies = self.frequencies

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES, Mlp, Region, RegionIndex, TrainingState, VertexTable
-from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
 
 from triquad_server.engine.adam import Parameter
 from triquad_server.engine.field import Field
@@ -34,7 +34,7 @@ class Moments:
 def region_record(
     index: RegionIndex,
     field: Field,
-    evidence: Evidence,
+    evidence: FrozenEvidence,
     training: TrainingState | None,
 ) -> Region:
     """A region as plain arrays that share nothing with ``field`` and ``evidence``."""

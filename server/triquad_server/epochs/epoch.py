@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import BLOCK_VOXELS, MapRecord, RegionIndex, region_centre
-from triquad_map.compiled.compiled_view import CompiledView, RegionView, field_samples
-from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.compiled_view import CompiledView, RegionView
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, SurfelTask, first_surfels
+from triquad_map.composition.field_samples import field_samples
 
 from triquad_server.engine.engine import make_engine
 from triquad_server.engine.field import Field
@@ -42,6 +43,11 @@ class Epoch(CompiledView):
         self.frozen_regions = regions
         self._name = name
         self._mesh = mesh
+
+    @property
+    def number(self) -> int:
+        """Number of this epoch."""
+        return self.epoch
 
     @property
     def regions(self) -> int:
@@ -105,14 +111,14 @@ class Publication:
     index: RegionIndex
     settings: FieldSettings
     field: Field
-    evidence: Evidence
+    evidence: LiveEvidence
     epoch: int
     refitted: int | None  # surfels that are fitted again at most; None: all
 
 
 def frozen_region(new: Publication, before: SurfelMap | None) -> FrozenRegion:
     """A copy of a live region; ``before`` are its surfels of an earlier epoch."""
-    field, evidence = new.field.copy(), new.evidence.copy()
+    field, evidence = new.field.copy(), new.evidence.freeze()
     engine = make_engine(field)
     samples = field_samples(engine, new.settings, MAPPING.split)
     task = SurfelTask(new.epoch, new.refitted)

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Longs
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.voxel_index import Keys, empty_keys, enter
+from triquad_map.compiled.sparse.thinning import enter
+from triquad_map.compiled.sparse.voxel_index import empty_keys
 
 from triquad_server.settings import ScanSettings
 
@@ -72,7 +74,7 @@ def _select(
     range_min_m: float,
     range_max_m: float,
     thin_m: float,
-    keys: Keys,
+    keys: Longs,
 ) -> tuple[NDArray[np.float64], int, int, int]:
     """The points that are used; how many are not finite, too near and too far."""
     kept = np.empty((len(points), 3))

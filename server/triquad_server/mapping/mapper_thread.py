@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Tally
 from triquad_server.epochs.epochs import EpochShelf, ShelfLimits
@@ -132,7 +132,7 @@ class MapperThread:
         return future.result()
 
     def _run(self) -> None:
-        be_patient(PATIENCE)
+        lower_priority(PATIENCE)
         try:
             while not self._stopping.is_set():
                 self._turn()

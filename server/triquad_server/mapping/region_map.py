@@ -14,9 +14,9 @@ from triquad_format.records.region import (
     leaf_coordinates,
     region_centre,
 )
-from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
-from triquad_map.compiled.sparse.voxel_index import thin
+from triquad_map.compiled.sparse.thinning import thin
 
 from triquad_server.engine.adam import Betas
 from triquad_server.engine.engine import GradientSums, Loss, make_engine
@@ -55,7 +55,7 @@ class RegionMap:
         seed = setup.training.seed + hash(index) % 1_000_003
         self.field = Field(setup.field, setup.device, seed)
         self._engine = make_engine(self.field, setup.sums)
-        self.evidence = Evidence(1 << setup.field.depth)
+        self.evidence = LiveEvidence(1 << setup.field.depth)
         placement = Placement(
             setup.scan.surface_share,
             setup.scan.spread_m,
@@ -126,7 +126,7 @@ class RegionMap:
     def record(self, training: bool) -> Region:
         """The region as plain arrays, sharing nothing with this one."""
         state = self._training_state() if training else None
-        return region_record(self.index, self.field, self.evidence, state)
+        return region_record(self.index, self.field, self.evidence.freeze(), state)
 
     @classmethod
     def restore(cls, record: Region, setup: RegionSetup) -> "RegionMap":
@@ -134,7 +134,7 @@ class RegionMap:
         region = cls(record.index, setup)
         region.field = field_from_record(record, setup.field, setup.device, setup.training.seed)
         region._engine = make_engine(region.field, setup.sums)
-        region.evidence = Evidence.restore(1 << setup.field.depth, record.evidence)
+        region.evidence = LiveEvidence.from_record(1 << setup.field.depth, record.evidence)
         if record.training is not None:
             state = record.training
             segments = sample_segments(state.sample_points, state.sample_labels)

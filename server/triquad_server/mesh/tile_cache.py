@@ -204,9 +204,9 @@ class TileShelf:
                 version, revision = old.version, old.revision
             else:
                 self._revision += 1
-                version, revision = view.number, self._revision
+                version, revision = view.epoch, self._revision
             tile = ShelvedTile(
-                index, version, revision, view.number, len(mesh.faces) == 0, digest, mesh.border
+                index, version, revision, view.epoch, len(mesh.faces) == 0, digest, mesh.border
             )
             shelf.tiles[index] = tile
             self._keep((level, index), data)
@@ -229,11 +229,11 @@ class TileShelf:
         for other, border in borders.items():
             near = np.abs(border.values) < lattice.cell_m
             places = (border.points[near] + corner) * lattice.cell_m
-            if len(places) and shelf.tiles[other].made < view.number and other != index:
+            if len(places) and shelf.tiles[other].made < view.epoch and other != index:
                 moved = np.abs(view.distances(places) - border.values[near])
                 if 2 * np.count_nonzero(moved > self._settings.tolerance_m) > len(moved):
                     with self._lock:
-                        shelf.changed[other] = max(shelf.changed[other], view.number)
+                        shelf.changed[other] = max(shelf.changed[other], view.epoch)
                     continue
             yield border
 

@@ -13,7 +13,7 @@ from triquad_format.errors import FormatError
 from triquad_format.wire import draco, keys
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_format.wire.tile_codec import Codec, decode_tile
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.epochs import EpochShelf
 from triquad_server.epochs.gate import QueryGate
@@ -100,7 +100,7 @@ class TileFeed:
         self._stopping = False
         self._next_look = 0.0
         self._senders = ThreadPoolExecutor(
-            _SENDERS, "tile-sender", initializer=be_patient, initargs=(PATIENCE,)
+            _SENDERS, "tile-sender", initializer=lower_priority, initargs=(PATIENCE,)
         )
         self._thread = threading.Thread(target=self._run, name="meshing")
 
@@ -182,7 +182,7 @@ class TileFeed:
             )
 
     def _run(self) -> None:
-        be_patient(PATIENCE)
+        lower_priority(PATIENCE)
         while True:
             with self._news:
                 if not self._held and not self._stopping:

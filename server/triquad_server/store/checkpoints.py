@@ -7,7 +7,7 @@ import time
 from concurrent.futures import Future
 
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import RequestError, StoreBaseError, StoreError
 from triquad_server.mapping.mapper_thread import MapperThread
@@ -70,7 +70,7 @@ class Checkpoints:
             raise RequestError("store", str(error)) from error
 
     def _run(self) -> None:
-        be_patient(2 * PATIENCE)  # mapping comes first, too
+        lower_priority(2 * PATIENCE)  # mapping comes first, too
         due = time.monotonic() + self._period_s
         while not self._stopping.is_set():
             self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)

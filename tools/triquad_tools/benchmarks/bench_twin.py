@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from triquad_client import OfflineMap, open_map
 from triquad_format.mapfile.mapfile import read_map, write_map
 from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.reference.recorded_map import RecordedMap
+from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.epochs.epoch import Epoch
 
 from triquad_tools.benchmarks.bench_core import seen_points
@@ -36,7 +36,7 @@ def measure_twin(made: BenchStreet) -> list[Figure]:
         with open_map(path) as offline:
             first_s = seconds(lambda: offline.query_distance(points[:1]))
             figures = _differences(offline, epoch, points) + _ratios(offline, epoch, points)
-        plain = RecordedMap(read_map(path))
+        plain = MapEvaluator(read_map(path))
     few = points[:1000]
     distances(plain, few[:1], DistanceOptions())
     plain_s = seconds(lambda: distances(plain, few, DistanceOptions()))

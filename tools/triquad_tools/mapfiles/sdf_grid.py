@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import MapRecord
-from triquad_map.reference.evaluator import Answer
+from triquad_map.view import Answer
 
 from triquad_tools.console.errors import ToolError
 from triquad_tools.console.progress import Report

@@ -1,32 +1,21 @@
 """The nearest unknown voxel: no ray ended in it, and none passed through it."""
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, Index, find_row, pack
+from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT
+from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, find_row, pack
 
-_SHIFT = BLOCK_VOXELS.bit_length() - 1
 _SIDE = float(BLOCK_VOXELS)
 _ALL = 0xFF
 
-Masks = NDArray[np.uint8]
-Doubles = NDArray[np.float64]
 Place = tuple[float, float, float]
 
 # What is known of the nearest unknown voxel while it is searched for.
 _SQUARE, _X, _Y, _Z = range(4)
-
-
-class SeenSpace(NamedTuple):
-    """The evidence of a region, as kernels take it."""
-
-    blocks: Index
-    surface: Masks  # [blocks, BLOCK_BYTES]
-    free: Masks  # [blocks, BLOCK_BYTES]
 
 
 @kernel(inline="always")
@@ -44,7 +33,7 @@ def _square_gap(x: float, low: float, side: float) -> float:
 
 @kernel(inline="always")
 def _take(at: Place, low: Place, side: float, square: float, state: Doubles) -> None:
-    """Note an unknown cube as the nearest so far."""
+    """Take an unknown cube as the nearest so far."""
     state[_SQUARE] = square
     state[_X] = _nearest(at[0], low[0], side)
     state[_Y] = _nearest(at[1], low[1], side)
@@ -56,7 +45,7 @@ def _search_block(
     row: int,
     corner: Place,
     at: Place,
-    seen: SeenSpace,
+    seen: SeenVoxels,
     state: Doubles,
 ) -> None:
     """Look at the unknown voxels of a block."""
@@ -64,8 +53,8 @@ def _search_block(
         bits = int(seen.surface[row, byte] | seen.free[row, byte])
         if bits == _ALL:
             continue
-        x = corner[0] + (byte >> _SHIFT)
-        y = corner[1] + (byte & (BLOCK_VOXELS - 1))
+        x = corner[0] + (byte >> SHIFT)
+        y = corner[1] + (byte & LOW)
         column = _square_gap(at[0], x, 1.0) + _square_gap(at[1], y, 1.0)
         if column >= state[_SQUARE]:
             continue
@@ -78,11 +67,11 @@ def _search_block(
 
 
 @kernel()
-def _search(at: Place, seen: SeenSpace, cells: tuple[int, int], state: Doubles) -> None:
+def _search(at: Place, seen: SeenVoxels, cells: tuple[int, int], state: Doubles) -> None:
     """Look at the blocks around a point, shell by shell."""
-    home_x = int(np.floor(at[0])) >> _SHIFT
-    home_y = int(np.floor(at[1])) >> _SHIFT
-    home_z = int(np.floor(at[2])) >> _SHIFT
+    home_x = int(np.floor(at[0])) >> SHIFT
+    home_y = int(np.floor(at[1])) >> SHIFT
+    home_z = int(np.floor(at[2])) >> SHIFT
     shell = 0
     while shell == 0 or ((shell - 1) * _SIDE) ** 2 < state[_SQUARE]:
         for x in range(max(home_x - shell, cells[0]), min(home_x + shell + 1, cells[1])):
@@ -111,7 +100,7 @@ def _search(at: Place, seen: SeenSpace, cells: tuple[int, int], state: Doubles) 
 @kernel()
 def find_unknown(
     points: Doubles,
-    seen: SeenSpace,
+    seen: SeenVoxels,
     cells: tuple[int, int],
     distances: Doubles,
     nearest: Doubles,

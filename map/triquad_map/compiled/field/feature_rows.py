@@ -12,12 +12,9 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Floats
 
 from triquad_map.compiled.kernel import kernel
-
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
 
 # The stub has it as if callers passed the typing context, which they do not.
 _kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., None]]", intrinsic)

@@ -3,48 +3,47 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Region
 
-from triquad_map.compiled.blended_field import FieldValues
 from triquad_map.compiled.field import field as compiled_field
 from triquad_map.compiled.field.encoding import Geometry
 from triquad_map.compiled.field.field import CompiledField
 from triquad_map.compiled.field.mlp import Mlp
-from triquad_map.compiled.field.quadtree import TriQuadtree
+from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
+from triquad_map.composition.region import FieldValues
 
-Floats = NDArray[np.float32]
 
+class FrozenField:
+    """The field of a region that does not change, in compiled code. For any thread."""
 
-class RecordedEngine:
-    """The field of a region as a file holds it; it is not for training."""
-
-    def __init__(self, settings: FieldSettings, region: Region) -> None:
+    def __init__(self, settings: FieldSettings, field: CompiledField) -> None:
         self._settings = settings
-        tree = TriQuadtree(settings)
+        self._field = field
+
+    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
+        """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
+        return field_values(self._field, self._settings, points, gradient)
+
+    @classmethod
+    def from_record(cls, settings: FieldSettings, region: Region) -> "FrozenField":
+        """The field of a region as a file holds it."""
+        tree = LiveQuadtree(settings)
         features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
         for table in region.tables:
             h = table.level - settings.levels.start
             tree.restore(table.plane, h, table.codes.astype(np.int64))
             features.append(table.vectors())
         layers = zip(region.mlp.weights, region.mlp.biases, strict=True)
-        self._field = make_field(
-            settings,
-            tree,
-            np.concatenate(features),
-            [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer],
-            np.asarray(region.frequencies, np.float32),
-        )
-
-    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
-        return field_values(self._field, self._settings, points, gradient)
+        mlp = [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer]
+        frequencies = np.asarray(region.frequencies, np.float32)
+        return cls(settings, make_field(settings, tree, np.concatenate(features), mlp, frequencies))
 
 
 def make_field(
     settings: FieldSettings,
-    tree: TriQuadtree,
+    tree: LiveQuadtree | FrozenQuadtree,
     features: Floats,
     mlp: Sequence[Floats],
     frequencies: Floats,
