@@ -11,7 +11,7 @@ from triquad_format.records.arrays import Bools, Doubles, Floats, Ints
 class NearestSurfels(NamedTuple):
     """The nearest surfels of N points of one region, in leaf coordinates; improved in place."""
 
-    distances: Doubles  # [N] voxels; what lies farther than this is not looked for
+    distances: Doubles  # [N] voxels; what lies farther than this is not searched for
     closest: Doubles  # [N, 3] their points that are nearest
     means: Doubles  # [N, 3] about the same, over all that is nearly as near
     rows: Ints  # [N] number of the surfel, -1 where there is none

@@ -35,7 +35,7 @@ from triquad_format.records.region import (
 from triquad_map.composition.field_view import FieldView
 from triquad_map.reference.evaluator import checked_points, in_chunks
 from triquad_map.reference.partial_region import PartialRegion
-from triquad_map.view import Answer
+from triquad_map.view import FieldAnswer
 
 
 class StoredMap:
@@ -89,7 +89,7 @@ class StoredMap:
         """Close all files."""
         self._index.close()
 
-    def query(self, points: NDArray[np.floating], gradient: bool = False) -> Answer:
+    def query(self, points: NDArray[np.floating], gradient: bool = False) -> FieldAnswer:
         """Distance, status and, on request, gradient: as :class:`MapEvaluator` gives them.
 
         Raises:
@@ -161,7 +161,7 @@ class StoredMap:
         return box.meets(extent(self._settings, key), slack)
 
     def _needed_at(self, points: Doubles) -> set[PartKey]:
-        """Parts that answers at points [N, 3] hang on."""
+        """Parts on which answers at points [N, 3] depend."""
         needed: set[PartKey] = set()
         half = self._settings.region_side_m / 2
         reach = vertex_reach(self._settings) + SLACK_LEAVES

@@ -9,7 +9,7 @@ from triquad_map.nearest import NearestSurface, NearestUnknown
 
 
 @dataclass(frozen=True)
-class Answer:
+class FieldAnswer:
     """What the map says of N points."""
 
     sdf: Floats  # [N] metres, positive in free space; NaN where no region is
@@ -28,14 +28,14 @@ class MapView(Protocol):
     def voxel_m(self) -> float:
         """Side of the voxels in which rays ended."""
 
-    def query(self, points: Doubles, gradient: bool = False) -> Answer:
+    def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
         """The trained field and the status at points."""
 
     def status(self, points: Doubles) -> Bytes:
         """Status values [N] of points."""
 
     def nearest_surface(self, points: Doubles, max_distance_m: float) -> NearestSurface:
-        """The nearest seen surface, looked for as far as ``max_distance_m``."""
+        """The nearest seen surface, searched for as far as ``max_distance_m``."""
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
-        """The nearest unknown space, looked for as far as ``max_distance_m``."""
+        """The nearest unknown space, searched for as far as ``max_distance_m``."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.status import Status
 from triquad_map.nearest import NearestSurface, NearestUnknown
-from triquad_map.view import Answer
+from triquad_map.view import FieldAnswer
 from triquad_tools.simulation.scene import Scene
 
 
@@ -21,11 +21,13 @@ class ExactView:
     epoch: int = 7
     voxel_m: float = 0.2
 
-    def query(self, points: NDArray[np.float64], gradient: bool = False) -> Answer:
+    def query(self, points: NDArray[np.float64], gradient: bool = False) -> FieldAnswer:
         local = self._local(points)
         sdf = self.scene.sdf(local).astype(np.float32)
         slopes = self.scene.gradient(local) @ self.map_from_scene[:3, :3].T
-        return Answer(sdf, self.status(points), slopes.astype(np.float32) if gradient else None)
+        return FieldAnswer(
+            sdf, self.status(points), slopes.astype(np.float32) if gradient else None
+        )
 
     def status(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
         local = self._local(points)

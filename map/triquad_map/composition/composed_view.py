@@ -43,7 +43,7 @@ class ComposedView(FieldView):
         return self._settings.leaf_m
 
     def nearest_surface(self, points: Doubles, max_distance_m: float) -> NearestSurface:
-        """The nearest seen surface to points [N, 3], looked for as far as ``max_distance_m``."""
+        """The nearest seen surface to points [N, 3], searched for as far as ``max_distance_m``."""
         nearest = NearestSurface.none(len(points), max_distance_m)
         # Here, not in the threads of the split: to make surfels may take all of these.
         near = [
@@ -58,7 +58,7 @@ class ComposedView(FieldView):
         return nearest
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
-        """The nearest unknown space to points [N, 3], looked for as far as ``max_distance_m``."""
+        """The nearest unknown space to points [N, 3], searched for as far as ``max_distance_m``."""
         nearest = NearestUnknown(np.full(len(points), max_distance_m), points.copy())
 
         def work(first: int, last: int) -> None:

@@ -12,7 +12,7 @@ from triquad_map.composition.blended_field import BlendedField
 from triquad_map.composition.region import FieldRegion
 from triquad_map.composition.region_lattice import Lattice, Owned, RegionLattice
 from triquad_map.composition.split import Split, in_one
-from triquad_map.view import Answer
+from triquad_map.view import FieldAnswer
 
 _REACH_VOXELS = 0.5
 """How far a surface is felt beyond the voxels in which rays ended."""
@@ -39,7 +39,7 @@ class FieldView:
         self._field = BlendedField(settings, self._field_regions)
         self._lattice = lattice or RegionLattice(settings, [region.index for region in regions])
 
-    def query(self, points: Doubles, gradient: bool = False) -> Answer:
+    def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
         """Signed distance, status and, on request, gradient at points [N, 3] of the map frame."""
         count = len(points)
         sdf = np.empty(count, np.float32)
@@ -56,7 +56,7 @@ class FieldView:
             status[part] = self._status(points[part], owners.groups, _REACH_VOXELS)
 
         self._split(count, work)
-        return Answer(sdf, status, slopes)
+        return FieldAnswer(sdf, status, slopes)
 
     def distances(self, points: Doubles) -> Floats:
         """Signed distances [N] alone at points [N, 3] of the map frame."""

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.pose import orthonormal
 from triquad_format.records.status import Status
 
 from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.questions.pose import moved, orthonormal
+from triquad_map.questions.pose import moved
 from triquad_map.questions.thinning import thinned
 from triquad_map.view import MapView
 
@@ -176,7 +177,7 @@ def _descend(
         if normal is None:
             return _Found(pose, iteration, False)
         step = normal.step()
-        # Where it goes to and fro, shorter steps settle between.
+        # Where steps go back and forth, shorter ones settle between.
         overshoot = min(_OVERSHOOT, 1.25 * overshoot) if step @ last >= 0 else 0.5 * overshoot
         last = step
         taken = (overshoot if scale == final else 1.0) * step
@@ -246,12 +247,12 @@ def _judged(view: MapView, points: Doubles, found: _Found, options: AlignOptions
         all_seen = len(normal.seen()[1]) == 6
     enough = count >= _LEAST_INLIERS and share >= _LEAST_INLIER_SHARE
     return Alignment(
-        found.pose,
-        covariance,
-        share,
-        rms_m,
-        found.settled and enough and all_seen,
-        found.iterations,
-        len(points),
-        view.epoch,
+        world_from_sensor=found.pose,
+        covariance=covariance,
+        inlier_share=share,
+        rms_m=rms_m,
+        converged=found.settled and enough and all_seen,
+        iterations=found.iterations,
+        points=len(points),
+        epoch=view.epoch,
     )

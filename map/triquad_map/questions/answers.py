@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.pose import is_rigid
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
@@ -30,7 +31,6 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.align import AlignOptions, align
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
-from triquad_map.questions.pose import is_rigid
 from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments, steps_at_most
 from triquad_map.questions.spheres import spheres
@@ -89,7 +89,12 @@ class Answers:
         points = _points("point", request.origin, request.points, self._limits.points)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
-            return SdfReply(view.epoch, answer.sdf, answer.status, answer.gradient)
+            return SdfReply(
+                epoch=view.epoch,
+                sdf=answer.sdf,
+                status=answer.status,
+                gradient=answer.gradient,
+            )
 
     def distance(self, request: DistanceRequest) -> DistanceReply:
         """Distances to the nearest surface."""
@@ -99,15 +104,15 @@ class Answers:
         with self._view(request.epoch) as view:
             answer = distances(view, points, options)
         return DistanceReply(
-            answer.epoch,
-            answer.distance,
-            answer.gradient,
-            answer.found.astype(np.uint8),
-            answer.status,
-            answer.confidence,
-            _relative(answer.surface_point, request.origin),
-            answer.unknown_distance,
-            _relative(answer.unknown_point, request.origin),
+            epoch=answer.epoch,
+            distance=answer.distance,
+            gradient=answer.gradient,
+            found=answer.found.astype(np.uint8),
+            status=answer.status,
+            confidence=answer.confidence,
+            surface_point=_relative(answer.surface_point, request.origin),
+            unknown_distance=answer.unknown_distance,
+            unknown_point=_relative(answer.unknown_point, request.origin),
         )
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
@@ -140,14 +145,14 @@ class Answers:
             self._check_count(steps / _STEPS_EACH, f"segments of {steps} steps")
             answer = segments(view, starts, ends, options)
         return SegmentsReply(
-            answer.epoch,
-            answer.length,
-            answer.blocked.astype(np.uint8),
-            answer.contact,
-            answer.clearance,
-            answer.clearance_at,
-            answer.meets_unknown.astype(np.uint8),
-            answer.unknown_contact,
+            epoch=answer.epoch,
+            length=answer.length,
+            blocked=answer.blocked.astype(np.uint8),
+            contact=answer.contact,
+            clearance=answer.clearance,
+            clearance_at=answer.clearance_at,
+            meets_unknown=answer.meets_unknown.astype(np.uint8),
+            unknown_contact=answer.unknown_contact,
         )
 
     def rays(self, request: RaysRequest) -> RaysReply:
@@ -203,14 +208,14 @@ class Answers:
                 view, request.points.astype(np.float64), request.world_from_sensor, options
             )
         return AlignReply(
-            answer.epoch,
-            answer.world_from_sensor,
-            answer.covariance,
-            answer.inlier_share,
-            answer.rms_m,
-            answer.converged,
-            answer.iterations,
-            answer.points,
+            epoch=answer.epoch,
+            world_from_sensor=answer.world_from_sensor,
+            covariance=answer.covariance,
+            inlier_share=answer.inlier_share,
+            rms_m=answer.rms_m,
+            converged=answer.converged,
+            iterations=answer.iterations,
+            points=answer.points,
         )
 
     def _searched(self, what: str, origin: Doubles, offsets: Floats) -> Doubles:

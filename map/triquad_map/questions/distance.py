@@ -60,15 +60,15 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
     if options.surface_point:
         surface_point = np.where(nearest.found[:, None], nearest.point, points)
     return Distances(
-        distance.astype(np.float32),
-        gradient.astype(np.float32),
-        nearest.found,
-        status,
-        np.where(status == Status.UNKNOWN, np.float32(0), nearest.confidence),
-        surface_point,
-        None if unknown is None else unknown.distance.astype(np.float32),
-        None if unknown is None else unknown.point,
-        view.epoch,
+        distance=distance.astype(np.float32),
+        gradient=gradient.astype(np.float32),
+        found=nearest.found,
+        status=status,
+        confidence=np.where(status == Status.UNKNOWN, np.float32(0), nearest.confidence),
+        surface_point=surface_point,
+        unknown_distance=None if unknown is None else unknown.distance.astype(np.float32),
+        unknown_point=None if unknown is None else unknown.point,
+        epoch=view.epoch,
     )
 
 
@@ -111,7 +111,7 @@ def _join_field(
     distance: Doubles,
     gradient: Doubles,
 ) -> None:
-    """Near a surface, take the side of it from the trained field, and by and by its value."""
+    """Near a surface, take the side of it from the trained field, and gradually its value."""
     low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
     rows = np.flatnonzero(nearest.found & (distance < high) & (status == Status.SURFACE))
     if not len(rows):

@@ -45,14 +45,14 @@ def along_polyline(parts: Segments) -> Polyline:
     unknown = parts.meets_unknown[: last + 1]
     first_unknown = int(unknown.argmax())
     return Polyline(
-        total,
-        bool(parts.blocked[last]),
-        float(begins[last] + parts.contact[last]) if parts.blocked[last] else total,
-        float(parts.clearance[narrowest]),
-        float(begins[narrowest] + parts.clearance_at[narrowest]),
-        bool(unknown.any()),
-        float(begins[first_unknown] + parts.unknown_contact[first_unknown])
+        length=total,
+        blocked=bool(parts.blocked[last]),
+        contact=float(begins[last] + parts.contact[last]) if parts.blocked[last] else total,
+        clearance=float(parts.clearance[narrowest]),
+        clearance_at=float(begins[narrowest] + parts.clearance_at[narrowest]),
+        meets_unknown=bool(unknown.any()),
+        unknown_contact=float(begins[first_unknown] + parts.unknown_contact[first_unknown])
         if unknown.any()
         else total,
-        parts.epoch,
+        epoch=parts.epoch,
     )

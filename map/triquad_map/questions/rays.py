@@ -16,7 +16,7 @@ _TOUCH_M = 1e-5
 """A ray that comes as near to unknown space has reached it: its places are no more exact."""
 
 _LOOK_AHEAD_M = 3.0
-"""How far around a surface is looked for: farther costs more than shorter steps."""
+"""How far around a surface is searched for: farther costs more than shorter steps."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class RayOptions:
 
 
 @dataclass(frozen=True)
-class Rays:
+class RayRanges:
     """How far N rays reach, metres, of one epoch.
 
     ``SURFACE``: to a seen surface. ``UNKNOWN``: to where unknown space begins. ``FREE``: to the
@@ -45,7 +45,7 @@ def rays(
     origins: Doubles,
     directions: Doubles,
     options: RayOptions,
-) -> Rays:
+) -> RayRanges:
     """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach."""
     status = np.full(len(origins), Status.FREE, np.uint8)
     ranges = np.full(len(origins), options.max_range_m)
@@ -53,7 +53,7 @@ def rays(
     status[hit] = Status.SURFACE
     if not options.through_unknown:
         _stop_at_unknown(view, origins, directions, ranges, status)
-    return Rays(ranges.astype(np.float32), status, view.epoch)
+    return RayRanges(ranges.astype(np.float32), status, view.epoch)
 
 
 def _trace(

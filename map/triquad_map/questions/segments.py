@@ -11,7 +11,7 @@ from triquad_map.unknown import Unknown, refuse_unknown
 from triquad_map.view import MapView
 
 STEP_VOXELS = 0.5
-"""Between places that are looked at, where nothing allows a longer step."""
+"""Between places that are checked, where nothing allows a longer step."""
 
 _Gap = Callable[[Doubles], Doubles]
 """Distances [N] at points [N, 3]."""
@@ -19,7 +19,7 @@ _Gap = Callable[[Doubles], Doubles]
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """What moves along the segments, and how far around surfaces are looked for."""
+    """What moves along the segments, and how far around surfaces are searched for."""
 
     radius_m: float
     max_distance_m: float
@@ -66,7 +66,7 @@ class _March:
 
 
 def steps_at_most(view: MapView, starts: Doubles, ends: Doubles) -> int:
-    """How many places may have to be looked at between ``starts`` and ``ends`` [N, 3]."""
+    """How many places may have to be checked between ``starts`` and ``ends`` [N, 3]."""
     lengths = np.linalg.norm(ends - starts, axis=1)
     return int(np.ceil(lengths / (STEP_VOXELS * view.voxel_m)).sum()) + 2 * len(starts)
 
@@ -95,14 +95,14 @@ def segments(
     inside = np.nextafter(radius, 0.0) if radius > 0 else 0.0
     unknown = _march(to_unknown, starts, directions, solid.contact, inside, step_m, clearance=False)
     return Segments(
-        lengths.astype(np.float32),
-        solid.blocked,
-        solid.contact.astype(np.float32),
-        np.minimum(solid.clearance, options.max_distance_m).astype(np.float32),
-        solid.clearance_at.astype(np.float32),
-        unknown.blocked,
-        np.where(unknown.blocked, unknown.contact, lengths).astype(np.float32),
-        view.epoch,
+        length=lengths.astype(np.float32),
+        blocked=solid.blocked,
+        contact=solid.contact.astype(np.float32),
+        clearance=np.minimum(solid.clearance, options.max_distance_m).astype(np.float32),
+        clearance_at=solid.clearance_at.astype(np.float32),
+        meets_unknown=unknown.blocked,
+        unknown_contact=np.where(unknown.blocked, unknown.contact, lengths).astype(np.float32),
+        epoch=view.epoch,
     )
 
 
@@ -138,7 +138,7 @@ def _march(
         step = distance - radius_m
         if clearance:
             step = np.minimum(step, distance - march.clearance[going] + step_m)
-        # The end is looked at, too.
+        # The end is checked, too.
         there = place >= lengths[going]
         at[going] = np.minimum(place + np.maximum(step, step_m), lengths[going])
         going = going[~touches & ~there]

@@ -13,7 +13,7 @@ from triquad_format.records.region import MapRecord
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.composition.split import Work
 from triquad_map.reference.reference_region import ReferenceRegion
-from triquad_map.view import Answer
+from triquad_map.view import FieldAnswer
 
 CHUNK_POINTS = 65_536
 
@@ -25,7 +25,7 @@ class MapEvaluator(ComposedView):
         regions = [ReferenceRegion(record.settings, region, in_chunks) for region in record.regions]
         super().__init__(record.epoch, record.settings, regions, split=in_chunks)
 
-    def query(self, points: NDArray[np.floating], gradient: bool = False) -> Answer:
+    def query(self, points: NDArray[np.floating], gradient: bool = False) -> FieldAnswer:
         """Signed distance, status and, on request, gradient.
 
         Args:

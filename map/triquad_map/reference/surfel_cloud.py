@@ -46,7 +46,7 @@ class SurfelCloud:
         for first in range(0, count, step):
             part = np.arange(first, min(first + step, count))
             gaps = self._block_gaps(points[part])
-            # The nearest block first: what it holds keeps most others from being looked at.
+            # The nearest block first: for what it holds, most others need no search.
             nearest = np.zeros(gaps.shape, np.bool_)
             nearest[np.arange(len(part)), gaps.argmin(axis=1)] = True
             limits = found.distances[part, None]

@@ -2,7 +2,7 @@
 
 The field is right within the band where it is trained and saturates beyond it. So distances over
 any range are measured to surfels: where the field crosses zero in a voxel with seen surface, and
-which way it faces there. A surfel hangs on the field around one voxel alone, which makes it cheap
+which way it faces there. A surfel depends on the field around one voxel alone, which makes it cheap
 to keep up to date.
 
 Everything here is in voxel units: one is the side of a leaf, and the voxel at integer coordinates

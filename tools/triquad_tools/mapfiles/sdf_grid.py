@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import MapRecord
-from triquad_map.view import Answer
+from triquad_map.view import FieldAnswer
 
 from triquad_tools.console.errors import ToolError
 from triquad_tools.console.progress import Report
@@ -30,7 +30,7 @@ BAND_CELLS = 3
 _POINTS_AT_ONCE = 1 << 20
 _ROUNDING = 1e-9
 
-Query = Callable[[NDArray[np.float64]], Answer]
+Query = Callable[[NDArray[np.float64]], FieldAnswer]
 """Answers at points [N, 3] of the map frame."""
 
 

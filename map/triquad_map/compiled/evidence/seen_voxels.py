@@ -24,41 +24,38 @@ class SeenVoxels(NamedTuple):
     free: Bytes  # [blocks, BLOCK_BYTES] a ray passed through the voxel
 
 
-@kernel(inline="always")
-def _is_near_surface(seen: SeenVoxels, x: float, y: float, z: float, reach: float) -> bool:
-    """Whether a ray ended in a voxel that is less than ``reach`` away on each axis."""
-    x0, x1 = int(np.floor(x - reach)), int(np.floor(x + reach))
-    y0, y1 = int(np.floor(y - reach)), int(np.floor(y + reach))
-    z0, z1 = int(np.floor(z - reach)), int(np.floor(z + reach))
-    row = find_block(seen.blocks, x0, y0, z0, seen.side)
-    block = (x0 >> SHIFT, y0 >> SHIFT, z0 >> SHIFT)
-    found = 0
-    for i in range(x0, x1 + 1):
-        for j in range(y0, y1 + 1):
-            for k in range(z0, z1 + 1):
-                here = (i >> SHIFT, j >> SHIFT, k >> SHIFT)
-                if here != block:
-                    row = find_block(seen.blocks, i, j, k, seen.side)
-                    block = here
-                if row >= 0:
-                    found |= is_set(seen.surface, row, i, j, k)
-        if found:
-            break
-    return found != 0
-
-
 @kernel()
 def find_status(voxels: Doubles, reach: float, seen: SeenVoxels, status: Bytes) -> None:
     """Fill in the ``status`` [N] at ``voxels`` [N, 3]; surfaces reach ``reach`` beyond theirs."""
+    side, blocks, surface, free = seen
     for i in range(len(voxels)):
-        if _is_near_surface(seen, voxels[i, 0], voxels[i, 1], voxels[i, 2], reach):
+        x0, x1 = int(np.floor(voxels[i, 0] - reach)), int(np.floor(voxels[i, 0] + reach))
+        y0, y1 = int(np.floor(voxels[i, 1] - reach)), int(np.floor(voxels[i, 1] + reach))
+        z0, z1 = int(np.floor(voxels[i, 2] - reach)), int(np.floor(voxels[i, 2] + reach))
+        found = 0
+        row = find_block(blocks, x0, y0, z0, side)
+        block = (x0 >> SHIFT, y0 >> SHIFT, z0 >> SHIFT)
+        for x in range(x0, x1 + 1):
+            for y in range(y0, y1 + 1):
+                for z in range(z0, z1 + 1):
+                    here = (x >> SHIFT, y >> SHIFT, z >> SHIFT)
+                    if here != block:
+                        row = find_block(blocks, x, y, z, side)
+                        block = here
+                    if row >= 0:
+                        found |= is_set(surface, row, x, y, z)
+            if found:
+                break
+        status[i] = _UNKNOWN
+        if found:
             status[i] = _SURFACE
             continue
         x = int(np.floor(voxels[i, 0]))
         y = int(np.floor(voxels[i, 1]))
         z = int(np.floor(voxels[i, 2]))
-        row = find_block(seen.blocks, x, y, z, seen.side)
-        status[i] = _FREE if row >= 0 and is_set(seen.free, row, x, y, z) else _UNKNOWN
+        row = find_block(blocks, x, y, z, side)
+        if row >= 0 and is_set(free, row, x, y, z):
+            status[i] = _FREE
 
 
 @kernel()

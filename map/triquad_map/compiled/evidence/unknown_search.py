@@ -48,7 +48,7 @@ def _search_block(
     seen: SeenVoxels,
     state: Doubles,
 ) -> None:
-    """Look at the unknown voxels of a block."""
+    """Search the unknown voxels of a block."""
     for byte in range(BLOCK_BYTES):
         bits = int(seen.surface[row, byte] | seen.free[row, byte])
         if bits == _ALL:
@@ -68,7 +68,7 @@ def _search_block(
 
 @kernel()
 def _search(at: Place, seen: SeenVoxels, cells: tuple[int, int], state: Doubles) -> None:
-    """Look at the blocks around a point, shell by shell."""
+    """Search the blocks around a point, shell by shell."""
     home_x = int(np.floor(at[0])) >> SHIFT
     home_y = int(np.floor(at[1])) >> SHIFT
     home_z = int(np.floor(at[2])) >> SHIFT
@@ -109,7 +109,7 @@ def find_unknown(
 
     Points are leaf coordinates of the region, as are the ``nearest`` [N, 3] of unknown space;
     distances are in voxels. Only blocks whose indices are in ``range(*cells)`` on each axis are
-    looked at; where there is none, all is unknown.
+    searched; where there is none, all is unknown.
     """
     state = np.empty(4)
     for i in range(len(points)):

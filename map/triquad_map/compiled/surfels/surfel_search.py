@@ -86,7 +86,7 @@ def _disc_square(a: float, b: float, c: float, normal: Floats, square: float) ->
 
 @kernel(fastmath=True, inline="always")
 def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) -> None:
-    """Look at the surfels of a block. All is relative to its corner, in single precision."""
+    """Search the surfels of a block. All is relative to its corner, in single precision."""
     row, boxes = index.groups.members[member], index.groups.member_boxes
     x = np.float32(at[0] - (int(boxes[0, member]) & ~LOW))
     y = np.float32(at[1] - (int(boxes[1, member]) & ~LOW))
@@ -126,7 +126,7 @@ def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) ->
 
 @kernel(fastmath=True, inline="always")
 def _search_group(index: SurfelIndex, group: int, at: Place, search: Search) -> None:
-    """Look at the blocks of a group, the nearest first."""
+    """Search the blocks of a group, the nearest first."""
     first, last = index.groups.starts[group], index.groups.starts[group + 1]
     boxes, away = index.groups.member_boxes, search.away
     x0, y0, z0 = boxes[0, first:last], boxes[1, first:last], boxes[2, first:last]
@@ -162,7 +162,7 @@ def _reaches(index: SurfelIndex, group: int, at: Place, search: Search) -> bool:
 
 @kernel(fastmath=True, inline="always")
 def _search(index: SurfelIndex, at: Place, search: Search) -> None:
-    """Look at the groups around a point, then at all others."""
+    """Search the groups around a point, then at all others."""
     places = index.groups.places
     x = int(np.floor(at[0] / GROUP_VOXELS))
     y = int(np.floor(at[1] / GROUP_VOXELS))
@@ -176,7 +176,7 @@ def _search(index: SurfelIndex, at: Place, search: Search) -> None:
         else:
             group = turn - _NEIGHBOURS
             a, b, c = unpack(places.row_keys[group])
-            if max(abs(a - x), abs(b - y), abs(c - z)) <= 1:  # looked at already
+            if max(abs(a - x), abs(b - y), abs(c - z)) <= 1:  # searched already
                 continue
         if group >= 0 and _reaches(index, group, at, search):
             _search_group(index, group, at, search)
