@@ -152,6 +152,19 @@ def test_answers_of_planners_are_the_same(ground):
     np.testing.assert_array_equal(have.status, want.status)
 
 
+@given(st.integers(0, 10**6), st.sampled_from([TWO, APART]))
+@settings(max_examples=10, deadline=None)
+def test_the_blended_field_of_several_regions_is_the_same(seed, indices):
+    record = random_record(seed, indices=indices, points=80, training=False)
+    points = around(record, 300, seed)
+    have, want = (view.query(points, gradient=True) for view in both(record))
+    np.testing.assert_allclose(have.sdf, want.sdf, atol=1e-4)
+    np.testing.assert_array_equal(have.status, want.status)
+    # At the kinks of a random field the last bit tells which side's gradient is taken.
+    same = np.isclose(have.gradient, want.gradient, atol=1e-3, equal_nan=True).all(axis=1)
+    assert same.mean() > 0.98
+
+
 @given(st.integers(0, 10**6), st.sampled_from([((0, 0, 0),), TWO, APART]))
 @settings(max_examples=10, deadline=None)
 def test_maps_of_several_regions_answer_alike(seed, indices):
@@ -190,6 +203,24 @@ def test_no_points_get_no_answers(ground):
     for view in ground:
         answer = distances(view, np.zeros((0, 3)), DistanceOptions(unknown_distance=True))
         assert len(answer.distance) == len(answer.gradient) == 0
+
+
+@pytest.mark.parametrize("reach_m", [0.0, 0.1, 0.35, 0.7])
+def test_the_status_is_the_same_however_far_surfaces_reach(ground, reach_m):
+    points = places(1000)
+    have, want = (view.status(points, reach_m) for view in ground)
+    np.testing.assert_array_equal(have, want)
+
+
+def test_a_closed_map_answers_on_the_callers_thread():
+    view = RecordedView(exact_map(flat(0.07)))
+    view.close()
+    points = places(20_000)
+    again = RecordedView(exact_map(flat(0.07)))
+    have, want = (v.query(points, gradient=True) for v in (view, again))
+    np.testing.assert_array_equal(have.sdf, want.sdf)
+    np.testing.assert_array_equal(have.gradient, want.gradient)
+    again.close()
 
 
 def test_surfels_are_fitted_once_however_many_threads_ask(ground):

@@ -1,6 +1,6 @@
 """Finds the owners of many points in compiled code."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
@@ -16,12 +16,7 @@ _NOBODY = -1
 
 @kernel()
 def _find_owners(
-    points: Doubles,
-    pitch_m: float,
-    core_m: float,
-    index: Index,
-    owners: Ints,
-    shared: Bools,
+    points: Doubles, pitch_m: float, core_m: float, index: Index, owners: Ints, shared: Bools
 ) -> None:
     for i in range(len(points)):
         owners[i] = _NOBODY
@@ -69,19 +64,19 @@ class CompiledLattice:
         regions, shared = np.empty(len(points), np.int32), np.empty(len(points), np.bool_)
         points = np.ascontiguousarray(points)
         _find_owners(points, self._pitch_m, self._core_m, self._index, regions, shared)
-        return Owners(list(_groups(regions)), shared)
+        return Owners(_groups(regions), shared)
 
 
-def _groups(regions: Ints) -> Iterator[Owned]:
+def _groups(regions: Ints) -> list[Owned]:
     """The points of each region, given the number of the one that owns each point [N]."""
     if len(regions) == 0:
-        return
+        return []
     first, last = int(regions.min()), int(regions.max())
     if first == last:
-        if first >= 0:
-            yield Owned(first, slice(None))
-        return
+        return [Owned(first, slice(None))] if first >= 0 else []
     order, starts = _sorted_by(regions, last + 1)
-    for region in range(last + 1):
-        if starts[region] < starts[region + 1]:
-            yield Owned(region, order[starts[region] : starts[region + 1]])
+    return [
+        Owned(region, order[starts[region] : starts[region + 1]])
+        for region in range(last + 1)
+        if starts[region] < starts[region + 1]
+    ]

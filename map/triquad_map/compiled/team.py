@@ -20,10 +20,7 @@ class Team:
     def __init__(self, name: str, niceness: int = 0) -> None:
         """Threads start with the first work; for ``niceness`` see :func:`lower_priority`."""
         self._pool = ThreadPoolExecutor(
-            THREADS,
-            thread_name_prefix=name,
-            initializer=lower_priority,
-            initargs=(niceness,),
+            THREADS, thread_name_prefix=name, initializer=lower_priority, initargs=(niceness,)
         )
 
     def close(self) -> None:

@@ -7,7 +7,7 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 
 from triquad_map.composition.region import FieldRegion, FieldValues
-from triquad_map.composition.region_lattice import Owners
+from triquad_map.composition.region_lattice import Owned, Owners
 
 
 class BlendedField:
@@ -17,26 +17,29 @@ class BlendedField:
         self._settings = settings
         self._regions = regions
 
-    def values(
-        self,
-        points: Doubles,
-        owners: Owners,
-        gradient: bool,
-    ) -> FieldValues:
+    def values(self, points: Doubles, owners: Owners, gradient: bool) -> FieldValues:
         """The field at points [N, 3], whose owners are known."""
+        several = np.flatnonzero(owners.shared)
+        if len(owners.groups) == 1 and not len(several):
+            (owned,) = owners.groups
+            if isinstance(owned.points, slice):
+                return self._of_one(owned, points, gradient)
         count = len(points)
         values = FieldValues(
             np.full(count, np.nan, np.float32),
             np.full((count if gradient else 0, 3), np.nan, np.float32),
         )
         for owned in owners.groups:
-            region = self._regions[owned.region]
-            local = (points[owned.points] - region.centre).astype(np.float32)
-            _put(values, owned.points, region.engine.evaluate(local, gradient))
-        several = np.flatnonzero(owners.shared)
+            _put(values, owned.points, self._of_one(owned, points, gradient))
         if len(several):
             _put(values, several, self._blend(points[several], gradient))
         return values
+
+    def _of_one(self, owned: Owned, points: Doubles, gradient: bool) -> FieldValues:
+        """The field of the region that owns some of the points."""
+        region = self._regions[owned.region]
+        local = (points[owned.points] - region.centre).astype(np.float32)
+        return region.engine.evaluate(local, gradient)
 
     def _blend(self, points: Doubles, gradient: bool) -> FieldValues:
         """Blend the regions that cover each point, so that there is no step where they overlap."""
@@ -74,15 +77,10 @@ def _put(values: FieldValues, where: slice | Longs, new: FieldValues) -> None:
         values.gradient[where] = new.gradient
 
 
-def _ramp_gradient(
-    offsets: Doubles,
-    ramps: Doubles,
-    overlap_m: float,
-) -> Doubles:
+def _ramp_gradient(offsets: Doubles, ramps: Doubles, overlap_m: float) -> Doubles:
     """Gradient [N, 3] of the product of the three ramps."""
     slopes = np.where((ramps > 0) & (ramps < 1), -np.sign(offsets) / overlap_m, 0.0)
     others = np.stack(
-        [ramps[:, 1] * ramps[:, 2], ramps[:, 0] * ramps[:, 2], ramps[:, 0] * ramps[:, 1]],
-        axis=1,
+        [ramps[:, 1] * ramps[:, 2], ramps[:, 0] * ramps[:, 2], ramps[:, 0] * ramps[:, 1]], axis=1
     )
     return slopes * others

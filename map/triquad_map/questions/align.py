@@ -89,12 +89,7 @@ class Alignment:
     epoch: int
 
 
-def align(
-    view: MapView,
-    points: Doubles,
-    guess: Doubles,
-    options: AlignOptions,
-) -> Alignment:
+def align(view: MapView, points: Doubles, guess: Doubles, options: AlignOptions) -> Alignment:
     """Move a scan from where it is guessed to be to where it fits the map best.
 
     The squared distances of its points to the nearest seen surface are made small by Gauss-Newton
@@ -162,12 +157,7 @@ class _Found:
     settled: bool
 
 
-def _descend(
-    view: MapView,
-    fine: Doubles,
-    pose: Doubles,
-    options: AlignOptions,
-) -> _Found:
+def _descend(view: MapView, fine: Doubles, pose: Doubles, options: AlignOptions) -> _Found:
     points = thinned(fine, _COARSE_POINTS)
     final = _FINAL_VOXELS * view.voxel_m
     scale = max(options.max_distance_m, final)
@@ -220,11 +210,7 @@ def _normal(
     rows = np.hstack([slope, np.cross(turned, slope) / arm_m])
     weighted = share[:, None] * rows
     return _Normal(
-        weighted.T @ rows,
-        weighted.T @ distance,
-        arm_m,
-        weight,
-        float(share @ distance**2),
+        weighted.T @ rows, weighted.T @ distance, arm_m, weight, float(share @ distance**2)
     )
 
 

@@ -90,10 +90,7 @@ class Answers:
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
             return SdfReply(
-                epoch=view.epoch,
-                sdf=answer.sdf,
-                status=answer.status,
-                gradient=answer.gradient,
+                epoch=view.epoch, sdf=answer.sdf, status=answer.status, gradient=answer.gradient
             )
 
     def distance(self, request: DistanceRequest) -> DistanceReply:

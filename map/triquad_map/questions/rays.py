@@ -40,12 +40,7 @@ class RayRanges:
     epoch: int
 
 
-def rays(
-    view: MapView,
-    origins: Doubles,
-    directions: Doubles,
-    options: RayOptions,
-) -> RayRanges:
+def rays(view: MapView, origins: Doubles, directions: Doubles, options: RayOptions) -> RayRanges:
     """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach."""
     status = np.full(len(origins), Status.FREE, np.uint8)
     ranges = np.full(len(origins), options.max_range_m)
@@ -56,12 +51,7 @@ def rays(
     return RayRanges(ranges.astype(np.float32), status, view.epoch)
 
 
-def _trace(
-    view: MapView,
-    origins: Doubles,
-    directions: Doubles,
-    ranges: Doubles,
-) -> Bools:
+def _trace(view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles) -> Bools:
     """Shorten ``ranges`` [N] to the first surface (Hart 1996); whether each ray meets one."""
     hit = np.zeros(len(origins), np.bool_)
     at = np.zeros(len(origins))
@@ -86,11 +76,7 @@ def _trace(
 
 
 def _stop_at_unknown(
-    view: MapView,
-    origins: Doubles,
-    directions: Doubles,
-    ranges: Doubles,
-    status: Bytes,
+    view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles, status: Bytes
 ) -> None:
     """Shorten the rays that enter unknown space."""
     step_m = STEP_VOXELS * view.voxel_m

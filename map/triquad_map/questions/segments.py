@@ -71,12 +71,7 @@ def steps_at_most(view: MapView, starts: Doubles, ends: Doubles) -> int:
     return int(np.ceil(lengths / (STEP_VOXELS * view.voxel_m)).sum()) + 2 * len(starts)
 
 
-def segments(
-    view: MapView,
-    starts: Doubles,
-    ends: Doubles,
-    options: SegmentOptions,
-) -> Segments:
+def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOptions) -> Segments:
     """What a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
     lengths = np.linalg.norm(ends - starts, axis=1)
     directions = (ends - starts) / np.maximum(lengths, 1e-12)[:, None]

@@ -8,11 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.region import MapRecord
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import MapRecord, Region
 
 from triquad_map.composition.composed_view import ComposedView
+from triquad_map.composition.field_samples import field_samples
+from triquad_map.composition.recorded_region import RecordedRegion
 from triquad_map.composition.split import Work
-from triquad_map.reference.reference_region import ReferenceRegion
+from triquad_map.reference.fitted_surfels import FittedSurfels
+from triquad_map.reference.region_field import RegionField
+from triquad_map.reference.seen_blocks import SeenBlocks
 from triquad_map.view import FieldAnswer
 
 CHUNK_POINTS = 65_536
@@ -22,7 +27,7 @@ class MapEvaluator(ComposedView):
     """A :class:`~triquad_map.view.MapView` of a record. For several threads."""
 
     def __init__(self, record: MapRecord) -> None:
-        regions = [ReferenceRegion(record.settings, region, in_chunks) for region in record.regions]
+        regions = [_recorded(record.settings, region) for region in record.regions]
         super().__init__(record.epoch, record.settings, regions, split=in_chunks)
 
     def query(self, points: NDArray[np.floating], gradient: bool = False) -> FieldAnswer:
@@ -36,6 +41,20 @@ class MapEvaluator(ComposedView):
             FormatError: ``points`` has another shape, or a coordinate is not finite.
         """
         return super().query(checked_points(points), gradient)
+
+
+def _recorded(settings: FieldSettings, region: Region) -> RecordedRegion:
+    engine, evidence = RegionField(settings, region), SeenBlocks(settings)
+    engine.add(region.tables)
+    evidence.add(region.evidence)
+    field = field_samples(engine, settings, in_chunks)
+    return RecordedRegion(
+        settings,
+        region.index,
+        engine,
+        evidence,
+        lambda: FittedSurfels.of(region.evidence, evidence, field),
+    )
 
 
 def in_chunks(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001

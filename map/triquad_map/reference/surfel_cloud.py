@@ -8,13 +8,7 @@ from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.region import BLOCK_VOXELS
 
 from triquad_map.nearest import NearestSurfels
-from triquad_map.surface.surfels import (
-    DISC_RADIUS,
-    OUTSIDE,
-    SMOOTHING,
-    SurfelKind,
-    Surfels,
-)
+from triquad_map.surface.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind, Surfels
 
 _PAIRS = 1 << 19
 """Points with blocks or surfels that are compared together: what bounds the memory."""
@@ -64,11 +58,7 @@ class SurfelCloud:
         return np.asarray(np.sqrt(squares) - OUTSIDE, np.float64)
 
     def _improve(
-        self,
-        found: NearestSurfels,
-        points: Doubles,
-        part: NDArray[np.intp],
-        chosen: Bools,
+        self, found: NearestSurfels, points: Doubles, part: NDArray[np.intp], chosen: Bools
     ) -> None:
         """Compare the surfels of the ``chosen`` [len(part), B] blocks of some points."""
         sizes = np.diff(self._starts)

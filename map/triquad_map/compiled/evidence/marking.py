@@ -78,7 +78,7 @@ def _part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[flo
     return first, min(length, leaves_x, leaves_y, leaves_z)
 
 
-@kernel(inline="always")
+@kernel()
 def _walk(
     at: Vector, way: Vector, reach: float, side: int, index: Index, masks: Bytes, count: int
 ) -> int:

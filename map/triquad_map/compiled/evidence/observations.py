@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.evidence_voxels import surface_counts
-from triquad_format.records.region import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.sparse.rows import with_room
@@ -99,12 +99,17 @@ def _levels(surface: Bytes, observed: Observed, levels: Bytes) -> None:
     at = 0
     for row in range(len(surface)):
         place = observed.places[row]
-        for voxel in range(_VOXELS):
-            if surface[row, voxel >> SHIFT] >> (voxel & LOW) & 1:
-                if place != _NOWHERE:
-                    weight, sectors = observed.weights[place, voxel], observed.sectors[place, voxel]
-                    levels[at] = _level(weight, sectors)
-                at += 1
+        for byte in range(BLOCK_BYTES):
+            bits = int(surface[row, byte])
+            if bits == 0:
+                continue
+            for z in range(BLOCK_VOXELS):
+                if bits >> z & 1:
+                    if place != _NOWHERE:
+                        voxel = byte << SHIFT | z
+                        weight = observed.weights[place, voxel]
+                        levels[at] = _level(weight, observed.sectors[place, voxel])
+                    at += 1
 
 
 @kernel()

@@ -41,13 +41,7 @@ def _take(at: Place, low: Place, side: float, square: float, state: Doubles) -> 
 
 
 @kernel()
-def _search_block(
-    row: int,
-    corner: Place,
-    at: Place,
-    seen: SeenVoxels,
-    state: Doubles,
-) -> None:
+def _search_block(row: int, corner: Place, at: Place, seen: SeenVoxels, state: Doubles) -> None:
     """Search the unknown voxels of a block."""
     for byte in range(BLOCK_BYTES):
         bits = int(seen.surface[row, byte] | seen.free[row, byte])
@@ -99,11 +93,7 @@ def _search(at: Place, seen: SeenVoxels, cells: tuple[int, int], state: Doubles)
 
 @kernel()
 def find_unknown(
-    points: Doubles,
-    seen: SeenVoxels,
-    cells: tuple[int, int],
-    distances: Doubles,
-    nearest: Doubles,
+    points: Doubles, seen: SeenVoxels, cells: tuple[int, int], distances: Doubles, nearest: Doubles
 ) -> None:
     """Lower ``distances`` [N] to those from ``points`` [N, 3] to the nearest unknown voxel.
 

@@ -121,12 +121,7 @@ def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
 
 
 @kernel(fastmath=True)
-def add_feature_gradient(
-    batch: PointBatch,
-    count: int,
-    levels: int,
-    sums: Floats,
-) -> None:
+def add_feature_gradient(batch: PointBatch, count: int, levels: int, sums: Floats) -> None:
     """Add the gradient of the first ``count`` points' features to ``sums`` [rows, d]."""
     size = sums.shape[1]
     _transpose_gradient(batch, levels * size)

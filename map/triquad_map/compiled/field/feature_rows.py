@@ -78,13 +78,7 @@ def prefetch_row(_: Any, table: Any, row: Any) -> Any:
 
 @_kernel_code
 def _add_rows_of_8(
-    _: Any,
-    out: Any,
-    point: Any,
-    start: Any,
-    table: Any,
-    rows: Any,
-    weights: Any,
+    _: Any, out: Any, point: Any, start: Any, table: Any, rows: Any, weights: Any
 ) -> Any:
     """``out[point, start:start + 8] += weights @ table[rows]`` for 4 rows and weights."""
 
@@ -106,13 +100,7 @@ def _add_rows_of_8(
 
 @_kernel_code
 def _add_to_row_of_8(
-    _: Any,
-    table: Any,
-    row: Any,
-    weight: Any,
-    values: Any,
-    point: Any,
-    start: Any,
+    _: Any, table: Any, row: Any, weight: Any, values: Any, point: Any, start: Any
 ) -> Any:
     """``table[row] += weight * values[point, start:start + 8]``."""
 

@@ -51,14 +51,7 @@ def block_key(plane: int, u: int, v: int) -> int:
 
 @kernel()
 def _enter(
-    shape: Shape,
-    vertices: Vertices,
-    plane: int,
-    h: int,
-    u: int,
-    v: int,
-    row: int,
-    count: int,
+    shape: Shape, vertices: Vertices, plane: int, h: int, u: int, v: int, row: int, count: int
 ) -> int:
     """Give ``row`` to vertex ``(u, v)`` in all blocks that it touches; returns the blocks now."""
     side = (1 << h) + 1
@@ -77,12 +70,7 @@ def _enter(
 
 @kernel()
 def grow_vertices(
-    shape: Shape,
-    vertices: Vertices,
-    leaves: Longs,
-    start: int,
-    blocks: int,
-    rows: int,
+    shape: Shape, vertices: Vertices, leaves: Longs, start: int, blocks: int, rows: int
 ) -> tuple[int, int, int]:
     """Make the nodes that ``leaves`` project into; returns (leaves done, blocks, rows)."""
     for i in range(start, len(leaves)):

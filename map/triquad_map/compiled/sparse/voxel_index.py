@@ -45,11 +45,7 @@ def pack(x: int, y: int, z: int) -> int:
 def unpack(key: int) -> tuple[int, int, int]:
     """The cell of a key."""
     low = (1 << 21) - 1
-    return (
-        (key >> 42) - CELL_LIMIT,
-        ((key >> 21) & low) - CELL_LIMIT,
-        (key & low) - CELL_LIMIT,
-    )
+    return ((key >> 42) - CELL_LIMIT, ((key >> 21) & low) - CELL_LIMIT, (key & low) - CELL_LIMIT)
 
 
 @kernel(inline="always")
