@@ -73,11 +73,12 @@ def _code_folder(module: str) -> Path | None:
     base = _base_folder(_numba_config.CACHE_DIR)
     if base is None:
         return None
-    path = str(_file_of(module))
-    versions = base / f"{module}-{hashlib.sha256(path.encode()).hexdigest()[:12]}"
+    place = f"{sys.implementation.cache_tag} {_file_of(module)}"  # installations do not mix
+    versions = base / f"{module}-{hashlib.sha256(place.encode()).hexdigest()[:12]}"
     folder = versions / source_digest(module)
-    if not folder.exists():
-        shutil.rmtree(versions, ignore_errors=True)
+    for other in versions.glob("*"):
+        if other != folder:
+            shutil.rmtree(other, ignore_errors=True)
     return folder
 
 
