@@ -16,7 +16,7 @@ from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.polyline import Polyline
-from triquad_map.questions.rays import Rays
+from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Segments
 from triquad_map.questions.spheres import Spheres
 from triquad_map.unknown import Unknown, UnknownSpaceError
@@ -79,7 +79,7 @@ __all__ = [
     "OfflineMap",
     "PinnedMap",
     "Polyline",
-    "Rays",
+    "RayRanges",
     "RefusedError",
     "RequestTimeoutError",
     "SdfResult",

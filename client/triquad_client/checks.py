@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
-from triquad_map.questions.pose import RIGID_TOLERANCE
 from triquad_map.unknown import Unknown
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
@@ -65,12 +65,10 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
         raise InvalidScanError(f"world_from_sensor is {list(pose.shape)}, not [4, 4]")
     if not np.isfinite(pose).all():
         raise InvalidScanError(f"world_from_sensor has values that are not finite:\n{pose}")
-    rotation = pose[:3, :3]
-    skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if skew > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+    if not is_rotation(pose):
         raise InvalidScanError(
-            f"world_from_sensor is not rigid: R R^T is off by {skew:.2g}, det R = "
-            f"{np.linalg.det(rotation):.3g}; remove scale, shear and mirroring",
+            f"world_from_sensor is not rigid: R R^T is off by {rotation_error(pose):.2g}, "
+            f"det R = {np.linalg.det(pose[:3, :3]):.3g}; remove scale, shear and mirroring",
         )
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InvalidScanError(

@@ -1,23 +1,31 @@
 """The map in a record as something to ask, as fast as this installation can."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 from triquad_format.records.region import MapRecord
 
-from triquad_map.reference.recorded_map import RecordedMap
+from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.view import MapView
 
 
-def record_view(record: MapRecord) -> MapView:
+@dataclass(frozen=True)
+class OpenView:
+    """A map that can be asked until it is closed."""
+
+    view: MapView
+    compiled: bool  # whether compiled code answers, as in a server; numpy is far slower
+    close: Callable[[], None]
+
+
+def open_view(record: MapRecord) -> OpenView:
     """The map that a record holds: answered by compiled code where numba is installed, else numpy.
 
     This is the one door to compiled code for whoever must do without numba.
     """
     try:
-        from triquad_map.compiled.recorded_view import recorded_view
+        from triquad_map.compiled.recorded_view import RecordedView
     except ImportError:  # no numba, or one that does not go with this numpy
-        return RecordedMap(record)
-    return recorded_view(record)
-
-
-def is_compiled(view: MapView) -> bool:
-    """Whether compiled code answers, as in a server; numpy is far slower."""
-    return not isinstance(view, RecordedMap)
+        return OpenView(MapEvaluator(record), compiled=False, close=lambda: None)
+    view = RecordedView(record)
+    return OpenView(view, compiled=True, close=view.close)

@@ -2,9 +2,8 @@
 
 from enum import Enum
 
-import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import TriquadError
+from triquad_format.records.arrays import Bools
 
 
 class UnknownSpaceError(TriquadError):
@@ -28,7 +27,7 @@ class Unknown(str, Enum):
     ERROR = "error"  # to meet it raises UnknownSpaceError
 
 
-def refuse_unknown(what: str, meets: NDArray[np.bool_]) -> None:
+def refuse_unknown(what: str, meets: Bools) -> None:
     """Raise :class:`UnknownSpaceError` where any of N things meets unknown space."""
     if meets.any():
         raise UnknownSpaceError(what, int(meets.argmax()), int(meets.sum()))

@@ -41,7 +41,7 @@ QUALITY = ("SDF error", "gradient angle", "mesh F-score", "houses UNKNOWN")
 
 
 def test_a_few_scans_leave_all_results(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(steps, "_SETTLE_LIMIT_S", 1.0)
+    monkeypatch.setattr(steps, "_SETTLE_LIMIT_S", 3.0)
     monkeypatch.setattr(steps, "_MESH_SAMPLES", 100_000)
     out = tmp_path / "out"
     before = signal.getsignal(signal.SIGTERM)

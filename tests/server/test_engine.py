@@ -5,9 +5,9 @@ import pytest
 import torch
 from support import small_world
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.compiled_engine import make_field
-from triquad_map.compiled.field.batch import load, new_tile
+from triquad_map.compiled.field.batch import load, new_batch
 from triquad_map.compiled.field.encoding import locate
+from triquad_map.compiled.field.frozen_field import make_field
 from triquad_server.engine.adam import Rates, step_rows, step_where
 from triquad_server.engine.batch import Batch
 from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
@@ -124,13 +124,13 @@ def test_the_faces_of_the_cube_are_no_trap(levels: int) -> None:
         face = np.float32(-settings.region_side_m / 2)
         points = np.array([[face, face, face], [0, face, face], [face, 0, 0]], np.float32)
         near = np.concatenate([points, np.nextafter(points, np.float32(-1e9)), -points])
-        tile = new_tile(levels, settings.feature_size, settings.input_size, settings.hidden)
-        load(tile, near, 0)
-        locate(tile, compiled.geometry, compiled.vertices, compiled.features)
+        batch = new_batch(levels, settings.feature_size, settings.input_size, settings.hidden)
+        load(batch, near, 0)
+        locate(batch, compiled.geometry, compiled.vertices, compiled.features)
         sides = np.array([(1 << (at % levels)) + 1 for at in range(3 * levels)])
         ends = np.cumsum([(1 << h) ** 2 + 2 * (1 << h) + 1 for h in range(levels)])
         last = ends[np.arange(3 * levels) % levels]
-        assert (tile.corners.max(axis=1) + sides + 1 < last).all()
+        assert (batch.corners.max(axis=1) + sides + 1 < last).all()
 
 
 def test_no_points_give_no_values() -> None:

@@ -8,7 +8,7 @@ import torch
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
-from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_server.engine.adam import Rates
 from triquad_server.engine.batch import Batch
 from triquad_server.engine.field_record import field_from_record, region_record
@@ -51,7 +51,9 @@ def train(field: LiveField, points: torch.Tensor, labels: torch.Tensor) -> None:
 def slow_sdf(field: LiveField, point: np.ndarray) -> float:
     settings = field.settings
     inputs: list[float] = []
-    record = region_record((0, 0, 0), field, Evidence(1 << settings.depth), training=None)
+    record = region_record(
+        (0, 0, 0), field, LiveEvidence(1 << settings.depth).freeze(), training=None
+    )
     tables = {
         (table.plane, table.level): {
             int(code): features for code, features in zip(table.codes, table.features, strict=True)
@@ -211,12 +213,14 @@ def test_a_frozen_field_does_not_change() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_the_gpu_gives_the_same_values() -> None:
     field = grown(small())
-    record = region_record((0, 0, 0), field, Evidence(1 << field.settings.depth), training=None)
+    record = region_record(
+        (0, 0, 0), field, LiveEvidence(1 << field.settings.depth).freeze(), training=None
+    )
     other = field_from_record(record, field.settings, torch.device("cuda"), seed=0)
     points = (torch.rand((500, 3)) * 2 - 1).numpy() * 7
     expected = field.freeze().evaluate(points, gradient=True)
     values = other.freeze().evaluate(points, gradient=True)
     np.testing.assert_allclose(values.sdf, expected.sdf, atol=1e-5)
-    again = region_record((0, 0, 0), other.freeze(), Evidence(1 << 8), training=None)
+    again = region_record((0, 0, 0), other.freeze(), LiveEvidence(1 << 8).freeze(), training=None)
     for table, same in zip(record.tables, again.tables, strict=True):
         np.testing.assert_array_equal(table.features, same.features)

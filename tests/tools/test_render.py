@@ -116,3 +116,7 @@ def test_height_colours_rise_from_blue_to_red() -> None:
     assert colours.shape == (101, 3)
     assert colours[0, 2] > colours[0, 0]
     assert colours[-1, 0] > colours[-1, 2]
+
+
+def test_a_mesh_without_vertices_has_no_colours() -> None:
+    assert height_colours(np.zeros((0, 3))).shape == (0, 3)

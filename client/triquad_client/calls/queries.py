@@ -5,7 +5,7 @@ from triquad_map.questions.align import Alignment, AlignOptions
 from triquad_map.questions.distance import DistanceOptions, Distances
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.polyline import Polyline
-from triquad_map.questions.rays import RayOptions, Rays
+from triquad_map.questions.rays import RayOptions, RayRanges
 from triquad_map.questions.segments import SegmentOptions, Segments
 from triquad_map.questions.spheres import Spheres
 from triquad_map.unknown import Unknown
@@ -113,7 +113,7 @@ class MapQueries:
         max_range_m: float = 50.0,
         through_unknown: bool = False,
         at_epoch: int | None = None,
-    ) -> Rays:
+    ) -> RayRanges:
         """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3].
 
         Args:

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_RANGE_M
 from triquad_format.wire.query_messages import RaysReply, RaysRequest
-from triquad_map.questions.rays import RayOptions, Rays
+from triquad_map.questions.rays import RayOptions, RayRanges
 
 from triquad_client import checks
 from triquad_client.errors import InvalidInputError
@@ -13,12 +13,12 @@ from triquad_client.net.call import Ask, Call
 from triquad_client.net.parts import in_parts, relative
 
 PART_RAYS = 2_000
-"""Rays of one request."""
+"""RayRanges of one request."""
 
 
 def query(
     origins: ArrayLike, directions: ArrayLike, options: RayOptions, at_epoch: int | None
-) -> Call[Rays]:
+) -> Call[RayRanges]:
     """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3]."""
     ways = checks.directions(directions)
     places = checks.place_or_places(origins)
@@ -43,7 +43,7 @@ def query(
 
     epoch = checks.chosen_epoch(at_epoch)
     parts = yield from in_parts(len(ways), PART_RAYS, request, epoch)
-    return Rays(
+    return RayRanges(
         np.concatenate([part.range_m for part in parts]),
         np.concatenate([part.status for part in parts]),
         parts[0].epoch,

@@ -137,6 +137,8 @@ class LocalCopy:
                 checked_s=asked_s,
                 report=report,
             )
+            if known is not None:
+                known.driver.close()
             return report
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from triquad_format.errors import RefusedError
 from triquad_format.records.region import MapRecord
 from triquad_map.questions.answers import Answers, QuestionLimits
-from triquad_map.record_view import is_compiled, record_view
+from triquad_map.record_view import open_view
 from triquad_map.view import MapView
 
 from triquad_client.net.call import Batch
@@ -21,13 +21,18 @@ class LocalDriver(BlockingDriver):
     """Runs calls over the map in a record, as fast as possible here; for several threads."""
 
     def __init__(self, record: MapRecord) -> None:
-        self._view = record_view(record)
+        self._open = open_view(record)
+        self._view = self._open.view
         self._answers = Answers(self._epoch, _NO_LIMITS)
 
     @property
     def compiled(self) -> bool:
         """Whether compiled code answers, as in a server; else numpy, which is far slower."""
-        return is_compiled(self._view)
+        return self._open.compiled
+
+    def close(self) -> None:
+        """End the threads that compiled code works on; nothing may be asked any more."""
+        self._open.close()
 
     async def _replies(self, batch: Batch) -> list[Any]:
         return [self._answers.answer(batch.request(item).message) for item in batch.items]
@@ -35,8 +40,8 @@ class LocalDriver(BlockingDriver):
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:
         """The view, where its epoch is asked for, or the newest."""
-        if number not in (0, self._view.number):
+        if number not in (0, self._view.epoch):
             raise RefusedError(
-                "epoch_gone", f"epoch {number} is not kept; kept is [{self._view.number}]"
+                "epoch_gone", f"epoch {number} is not kept; kept is [{self._view.epoch}]"
             )
         yield self._view

@@ -38,7 +38,9 @@ class OfflineMap(MapQueries):
 
     def close(self) -> None:
         """Let go of the map; later queries raise :class:`ClosedError`."""
-        self._driver = None
+        driver, self._driver = self._driver, None
+        if driver is not None:
+            driver.close()
 
     def _answer(self, call: Call[ResultT]) -> ResultT:
         driver = self._driver

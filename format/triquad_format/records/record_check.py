@@ -39,10 +39,15 @@ def check_record(record: MapRecord) -> None:
     if len(set(indices)) != len(indices):
         raise FormatError("two regions have the same index")
     for region in record.regions:
-        try:
-            _check_region(record.settings, region)
-        except FormatError as error:
-            raise FormatError(f"region {region.index}: {error}") from error
+        check_region(record.settings, region)
+
+
+def check_region(settings: FieldSettings, region: Region) -> None:
+    """Raise :class:`FormatError`, naming region and field, unless ``region`` is sound."""
+    try:
+        _check_region(settings, region)
+    except FormatError as error:
+        raise FormatError(f"region {region.index}: {error}") from error
 
 
 def _check_region(settings: FieldSettings, region: Region) -> None:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import RefusedError
+from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.pose import is_rigid
 from triquad_format.wire.codec import Message
 from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_ITERATIONS, MAX_RANGE_M, MIN_LENGTH_M
 from triquad_format.wire.messages import SdfReply, SdfRequest
@@ -32,7 +33,6 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.align import AlignOptions, align
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
-from triquad_map.questions.pose import is_rigid
 from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments, steps_at_most
 from triquad_map.questions.spheres import spheres
@@ -79,7 +79,9 @@ class Answers:
         points = _points("point", request.origin, request.points, self._limits.points)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
-            return SdfReply(view.number, answer.sdf, answer.status, answer.gradient)
+            return SdfReply(
+                epoch=view.epoch, sdf=answer.sdf, status=answer.status, gradient=answer.gradient
+            )
 
     def distance(self, request: DistanceRequest) -> DistanceReply:
         """Distances to the nearest surface."""
@@ -89,15 +91,15 @@ class Answers:
         with self._view(request.epoch) as view:
             answer = distances(view, points, options)
         return DistanceReply(
-            answer.epoch,
-            answer.distance_m,
-            answer.gradient,
-            answer.found.astype(np.uint8),
-            answer.status,
-            answer.confidence,
-            _relative(answer.surface_point, request.origin),
-            answer.unknown_distance_m,
-            _relative(answer.unknown_point, request.origin),
+            epoch=answer.epoch,
+            distance_m=answer.distance_m,
+            gradient=answer.gradient,
+            found=answer.found.astype(np.uint8),
+            status=answer.status,
+            confidence=answer.confidence,
+            surface_point=_relative(answer.surface_point, request.origin),
+            unknown_distance_m=answer.unknown_distance_m,
+            unknown_point=_relative(answer.unknown_point, request.origin),
         )
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
@@ -130,14 +132,14 @@ class Answers:
             self._check_count(steps / _STEPS_EACH, f"segments of {steps} steps")
             answer = segments(view, starts, ends, options)
         return SegmentsReply(
-            answer.epoch,
-            answer.length_m,
-            answer.blocked.astype(np.uint8),
-            answer.contact_m,
-            answer.clearance_m,
-            answer.clearance_at_m,
-            answer.meets_unknown.astype(np.uint8),
-            answer.unknown_contact_m,
+            epoch=answer.epoch,
+            length_m=answer.length_m,
+            blocked=answer.blocked.astype(np.uint8),
+            contact_m=answer.contact_m,
+            clearance_m=answer.clearance_m,
+            clearance_at_m=answer.clearance_at_m,
+            meets_unknown=answer.meets_unknown.astype(np.uint8),
+            unknown_contact_m=answer.unknown_contact_m,
         )
 
     def rays(self, request: RaysRequest) -> RaysReply:
@@ -193,19 +195,17 @@ class Answers:
                 view, request.points.astype(np.float64), request.world_from_sensor, options
             )
         return AlignReply(
-            answer.epoch,
-            answer.world_from_sensor,
-            answer.covariance,
-            answer.inlier_share,
-            answer.rms_m,
-            answer.converged,
-            answer.iterations,
-            answer.points,
+            epoch=answer.epoch,
+            world_from_sensor=answer.world_from_sensor,
+            covariance=answer.covariance,
+            inlier_share=answer.inlier_share,
+            rms_m=answer.rms_m,
+            converged=answer.converged,
+            iterations=answer.iterations,
+            points=answer.points,
         )
 
-    def _searched(
-        self, what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
+    def _searched(self, what: str, origin: Doubles, offsets: Floats) -> Doubles:
         return _points(what, origin, offsets, self._limits.searches)
 
     def _check_count(self, count: float, what: str) -> None:
@@ -227,9 +227,7 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
 }
 
 
-def _points(
-    what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32], most: int
-) -> NDArray[np.float64]:
+def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
     """Points [N, 3] of the map frame.
 
     Raises:
@@ -254,7 +252,7 @@ def _within(name: str, value: float, most: float, least: float = MIN_LENGTH_M) -
     return float(value)
 
 
-def _short(what: str, lengths: NDArray[np.float64]) -> None:
+def _short(what: str, lengths: Doubles) -> None:
     """Refuse ways [N] that are too long: each of their steps waits for the one before."""
     if lengths.max(initial=0.0) > MAX_RANGE_M:
         worst = int(lengths.argmax())
@@ -264,12 +262,10 @@ def _short(what: str, lengths: NDArray[np.float64]) -> None:
         )
 
 
-def _same_length(first: NDArray[np.float32], name: str, second: NDArray[np.float32]) -> None:
+def _same_length(first: Floats, name: str, second: Floats) -> None:
     if len(first) != len(second):
         raise RefusedError("bad_request", f"{len(second)} {name} for {len(first)} points")
 
 
-def _relative(
-    points: NDArray[np.float64] | None, origin: NDArray[np.float64]
-) -> NDArray[np.float32] | None:
+def _relative(points: Doubles | None, origin: Doubles) -> Floats | None:
     return None if points is None else (points - origin).astype(np.float32)

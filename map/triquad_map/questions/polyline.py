@@ -44,14 +44,14 @@ def along_polyline(parts: Segments) -> Polyline:
     unknown = parts.meets_unknown[: last + 1]
     first_unknown = int(unknown.argmax())
     return Polyline(
-        total,
-        bool(parts.blocked[last]),
-        float(begins[last] + parts.contact_m[last]) if parts.blocked[last] else total,
-        float(parts.clearance_m[narrowest]),
-        float(begins[narrowest] + parts.clearance_at_m[narrowest]),
-        bool(unknown.any()),
-        float(begins[first_unknown] + parts.unknown_contact_m[first_unknown])
+        length_m=total,
+        blocked=bool(parts.blocked[last]),
+        contact_m=float(begins[last] + parts.contact_m[last]) if parts.blocked[last] else total,
+        clearance_m=float(parts.clearance_m[narrowest]),
+        clearance_at_m=float(begins[narrowest] + parts.clearance_at_m[narrowest]),
+        meets_unknown=bool(unknown.any()),
+        unknown_contact_m=float(begins[first_unknown] + parts.unknown_contact_m[first_unknown])
         if unknown.any()
         else total,
-        parts.epoch,
+        epoch=parts.epoch,
     )

@@ -3,11 +3,11 @@
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
 from triquad_map.compiled.field.field import Touched
+from triquad_map.compiled.kernel import kernel
 
 from triquad_server.engine.adam import EPSILON, Rates
 from triquad_server.engine.parameter import Parameter
@@ -68,7 +68,7 @@ def _corrections(mean_decay: float, variance_decay: float) -> tuple[Floats, Floa
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
+@kernel(fastmath=True, error_model="numpy", inline="always")
 def step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: CompiledRates) -> None:
     """One step of a row along its gradient, which is cleared."""
     parameter.steps[row] += 1
@@ -85,7 +85,7 @@ def step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: Compi
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def step_touched(
     part: int,
     count: int,

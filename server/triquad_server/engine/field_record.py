@@ -15,7 +15,7 @@ from triquad_format.records.region import (
     TrainingState,
     VertexTable,
 )
-from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
 
 from triquad_server.engine.batch import Batch
 from triquad_server.engine.live_field import LiveField, StoredField
@@ -24,7 +24,7 @@ from triquad_server.engine.live_field import LiveField, StoredField
 def region_record(
     index: RegionIndex,
     field: StoredField,
-    evidence: Evidence,
+    evidence: FrozenEvidence,
     training: TrainingState | None,
 ) -> Region:
     """A region as plain arrays that share nothing with ``field`` and ``evidence``."""

@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.blended_field import FieldEngine
-from triquad_map.compiled.compiled_engine import FieldArrays, FrozenCompiledField
-from triquad_map.compiled.field.quadtree import TriQuadtree
+from triquad_map.compiled.field.frozen_field import FieldArrays, FrozenCompiledField
+from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
+from triquad_map.composition.region import FieldEngine
 
 from triquad_server.engine.parameter import Parameter
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
@@ -24,7 +24,7 @@ class StoredField(Protocol):
         """Its shape."""
 
     @property
-    def tree(self) -> TriQuadtree:
+    def tree(self) -> LiveQuadtree | FrozenQuadtree:
         """Its vertices."""
 
     @property
@@ -60,7 +60,7 @@ class LiveField:
         """
         self.settings = settings
         self.device = frequencies.device
-        self.tree = TriQuadtree(settings)
+        self.tree = LiveQuadtree(settings)
         # Row 0 stands for absent vertices, and stays zero.
         self.features = Parameter(torch.zeros((1, settings.feature_size), device=self.device))
         self.frequencies = frequencies
@@ -112,7 +112,7 @@ class LiveField:
         copied = FieldTensors(
             values.features.clone(), tuple(part.clone() for part in values.mlp), values.frequencies
         )
-        tree = self.tree.copy()
+        tree = self.tree.freeze()
         if self.device.type == "cpu":
             return FrozenCompiledField(self.settings, tree, copied.arrays)
         return TensorField(self.settings, tree, copied)

@@ -15,9 +15,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.blended_field import FieldValues
-from triquad_map.compiled.compiled_engine import FieldArrays
-from triquad_map.compiled.field.quadtree import TriQuadtree
+from triquad_map.compiled.field.frozen_field import FieldArrays
+from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
+from triquad_map.composition.region import FieldValues
 
 from triquad_server.engine.corners import CornerIndex, Corners
 
@@ -45,7 +45,12 @@ class TensorField:
     Points are float32 [N, 3], metres from the region's centre.
     """
 
-    def __init__(self, settings: FieldSettings, tree: TriQuadtree, tensors: FieldTensors) -> None:
+    def __init__(
+        self,
+        settings: FieldSettings,
+        tree: LiveQuadtree | FrozenQuadtree,
+        tensors: FieldTensors,
+    ) -> None:
         self.settings = settings
         self.tree = tree
         self.tensors = tensors

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord
-from triquad_map.compiled.compiled_view import CompiledView, RegionView, Split
+from triquad_map.compiled.compiled_view import CompiledView, RegionView
+from triquad_map.composition.split import Split
 
 from triquad_server.engine.field_record import region_record
 from triquad_server.engine.live_field import FrozenField
@@ -35,6 +36,11 @@ class Epoch(CompiledView):
         super().__init__(number, settings, regions, split)
         self.frozen_regions = regions
         self._name = name
+
+    @property
+    def number(self) -> int:
+        """Number of this epoch."""
+        return self.epoch
 
     @property
     def regions(self) -> int:

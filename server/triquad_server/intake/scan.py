@@ -2,17 +2,18 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
-from triquad_map.compiled.voxel_index import Keys, empty_keys, enter
+from triquad_format.records.arrays import Longs
+from triquad_format.records.pose import is_rigid, rotation_error
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.thinning import enter
+from triquad_map.compiled.sparse.voxel_index import empty_keys
 
 from triquad_server.settings import ScanSettings
 
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
-
-_RIGID_TOLERANCE = 1e-3
 
 
 class ScanRefusedError(Exception):
@@ -41,13 +42,11 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
         raise ScanRefusedError(
             "pose_not_finite", f"the pose has values that are not finite: {pose}"
         )
-    rotation = np.clip(pose[:3, :3], -2, 2)  # no larger number can be part of a rotation
-    skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if skew > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or (pose[3] != (0, 0, 0, 1)).any():
+    if not is_rigid(pose):
         raise ScanRefusedError(
             "pose_not_rigid",
-            f"the pose is not a rotation and a translation (rotation off by {skew:.2g}, "
-            f"last row {pose[3]}); scale and shear are not allowed",
+            f"the pose is not a rotation and a translation (rotation off by "
+            f"{rotation_error(pose):.2g}, last row {pose[3]}); scale and shear are not allowed",
         )
     far = float(np.abs(pose[:3, 3]).max())
     if far > WORLD_LIMIT_M:
@@ -69,13 +68,13 @@ def _check_points(points: NDArray[np.float32], max_points: int) -> None:
         )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _select(
     points: NDArray[np.float32],
     range_min_m: float,
     range_max_m: float,
     thin_m: float,
-    keys: Keys,
+    keys: Longs,
 ) -> tuple[NDArray[np.float64], int, int, int]:
     """The points that are used; how many are not finite, too near and too far."""
     kept = np.empty((len(points), 3))

@@ -13,12 +13,12 @@ from triquad_format.records.region import (
     leaf_coordinates,
     region_centre,
 )
-from triquad_map.compiled.compiled_view import field_samples
-from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
+from triquad_map.compiled.sparse.thinning import thin
 from triquad_map.compiled.surfels.surfel_map import SurfelTask, first_surfels
 from triquad_map.compiled.team import Team
-from triquad_map.compiled.voxel_index import thin
+from triquad_map.composition.field_samples import field_samples
 
 from triquad_server.engine.adam import Rates
 from triquad_server.engine.compiled_trainer import GradientSums
@@ -72,7 +72,7 @@ class LiveRegion:
     """A region that is being mapped, by one thread. Everything public is in the map frame."""
 
     def __init__(
-        self, index: RegionIndex, setup: RegionSetup, field: LiveField, evidence: Evidence
+        self, index: RegionIndex, setup: RegionSetup, field: LiveField, evidence: LiveEvidence
     ) -> None:
         self.index = index
         self.centre = region_centre(setup.field, index)
@@ -99,14 +99,14 @@ class LiveRegion:
         """A region of which nothing is known yet."""
         seed, _ = setup.seeds(index)
         field = initial_field(setup.field, setup.device, seed)
-        return cls(index, setup, field, Evidence(1 << setup.field.depth))
+        return cls(index, setup, field, LiveEvidence(1 << setup.field.depth))
 
     @classmethod
     def restore(cls, record: Region, setup: RegionSetup) -> "LiveRegion":
         """A region from its record; without training state its replay pool starts empty."""
         seed, _ = setup.seeds(record.index)
         field = field_from_record(record, setup.field, setup.device, seed)
-        evidence = Evidence.restore(1 << setup.field.depth, record.evidence)
+        evidence = LiveEvidence.from_record(1 << setup.field.depth, record.evidence)
         region = cls(record.index, setup, field, evidence)
         state = record.training
         if state is not None and len(state.sample_points):
@@ -175,7 +175,7 @@ class LiveRegion:
         ``before`` is how it was published last: what did not change is shared with it.
         """
         self.changed = False
-        field, evidence = self.field.freeze(), self.evidence.copy()
+        field, evidence = self.field.freeze(), self.evidence.freeze()
         samples = field_samples(field, self._settings, self._setup.team.split)
         task = SurfelTask(epoch, _SURFELS_REFITTED if self.budget_samples else None)
         surfels = (
@@ -198,7 +198,7 @@ class LiveRegion:
         """The region with its training state as plain arrays, sharing nothing with this one."""
         samples = self.pool.sample(_CHECKPOINT_SAMPLES)
         state = training_state(self.field, samples, self.budget_samples)
-        return region_record(self.index, self.field, self.evidence, state)
+        return region_record(self.index, self.field, self.evidence.freeze(), state)
 
     def _cooling(self) -> float:
         """Share of the learning rate: falls as the budget is used up, so that the field settles."""

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
 from triquad_server.epochs.gate import QueryGate
@@ -135,7 +135,7 @@ class MapperThread:
         return result.result()
 
     def _run(self) -> None:
-        be_patient(NICENESS)
+        lower_priority(NICENESS)
         ended = "the mapper has stopped"
         try:
             while not self._stopping.is_set():

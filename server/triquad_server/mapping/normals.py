@@ -5,12 +5,19 @@ tell the normal of far ground, where it is a few lines of points; the moments of
 fine grid serves where it has a plane, the coarse one where it has not.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
-from triquad_map.compiled.rows import with_room
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.rows import with_room
+from triquad_map.compiled.sparse.voxel_index import (
+    Index,
+    VoxelIndex,
+    find_row,
+    make_row,
+    pack,
+    unpack,
+)
 from triquad_map.compiled.team import Team
-from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
@@ -24,7 +31,7 @@ Rows = NDArray[np.int32]
 Counts = NDArray[np.float32]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _add(
     points: NDArray[np.float64],
     start: int,
@@ -63,7 +70,7 @@ def _add(
     return len(points), count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _gather(
     row: int,
     cell_m: float,
@@ -95,7 +102,7 @@ def _gather(
                 total[9] += m[9] + 2 * c * m[3] + n * c * c
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
     """Normal of the plane through points with the moments ``m``; False where there is none."""
     n = m[0]
@@ -134,7 +141,7 @@ def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _outdated(
     rows: Rows, normals: NDArray[np.float64], moments: PointMoments, basis: Counts
 ) -> Rows:
@@ -153,7 +160,7 @@ def _outdated(
     return outdated[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _estimate(
     rows: Rows, cell_m: float, index: Index, moments: PointMoments, normals: Normals
 ) -> None:
@@ -166,7 +173,7 @@ def _estimate(
         normals[row] = normal
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _adopt(rows: Rows, of_cells: Normals, normals: NDArray[np.float64]) -> None:
     """Replace those of ``normals`` that are NaN by those of their cells."""
     for i in range(len(rows)):

@@ -8,9 +8,9 @@ the distance to its plane, so it changes by the cosine of the angle of incidence
 A table of ray intervals [N, COLUMNS] is float32, metres, relative to the region's centre.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_map.compiled.kernel import kernel
 
 from triquad_server.intake.scan import ScanRays
 from triquad_server.settings import ScanSettings
@@ -28,7 +28,7 @@ _MIN_COSINE = 0.05
 Vectors = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _set_direction(direction: Vectors, origin: Vectors, end: Vectors) -> float:
     """Set the unit vector [3] from ``origin`` to ``end``; returns how far it is."""
     squared = 0.0
@@ -42,7 +42,7 @@ def _set_direction(direction: Vectors, origin: Vectors, end: Vectors) -> float:
     return reach_m
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _clipped(
     end: Vectors, direction: Vectors, half_side_m: float, first: float, last: float
 ) -> tuple[float, float]:
@@ -60,7 +60,7 @@ def _clipped(
     return first, last
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _fill(
     origin: Vectors,
     ends: Vectors,

@@ -7,13 +7,13 @@ take over.
 
 import math
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_map.compiled.field.feature_rows import prefetch_row
-from triquad_map.compiled.rows import with_room
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.rows import with_room
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.batch import Batch
@@ -29,7 +29,7 @@ Ints = NDArray[np.int32]
 Places = NDArray[np.int64]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _bin(interval: Floats) -> int:
     mixed: int = np.int64(0)
     for axis, prime in enumerate((73856093, 19349663, 83492791)):
@@ -37,7 +37,7 @@ def _bin(interval: Floats) -> int:
     return mixed & (_BINS - 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _best_to_push_out(
     size: int, count: int, first: int, stride: int, offset: int, bins: Ints, occupancy: Ints
 ) -> Places:
@@ -54,7 +54,7 @@ def _best_to_push_out(
     return chosen
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _put(
     new: Floats, places: Places, used: int, intervals: Floats, bins: Ints, occupancy: Ints
 ) -> None:

@@ -5,13 +5,13 @@ Every draw makes new ones: an interval that is trained on again teaches other po
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.morton import encode
+from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.batch import Batch
@@ -50,7 +50,7 @@ def draw_samples(intervals: Tensor, placement: Placement, generator: torch.Gener
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _draw(
     intervals: Floats,
     chosen: NDArray[np.int64],
@@ -82,7 +82,7 @@ def _draw(
         cells[i] = encode(u, v)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _in_order(samples: Floats, cells: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Points [B, 3] and labels [B] in the order of their cells (a counting sort)."""
     starts = np.zeros((2 * _CELLS) ** 2 + 1, np.int32)

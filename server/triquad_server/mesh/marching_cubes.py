@@ -12,10 +12,10 @@ searches only the cells it is given, names the edges, on which neighbouring tile
 takes 4 ms for a tile of 64^3 cells, without Python's lock: the other takes 8 ms and holds it.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
-from triquad_map.compiled.voxel_index import EMPTY, empty_keys, find_slot
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_index import EMPTY, empty_keys, find_slot
 
 # A corner of a cell is 4 x + 2 y + z; the edge from corner c along axis a is 3 c + a.
 _AXIS_BIT = (4, 2, 1)
@@ -77,7 +77,7 @@ def _table() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 COUNTS, EDGES = _table()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _configurations(
     cells: NDArray[np.int64], volume: NDArray[np.float32], counts: NDArray[np.int64]
 ) -> tuple[NDArray[np.uint8], int]:
@@ -102,7 +102,7 @@ def _configurations(
     return solid, triangles
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _fill(
     cells: NDArray[np.int64],
     solid: NDArray[np.uint8],
@@ -139,7 +139,7 @@ def _fill(
     return vertices
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _places(
     names: NDArray[np.int64],
     volume: NDArray[np.float32],

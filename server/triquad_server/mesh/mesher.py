@@ -10,11 +10,11 @@ import functools
 from dataclasses import dataclass
 from typing import Protocol
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.status import Status
 from triquad_format.wire.tile_codec import STEPS, TileSurface
+from triquad_map.compiled.kernel import kernel
 
 from triquad_server.mesh.marching_cubes import Crossings
 from triquad_server.mesh.tile_border import TileBorder
@@ -108,7 +108,7 @@ def _seen_cells(
     return np.asarray(cells[seen == Status.SURFACE])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _cells_of(groups: NDArray[np.int64], group_side: int, side: int) -> NDArray[np.int64]:
     """Cells [C, 3] of groups, named by their least corners, of a tile of ``side`` cells."""
     cells = np.empty((len(groups) * group_side**3, 3), np.int64)
@@ -122,7 +122,7 @@ def _cells_of(groups: NDArray[np.int64], group_side: int, side: int) -> NDArray[
     return cells[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _positions(
     cells: NDArray[np.int64], offset: float, first: NDArray[np.int64], cell_m: float
 ) -> NDArray[np.float64]:
@@ -134,7 +134,7 @@ def _positions(
     return positions
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _centroids(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     centroids = np.empty((len(faces), 3))
     for i in range(len(faces)):
@@ -144,7 +144,7 @@ def _centroids(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArr
     return centroids
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _renumbered(
     faces: NDArray[np.int32], vertices: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
@@ -172,7 +172,7 @@ def _grid(side: int) -> NDArray[np.int64]:
     return cells.reshape(-1, 3)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _corners(seen: NDArray[np.int64], volume: NDArray[np.float32]) -> NDArray[np.int64]:
     """The lattice points [P, 3] at the corners of cells [C, 3]; they become NaN in ``volume``."""
     points = np.empty((8 * len(seen), 3), np.int64)

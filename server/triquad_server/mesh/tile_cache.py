@@ -127,12 +127,12 @@ class TileCache:
                 version, revision = old.version, old.revision
             else:
                 self._revision += 1
-                version, revision = view.number, self._revision
+                version, revision = view.epoch, self._revision
             tile = CachedTile(
                 index=index,
                 version=version,
                 revision=revision,
-                made=view.number,
+                made=view.epoch,
                 empty=len(mesh.faces) == 0,
                 digest=digest,
                 border=mesh.border,
@@ -164,11 +164,11 @@ class TileCache:
             near = np.abs(border.values) < lattice.cell_m
             places = (border.points[near] + corner) * lattice.cell_m
             neighbour = tiles.tile(other)
-            outdated = neighbour is not None and neighbour.made < view.number and other != index
+            outdated = neighbour is not None and neighbour.made < view.epoch and other != index
             if len(places) and outdated:
                 moved = np.abs(view.distances(places) - border.values[near])
                 if 2 * np.count_nonzero(moved > self._settings.tolerance_m) > len(moved):
                     with self._lock:
-                        tiles.invalidate(other, view.number)
+                        tiles.invalidate(other, view.epoch)
                     continue
             yield border

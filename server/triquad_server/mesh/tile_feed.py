@@ -7,7 +7,7 @@ import time
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdatesRequest
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.gate import QueryGate
 from triquad_server.epochs.history import EpochHistory
@@ -98,7 +98,7 @@ class TileFeed:
             self._changed.notify_all()
 
     def _run(self) -> None:
-        be_patient(NICENESS)
+        lower_priority(NICENESS)
         while True:
             with self._changed:
                 if not self._pending and not self._stopping:

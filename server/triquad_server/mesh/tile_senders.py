@@ -6,7 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 from triquad_format.wire.messages import TileUpdates
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.mesh.bandwidth import Bandwidth
 from triquad_server.mesh.follower import Follower
@@ -25,7 +25,7 @@ class TileSenders:
         self._lock = threading.Lock()
         self._sending = 0
         self._threads = ThreadPoolExecutor(
-            _SENDERS, "tile-sender", initializer=be_patient, initargs=(NICENESS,)
+            _SENDERS, "tile-sender", initializer=lower_priority, initargs=(NICENESS,)
         )
 
     @property

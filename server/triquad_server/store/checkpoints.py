@@ -8,7 +8,7 @@ from concurrent.futures import Future
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges
@@ -72,7 +72,7 @@ class Checkpoints:
             raise RefusedError("store", str(error)) from error
 
     def _run(self) -> None:
-        be_patient(2 * NICENESS)  # mapping comes first, too
+        lower_priority(2 * NICENESS)  # mapping comes first, too
         due = time.monotonic() + self._period_s
         while not self._stopping.is_set():
             self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)

@@ -11,7 +11,7 @@ from triquad_client import OfflineMap, open_map
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.reference.recorded_map import RecordedMap
+from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.epochs.epoch import Epoch
 
 from triquad_tools.benchmarks.core import seen_points
@@ -36,7 +36,7 @@ def measure_offline(made: BenchStreet) -> list[Figure]:
         with open_map(path) as offline:
             first_s = seconds(lambda: offline.query_distance(points[:1]))
             figures = _differences(offline, epoch, points) + _ratios(offline, epoch, points)
-        plain = RecordedMap(read_map(path))
+        plain = MapEvaluator(read_map(path))
     few = points[:1000]
     distances(plain, few[:1], DistanceOptions())
     plain_s = seconds(lambda: distances(plain, few, DistanceOptions()))

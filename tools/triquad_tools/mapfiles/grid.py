@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import MapRecord, region_centre
-from triquad_map.record_view import record_view
-from triquad_map.reference.evaluator import Answer
-from triquad_map.view import MapView
+from triquad_map.record_view import open_view
+from triquad_map.view import FieldAnswer, MapView
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import Report
@@ -32,7 +31,7 @@ BAND_CELLS = 3
 _POINTS_AT_ONCE = 1 << 20
 _ROUNDING = 1e-9
 
-Query = Callable[[NDArray[np.float64]], Answer]
+Query = Callable[[NDArray[np.float64]], FieldAnswer]
 """Answers at points [N, 3] of the map frame."""
 
 
@@ -65,7 +64,7 @@ def open_record(record: MapRecord) -> MapView:
     Raises:
         ToolError: it has regions that compiled code does not reach.
     """
-    view = record_view(record)
+    view = open_view(record).view
     centres = [region_centre(record.settings, region.index) for region in record.regions]
     if centres and np.isnan(view.query(np.stack(centres)).sdf).any():
         raise ToolError("its regions lie too far from the origin: use --crop")

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_map.compiled.kernel import kernel
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def rasterise(
     return raster
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _draw(
     corners: NDArray[np.float64],
     faces: NDArray[np.int32],
@@ -77,7 +77,7 @@ def _draw(
                     weights[row, column, 2] = wc
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     """Unit normals ``[V, 3]``: those of the faces around a vertex, weighted by their area."""
     normals = np.zeros((len(vertices), 3))

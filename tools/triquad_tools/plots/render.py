@@ -69,6 +69,8 @@ def render_mesh(
 
 def height_colours(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
     """Colours ``[V, 3]`` of vertices by their height, blue below to red above."""
+    if not len(vertices):
+        return np.zeros((0, 3))
     low, high = np.quantile(vertices[:, 2], [0.01, 0.99])
     place = (vertices[:, 2] - low) / max(float(high - low), 1e-6)
     stops = np.linspace(0.0, 1.0, len(_HEIGHT_STOPS))

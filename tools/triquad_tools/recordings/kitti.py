@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.pose import is_rotation, orthonormal, rotation_error
 
 from triquad_tools.console.command import ToolError
 
 SCAN_FOLDERS = (".", "scans", "velodyne", "velodyne_points/data")
 DEFAULT_PERIOD_NS = 100_000_000  # between scans of a folder without times
-_RIGID_TOLERANCE = 1e-3  # files of 6 digits are that far from orthonormal
 _POINT_BYTES = 16
 
 
@@ -128,16 +128,12 @@ def _parse_pose(place: str, line: str) -> NDArray[np.float64]:
     for i, word in enumerate(words):
         pose[i // 4, i % 4] = _parse_number(place, word)
     rotation = pose[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    determinant = float(np.linalg.det(rotation))
-    if error > _RIGID_TOLERANCE or determinant < 0.0:
+    if not is_rotation(pose):
         raise PoseError(
-            f"{place}: not a rotation: off orthonormal by {error:.3g}, "
-            f"determinant {determinant:.3g}"
+            f"{place}: not a rotation: off orthonormal by {rotation_error(pose):.3g}, "
+            f"determinant {np.linalg.det(rotation):.3g}"
         )
-    left, _, right = np.linalg.svd(rotation)
-    pose[:3, :3] = left @ right
-    return pose
+    return orthonormal(pose)
 
 
 def _parse_number(place: str, word: str) -> float:

@@ -6,9 +6,9 @@ started outside never steps past the first hit. The same code thus answers rays 
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_map.compiled.kernel import kernel
 
 from triquad_tools.simulation.solids import BOUND, X, Y, Z, distance_to
 
@@ -41,7 +41,7 @@ def cast_rays(
     return _cast(ordered, offsets[order], gaps[order], origin, directions, range_max_m)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _cast(
     solids: NDArray[np.float64],
     offsets: NDArray[np.float64],
@@ -74,7 +74,7 @@ def _cast(
     return ranges
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _hit(
     row: NDArray[np.float64],
     origin: NDArray[np.float64],

@@ -3,18 +3,16 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Region
 
-from triquad_map.compiled.blended_field import FieldValues
 from triquad_map.compiled.field import field as compiled_field
 from triquad_map.compiled.field.encoding import Geometry
 from triquad_map.compiled.field.field import CompiledField
 from triquad_map.compiled.field.mlp import Mlp
-from triquad_map.compiled.field.quadtree import TriQuadtree
-
-Floats = NDArray[np.float32]
+from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
+from triquad_map.composition.region import FieldValues
 
 
 class FieldArrays(NamedTuple):
@@ -30,7 +28,7 @@ class FieldArrays(NamedTuple):
 class FrozenCompiledField:
     """A field that answers from arrays, which nothing may change from then on."""
 
-    def __init__(self, settings: FieldSettings, tree: TriQuadtree, arrays: FieldArrays) -> None:
+    def __init__(self, settings: FieldSettings, tree: FrozenQuadtree, arrays: FieldArrays) -> None:
         self.settings = settings
         self.tree = tree
         self.arrays = arrays
@@ -47,7 +45,7 @@ class FrozenCompiledField:
 
 def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledField:
     """The field of a region as a file holds it."""
-    tree = TriQuadtree(settings)
+    tree = LiveQuadtree(settings)
     features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
     for table in region.tables:
         h = table.level - settings.levels.start
@@ -59,10 +57,12 @@ def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledFie
         tuple(np.ascontiguousarray(array, np.float32) for layer in layers for array in layer),
         np.asarray(region.frequencies, np.float32),
     )
-    return FrozenCompiledField(settings, tree, arrays)
+    return FrozenCompiledField(settings, tree.freeze(), arrays)
 
 
-def make_field(settings: FieldSettings, tree: TriQuadtree, arrays: FieldArrays) -> CompiledField:
+def make_field(
+    settings: FieldSettings, tree: LiveQuadtree | FrozenQuadtree, arrays: FieldArrays
+) -> CompiledField:
     """The form of a field that kernels take; it shares memory with the arrays and the tree."""
     geometry = Geometry(
         np.float32(settings.leaf_m),

@@ -5,29 +5,27 @@ Everything that is sparse in space is kept in rows that such an index finds.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Ints, Longs
+
+from triquad_map.compiled.kernel import kernel
 
 EMPTY = np.int64(-1)
 MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed number
 CELL_LIMIT = 1 << 20
 """Cells lie in ``[-CELL_LIMIT, CELL_LIMIT)`` on each axis."""
 
-Keys = NDArray[np.int64]
-Rows = NDArray[np.int32]
-
 
 class Index(NamedTuple):
     """The arrays of an index, as kernels take them."""
 
-    keys: Keys  # [slots] EMPTY where there is none; the number of slots is a power of two
-    rows: Rows  # [slots]
-    row_keys: Keys  # [capacity] key of each row
+    keys: Longs  # [slots] EMPTY where there is none; the number of slots is a power of two
+    rows: Ints  # [slots]
+    row_keys: Longs  # [capacity] key of each row
 
 
-def empty_keys(cells: int) -> Keys:
-    """Slots of a set with room for so many cells, at a load of one half; see :func:`enter`."""
+def empty_keys(cells: int) -> Longs:
+    """Slots of a set with room for so many cells, at a load of one half."""
     return np.full(1 << max(4, int(2 * cells - 1).bit_length()), EMPTY)
 
 
@@ -37,25 +35,21 @@ def _new_index(capacity: int) -> Index:
     return Index(keys, np.zeros(len(keys), np.int32), np.zeros(capacity, np.int64))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def pack(x: int, y: int, z: int) -> int:
     """Key of a cell."""
     return int(((x + CELL_LIMIT) << 42) | ((y + CELL_LIMIT) << 21) | (z + CELL_LIMIT))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def unpack(key: int) -> tuple[int, int, int]:
     """The cell of a key."""
     low = (1 << 21) - 1
-    return (
-        (key >> 42) - CELL_LIMIT,
-        ((key >> 21) & low) - CELL_LIMIT,
-        (key & low) - CELL_LIMIT,
-    )
+    return ((key >> 42) - CELL_LIMIT, ((key >> 21) & low) - CELL_LIMIT, (key & low) - CELL_LIMIT)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def find_slot(keys: Keys, key: int) -> int:
+@kernel(inline="always")
+def find_slot(keys: Longs, key: int) -> int:
     """Slot that holds ``key``, or the empty slot where it belongs."""
     mask = len(keys) - 1
     slot: int = ((key * MULTIPLIER) >> 32) & mask
@@ -64,14 +58,14 @@ def find_slot(keys: Keys, key: int) -> int:
     return slot
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def find_row(index: Index, key: int) -> int:
     """Row of ``key``, -1 where it has none."""
     slot = find_slot(index.keys, key)
     return -1 if index.keys[slot] == EMPTY else int(index.rows[slot])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def make_row(index: Index, count: int, key: int) -> int:
     """Row of ``key``; a new one is row ``count``, or -1 where there is no more room."""
     slot = find_slot(index.keys, key)
@@ -84,7 +78,7 @@ def make_row(index: Index, count: int, key: int) -> int:
     return int(index.rows[slot])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _reindex(index: Index, count: int) -> None:
     for row in range(count):
         slot = find_slot(index.keys, index.row_keys[row])
@@ -92,7 +86,7 @@ def _reindex(index: Index, count: int) -> None:
         index.rows[slot] = row
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def longest_probe(index: Index) -> int:
     """Slots that the look-up of any key in the index may have to read."""
     mask = len(index.keys) - 1
@@ -104,8 +98,9 @@ def longest_probe(index: Index) -> int:
     return longest
 
 
-@numba.njit(cache=True, nogil=True)
-def _cells(keys: Keys) -> NDArray[np.int64]:
+@kernel()
+def cells_of(keys: Longs) -> Longs:
+    """The cells [N, 3] of ``keys`` [N]."""
     cells = np.empty((len(keys), 3), np.int64)
     for i in range(len(keys)):
         cells[i, 0], cells[i, 1], cells[i, 2] = unpack(keys[i])
@@ -125,60 +120,32 @@ class VoxelIndex:
 
     @property
     def capacity(self) -> int:
-        """Rows that there is room for."""
+        """Ints that there is room for."""
         return len(self.arrays.row_keys)
 
-    def cells(self) -> NDArray[np.int64]:
+    def cells(self) -> Longs:
         """The cells [count, 3], by row."""
-        return np.asarray(_cells(self.arrays.row_keys[: self.count]))
+        return np.asarray(cells_of(self.arrays.row_keys[: self.count]))
 
     def grow(self) -> None:
         """Double the room."""
         self._refill(self.arrays.row_keys[: self.count], 2 * self.capacity)
 
-    def copy(self) -> "VoxelIndex":
-        """An independent copy."""
-        twin = VoxelIndex.__new__(VoxelIndex)
-        twin.count = self.count
-        twin.arrays = Index(*(array.copy() for array in self.arrays))
-        return twin
+    def freeze(self) -> Index:
+        """A copy of the arrays, with no room for more cells."""
+        keys, rows, row_keys = self.arrays
+        return Index(keys.copy(), rows.copy(), row_keys[: self.count].copy())
 
     @classmethod
-    def of_cells(cls, cells: NDArray[np.int64]) -> "VoxelIndex":
+    def of_cells(cls, cells: Longs) -> "VoxelIndex":
         """An index whose rows belong to different ``cells`` [N, 3], in their order."""
         x, y, z = cells.T + CELL_LIMIT
         index = cls(1)
         index._refill((x << 42) | (y << 21) | z, max(256, 2 * len(cells)))
         return index
 
-    def _refill(self, keys: Keys, capacity: int) -> None:
+    def _refill(self, keys: Longs, capacity: int) -> None:
         self.arrays = _new_index(capacity)
         self.arrays.row_keys[: len(keys)] = keys
         self.count = len(keys)
         _reindex(self.arrays, self.count)
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def enter(keys: Keys, x: float, y: float, z: float, cell_m: float) -> bool:
-    """Put the cell of a point into a set; False where it is there already."""
-    key = pack(int(np.floor(x / cell_m)), int(np.floor(y / cell_m)), int(np.floor(z / cell_m)))
-    slot = find_slot(keys, key)
-    if keys[slot] == key:
-        return False
-    keys[slot] = key
-    return True
-
-
-@numba.njit(cache=True, nogil=True)
-def _first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Keys) -> NDArray[np.bool_]:
-    chosen = np.zeros(len(points), np.bool_)
-    for i in range(len(points)):
-        chosen[i] = enter(keys, points[i, 0], points[i, 1], points[i, 2], cell_m)
-    return chosen
-
-
-def thin(points: NDArray[np.floating], cell_m: float) -> NDArray[np.bool_]:
-    """Mask [N] that keeps one of the points [N, 3] per cell of side ``cell_m``, the first."""
-    return np.asarray(
-        _first_per_cell(np.ascontiguousarray(points), cell_m, empty_keys(len(points)))
-    )

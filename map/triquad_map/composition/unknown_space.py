@@ -2,43 +2,27 @@
 
 import itertools
 from collections.abc import Iterable
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import RegionIndex, leaf_coordinates, owned_blocks
 
-from triquad_map.compiled.evidence.evidence import Evidence
-from triquad_map.compiled.voxel_index import CELL_LIMIT
+from triquad_map.composition.region import MapRegion
 from triquad_map.nearest import NearestUnknown
 
-
-class PlacedEvidence(Protocol):
-    """The evidence of a region and where it is."""
-
-    @property
-    def index(self) -> RegionIndex:
-        """Which region."""
-
-    @property
-    def centre(self) -> NDArray[np.float64]:
-        """[3] metres, map frame."""
-
-    @property
-    def evidence(self) -> Evidence:
-        """What rays have shown of it."""
+_FARTHEST_CELL = 1 << 20
 
 
 class UnknownSpace:
     """The unknown space of all regions, and all that lies in none."""
 
-    def __init__(self, settings: FieldSettings, regions: Iterable[PlacedEvidence]) -> None:
+    def __init__(self, settings: FieldSettings, regions: Iterable[MapRegion]) -> None:
         self._settings = settings
         self._regions = {region.index: region for region in regions}
 
-    def improve(self, found: NearestUnknown, points: NDArray[np.float64]) -> None:
-        """Note in ``found`` what unknown space lies nearer to ``points`` [N, 3]."""
+    def improve(self, found: NearestUnknown, points: Doubles) -> None:
+        """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""
         homes, owners = np.unique(self._cells(points), axis=0, return_inverse=True)
         owners = owners.reshape(-1)
         known = np.array([tuple(home) in self._regions for home in homes.tolist()], np.bool_)
@@ -53,34 +37,30 @@ class UnknownSpace:
             self._improve_near(near, points[rows], (x, y, z))
             found.distance[rows], found.point[rows] = near.distance, near.point
 
-    def _improve_near(
-        self, found: NearestUnknown, points: NDArray[np.float64], home: RegionIndex
-    ) -> None:
+    def _improve_near(self, found: NearestUnknown, points: Doubles, home: RegionIndex) -> None:
         """As :meth:`improve`, of points in the cell of one region."""
         # Mostly that is all: what it finds is nearer than the other cells.
-        self._look_in_region(found, points, self._regions[home])
+        self._search_region(found, points, self._regions[home])
         for cell in self._cells_around(points, float(found.distance.max())):
             region = self._regions.get(cell)
             if region is None:
-                self._look_in_cell(found, points, cell)
+                self._search_empty_cell(found, points, cell)
             elif cell != home:
-                self._look_in_region(found, points, region)
+                self._search_region(found, points, region)
 
-    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _cells(self, points: Doubles) -> Longs:
         """Cells [N, 3] of the region lattice that hold the points; far ones at its ends."""
         cells = np.floor(points / self._settings.region_pitch_m + 0.5)
-        return np.clip(cells, -CELL_LIMIT, CELL_LIMIT).astype(np.int64)
+        return np.clip(cells, -_FARTHEST_CELL, _FARTHEST_CELL).astype(np.int64)
 
-    def _cells_around(self, points: NDArray[np.float64], reach_m: float) -> list[RegionIndex]:
+    def _cells_around(self, points: Doubles, reach_m: float) -> list[RegionIndex]:
         """Cells that come within ``reach_m`` of the box around the points."""
         low = self._cells(points.min(axis=0) - reach_m).tolist()
         high = self._cells(points.max(axis=0) + reach_m).tolist()
         x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
         return list(itertools.product(x, y, z))
 
-    def _look_in_cell(
-        self, found: NearestUnknown, points: NDArray[np.float64], cell: RegionIndex
-    ) -> None:
+    def _search_empty_cell(self, found: NearestUnknown, points: Doubles, cell: RegionIndex) -> None:
         """Nothing is known of a cell without a region."""
         pitch = self._settings.region_pitch_m
         middle = np.asarray(cell) * pitch
@@ -90,17 +70,14 @@ class UnknownSpace:
         found.distance[nearer] = distance[nearer]
         found.point[nearer] = nearest[nearer]
 
-    def _look_in_region(
-        self, found: NearestUnknown, points: NDArray[np.float64], region: PlacedEvidence
-    ) -> None:
-        """Look at what a region owns of the space around."""
+    def _search_region(self, found: NearestUnknown, points: Doubles, region: MapRegion) -> None:
+        """Search what a region owns of the space around."""
         leaf_m = self._settings.leaf_m
-        mine = owned_blocks(self._settings)
         voxels = leaf_coordinates(self._settings, points - region.centre)
         distances = found.distance / leaf_m
         before = distances.copy()
         nearest = np.empty((len(points), 3))
-        region.evidence.find_unknown(voxels, (mine.start, mine.stop), distances, nearest)
+        region.evidence.find_unknown(voxels, owned_blocks(self._settings), distances, nearest)
         nearer = distances < before
         found.distance[nearer] = distances[nearer] * leaf_m
         corner = region.centre - self._settings.region_side_m / 2
