@@ -13,13 +13,11 @@ from triquad_format.errors import MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_map.questions.align import Alignment
-from triquad_map.questions.distance import Distances
+from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
 from triquad_map.questions.grid import Grid
-from triquad_map.questions.polyline import Polyline
 from triquad_map.questions.rays import RayRanges
-from triquad_map.questions.segments import Segments
+from triquad_map.questions.segments import Polyline, Segments
 from triquad_map.questions.spheres import Spheres
-from triquad_map.unknown import Unknown, UnknownSpaceError
 
 from triquad_client.async_client import AsyncClient, connect_async
 from triquad_client.calls.async_queries import AsyncPinnedMap

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
-from triquad_map.unknown import Unknown
+from triquad_map.questions.distance import Unknown
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
 

@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.wire import keys
 from triquad_format.wire.query_messages import AlignReply, AlignRequest
-from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions
-from triquad_map.questions.thinning import thinned
+from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions, thinned
 
 from triquad_client import checks
 from triquad_client.net.call import Ask, Call, ask, offload

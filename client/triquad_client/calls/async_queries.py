@@ -2,13 +2,11 @@
 
 from numpy.typing import ArrayLike
 from triquad_map.questions.align import Alignment, AlignOptions
-from triquad_map.questions.distance import DistanceOptions, Distances
+from triquad_map.questions.distance import DistanceOptions, Distances, Unknown
 from triquad_map.questions.grid import Grid
-from triquad_map.questions.polyline import Polyline
 from triquad_map.questions.rays import RayOptions, RayRanges
-from triquad_map.questions.segments import SegmentOptions, Segments
+from triquad_map.questions.segments import Polyline, SegmentOptions, Segments
 from triquad_map.questions.spheres import Spheres
-from triquad_map.unknown import Unknown
 
 from triquad_client.calls import alignment, distance, grid, rays, sdf, segments, spheres
 from triquad_client.calls.queries import MapQueries

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.wire import keys
 from triquad_format.wire.query_messages import DistanceReply, DistanceRequest
-from triquad_map.questions.distance import DistanceOptions, Distances, with_unknown
-from triquad_map.unknown import Unknown
+from triquad_map.questions.distance import DistanceOptions, Distances, Unknown, with_unknown
 
 from triquad_client import checks
 from triquad_client.net.call import Ask, Call

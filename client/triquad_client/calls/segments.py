@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.wire import keys
 from triquad_format.wire.query_messages import SegmentsReply, SegmentsRequest
-from triquad_map.questions.polyline import Polyline, along_polyline
-from triquad_map.questions.segments import SegmentOptions, Segments
+from triquad_map.questions.segments import Polyline, SegmentOptions, Segments, along_polyline
 
 from triquad_client import checks
 from triquad_client.errors import InvalidInputError

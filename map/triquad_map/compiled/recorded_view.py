@@ -2,17 +2,15 @@
 
 from triquad_format.records.region import MapRecord, Region
 
-from triquad_map.compiled.compiled_view import CompiledView
-from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
-from triquad_map.compiled.field.frozen_field import recorded_field
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.field.field import recorded_field
 from triquad_map.compiled.surfels.surfel_map import SurfelTask, first_surfels
 from triquad_map.compiled.team import Team
-from triquad_map.composition.field_samples import field_samples
-from triquad_map.composition.recorded_region import RecordedRegion
-from triquad_map.composition.split import Split
+from triquad_map.composition.composed_view import ComposedView
+from triquad_map.composition.region import RecordedRegion, Split, field_samples
 
 
-class RecordedView(CompiledView):
+class RecordedView(ComposedView):
     """The map in a record. Questions are split over all cores, by threads of its own."""
 
     def __init__(self, record: MapRecord) -> None:

@@ -6,9 +6,9 @@ Kernels stop where the index has no more room; the caller makes room and goes on
 import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Longs
 
+from triquad_map.compiled.evidence.seen_voxels import LOW, bit_of, block_key, byte_of, is_inside
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.voxel_bits import LOW, bit_of, block_key, byte_of, is_inside
-from triquad_map.compiled.sparse.voxel_index import Index, make_row
+from triquad_map.compiled.voxel_index import Index, make_row
 
 Vector = tuple[float, float, float]
 

@@ -8,11 +8,10 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
+from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT, block_key, byte_of, is_inside
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.rows import with_room
-from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT, block_key, byte_of, is_inside
-from triquad_map.compiled.sparse.voxel_index import Index, find_row
-from triquad_map.surface.confidence import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
+from triquad_map.compiled.voxel_index import Index, find_row, with_room
+from triquad_map.surface import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
 
 _VOXELS = BLOCK_VOXELS**3
 _NOWHERE = -1

@@ -4,10 +4,9 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT, SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT
-from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, find_row, pack
+from triquad_map.compiled.voxel_index import CELL_LIMIT, find_row, pack
 
 _SIDE = float(BLOCK_VOXELS)
 _ALL = 0xFF
