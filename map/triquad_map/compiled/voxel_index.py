@@ -16,6 +16,8 @@ MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed
 CELL_LIMIT = 1 << 20
 """Cells lie in ``[-CELL_LIMIT, CELL_LIMIT)`` on each axis."""
 
+_LOW = (1 << 21) - 1  # the bits of a key that tell one coordinate
+
 
 class Index(NamedTuple):
     """The arrays of an index, as kernels take them."""
@@ -30,12 +32,6 @@ def empty_keys(cells: int) -> Longs:
     return np.full(1 << max(4, int(2 * cells - 1).bit_length()), EMPTY)
 
 
-def _new_index(capacity: int) -> Index:
-    """Empty arrays for ``capacity`` cells."""
-    keys = empty_keys(capacity)
-    return Index(keys, np.zeros(len(keys), np.int32), np.zeros(capacity, np.int64))
-
-
 @kernel(inline="always")
 def pack(x: int, y: int, z: int) -> int:
     """Key of a cell."""
@@ -45,8 +41,7 @@ def pack(x: int, y: int, z: int) -> int:
 @kernel()
 def unpack(key: int) -> tuple[int, int, int]:
     """The cell of a key."""
-    low = (1 << 21) - 1
-    return ((key >> 42) - CELL_LIMIT, ((key >> 21) & low) - CELL_LIMIT, (key & low) - CELL_LIMIT)
+    return (key >> 42) - CELL_LIMIT, (key >> 21 & _LOW) - CELL_LIMIT, (key & _LOW) - CELL_LIMIT
 
 
 @kernel(inline="always")
@@ -99,13 +94,9 @@ def longest_probe(index: Index) -> int:
     return longest
 
 
-@kernel()
 def cells_of(keys: Longs) -> Longs:
     """The cells [N, 3] of ``keys`` [N]."""
-    cells = np.empty((len(keys), 3), np.int64)
-    for i in range(len(keys)):
-        cells[i, 0], cells[i, 1], cells[i, 2] = unpack(keys[i])
-    return cells
+    return np.stack([keys >> 42, keys >> 21 & _LOW, keys & _LOW], axis=1) - CELL_LIMIT
 
 
 class VoxelIndex:
@@ -116,17 +107,16 @@ class VoxelIndex:
     """
 
     def __init__(self, capacity: int) -> None:
-        self.count = 0
-        self.arrays = _new_index(capacity)
+        self._refill(np.zeros(0, np.int64), capacity)
 
     @property
     def capacity(self) -> int:
-        """Ints that there is room for."""
+        """Cells that there is room for."""
         return len(self.arrays.row_keys)
 
     def cells(self) -> Longs:
         """The cells [count, 3], by row."""
-        return np.asarray(cells_of(self.arrays.row_keys[: self.count]))
+        return cells_of(self.arrays.row_keys[: self.count])
 
     def grow(self) -> None:
         """Double the room."""
@@ -146,8 +136,9 @@ class VoxelIndex:
         return index
 
     def _refill(self, keys: Longs, capacity: int) -> None:
-        self.arrays = _new_index(capacity)
-        self.arrays.row_keys[: len(keys)] = keys
+        slots = empty_keys(capacity)
+        row_keys = with_room(keys, capacity)
+        self.arrays = Index(slots, np.zeros(len(slots), np.int32), row_keys)
         self.count = len(keys)
         _reindex(self.arrays, self.count)
 

@@ -1,6 +1,6 @@
 """Rows of numbers by Morton code, found with numpy alone."""
 
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,6 @@ ScalarT = TypeVar("ScalarT", bound=np.generic)
 
 ONE_CELL = 63
 """A shift that leaves nothing of a code."""
-
-
-_SIDES: tuple[Literal["left", "right"], ...] = ("left", "right")
 
 
 class FoundRows(NamedTuple, Generic[ScalarT]):
@@ -35,10 +32,10 @@ class CodedRows(Generic[ScalarT]):
 
     def add(self, codes: Longs, rows: NDArray[Any]) -> None:
         """Add rows [N, size] of increasing ``codes`` [N]: all of the cells that they are in."""
-        cells = np.unique(codes >> self._shift)
-        starts, ends = (np.searchsorted(codes >> self._shift, cells, side) for side in _SIDES)
+        cells, starts = np.unique(codes >> self._shift, return_index=True)
+        ends = [*starts[1:], len(codes)]
         rows = rows.astype(self._nothing.dtype, copy=False)
-        for cell, start, end in zip(cells.tolist(), starts, ends, strict=True):
+        for cell, start, end in zip(cells.tolist(), starts, ends, strict=False):
             self._cells[cell] = codes[start:end], rows[start:end]
 
     def find(self, codes: Longs) -> FoundRows[ScalarT]:

@@ -40,7 +40,7 @@ class FrozenEvidence:
     @property
     def cells(self) -> Longs:
         """The blocks [B, 3], in units of blocks."""
-        return np.asarray(cells_of(self.seen.blocks.row_keys))
+        return cells_of(self.seen.blocks.row_keys)
 
     @property
     def newest_s(self) -> int:
@@ -112,10 +112,9 @@ class LiveEvidence:
 
     def __init__(self, side: int) -> None:
         """``side`` is that of the region, voxels."""
-        self._side = side
         self._blocks = VoxelIndex(_MIN_CAPACITY)
-        self._surface = np.zeros((_MIN_CAPACITY, BLOCK_BYTES), np.uint8)
-        self._free = np.zeros((_MIN_CAPACITY, BLOCK_BYTES), np.uint8)
+        masks = np.zeros((2, _MIN_CAPACITY, BLOCK_BYTES), np.uint8)
+        self._seen = SeenVoxels(side, self._blocks.arrays, *masks)
         self._observations = Observations(_MIN_CAPACITY)
         self._frozen: FrozenEvidence | None = None  # until anything changes
 
@@ -137,19 +136,12 @@ class LiveEvidence:
         done = found = 0
         while done < len(voxels):
             done, self._blocks.count, found = mark_ends(
-                voxels,
-                done,
-                self._side,
-                self._blocks.arrays,
-                self._surface,
-                self._blocks.count,
-                new,
-                found,
+                voxels, done, self._seen, self._blocks.count, new, found
             )
             if done < len(voxels):
                 self._grow()
         if sighting is not None:
-            self._observations.record(voxels, self._side, self._blocks.arrays, sighting)
+            self._observations.record(voxels, self._seen, sighting)
         return new[:found]
 
     def carve(self, origin: Doubles, ends: Doubles, stop_short: float) -> None:
@@ -164,14 +156,7 @@ class LiveEvidence:
         done = 0
         while done < len(ends):
             done, self._blocks.count = mark_crossed(
-                origin,
-                ends,
-                done,
-                stop_short,
-                self._side,
-                self._blocks.arrays,
-                self._free,
-                self._blocks.count,
+                origin, ends, done, stop_short, self._seen, self._blocks.count
             )
             if done < len(ends):
                 self._grow()
@@ -186,16 +171,17 @@ class LiveEvidence:
             centres = corners[row] + offsets + 0.5
             kept = ~((centres > low) & (centres < high)).all(axis=-1)
             keep = np.packbits(kept, axis=-1, bitorder="little").reshape(BLOCK_BYTES)
-            self._surface[row] &= keep
-            self._free[row] &= keep
-        self._observations.forget(np.flatnonzero(near), self._surface[: self.blocks])
+            self._seen.surface[row] &= keep
+            self._seen.free[row] &= keep
+        self._observations.forget(np.flatnonzero(near), self._seen.surface[: self.blocks])
 
     def freeze(self) -> FrozenEvidence:
         """The evidence as it is now; the same object until anything changes."""
         if self._frozen is None:
-            surface, free = self._surface[: self.blocks].copy(), self._free[: self.blocks].copy()
+            side, _, *masks = self._seen
+            surface, free = (mask[: self.blocks].copy() for mask in masks)
             self._frozen = FrozenEvidence(
-                SeenVoxels(self._side, self._blocks.freeze(), surface, free),
+                SeenVoxels(side, self._blocks.freeze(), surface, free),
                 self._observations.levels(surface),
                 self._observations.seen_s(self.blocks),
             )
@@ -206,8 +192,8 @@ class LiveEvidence:
         """The evidence of a record, of a region of ``side`` voxels."""
         evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
-        evidence._surface = with_room(frozen.seen.surface, evidence._blocks.capacity)
-        evidence._free = with_room(frozen.seen.free, evidence._blocks.capacity)
+        evidence._seen = frozen.seen
+        evidence._make_room()
         if record.levels is not None:
             evidence._observations = Observations.restore(
                 frozen.surface, frozen.levels, frozen.seen_s
@@ -216,5 +202,10 @@ class LiveEvidence:
 
     def _grow(self) -> None:
         self._blocks.grow()
-        self._surface = with_room(self._surface, self._blocks.capacity)
-        self._free = with_room(self._free, self._blocks.capacity)
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Masks for as many blocks as the index has room for."""
+        side, _, *masks = self._seen
+        roomy = (with_room(mask, self._blocks.capacity) for mask in masks)
+        self._seen = SeenVoxels(side, self._blocks.arrays, *roomy)

@@ -8,9 +8,16 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT, block_key, byte_of, is_inside
+from triquad_map.compiled.evidence.seen_voxels import (
+    LOW,
+    SHIFT,
+    SeenVoxels,
+    block_key,
+    byte_of,
+    is_inside,
+)
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import Index, find_row, with_room
+from triquad_map.compiled.voxel_index import find_row, with_room
 from triquad_map.surface import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
 
 _VOXELS = BLOCK_VOXELS**3
@@ -48,8 +55,7 @@ def _sector(x: float, y: float) -> int:
 def _record(
     voxels: Doubles,
     start: int,
-    side: int,
-    blocks: Index,
+    seen: SeenVoxels,
     sighting: Sighting,
     observed: Observed,
     count: int,
@@ -60,9 +66,9 @@ def _record(
         x = int(np.floor(voxels[i, 0]))
         y = int(np.floor(voxels[i, 1]))
         z = int(np.floor(voxels[i, 2]))
-        if not is_inside(x, y, z, side):
+        if not is_inside(x, y, z, seen.side):
             continue
-        row = find_row(blocks, block_key(x, y, z))
+        row = find_row(seen.blocks, block_key(x, y, z))
         place = observed.places[row]
         if place == _NOWHERE:
             if count == len(observed.seen_s):
@@ -133,16 +139,14 @@ class Observations:
         self._count = 0
         self._observed = _arrays(blocks, _MIN_CAPACITY)
 
-    def record(self, voxels: Doubles, side: int, blocks: Index, sighting: Sighting) -> None:
-        """Count rays that ended at ``voxels`` [N, 3], whose ``blocks`` are all there."""
-        self._make_room(len(blocks.row_keys))
+    def record(self, voxels: Doubles, seen: SeenVoxels, sighting: Sighting) -> None:
+        """Count rays that ended at ``voxels`` [N, 3], whose blocks are all in ``seen``."""
+        self._make_room(len(seen.surface))
         done = 0
         while done < len(voxels):
-            done, self._count = _record(
-                voxels, done, side, blocks, sighting, self._observed, self._count
-            )
+            done, self._count = _record(voxels, done, seen, sighting, self._observed, self._count)
             if done < len(voxels):
-                self._grow(2 * len(self._observed.seen_s))
+                self._grow()
 
     def levels(self, surface: Bytes) -> Bytes:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
@@ -185,13 +189,14 @@ class Observations:
             places[:known] = self._observed.places
             self._observed = self._observed._replace(places=places)
 
-    def _grow(self, capacity: int) -> None:
-        old = self._observed
+    def _grow(self) -> None:
+        places, weights, sectors, seen_s = self._observed
+        capacity = 2 * len(seen_s)
         self._observed = Observed(
-            old.places,
-            with_room(old.weights, capacity),
-            with_room(old.sectors, capacity),
-            with_room(old.seen_s, capacity),
+            places,
+            with_room(weights, capacity),
+            with_room(sectors, capacity),
+            with_room(seen_s, capacity),
         )
 
 

@@ -40,7 +40,7 @@ class SurfelPlaces:
 
 def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
     """Places for the voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks at ``cells`` [, 3]."""
-    starts = surfel_starts(surface)
+    starts = np.concatenate([[0], np.cumsum(surface_counts(surface))]).astype(np.int32)
     voxels = surfel_voxels(cells, surface, int(starts[-1]))
     return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface))
 
@@ -57,11 +57,6 @@ def surfel_index(places: SurfelPlaces, surfels: Surfels) -> SurfelIndex:
         surfels.normals,
         surfels.kinds,
     )
-
-
-def surfel_starts(surface: Bytes) -> Ints:
-    """The first surfel [blocks + 1] of the voxels in ``surface`` [blocks, BLOCK_BYTES]."""
-    return np.concatenate([[0], np.cumsum(surface_counts(surface))]).astype(np.int32)
 
 
 @kernel()
@@ -143,14 +138,6 @@ def block_groups(cells: Longs, surface: Bytes) -> BlockGroups:
 
 
 @dataclass(frozen=True)
-class SurfelTask:
-    """What an update of surfels is to do."""
-
-    epoch: int  # number of the epoch that they are for
-    most: int | None  # surfels that are fitted again at most, new ones apart; None: all
-
-
-@dataclass(frozen=True)
 class _Fitted:
     """Surfels in their places, and the epoch in which each was fitted last."""
 
@@ -177,16 +164,19 @@ class SurfelMap:
         find_nearest(points, self._index, found)
 
     def updated(
-        self, evidence: FrozenEvidence, field: SampleField, task: SurfelTask
+        self, evidence: FrozenEvidence, field: SampleField, epoch: int, most: int | None
     ) -> "SurfelMap":
-        """The surfels of a later epoch: new ones are fitted, and of the others the oldest."""
-        return _fitted_again(evidence, _carried(self._fitted, evidence), field, task)
+        """The surfels of a later epoch: new ones are fitted, and of the others the oldest.
+
+        At most so many of the others are fitted; ``None``: all.
+        """
+        return _fitted_again(evidence, _carried(self._fitted, evidence), field, epoch, most)
 
 
-def first_surfels(evidence: FrozenEvidence, field: SampleField, task: SurfelTask) -> SurfelMap:
-    """The surfels of all seen voxels."""
+def first_surfels(evidence: FrozenEvidence, field: SampleField, epoch: int) -> SurfelMap:
+    """The surfels of all seen voxels, for an epoch."""
     places = surfel_places(evidence.cells, evidence.surface)
-    return _fitted_again(evidence, _nothing_in(places), field, task)
+    return _fitted_again(evidence, _nothing_in(places), field, epoch, most=None)
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
@@ -213,15 +203,15 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
 
 
 def _fitted_again(
-    evidence: FrozenEvidence, fitted: _Fitted, field: SampleField, task: SurfelTask
+    evidence: FrozenEvidence, fitted: _Fitted, field: SampleField, epoch: int, most: int | None
 ) -> SurfelMap:
-    """Fit what was never fitted, and as much of the rest as the task says; changes ``fitted``."""
+    """Fit what was never fitted, and at most so many of the rest; changes ``fitted``."""
     known = np.flatnonzero(fitted.epochs != _NEVER)
-    if task.most is not None and len(known) > task.most:
-        known = known[np.argpartition(fitted.epochs[known], task.most)[: task.most]]
+    if most is not None and len(known) > most:
+        known = known[np.argpartition(fitted.epochs[known], most)[:most]]
     chosen = np.concatenate([np.flatnonzero(fitted.epochs == _NEVER), known])
     new = fit_surfels(fitted.places.voxels[chosen], field, evidence.ended_in)
     for name, array in vars(new).items():
         getattr(fitted.surfels, name)[chosen] = array
-    fitted.epochs[chosen] = task.epoch
+    fitted.epochs[chosen] = epoch
     return SurfelMap(evidence, fitted)
