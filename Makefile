@@ -1,4 +1,5 @@
 # make test    set up a virtual environment and run every check
+# make docs    write the tables of docs/settings.md from the settings
 # make demo    set up a virtual environment and map a street, end to end
 VENV ?= .venv
 PYTHON ?= python3
@@ -8,13 +9,16 @@ PIP_FLAGS ?=
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 
-.PHONY: demo test lint clean
+.PHONY: demo docs test lint clean
 
 demo: $(INSTALLED)
 	$(BIN)/triquad-demo --out demo-out
 
 test: lint
 	$(BIN)/python -m pytest -q --durations=10
+
+docs: $(INSTALLED)
+	$(BIN)/python docs/settings_tables.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

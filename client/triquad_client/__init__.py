@@ -9,17 +9,17 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 """
 
 from triquad_format import __version__
+from triquad_format.errors import MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
-from triquad_map.errors import TriquadError, UnknownSpaceError
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.polyline import Polyline
-from triquad_map.questions.rays import Rays
+from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Segments
 from triquad_map.questions.spheres import Spheres
-from triquad_map.unknown import Unknown
+from triquad_map.unknown import Unknown, UnknownSpaceError
 
 from triquad_client.async_client import AsyncClient, connect_async
 from triquad_client.calls.async_queries import AsyncPinnedMap
@@ -36,17 +36,18 @@ from triquad_client.errors import (
     InvalidInputError,
     InvalidScanError,
     NoReplyError,
-    RefusedError,
     RequestTimeoutError,
     UnknownMapError,
 )
+from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import MeshUpdate
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_tiles import HeldTiles, MeshTile
-from triquad_client.mesh.mesh_watch import AsyncMeshWatch, MeshWatch
+from triquad_client.mesh.mesh_tiles import KnownTiles, MeshTile
+from triquad_client.mesh.mesh_watch import MeshWatch
+from triquad_client.offline.async_synced_map import AsyncSyncedMap
 from triquad_client.offline.local_copy import SyncReport
-from triquad_client.offline.offline import OfflineMap, open_map
-from triquad_client.offline.synced import AsyncSyncedMap, SyncedMap
+from triquad_client.offline.offline_map import OfflineMap, open_map
+from triquad_client.offline.synced_map import SyncedMap
 
 __all__ = [
     "Alignment",
@@ -64,9 +65,10 @@ __all__ = [
     "DownloadError",
     "FlushReport",
     "Grid",
-    "HeldTiles",
+    "KnownTiles",
     "InvalidInputError",
     "InvalidScanError",
+    "MapFileError",
     "MapInfo",
     "MapQueries",
     "Mesh",
@@ -77,7 +79,7 @@ __all__ = [
     "OfflineMap",
     "PinnedMap",
     "Polyline",
-    "Rays",
+    "RayRanges",
     "RefusedError",
     "RequestTimeoutError",
     "SdfResult",

@@ -4,32 +4,35 @@ import asyncio
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from numpy.typing import ArrayLike
-from triquad_format.mapfile.written_map import MapFileInfo
+from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
 from triquad_client.calls import admin, download, meshes, sdf
 from triquad_client.calls.async_queries import AsyncMapQueries, AsyncPinnedMap
 from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds
+from triquad_client.client import Client
+from triquad_client.documentation import documented_as
+from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import FollowedMesh
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_tiles import HeldTiles
-from triquad_client.mesh.mesh_watch import AsyncMeshWatch
+from triquad_client.mesh.mesh_tiles import KnownTiles
 from triquad_client.net.async_driver import AsyncDriver
 from triquad_client.net.connection import Connection, open_connection
-from triquad_client.offline.local_copy import LocalCopy
-from triquad_client.offline.synced import AsyncSyncedMap
+from triquad_client.offline.async_synced_map import AsyncSyncedMap
 
 
+@documented_as(Client)
 class AsyncClient(AsyncMapQueries):
-    """As :class:`Client`, with methods to be awaited in one event loop.
+    """A connection to one map of a server, for one event loop: :class:`Client` to be awaited.
 
-    Any number of calls may be awaited at the same time. Where the task of a call is cancelled, so
-    are its requests; where the client is closed, they raise :class:`ClosedError`.
+    Scans go out in the order of the calls of :meth:`publish_scan`. :meth:`watch_mesh` itself is
+    not awaited, but what its watch does is. Any number of calls may be awaited at the same time.
+    Where the task of a call is cancelled, so are its requests; where the client is closed, they
+    raise :class:`ClosedError`.
     """
 
     def __init__(self, connection: Connection, driver: AsyncDriver) -> None:
@@ -37,7 +40,7 @@ class AsyncClient(AsyncMapQueries):
         self._connection = connection
         self._driver = driver
         self._scans = ScanPublisher(connection)
-        super().__init__(driver.run)
+        super().__init__(driver.run_call)
 
     @property
     def map_name(self) -> str:
@@ -45,43 +48,35 @@ class AsyncClient(AsyncMapQueries):
         return self._connection.map_name
 
     async def close(self) -> None:
-        """As :meth:`Client.close`."""
         await self._driver.close()
 
     async def publish_scan(
         self,
         points: ArrayLike,
         world_from_sensor: ArrayLike,
-        stamp: float | None = None,
+        stamp_s: float | None = None,
         source: str = "default",
     ) -> None:
-        """As :meth:`Client.publish_scan`; scans go out in the order of the calls."""
         await self._driver.in_order(
-            lambda: self._scans.publish(points, world_from_sensor, stamp, source)
+            lambda: self._scans.publish(points, world_from_sensor, stamp_s, source)
         )
 
-    async def flush(self, timeout: float = 30.0, pending: int = 0) -> FlushReport:
-        """As :meth:`Client.flush`."""
-        return await self._run(self._scans.flush(timeout, pending))
+    async def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
+        return await self._run(self._scans.flush(timeout_s, pending))
 
-    async def settle(self, timeout: float = 600.0) -> ServerStatus:
-        """As :meth:`Client.settle`."""
-        return await self._run(admin.settle(timeout))
+    async def settle(self, timeout_s: float = 600.0) -> ServerStatus:
+        return await self._run(admin.settle(timeout_s))
 
     async def pinned(self) -> AsyncPinnedMap:
-        """As :meth:`Client.pinned`."""
         return AsyncPinnedMap(self._run, await self._run(sdf.pin_newest()))
 
     async def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
-        """As :meth:`Client.tiles`."""
         return await self._run(meshes.tiles(bounds, level))
 
     async def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
-        """As :meth:`Client.mesh_tile`."""
         return await self._run(meshes.tile(x, y, z, level))
 
     async def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
-        """As :meth:`Client.mesh`."""
         return await self._run(meshes.mesh(bounds, level))
 
     def watch_mesh(
@@ -89,40 +84,32 @@ class AsyncClient(AsyncMapQueries):
         bounds: Bounds | None = None,
         level: int = 0,
         max_bytes_per_s: int | None = None,
-        held: HeldTiles | None = None,
+        known: KnownTiles | None = None,
     ) -> AsyncMeshWatch:
-        """As :meth:`Client.watch_mesh`; what it returns is awaited, not this."""
-        followed = FollowedMesh.to_begin_with(bounds, level, max_bytes_per_s, held)
+        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s, known)
         return AsyncMeshWatch(self._run, followed)
 
     async def status(self) -> ServerStatus:
-        """As :meth:`Client.status`."""
         return await self._run(admin.status())
 
     async def checkpoint(self) -> CheckpointInfo:
-        """As :meth:`Client.checkpoint`."""
         return await self._run(admin.checkpoint())
 
     async def reset(self, bounds: Bounds | None = None) -> int:
-        """As :meth:`Client.reset`."""
         return await self._run(admin.reset(bounds))
 
     async def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
-        """As :meth:`Client.download_map`."""
         return await self._run(download.fetch(Path(path), training))
 
     async def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
-        """As :meth:`Client.download_box`."""
         return await self._run(download.fetch_box(Path(path), bounds))
 
     async def sync(self, bounds: Bounds, path: str | Path) -> AsyncSyncedMap:
-        """As :meth:`Client.sync`."""
-        copy = LocalCopy(Path(path), bounds)
-        await self._run(copy.update())
-        return AsyncSyncedMap(copy, self._run)
+        synced = AsyncSyncedMap(Path(path), bounds, self._run)
+        await synced.refresh()
+        return synced
 
     async def maps(self) -> list[str]:
-        """As :meth:`Client.maps`."""
         return await self._driver.maps()
 
 
@@ -140,12 +127,7 @@ class Connecting:
         self._client = await self
         return self._client
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._client.close()
 
     async def _connect(self) -> AsyncClient:
@@ -167,7 +149,18 @@ def connect_async(
     timeout_s: float = 10.0,
     config: str | Path | None = None,
 ) -> Connecting:
-    """As :func:`connect`: ``async with connect_async(...) as client``, or await it and close."""
+    """Connect to a map server: ``async with connect_async(...) as client``, or await it and close.
+
+    Args:
+        endpoint: Zenoh endpoint of the server, or of a router that leads to it.
+        map: name of the map.
+        timeout_s: for connecting and for each request.
+        config: Zenoh configuration file (JSON5), for TLS or credentials; the endpoint is added.
+
+    Raises:
+        ConnectError: nothing listens at the endpoint, or it does not let us in.
+        UnknownMapError: no server there has this map.
+    """
     file = None if config is None else Path(config)
     return Connecting(lambda: open_connection(endpoint, map, timeout_s, file))
 

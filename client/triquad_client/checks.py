@@ -7,7 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_map.questions.pose import RIGID_TOLERANCE
+from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
+from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
 from triquad_map.unknown import Unknown
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
@@ -16,9 +17,6 @@ Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
 
 FARTHEST_M = 1e9
-
-LEVELS = 3
-"""Levels of detail: cells of level ``l`` are ``2**l`` times as large as those of level 0."""
 
 
 def query_points(points: ArrayLike) -> NDArray[np.float64]:
@@ -67,12 +65,10 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
         raise InvalidScanError(f"world_from_sensor is {list(pose.shape)}, not [4, 4]")
     if not np.isfinite(pose).all():
         raise InvalidScanError(f"world_from_sensor has values that are not finite:\n{pose}")
-    rotation = pose[:3, :3]
-    skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if skew > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+    if not is_rotation(pose):
         raise InvalidScanError(
-            f"world_from_sensor is not rigid: R R^T is off by {skew:.2g}, det R = "
-            f"{np.linalg.det(rotation):.3g}; remove scale, shear and mirroring",
+            f"world_from_sensor is not rigid: R R^T is off by {rotation_error(pose):.2g}, "
+            f"det R = {np.linalg.det(pose[:3, :3]):.3g}; remove scale, shear and mirroring",
         )
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InvalidScanError(
@@ -83,32 +79,34 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
     return exact
 
 
-def stamp_ns(stamp: float) -> int:
+def stamp_ns(stamp_s: float) -> int:
     """A stamp in seconds since 1970 as nanoseconds.
 
     Raises:
         InvalidScanError: it is not a time.
     """
-    if not math.isfinite(stamp) or not 0 <= stamp < 2**63 / 1e9:
-        raise InvalidScanError(f"stamp = {stamp!r} is not a time in seconds since 1970")
-    return round(stamp * 1e9)
+    if not math.isfinite(stamp_s) or not 0 <= stamp_s < 2**63 / 1e9:
+        raise InvalidScanError(f"stamp_s = {stamp_s!r} is not a time in seconds since 1970")
+    return round(stamp_s * 1e9)
 
 
-def epoch(number: int) -> int:
-    """The number of an epoch.
+def chosen_epoch(at_epoch: int | None) -> int | None:
+    """The number of an epoch, or ``None`` for the newest.
 
     Raises:
-        InvalidInputError: it is none.
+        InvalidInputError: it is neither.
     """
+    if at_epoch is None:
+        return None
     try:
-        if isinstance(number, bool):
+        if isinstance(at_epoch, bool):
             raise TypeError("a truth value")
-        checked = operator.index(number)
+        number = operator.index(at_epoch)
     except TypeError as error:
-        raise InvalidInputError(f"at_epoch = {number!r} is not the number of an epoch") from error
-    if not 0 < checked < 2**63:
-        raise InvalidInputError(f"at_epoch = {number!r}: epochs are numbered from 1 on")
-    return checked
+        raise InvalidInputError(f"at_epoch = {at_epoch!r} is not the number of an epoch") from error
+    if not 0 < number < 2**63:
+        raise InvalidInputError(f"at_epoch = {at_epoch!r}: epochs are numbered from 1 on")
+    return number
 
 
 def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -152,8 +150,8 @@ def bytes_per_second(limit: int | None) -> int:
     return limit or 0
 
 
-def filled_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As :func:`box`, with infinite sides at ``FARTHEST_M``.
+def finite_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The corners [3] of ``bounds``, infinite sides at ``FARTHEST_M``.
 
     Raises:
         InvalidInputError: the box holds nothing.
@@ -162,11 +160,6 @@ def filled_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]
     if not (minimum < maximum).all():
         raise InvalidInputError(f"bounds = {bounds!r} hold nothing")
     return minimum, maximum
-
-
-def chosen_epoch(at_epoch: int | None) -> int | None:
-    """As :func:`epoch`, or ``None`` for the newest."""
-    return None if at_epoch is None else epoch(at_epoch)
 
 
 def unknown_policy(unknown: Unknown | str) -> Unknown:
@@ -182,27 +175,20 @@ def unknown_policy(unknown: Unknown | str) -> Unknown:
         raise InvalidInputError(f"unknown = {unknown!r}: use one of {ways}") from error
 
 
-def positive(name: str, value: float) -> float:
-    """A finite number above 0.
+def within(
+    name: str, value: float, most: float = MAX_DISTANCE_M, *, least: float = MIN_LENGTH_M
+) -> float:
+    """A number from ``least`` to ``most``.
 
     Raises:
         InvalidInputError: it is none.
     """
-    number = _number(name, value)
-    if not number > 0:
-        raise InvalidInputError(f"{name} = {value!r}: give more than 0")
-    return number
-
-
-def not_negative(name: str, value: float) -> float:
-    """A finite number, 0 or more.
-
-    Raises:
-        InvalidInputError: it is none.
-    """
-    number = _number(name, value)
-    if number < 0:
-        raise InvalidInputError(f"{name} = {value!r}: give 0 or more")
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"{name} = {value!r} is not a number") from error
+    if not least <= number <= most:
+        raise InvalidInputError(f"{name} = {value!r}: use {least:g} to {most:g}")
     return number
 
 
@@ -210,16 +196,18 @@ def radii(values: ArrayLike, count: int) -> NDArray[np.float32]:
     """Radii [count], from as many or a single one.
 
     Raises:
-        InvalidInputError: they are not finite numbers, 0 or more.
+        InvalidInputError: they are not numbers from 0 to ``MAX_DISTANCE_M``.
     """
     try:
         array = np.broadcast_to(np.asarray(values, np.float32), (count,))
     except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"radii are not one number or {count}: {error}") from error
-    bad = ~(np.isfinite(array) & (array >= 0))
+        raise InvalidInputError(f"radii_m are not one number or {count}: {error}") from error
+    bad = ~((array >= 0) & (array <= MAX_DISTANCE_M))
     if bad.any():
         index = int(bad.argmax())
-        raise InvalidInputError(f"radius {index} is {array[index]}: give 0 or more, in metres")
+        raise InvalidInputError(
+            f"radius {index} is {array[index]}: use 0 to {MAX_DISTANCE_M:g}, in metres"
+        )
     return array
 
 
@@ -245,16 +233,6 @@ def directions(vectors: ArrayLike) -> NDArray[np.float64]:
         index = int((lengths <= 0).argmax())
         raise InvalidInputError(f"direction {index} is {array[index]}: it has no length")
     return np.asarray(array / lengths[:, None], np.float64)
-
-
-def _number(name: str, value: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"{name} = {value!r} is not a number") from error
-    if not math.isfinite(number):
-        raise InvalidInputError(f"{name} = {value!r} is not finite")
-    return number
 
 
 def _points(points: ArrayLike, dtype: Any, error: type[InvalidInputError]) -> NDArray[Any]:

@@ -1,10 +1,9 @@
 """The client: publishes scans to a map server, and asks it about the map."""
 
 from pathlib import Path
-from types import TracebackType
 
 from numpy.typing import ArrayLike
-from triquad_format.mapfile.written_map import MapFileInfo
+from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
 from triquad_client.calls import admin, download, meshes, sdf
@@ -13,12 +12,11 @@ from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import FollowedMesh
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_tiles import HeldTiles
+from triquad_client.mesh.mesh_tiles import KnownTiles
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.net.blocking import BlockingDriver
 from triquad_client.net.connection import Connection, open_connection
-from triquad_client.offline.local_copy import LocalCopy
-from triquad_client.offline.synced import SyncedMap
+from triquad_client.net.remote_driver import RemoteDriver
+from triquad_client.offline.synced_map import SyncedMap
 
 
 class Client(MapQueries):
@@ -33,19 +31,14 @@ class Client(MapQueries):
     def __init__(self, connection: Connection) -> None:
         """Use :func:`connect`."""
         self._connection = connection
-        self._driver = BlockingDriver(connection)
+        self._driver = RemoteDriver(connection)
         self._scans = ScanPublisher(connection)
         super().__init__(self._driver.run)
 
     def __enter__(self) -> "Client":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -61,7 +54,7 @@ class Client(MapQueries):
         self,
         points: ArrayLike,
         world_from_sensor: ArrayLike,
-        stamp: float | None = None,
+        stamp_s: float | None = None,
         source: str = "default",
     ) -> None:
         """Send a scan to be learnt. Returns once it is handed to the network.
@@ -69,19 +62,18 @@ class Client(MapQueries):
         Args:
             points: [N, 3] metres, sensor frame; points that are not finite are left out.
             world_from_sensor: [4, 4] rigid pose of the sensor in the map frame.
-            stamp: seconds since 1970, never running backwards within a source; ``None``: now.
+            stamp_s: since 1970, never running backwards within a source; ``None``: now.
             source: name of the sensor.
 
         Raises:
             InvalidScanError: the scan cannot be used; nothing was sent.
         """
-        self._scans.publish(points, world_from_sensor, stamp, source)
+        self._scans.publish(points, world_from_sensor, stamp_s, source)
 
-    def flush(self, timeout: float = 30.0, pending: int = 0) -> FlushReport:
+    def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
         """Wait until what this client published is dealt with and queries see it.
 
         Args:
-            timeout: seconds.
             pending: number of scans that may still be under way: more than 0 lets a fast
                 publisher run ahead of the server by so many.
 
@@ -91,18 +83,15 @@ class Client(MapQueries):
         Raises:
             RefusedError: ``timeout``.
         """
-        return self._run(self._scans.flush(timeout, pending))
+        return self._run(self._scans.flush(timeout_s, pending))
 
-    def settle(self, timeout: float = 600.0) -> ServerStatus:
+    def settle(self, timeout_s: float = 600.0) -> ServerStatus:
         """Wait until the server has nothing left to learn from the scans that reached it.
 
-        Args:
-            timeout: seconds.
-
         Raises:
-            RequestTimeoutError: it still had after that time.
+            RequestTimeoutError: it still had some after ``timeout_s``.
         """
-        return self._run(admin.settle(timeout))
+        return self._run(admin.settle(timeout_s))
 
     def pinned(self) -> PinnedMap:
         """The map as it is now, for queries that belong together."""
@@ -135,7 +124,7 @@ class Client(MapQueries):
         bounds: Bounds | None = None,
         level: int = 0,
         max_bytes_per_s: int | None = None,
-        held: HeldTiles | None = None,
+        known: KnownTiles | None = None,
     ) -> MeshWatch:
         """Follow the mesh tiles that meet ``bounds``: they are fetched once, then as they change.
 
@@ -143,9 +132,9 @@ class Client(MapQueries):
             bounds: corners of a box; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
             max_bytes_per_s: what this watch may take of the network; the server may allow less.
-            held: tiles of an earlier watch, which are not fetched again.
+            known: tiles of an earlier watch, which are not fetched again.
         """
-        followed = FollowedMesh.to_begin_with(bounds, level, max_bytes_per_s, held)
+        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s, known)
         return MeshWatch(self._connection, followed)
 
     def status(self) -> ServerStatus:
@@ -185,7 +174,7 @@ class Client(MapQueries):
 
         Raises:
             InvalidInputError: the bounds are not a box, or hold nothing.
-            DownloadError: nothing of the map lies in the box, or what arrived is not sound.
+            DownloadError: nothing of the map lies in the box, or what arrived is not valid.
             OSError: the file cannot be written.
         """
         return self._run(download.fetch_box(Path(path), bounds))
@@ -199,17 +188,17 @@ class Client(MapQueries):
         Args:
             bounds: corners of a box, metres, map frame. Surfaces are known as far as it reaches:
                 make it larger than where you ask by the largest distance that you ask for.
-            path: the file; one that is no sound map file is replaced. :func:`open_map` opens it
+            path: the file; one that is no valid map file is replaced. :func:`open_map` opens it
                 without a server.
 
         Raises:
             InvalidInputError: the bounds are not a box, or hold nothing.
-            DownloadError: what arrived is not sound.
+            DownloadError: what arrived is not valid.
             OSError: the file cannot be read or written.
         """
-        copy = LocalCopy(Path(path), bounds)
-        self._run(copy.update())
-        return SyncedMap(copy, self._run)
+        synced = SyncedMap(Path(path), bounds, self._run)
+        synced.refresh()
+        return synced
 
     def maps(self) -> list[str]:
         """Names of all maps that can be reached, also those of other servers."""

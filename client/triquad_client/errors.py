@@ -1,6 +1,6 @@
 """The errors of the client. Each text says what to do about it."""
 
-from triquad_map.errors import TriquadError
+from triquad_format.errors import TriquadError
 
 
 class ConnectError(TriquadError):
@@ -27,15 +27,6 @@ class RequestTimeoutError(TriquadError):
 
 class BadReplyError(TriquadError):
     """A reply that this release does not understand."""
-
-
-class RefusedError(TriquadError):
-    """The server refused; ``code`` is one of ``triquad_format.wire.messages.ERROR_CODES``."""
-
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(f"{code}: {message}")
-        self.code = code
-        self.message = message
 
 
 class ClosedError(TriquadError):

@@ -31,8 +31,8 @@ def costs(grid: Grid, robot: Robot, floor_m: float, decay: float) -> NDArray[np.
     """Costs [x, y] of the robot's balls at the grid's layers."""
     heights = grid.shape.corner[2] + (np.arange(grid.shape.counts[2]) + 0.5) * grid.shape.cell_m
     # The floor is near, too, and no obstacle: what counts is nearer than it by the step.
-    counts = grid.distance <= heights - floor_m - robot.step_m
-    distance = np.where(counts, grid.distance, np.inf).min(axis=2)
+    counts = grid.distance_m <= heights - floor_m - robot.step_m
+    distance = np.where(counts, grid.distance_m, np.inf).min(axis=2)
     beyond = np.maximum(distance - robot.radius_m, 0.0)
     cost = ((INSCRIBED - 1) * np.exp(-decay * beyond)).astype(np.int8)
     # Where no ray has been there may be anything: distances are to what was seen.

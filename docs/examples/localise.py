@@ -34,7 +34,7 @@ def simulated_scan(view: MapQueries, world_from_sensor: NDArray[np.float64]) -> 
     answer = view.query_rays(world_from_sensor[:3, 3], rays @ world_from_sensor[:3, :3].T, 40.0)
     hit = answer.status == Status.SURFACE  # where it is UNKNOWN, nobody knows what is there
     noise = np.random.default_rng(0).normal(0, 0.02, hit.sum())
-    return (answer.range[hit] + noise)[:, None] * rays[hit]
+    return (answer.range_m[hit] + noise)[:, None] * rays[hit]
 
 
 def read_scan(path: Path) -> NDArray[np.float64]:
@@ -85,7 +85,7 @@ def main() -> None:
             points = read_scan(options.scan)
         else:
             points = simulated_scan(view, pose(*SIMULATED_AT))
-        answer = view.align(points, pose(*options.guess), max_distance=2.0)
+        answer = view.align(points, pose(*options.guess), max_distance_m=2.0)
     found = answer.world_from_sensor
     x, y, z = found[:3, 3]
     yaw_deg = np.degrees(np.arctan2(found[1, 0], found[0, 0]))

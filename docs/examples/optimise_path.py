@@ -58,7 +58,7 @@ async def bend(view: AsyncPinnedMap, path: Places, body: Body) -> Places:
     reach_m = body.radius_m + body.margin_m
     for _ in range(STEPS):
         near = await view.query_distance(path[1:-1], reach_m, unknown="obstacle")
-        price = push(near.distance, near.gradient, body)
+        price = push(near.distance_m, near.gradient, body)
         ahead = path[2:] - path[:-2]
         ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
         price -= (price * ahead).sum(axis=1, keepdims=True) * ahead  # aside, not along the path
@@ -81,13 +81,13 @@ async def optimise(options: argparse.Namespace) -> None:
         for bow_m, check in zip(BOWS_M, checks, strict=True):
             free = "free" if check.free() else "not free"
             print(
-                f"bow {bow_m:+.0f} m: {check.length:.2f} m, clearance {check.clearance:.2f} m, "
+                f"bow {bow_m:+.0f} m: {check.length_m:.2f} m, clearance {check.clearance_m:.2f} m, "
                 f"{free} in epoch {check.epoch}"
             )
         good = [number for number, check in enumerate(checks) if check.free()]
         if not good:
             raise SystemExit("no path is free: plan one first, and bend that")
-        best = min(good, key=lambda number: checks[number].length)
+        best = min(good, key=lambda number: checks[number].length_m)
         print(f"best: bow {BOWS_M[best]:+.0f} m")
         print(paths[best][:: POINTS // 6].round(2))
 

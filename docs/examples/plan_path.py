@@ -109,7 +109,9 @@ def main() -> None:
         # The map has gone on meanwhile: what is driven must be free in the newest one.
         now = client.query_polyline(path, options.radius)
         print(f"planned in epoch {view.epoch}, checked in epoch {now.epoch}: free {now.free()}")
-        print(f"{now.length:.1f} m, clearance {now.clearance:.2f} m at {now.clearance_at:.1f} m")
+        print(
+            f"{now.length_m:.1f} m, clearance {now.clearance_m:.2f} m at {now.clearance_at_m:.1f} m"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,37 @@
-"""The errors of the format package. Each carries the offending value in its text."""
+"""The errors that all of triquad shares. Each carries the offending value in its text."""
+
+ERROR_CODES = {
+    "bad_request": "the request is malformed or out of range",
+    "bad_version": "the request is of another protocol version",
+    "too_large": "the request exceeds a limit of the server; split it",
+    "epoch_gone": "the pinned epoch is no longer kept",
+    "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
+    "timeout": "the server could not finish in the time that the request allows",
+    "busy": "too many requests are waiting",
+    "store": "the checkpoint could not be written",
+    "internal": "an error inside the server; its log has the details",
+}
+"""Why a request is refused; they travel in :class:`triquad_format.wire.messages.ErrorReply`."""
 
 
-class FormatError(Exception):
+class TriquadError(Exception):
+    """Base of all errors of triquad."""
+
+
+class RefusedError(TriquadError):
+    """A request that is not answered.
+
+    ``code`` is one of :data:`ERROR_CODES`, or one that a newer server added; ``message`` names the
+    offending value.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(f"{code}: {message}")
+        self.code = code
+        self.message = message
+
+
+class FormatError(TriquadError):
     """Bytes or values that are not what the triquad formats allow."""
 
 
@@ -26,7 +56,7 @@ class NoIndexError(MapFileError):
 
 
 class UnsupportedMapFileError(MapFileError):
-    """A sound map file that needs a newer reader; the text names what is missing."""
+    """A valid map file that needs a newer reader; the text names what is missing."""
 
 
 class TooLargeMapFileError(MapFileError):

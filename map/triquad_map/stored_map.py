@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from triquad_format.mapfile.file_errors import named
 from triquad_format.mapfile.index import MapIndex, OpenFile, files_in
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.parts.cell import cells_near, extent, vertex_reach
+from triquad_format.mapfile.mcap.random_access import FileBytes, RandomAccess
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     FIELD_TOPICS,
@@ -18,9 +18,12 @@ from triquad_format.mapfile.parts.part import (
     REGION_TOPICS,
     VERTICES,
     PartKey,
+    cells_near,
+    extent,
+    vertex_reach,
 )
-from triquad_format.mapfile.parts.unpack import RegionParts, assemble
-from triquad_format.mapfile.random_access import FileBytes, RandomAccess
+from triquad_format.mapfile.reader import assemble
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.leaf_box import SLACK_LEAVES, LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import (
@@ -31,7 +34,10 @@ from triquad_format.records.region import (
     region_centre,
 )
 
-from triquad_map.reference.evaluator import Answer, MapEvaluator, check_points
+from triquad_map.composition.field_view import FieldView
+from triquad_map.reference.evaluator import checked_points, in_chunks
+from triquad_map.reference.partial_region import PartialRegion
+from triquad_map.view import FieldAnswer
 
 
 class StoredMap:
@@ -43,18 +49,18 @@ class StoredMap:
         with named(self.name):
             self._index = MapIndex(source, open_file)
         self._settings = self.manifest.facts.settings
-        self._parts: dict[RegionIndex, RegionParts] = {}
         self._loaded: set[PartKey] = set()
         self._by_key = {entry.key: entry for entry in self.manifest.entries}
-        self._regions = [e.key.region for e in self.manifest.entries if e.key.topic == REGION]
-        self._evaluator = MapEvaluator(self._record())
+        self._indices = [e.key.region for e in self.manifest.entries if e.key.topic == REGION]
+        self._regions: dict[RegionIndex, PartialRegion] = {}
+        self._view = FieldView(self._settings, [], split=in_chunks)
 
     @classmethod
     def open(cls, path: Path | str) -> "StoredMap":
         """The map in a file; other files that it needs lie in the same folder.
 
         Raises:
-            NoIndexError: only :func:`triquad_format.mapfile.mapfile.read_map` can read the file.
+            NoIndexError: only :func:`triquad_format.mapfile.reader.read_map` can read the file.
             MapFileError: it is not a map file, is damaged, or needs a newer reader.
             OSError: it cannot be read.
         """
@@ -85,17 +91,16 @@ class StoredMap:
         """Close all files."""
         self._index.close()
 
-    def query(self, points: NDArray[np.floating], gradient: bool = False) -> Answer:
-        """Distance, status and, on request, gradient: see :meth:`MapEvaluator.query`.
+    def query(self, points: NDArray[np.floating], gradient: bool = False) -> FieldAnswer:
+        """Distance, status and, on request, gradient: as :class:`MapEvaluator` gives them.
 
         Raises:
             MapFileError: a part that is needed is damaged.
         """
-        positions = np.asarray(points, np.float64)
-        check_points(positions)
+        positions = checked_points(points)
         with named(self.name):
             self._load(self._needed_at(positions))
-        return self._evaluator.query(positions, gradient)
+        return self._view.query(positions, gradient)
 
     def record(self, training: bool = True) -> MapRecord:
         """The whole map, read part by part.
@@ -127,7 +132,7 @@ class StoredMap:
     def parts_in(self, minimum: ArrayLike, maximum: ArrayLike) -> tuple[Entry, ...]:
         """The parts that :meth:`box` consists of; arguments and errors are the same."""
         low, high = check_box(minimum, maximum)
-        boxes = {index: leaf_box(self._settings, index, low, high) for index in self._regions}
+        boxes = {index: leaf_box(self._settings, index, low, high) for index in self._indices}
         return tuple(
             entry
             for entry in self.manifest.entries
@@ -157,12 +162,12 @@ class StoredMap:
         slack = vertex_reach(self._settings) if key.topic == VERTICES else 1
         return box.meets(extent(self._settings, key), slack)
 
-    def _needed_at(self, points: NDArray[np.float64]) -> set[PartKey]:
-        """Parts that answers at points [N, 3] hang on."""
+    def _needed_at(self, points: Doubles) -> set[PartKey]:
+        """Parts on which answers at points [N, 3] depend."""
         needed: set[PartKey] = set()
         half = self._settings.region_side_m / 2
         reach = vertex_reach(self._settings) + SLACK_LEAVES
-        for index in self._regions:
+        for index in self._indices:
             offset = points - region_centre(self._settings, index)
             offset = offset[(np.abs(offset) < half).all(axis=1)]
             if not len(offset):
@@ -176,30 +181,18 @@ class StoredMap:
         return needed & self._by_key.keys()
 
     def _load(self, keys: set[PartKey]) -> None:
-        """Read what is not there yet."""
-        missing = keys - self._loaded
+        """Read what is not there yet; of each region all or nothing."""
+        missing = sorted(keys - self._loaded)
         if not missing:
             return
-        try:
-            for key in sorted(missing):
-                parts = self._parts.setdefault(key.region, RegionParts(key.region, self._settings))
-                parts.add(key, self._index.payload(self._by_key[key]))
-            record = self._record()
-            check_record(record)
-        except BaseException:
-            self._forget({key.region for key in missing})
-            raise
-        self._loaded |= missing
-        self._evaluator = MapEvaluator(record)
-
-    def _forget(self, regions: set[RegionIndex]) -> None:
-        """Let regions be read anew: what was read of them may be half of what they need."""
-        self._parts = {index: parts for index, parts in self._parts.items() if index not in regions}
-        self._loaded = {key for key in self._loaded if key.region not in regions}
-
-    def _record(self) -> MapRecord:
-        facts = self.manifest.facts
+        for index in sorted({key.region for key in missing}):
+            new = [key for key in missing if key.region == index]
+            payloads = {key: self._index.payload(self._by_key[key]) for key in new}
+            head = payloads.pop(PartKey(REGION, index), b"")
+            region = self._regions.get(index) or PartialRegion(self._settings, index, head)
+            region.add(payloads)
+            self._regions[index] = region
+            self._loaded.update(new)
         # Blending adds up regions in their order, which is that of the file.
-        loaded = [self._parts[index] for index in self._regions if index in self._parts]
-        regions = tuple(parts.region() for parts in loaded)
-        return MapRecord(facts.name, facts.epoch, facts.settings, regions)
+        there = [self._regions[index] for index in self._indices if index in self._regions]
+        self._view = FieldView(self._settings, there, split=in_chunks)

@@ -25,7 +25,7 @@ exit codes:
      or the newest needs a newer release or more memory
 """
 
-_NEEDED = ("torch", "numba", "foxglove_schemas_protobuf")
+_NEEDED = ("torch", "numba", "pydantic_settings")
 
 _log = logging.getLogger("triquad_server")
 
@@ -44,33 +44,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     if missing:
         _log.error("%s is missing: install triquad[server]", ", ".join(missing))
         return USAGE
-    return _run(options)
+    return _exit_code(options)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _exit_code(options: argparse.Namespace) -> int:
+    """Do what the options say; every error becomes a line in the log and an exit code."""
     from triquad_server.errors import ListenError, ServerError, StoreError
-    from triquad_server.net.session import NetworkOptions
-    from triquad_server.settings import Settings, load_settings
-    from triquad_server.stop import Stop, Stops
 
     try:
-        check_name("map", options.map)
-        settings = load_settings(options.settings) if options.settings else Settings()
-        stops: Stops = queue.SimpleQueue()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stops.put(Stop.ASKED))
-        # Only now, since it takes seconds to import.
-        from triquad_server.launch import LaunchOptions, run_server
-
-        network = NetworkOptions(
-            tuple(options.listen),
-            tuple(options.connect),
-            options.mode,
-            options.config,
-            False if options.no_multicast_scouting else None,
-        )
-        launch = LaunchOptions(options.map, network, settings, options.store, options.device)
-        why = run_server(launch, stops)
+        return _run(options)
     except ListenError as error:
         _log.error("%s", error)
         return CANNOT_LISTEN
@@ -83,6 +65,41 @@ def _run(options: argparse.Namespace) -> int:
     except Exception:
         _log.exception("unexpected")
         return UNEXPECTED
+
+
+def _run(options: argparse.Namespace) -> int:
+    from triquad_server.net.session import NetworkOptions
+    from triquad_server.settings_sources import load_settings, settings_toml
+    from triquad_server.stop import Stop, Stops
+
+    check_name("map", options.map)
+    settings = load_settings(options.settings, options.set)
+    if options.print_settings:
+        sys.stdout.write(settings_toml(settings))
+        return OK
+    stops: Stops = queue.SimpleQueue()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stops.put(Stop.ASKED))
+    # Only now, since it takes seconds to import.
+    from triquad_server.launch import LaunchOptions, run_server
+
+    network = NetworkOptions(
+        listen=tuple(options.listen),
+        connect=tuple(options.connect),
+        mode=options.mode,
+        config_file=options.config,
+        multicast_scouting=False if options.no_multicast_scouting else None,
+    )
+    why = run_server(
+        LaunchOptions(
+            map_name=options.map,
+            network=network,
+            settings=settings,
+            store=options.store,
+            device=options.device,
+        ),
+        stops,
+    )
     return OK if why is Stop.ASKED else UNEXPECTED
 
 
@@ -102,10 +119,35 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="folder for checkpoints, in a folder per map; without it the map is not kept",
     )
-    add("--settings", type=Path, metavar="FILE", help="settings of the server, TOML")
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
-    network = parser.add_argument_group("network")
-    add = network.add_argument
+    _add_settings(parser.add_argument_group("settings (docs/settings.md)"))
+    _add_network(parser.add_argument_group("network"))
+    add(
+        "--log-level",
+        choices=("debug", "info", "warning", "error"),
+        default="info",
+        help="default: info",
+    )
+    add("--version", action="version", version=f"triquad {triquad_format.__version__}")
+    return parser
+
+
+def _add_settings(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--settings", type=Path, metavar="FILE", help="settings of the server, TOML")
+    add(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="one setting, such as training.batch=4096, repeatable; goes before the environment "
+        "(TRIQUAD_TRAINING__BATCH=4096), and that before the file",
+    )
+    add("--print-settings", action="store_true", help="print the settings in effect, and exit")
+
+
+def _add_network(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
     add(
         "-l",
         "--listen",
@@ -125,16 +167,6 @@ def _parser() -> argparse.ArgumentParser:
     add("-m", "--mode", choices=("router", "peer", "client"), help="default: router")
     add("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration, JSON5")
     add("--no-multicast-scouting", action="store_true", help="do not look for others by multicast")
-    parser.add_argument(
-        "--log-level",
-        choices=("debug", "info", "warning", "error"),
-        default="info",
-        help="default: info",
-    )
-    parser.add_argument(
-        "--version", action="version", version=f"triquad {triquad_format.__version__}"
-    )
-    return parser
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import threading
 
 
-class Tally:
+class Counter:
     """How often each thing happened."""
 
     def __init__(self) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import triquad_format
 from triquad_format.wire.messages import ServerStatus, StatusRequest
 
-from triquad_server.counter import Tally
+from triquad_server.counter import Counter
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper_thread import MapperThread
@@ -27,9 +27,9 @@ class Identity:
 class Counts:
     """What the server counts."""
 
-    scans_dropped: Tally
-    points_dropped: Tally
-    requests_refused: Tally
+    scans_dropped: Counter
+    points_dropped: Counter
+    requests_refused: Counter
 
 
 class Health:
@@ -74,7 +74,7 @@ class Health:
             points_dropped=self._counts.points_dropped.counts(),
             requests_refused=self._counts.requests_refused.counts(),
             samples_trained=progress.samples_trained,
-            segments_kept=progress.segments_kept,
+            rays_kept=progress.rays_kept,
             loss=float(progress.loss),
             regions=epoch.regions,
             vertices=epoch.vertices,

@@ -17,8 +17,10 @@ from triquad_server.net.session import NetworkOptions, listen_endpoints, open_se
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.stop import Stop, Stops, wait_for_stop
+from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
+from triquad_server.threads import Teams
 from triquad_server.warm_up import warm_up
 
 _log = logging.getLogger("triquad_server")
@@ -57,20 +59,22 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         if options.store is not None:
             store = Store(options.store, options.map_name, Retention.chosen(options.settings.store))
             stack.enter_context(closing(store))
-            restored = store.newest()
-        if restored is not None:
-            _log.info("restoring epoch %d from %s", restored.record.epoch, restored.info.path)
-        record = restored.record if restored else None
-        if record is not None and record.name != options.map_name:
-            _log.warning("the checkpoint is of a map named '%s'", record.name)
-        if record is not None and record.settings != options.settings.field:
-            _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
+            restored = _restored(store, options)
         _prepare(options.settings, device)
-        mapper = Mapper(options.map_name, options.settings, device, record)
+        teams = Teams()
+        mapper = Mapper(
+            options.map_name, options.settings, device, restored.record if restored else None, teams
+        )
         session = stack.enter_context(closing(open_session(options.network)))
-        info = restored.info if restored else None
-        served = ServedMap(options.map_name, mapper, device, store, info)
-        service = Service(session, served, options.settings, lambda: stops.put(Stop.DEFECT))
+        served = ServedMap(
+            name=options.map_name,
+            mapper=mapper,
+            device=device,
+            store=store,
+            restored=restored.info if restored else None,
+            teams=teams,
+        )
+        service = Service(session, served, options.settings, lambda: stops.put(Stop.INTERNAL_ERROR))
         stack.enter_context(closing(service))
         spare_from_collection()
         _log_ready(options, service.epoch, device)
@@ -78,6 +82,20 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         _log.info("stopping, %s", why.value)
     _log.info("stopped")
     return why
+
+
+def _restored(store: Store, options: LaunchOptions) -> ValidCheckpoint | None:
+    """The checkpoint from which the map goes on, if there is one."""
+    restored = store.newest()
+    if restored is None:
+        return None
+    record = restored.record
+    _log.info("restoring epoch %d from %s", record.epoch, restored.path)
+    if record.name != options.map_name:
+        _log.warning("the checkpoint is of a map named '%s'", record.name)
+    if record.settings != options.settings.field:
+        _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
+    return restored
 
 
 def choose_device(wanted: str) -> str:

@@ -29,7 +29,7 @@ def give_back_early() -> None:
     """Have memory that is free go back to the system, where its C library is glibc.
 
     By default it keeps arrays of up to 32 MB for later, for each of some 30 threads apart: a server
-    that allocates and frees such arrays all the time would hold a quarter more than it uses.
+    that allocates and frees such arrays all the time would take a quarter more than it uses.
     """
     if sys.platform != "linux":
         return
@@ -43,7 +43,7 @@ def give_back_early() -> None:
 def spare_from_collection() -> None:
     """Leave all objects that are there now out of every later garbage collection.
 
-    torch and numba make a quarter of a million, which stay: to look through them would stop all
+    torch and numba make a quarter of a million, which stay: to go through them would stop all
     threads for a tenth of a second.
     """
     gc.collect()

@@ -1,105 +1,148 @@
-"""Settings of the server: one small record per part, and their TOML file."""
+"""Settings of the server: one record per section, with ranges and descriptions.
 
-import dataclasses
-import sys
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+:mod:`triquad_server.settings_sources` reads them from a file, the environment and the command line.
+"""
 
-from triquad_format.errors import SettingsError
-from triquad_format.records.field_settings import FieldSettings, check_range
+from typing import Annotated, Any
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from triquad_format.records.field_settings import FieldSettings
+
+_RECORD = ConfigDict(
+    frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+)
 
 
-@dataclass(frozen=True)
-class ScanSettings:
+class ScanSettings(BaseModel):
     """Which points of a scan are used, and where its rays are sampled."""
 
-    range_min_m: float = 1.5
-    range_max_m: float = 50.0
-    thin_m: float = 0.05  # one point is kept per voxel of this side
-    surface_share: float = 0.5  # of the training samples that lie around end points
-    spread_m: float = 0.08  # standard deviation of their distance from them, along the ray
-    truncation_m: float = 0.3  # and how far from them they lie at most
-    free_from: float = 0.3  # free samples begin at this share of the range
-    behind_m: float = 0.8  # and end this far behind the end point
-    max_points: int = 500_000  # a larger scan is refused
+    model_config = _RECORD
 
-    def __post_init__(self) -> None:
-        check_range("range_min_m", self.range_min_m, 0.0, 1e3)
-        check_range("range_max_m", self.range_max_m, self.range_min_m, 1e4)
-        check_range("thin_m", self.thin_m, 1e-3, 10.0)
-        check_range("surface_share", self.surface_share, 0.01, 1.0)
-        check_range("spread_m", self.spread_m, 1e-3, 10.0)
-        check_range("truncation_m", self.truncation_m, 0.01, 10.0)
-        check_range("free_from", self.free_from, 0.0, 1.0)
-        check_range("behind_m", self.behind_m, 0.0, 100.0)
-        check_range("max_points", self.max_points, 1, 20_000_000)
+    range_min_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
+    """Nearer points are dropped."""
+
+    range_max_m: Annotated[float, Field(ge=0, le=1e4)] = 50.0
+    """Farther points are dropped; at least `range_min_m`."""
+
+    thin_m: Annotated[float, Field(ge=1e-3, le=10)] = 0.05
+    """One point is kept per voxel of this side."""
+
+    surface_share: Annotated[float, Field(ge=0.01, le=1)] = 0.5
+    """Share of the training samples that lie around end points; the others lie in free space."""
+
+    spread_m: Annotated[float, Field(ge=1e-3, le=10)] = 0.08
+    """Standard deviation of the distance of samples from their end point, along the ray."""
+
+    truncation_m: Annotated[float, Field(ge=0.01, le=10)] = 0.3
+    """Largest distance of such samples from their end point."""
+
+    free_from: Annotated[float, Field(ge=0, le=1)] = 0.3
+    """Samples of free space begin at this share of the range."""
+
+    behind_m: Annotated[float, Field(ge=0, le=100)] = 0.8
+    """Samples of free space end so far behind the end point."""
+
+    max_points: Annotated[int, Field(ge=1, le=20_000_000)] = 500_000
+    """A larger scan is refused."""
+
+    @model_validator(mode="after")
+    def _range_is_not_empty(self) -> "ScanSettings":
+        if self.range_max_m < self.range_min_m:
+            raise ValueError(
+                f"scan.range_max_m = {self.range_max_m:g} is less than "
+                f"scan.range_min_m = {self.range_min_m:g}: use at least that"
+            )
+        return self
 
 
-@dataclass(frozen=True)
-class TrainingSettings:
+class TrainingSettings(BaseModel):
     """How the field is trained."""
 
-    batch: int = 16_384  # samples per step
-    learning_rate: float = 0.01
-    beta1: float = 0.9
-    beta2: float = 0.99
-    pool_segments: int = 1_200_000  # what so many rays taught is kept, over the whole map
-    fresh_share: float = 0.5  # of a batch, drawn from the newest scans while they stream in
-    visits: float = 48.0  # training samples that each new segment pays for
-    max_backlog: int = 24_000_000  # samples owed at most, per region
-    cooldown: float = 8.0  # the rate falls once less than this many samples a kept segment are owed
-    max_regions: int = 256  # of the map; a scan that would need more is refused
-    seed: int = 42
+    model_config = _RECORD
 
-    def __post_init__(self) -> None:
-        check_range("batch", self.batch, 1, 10_000_000)
-        check_range("learning_rate", self.learning_rate, 0.0, 1.0)
-        check_range("beta1", self.beta1, 0.001, 0.9999)
-        check_range("beta2", self.beta2, 0.001, 0.99999)
-        if self.beta2 < self.beta1**2:  # steps would grow without a bound (Kingma and Ba, sec. 4)
-            raise SettingsError(
-                f"beta2 = {self.beta2} is too small for beta1 = {self.beta1}: "
+    batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
+    """Samples per step."""
+
+    learning_rate: Annotated[float, Field(ge=0, le=1)] = 0.01
+    """Learning rate of Adam, before it cools."""
+
+    beta1: Annotated[float, Field(ge=0.001, le=0.9999)] = 0.9
+    """Decay of Adam's mean of gradients."""
+
+    beta2: Annotated[float, Field(ge=0.001, le=0.99999)] = 0.99
+    """Decay of Adam's mean of squared gradients; at least the square of `beta1`."""
+
+    pool_rays: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
+    """What so many rays taught is kept for training, over the whole map."""
+
+    fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """Share of a batch that is drawn from the newest scans while they stream in."""
+
+    samples_per_ray: Annotated[float, Field(ge=0, le=1000)] = 48.0
+    """Each new ray raises the training budget of its region by so many samples."""
+
+    max_budget_samples: Annotated[int, Field(ge=1, le=10_000_000_000)] = 24_000_000
+    """Largest training budget of a region, in samples."""
+
+    cooldown: Annotated[float, Field(ge=0.001, le=1000)] = 8.0
+    """The learning rate falls once the budget is less than this many samples per kept ray."""
+
+    max_regions: Annotated[int, Field(ge=1, le=1_000_000)] = 256
+    """Regions of the map; a scan that would need more is refused."""
+
+    seed: Annotated[int, Field(ge=0, le=2**31)] = 42
+    """Seed of all random choices."""
+
+    @model_validator(mode="after")
+    def _steps_are_bounded(self) -> "TrainingSettings":
+        """Kingma and Ba, section 4."""
+        if self.beta2 < self.beta1**2:
+            raise ValueError(
+                f"training.beta2 = {self.beta2} is too small for training.beta1 = {self.beta1}: "
                 f"use at least {self.beta1**2:.6g}"
             )
-        check_range("pool_segments", self.pool_segments, 100, 1_000_000_000)
-        check_range("fresh_share", self.fresh_share, 0.0, 1.0)
-        check_range("visits", self.visits, 0.0, 1000.0)
-        check_range("cooldown", self.cooldown, 0.001, 1000.0)
-        check_range("max_regions", self.max_regions, 1, 1_000_000)
-        check_range("seed", self.seed, 0, 2**31)
-        check_range("max_backlog", self.max_backlog, 1, 10_000_000_000)
+        return self
 
 
-@dataclass(frozen=True)
-class MeshSettings:
-    """The lattice of mesh tiles."""
+class MeshSettings(BaseModel):
+    """The lattice of mesh tiles, and how clients follow them."""
 
-    cell_m: float = 0.1
-    tile_cells: int = 64  # along the side of a tile
-    reach_m: float = 0.02  # centres of faces lie at most this far from voxels with seen surface
-    tolerance_m: float = 0.01  # a tile changes where its surface moved by more
-    update_period_s: float = 0.5  # between looks at what changed, while somebody follows the mesh
-    update_timeout_max_s: float = 60.0  # longest that a request is held
-    reply_bytes: int = 1_000_000  # of tiles in one reply; one tile may be larger
-    client_bytes_per_s: int = 0  # of tiles to each client; 0: no limit
-    shelf_bytes: int = 200_000_000  # of encoded tiles that are kept
+    model_config = _RECORD
 
-    def __post_init__(self) -> None:
-        check_range("cell_m", self.cell_m, 0.01, 10.0)
-        check_range("tile_cells", self.tile_cells, 4, 256)
-        check_range("reach_m", self.reach_m, 0.0, 1.0)
-        check_range("tolerance_m", self.tolerance_m, 0.0, 1.0)
-        check_range("update_period_s", self.update_period_s, 0.01, 3600.0)
-        check_range("update_timeout_max_s", self.update_timeout_max_s, 0.1, 3600.0)
-        check_range("reply_bytes", self.reply_bytes, 1000, 100_000_000)
-        check_range("client_bytes_per_s", self.client_bytes_per_s, 0, 2**40)
-        check_range("shelf_bytes", self.shelf_bytes, 0, 2**40)
+    cell_m: Annotated[float, Field(ge=0.01, le=10)] = 0.1
+    """Side of the cells of marching cubes."""
+
+    tile_cells: Annotated[int, Field(ge=4, le=256)] = 64
+    """Cells along the side of a tile."""
+
+    reach_m: Annotated[float, Field(ge=0, le=1)] = 0.02
+    """Centres of faces lie at most this far from voxels with seen surface; twice and four times as
+    far on levels of detail 1 and 2."""
+
+    tolerance_m: Annotated[float, Field(ge=0, le=1)] = 0.01
+    """A tile changes where its surface moved by more."""
+
+    update_period_s: Annotated[float, Field(ge=0.01, le=3600)] = 0.5
+    """Time between searches for changed tiles, while somebody follows the mesh."""
+
+    update_timeout_max_s: Annotated[float, Field(ge=0.1, le=3600)] = 60.0
+    """Longest time that a request for changes may wait, whatever the client asks for."""
+
+    reply_bytes: Annotated[int, Field(ge=1000, le=100_000_000)] = 1_000_000
+    """Bytes of tiles in one reply; a single tile may be larger."""
+
+    client_bytes_per_s: Annotated[int, Field(ge=0, le=2**40)] = 0
+    """Bytes of tiles that each client is sent per second; 0: no limit but its own."""
+
+    cache_bytes: Annotated[int, Field(ge=0, le=2**40)] = 200_000_000
+    """Bytes of encoded tiles that are cached; others are made again when they are asked for."""
 
     @property
     def tile_side_m(self) -> float:
@@ -107,53 +150,66 @@ class MeshSettings:
         return self.cell_m * self.tile_cells
 
 
-@dataclass(frozen=True)
-class StoreSettings:
+class StoreSettings(BaseModel):
     """When checkpoints are written and how far back they are kept."""
 
-    period_s: float = 60.0  # between checkpoints while the map changes; 0: only on request
-    keep: int = 20  # newest checkpoints that stay on disk; two always do
-    keep_age_s: float = 0.0  # older ones go; 0: of any age
-    keep_bytes: int = 4_000_000_000  # as long as all take more, the oldest go; 0: no limit
+    model_config = _RECORD
 
-    def __post_init__(self) -> None:
-        check_range("period_s", self.period_s, 0.0, 1e7)
-        check_range("keep", self.keep, 2, 1_000_000)
-        check_range("keep_age_s", self.keep_age_s, 0.0, 1e10)
-        check_range("keep_bytes", self.keep_bytes, 0, 2**60)
+    period_s: Annotated[float, Field(ge=0, le=1e7)] = 60.0
+    """Time between checkpoints while the map changes; 0: only on request."""
+
+    keep: Annotated[int, Field(ge=2, le=1_000_000)] = 20
+    """Newest checkpoints that stay on disk; two always do."""
+
+    keep_age_s: Annotated[float, Field(ge=0, le=1e10)] = 0.0
+    """Older checkpoints are deleted; 0: of any age stay."""
+
+    keep_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
+    """The oldest checkpoints are deleted while all take more; 0: no limit."""
 
 
-@dataclass(frozen=True)
-class ServiceSettings:
+class ServiceSettings(BaseModel):
     """Limits of the network service."""
 
-    scan_queue: int = 32  # scans waiting; the oldest is pushed out, and counted
-    request_queue: int = 64  # requests waiting per group of operations
-    query_workers: int = 2
-    max_query_points: int = 1_000_000  # of one request for the field
-    max_search_points: int = 250_000  # of one request that searches around points
-    publish_period_s: float = 0.5  # between epochs while the map changes
-    epochs_kept: int = 4  # newest epochs that requests can ask for by number
-    epochs_pinned: int = 8  # older ones that stay because they were asked for by number
-    pin_s: float = 30.0  # and that for so long after the last time
-    flush_timeout_max_s: float = 600.0
+    model_config = _RECORD
 
-    def __post_init__(self) -> None:
-        check_range("scan_queue", self.scan_queue, 1, 10_000)
-        check_range("request_queue", self.request_queue, 1, 10_000)
-        check_range("query_workers", self.query_workers, 1, 64)
-        check_range("max_query_points", self.max_query_points, 1, 20_000_000)
-        check_range("max_search_points", self.max_search_points, 1, 20_000_000)
-        check_range("publish_period_s", self.publish_period_s, 0.01, 3600.0)
-        check_range("epochs_kept", self.epochs_kept, 1, 1000)
-        check_range("epochs_pinned", self.epochs_pinned, 0, 1000)
-        check_range("pin_s", self.pin_s, 0.0, 1e6)
-        check_range("flush_timeout_max_s", self.flush_timeout_max_s, 0.1, 1e6)
+    scan_queue: Annotated[int, Field(ge=1, le=10_000)] = 32
+    """Scans that wait; the oldest is pushed out, and counted."""
+
+    request_queue: Annotated[int, Field(ge=1, le=10_000)] = 64
+    """Requests that wait, per group of operations."""
+
+    query_workers: Annotated[int, Field(ge=1, le=64)] = 2
+    """Threads that answer queries of the field, as many for distances and spheres, and as many for
+    segments, rays and grids."""
+
+    max_query_points: Annotated[int, Field(ge=1, le=20_000_000)] = 1_000_000
+    """Points of one request for the field."""
+
+    max_search_points: Annotated[int, Field(ge=1, le=20_000_000)] = 250_000
+    """Points of one request that searches around points."""
+
+    publish_period_s: Annotated[float, Field(ge=0.01, le=3600)] = 0.5
+    """Time between epochs while the map changes."""
+
+    epochs_kept: Annotated[int, Field(ge=1, le=1000)] = 4
+    """Newest epochs that requests can ask for by number."""
+
+    epochs_pinned: Annotated[int, Field(ge=0, le=1000)] = 8
+    """Older epochs that stay because they were asked for by number; of more, the one asked for
+    longest ago goes."""
+
+    pin_s: Annotated[float, Field(ge=0, le=1e6)] = 30.0
+    """Time for which an epoch stays after it was last asked for by number."""
+
+    flush_timeout_max_s: Annotated[float, Field(ge=0.1, le=1e6)] = 600.0
+    """Longest time that a client may ask to wait in a flush."""
 
 
-@dataclass(frozen=True)
-class Settings:
+class Settings(BaseModel):
     """All settings; each part of the server receives its own section."""
+
+    model_config = _RECORD
 
     field: FieldSettings = FieldSettings()
     scan: ScanSettings = ScanSettings()
@@ -162,78 +218,50 @@ class Settings:
     store: StoreSettings = StoreSettings()
     service: ServiceSettings = ServiceSettings()
 
-    def __post_init__(self) -> None:
-        """Refuse settings that are each in range but do not go together."""
-        reach_m = self.scan.range_max_m
-        _check_together(
-            self.field.region_pitch_m * 8 >= reach_m,
-            f"scan.range_max_m = {reach_m:g} reaches over too many regions of field.leaf_m = "
-            f"{self.field.leaf_m:g} and field.depth = {self.field.depth}: "
-            f"use at most {self.field.region_pitch_m * 8:g}, or larger regions",
-        )
-        _check_together(
-            self.scan.thin_m * 1e6 >= reach_m,
-            f"scan.thin_m = {self.scan.thin_m:g} is too fine for scan.range_max_m = {reach_m:g}",
-        )
-        _check_together(
-            4 * (self.mesh.cell_m + self.mesh.reach_m) <= 16 * self.field.leaf_m,
-            f"mesh.cell_m = {self.mesh.cell_m:g} and mesh.reach_m = {self.mesh.reach_m:g} are too "
-            f"coarse for field.leaf_m = {self.field.leaf_m:g}",
-        )
+    @field_validator("*", mode="before")
+    @classmethod
+    def _numbers_are_no_truth_values(cls, section: object, info: ValidationInfo) -> object:
+        """Refuse ``true``, which Python takes for 1."""
+        for key, value in section.items() if isinstance(section, dict) else ():
+            if isinstance(value, bool):
+                raise ValueError(f"{info.field_name}.{key} = {value}: no setting is a truth value")
+        return section
+
+    @model_validator(mode="after")
+    def _regions_hold_scans(self) -> "Settings":
+        reach_m, most_m = self.scan.range_max_m, 8 * self.field.region_pitch_m
+        if reach_m > most_m:
+            raise ValueError(
+                f"scan.range_max_m = {reach_m:g} reaches over too many regions of field.leaf_m = "
+                f"{self.field.leaf_m:g} and field.depth = {self.field.depth}: "
+                f"use at most {most_m:g}, or larger regions"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _thinning_fits_range(self) -> "Settings":
+        if self.scan.thin_m * 1e6 < self.scan.range_max_m:
+            raise ValueError(
+                f"scan.thin_m = {self.scan.thin_m:g} is too fine for scan.range_max_m = "
+                f"{self.scan.range_max_m:g}: use at least {self.scan.range_max_m * 1e-6:g}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _mesh_fits_leaves(self) -> "Settings":
+        if self.mesh.cell_m + self.mesh.reach_m > 4 * self.field.leaf_m:
+            raise ValueError(
+                f"mesh.cell_m = {self.mesh.cell_m:g} and mesh.reach_m = {self.mesh.reach_m:g} are "
+                f"too coarse for field.leaf_m = {self.field.leaf_m:g}: "
+                f"together, use at most {4 * self.field.leaf_m:g}"
+            )
+        return self
 
 
-def _check_together(fits: bool, otherwise: str) -> None:
-    if not fits:
-        raise SettingsError(otherwise)
-
-
-def load_settings(path: Path) -> Settings:
-    """Settings from a TOML file; what it leaves out keeps its default.
-
-    Raises:
-        SettingsError: the file cannot be read, or a key is unknown, of the wrong type or out of
-            range. The text names the key and what is allowed.
-    """
-    try:
-        sections = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise SettingsError(f"settings file {path}: {error}") from error
-    try:
-        return parse_settings(sections)
-    except SettingsError as error:
-        raise SettingsError(f"settings file {path}: {error}") from error
-
-
-def parse_settings(sections: dict[str, Any]) -> Settings:
-    """Settings from nested tables, such as ``{"field": {"leaf_m": 0.3}}``."""
-    defaults = Settings()
-    known = [part.name for part in dataclasses.fields(Settings)]
-    parts: dict[str, Any] = {}
-    for name, table in sections.items():
-        if name not in known:
-            raise SettingsError(f"unknown section [{name}]; known are {', '.join(known)}")
-        if not isinstance(table, dict):
-            raise SettingsError(f"{name} = {table!r} is not a section: write [{name}]")
-        parts[name] = _parse_section(name, type(getattr(defaults, name)), table)
-    return dataclasses.replace(defaults, **parts)
-
-
-def _parse_section(section: str, record: type[Any], table: dict[str, Any]) -> Any:
-    known = {entry.name: entry.type for entry in dataclasses.fields(record)}
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        if key not in known:
-            raise SettingsError(f"unknown key {key!r} in [{section}]; known are {', '.join(known)}")
-        wanted = known[key]
-        if type(value) is int and abs(value) >= 2**63:
-            raise SettingsError(f"{section}.{key} is a number of more than 64 bits")
-        if wanted is float and type(value) is int:
-            value = float(value)
-        if type(value) is not wanted:
-            kind = getattr(wanted, "__name__", wanted)
-            raise SettingsError(f"{section}.{key} = {value!r} is not of type {kind}")
-        values[key] = value
-    try:
-        return record(**values)
-    except SettingsError as error:
-        raise SettingsError(f"[{section}] {error}") from error
+def setting_schemas() -> dict[str, dict[str, Any]]:
+    """The JSON schema of each setting: by section, then by key."""
+    schema = Settings.model_json_schema()
+    return {
+        section: schema["$defs"][reference["$ref"].rpartition("/")[2]]["properties"]
+        for section, reference in schema["properties"].items()
+    }

@@ -9,13 +9,13 @@ class Stop(Enum):
     """Why a server stops."""
 
     ASKED = "asked to"
-    DEFECT = "by a defect"
+    INTERNAL_ERROR = "by an internal error"
 
 
 Stops = queue.SimpleQueue[Stop]
-"""Where signals and defects ask the server to stop; may be put to from a signal handler."""
+"""Where signals and internal errors ask the server to stop; may be put to from a signal handler."""
 
-_LOOK_S = 0.5
+_WAKE_S = 0.5
 
 
 def wait_for_stop(stops: Stops) -> Stop:
@@ -26,4 +26,4 @@ def wait_for_stop(stops: Stops) -> Stop:
     """
     while True:
         with suppress(queue.Empty):
-            return stops.get(timeout=_LOOK_S)
+            return stops.get(timeout=_WAKE_S)

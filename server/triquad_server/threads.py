@@ -1,12 +1,19 @@
 """The teams of threads between which the server's work is split."""
 
+from dataclasses import dataclass, field
+
 from triquad_map.compiled.team import Team
 
-ANSWERS = Team("triquad-answers")
-"""For queries: someone waits."""
+NICENESS = 5
+"""How much later than queries, for which somebody waits, the system schedules all other work."""
 
-PATIENCE = 5
-"""Of everything but queries."""
 
-MAPPING = Team("triquad-mapping", PATIENCE)
-"""For taking in scans and training; the mapper's own thread is as patient."""
+@dataclass(frozen=True)
+class Teams:
+    """Teams for the work of one map; their threads are started when they are first needed."""
+
+    answers: Team = field(default_factory=lambda: Team("triquad-answers"))  # to queries
+    # Taking in scans and training; the mapper's own thread has the same niceness.
+    mapping: Team = field(default_factory=lambda: Team("triquad-mapping", NICENESS))
+    # Tiles that nobody waits for at the moment.
+    meshing: Team = field(default_factory=lambda: Team("triquad-meshing", NICENESS))

@@ -6,8 +6,9 @@ import numpy as np
 from triquad_map.questions.distance import DistanceOptions, distances
 
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_cache import TileShelf
+from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.settings import Settings
+from triquad_server.threads import Teams
 
 _DIRECTIONS = 400
 _RADIUS_M = 3.0
@@ -25,7 +26,8 @@ def warm_up(
     directions = np.random.default_rng(0).normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     radius = min(max(_RADIUS_M, settings.scan.range_min_m), settings.scan.range_max_m)
-    mapper = Mapper("warm-up", settings, device)
+    teams = Teams()
+    mapper = Mapper("warm-up", settings, device, teams=teams)
     report("taking in scans")
     mapper.ingest((directions * radius).astype(np.float32), np.eye(4))
     report("training")
@@ -35,6 +37,6 @@ def warm_up(
     epoch.query(directions, gradient=True)
     distances(epoch, directions, DistanceOptions(unknown_distance=True))
     report("meshes")
-    shelf = TileShelf(settings.mesh)
-    shelf.look(epoch)
-    shelf.make(0, (0, 0, 0))
+    cache = TileCache(settings.mesh, teams.meshing)
+    cache.refresh(epoch)
+    cache.make(0, (0, 0, 0))

@@ -5,30 +5,28 @@ import inspect
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable
-from typing import TypeVar
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import triquad_client
 import zenoh
 from support import servers
+from support.event_loop import connected
 from triquad_client import (
     AsyncClient,
     BadReplyError,
     ClosedError,
     ConnectError,
-    InvalidInputError,
     InvalidScanError,
     NoReplyError,
-    RefusedError,
     RequestTimeoutError,
     Status,
     UnknownMapError,
 )
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
-    ErrorReply,
     MapInfo,
     SdfReply,
     SdfRequest,
@@ -39,11 +37,9 @@ from triquad_map.stored_map import StoredMap
 POSE = np.eye(4)
 POINTS = servers.sphere(200).astype(np.float64)
 
-ResultT = TypeVar("ResultT")
-
 
 @pytest.fixture(scope="module")
-def endpoint(tmp_path_factory):
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A service that has learnt a sphere."""
     with servers.running_service(store=tmp_path_factory.mktemp("store")) as endpoint:
         with triquad_client.connect(endpoint) as client:
@@ -51,18 +47,6 @@ def endpoint(tmp_path_factory):
             client.flush(servers.WAIT_S)
             client.settle(servers.WAIT_S)
         yield endpoint
-
-
-def connected(
-    endpoint: str, use: Callable[[AsyncClient], Awaitable[ResultT]], timeout_s: float = 10.0
-) -> ResultT:
-    """What ``use`` returns of a client in an event loop of its own."""
-
-    async def main() -> ResultT:
-        async with triquad_client.connect_async(endpoint, timeout_s=timeout_s) as client:
-            return await asyncio.wait_for(use(client), servers.WAIT_S)
-
-    return asyncio.run(main())
 
 
 def sdf_reply(query: zenoh.Query, epoch: int = 3) -> bytes:
@@ -98,7 +82,7 @@ class Held:
             query.drop()
 
 
-def test_scans_are_learnt_and_all_questions_answered_as_by_the_other_client(tmp_path):
+def test_scans_are_learnt_and_all_questions_answered_as_by_the_other_client(tmp_path: Path) -> None:
     with servers.running_service(store=tmp_path / "store") as endpoint:
 
         async def use(client: AsyncClient) -> None:
@@ -109,8 +93,8 @@ def test_scans_are_learnt_and_all_questions_answered_as_by_the_other_client(tmp_
             assert (report.taken, report.refused, report.lost) == (3, 0, 0)
             assert (await client.settle(servers.WAIT_S)).settled
             with triquad_client.connect(endpoint) as other:
-                expected = other.query_gradient(POINTS)
-                result = await client.query_gradient(POINTS)
+                expected = other.query_sdf(POINTS, gradient=True)
+                result = await client.query_sdf(POINTS, gradient=True)
                 np.testing.assert_array_equal(result.sdf, expected.sdf)
                 np.testing.assert_array_equal(result.status, expected.status)
                 np.testing.assert_array_equal(result.gradient, expected.gradient)
@@ -137,7 +121,7 @@ def test_scans_are_learnt_and_all_questions_answered_as_by_the_other_client(tmp_
         connected(endpoint, use)
 
 
-def test_hundreds_of_queries_at_a_time_are_answered_without_a_thread_each(endpoint):
+def test_hundreds_of_queries_at_a_time_are_answered_without_a_thread_each(endpoint: str) -> None:
     async def use(client: AsyncClient) -> None:
         whole = await client.query_sdf(POINTS)
         threads = threading.active_count()
@@ -156,11 +140,11 @@ def test_hundreds_of_queries_at_a_time_are_answered_without_a_thread_each(endpoi
     connected(endpoint, use)
 
 
-def test_a_query_of_many_parts_is_joined_in_order(endpoint):
+def test_a_query_of_many_parts_is_joined_in_order(endpoint: str) -> None:
     points = np.tile(POINTS, (1750, 1))  # 3.5 parts
 
     async def use(client: AsyncClient) -> None:
-        few, many = await asyncio.gather(client.query_gradient(POINTS), client.query_sdf(points))
+        few, many = await asyncio.gather(client.query_sdf(POINTS), client.query_sdf(points))
         np.testing.assert_allclose(many.sdf, np.tile(few.sdf, 1750), atol=1e-6)
         assert many.gradient is None
         assert many.epoch == few.epoch
@@ -168,7 +152,7 @@ def test_a_query_of_many_parts_is_joined_in_order(endpoint):
     connected(endpoint, use)
 
 
-def test_scans_go_out_in_the_order_of_the_calls(endpoint):
+def test_scans_go_out_in_the_order_of_the_calls(endpoint: str) -> None:
     async def use(client: AsyncClient) -> None:
         scans = [
             client.publish_scan(servers.sphere(100), POSE, 50.0 + number, "ordered")
@@ -184,18 +168,7 @@ def test_scans_go_out_in_the_order_of_the_calls(endpoint):
     connected(endpoint, use)
 
 
-def test_errors_are_those_of_the_other_client(endpoint):
-    async def use(client: AsyncClient) -> None:
-        with pytest.raises(InvalidInputError, match="point 1 is not finite"):
-            await client.query_sdf([[0, 0, 0], [0, np.nan, 0]])
-        with pytest.raises(RefusedError) as caught:
-            await client.query_sdf(POINTS, at_epoch=10**9)
-        assert caught.value.code == "epoch_gone"
-        with pytest.raises(InvalidInputError, match="negative"):
-            await client.flush(-1.0)
-
-    connected(endpoint, use)
-
+def test_a_server_or_a_map_that_is_not_there_is_told(endpoint: str) -> None:
     async def connect(endpoint: str, name: str = servers.MAP) -> None:
         async with triquad_client.connect_async(endpoint, name):
             pass
@@ -206,7 +179,7 @@ def test_errors_are_those_of_the_other_client(endpoint):
         asyncio.run(connect(servers.free_endpoint()))
 
 
-def test_replies_that_are_none_are_told_apart():
+def test_replies_that_are_none_are_told_apart() -> None:
     held = Held()
 
     def nonsense(query: zenoh.Query, key: str) -> None:
@@ -226,26 +199,7 @@ def test_replies_that_are_none_are_told_apart():
         held.drop()
 
 
-def test_a_query_whose_epoch_goes_starts_again():
-    epochs = iter((3, 4))
-
-    def answer(query: zenoh.Query, key: str) -> None:
-        asked = codec.decode(SdfRequest, query.payload.to_bytes()).epoch
-        with query:
-            if asked == 3:
-                query.reply_err(codec.encode(ErrorReply("epoch_gone", "")))
-            else:
-                query.reply(key, sdf_reply(query, asked or next(epochs)))
-
-    async def use(client: AsyncClient) -> None:
-        result = await client.query_sdf(np.zeros((250_000, 3)))
-        assert (result.epoch, len(result.sdf)) == (4, 250_000)
-
-    with servers.answering({keys.SDF: answer}) as endpoint:
-        connected(endpoint, use)
-
-
-def test_cancelled_queries_leave_room_for_others():
+def test_cancelled_queries_leave_room_for_others() -> None:
     """More are cancelled than may be under way; what was sent goes no further."""
     held = Held()
 
@@ -269,7 +223,7 @@ def test_cancelled_queries_leave_room_for_others():
         held.drop()
 
 
-def test_a_big_query_can_be_cancelled_between_its_parts():
+def test_a_big_query_can_be_cancelled_between_its_parts() -> None:
     held = Held()
 
     def first_then_hold(query: zenoh.Query, key: str) -> None:
@@ -295,7 +249,7 @@ def test_a_big_query_can_be_cancelled_between_its_parts():
         held.drop()
 
 
-def test_a_real_server_goes_on_after_queries_were_cancelled_at_any_moment(endpoint):
+def test_a_real_server_goes_on_after_queries_were_cancelled_at_any_moment(endpoint: str) -> None:
     async def use(client: AsyncClient) -> None:
         points = np.tile(POINTS, (1000, 1))
         for turn in range(40):
@@ -309,7 +263,7 @@ def test_a_real_server_goes_on_after_queries_were_cancelled_at_any_moment(endpoi
     connected(endpoint, use)
 
 
-def test_a_cancelled_download_leaves_the_older_file(tmp_path):
+def test_a_cancelled_download_leaves_the_older_file(tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
     path.write_text("older")
     held = Held()
@@ -332,7 +286,7 @@ def test_a_cancelled_download_leaves_the_older_file(tmp_path):
         held.drop()
 
 
-def test_what_is_under_way_when_the_client_is_closed_says_so(tmp_path):
+def test_what_is_under_way_when_the_client_is_closed_says_so(tmp_path: Path) -> None:
     held, held_files = Held(), Held()
 
     def unsettled(query: zenoh.Query, key: str) -> None:
@@ -370,7 +324,7 @@ def unsettled_status() -> ServerStatus:
     )
 
 
-def test_a_connection_that_is_cancelled_while_it_opens_is_closed():
+def test_a_connection_that_is_cancelled_while_it_opens_is_closed() -> None:
     endpoint = servers.free_endpoint()
 
     async def main(router: zenoh.Session) -> None:
@@ -414,7 +368,7 @@ asyncio.run(main(*sys.argv[1:]))
 
 
 @pytest.mark.parametrize("forgotten", ["nothing else", "query", "flush", "error"])
-def test_a_program_that_forgets_to_close_its_client_ends(endpoint, forgotten):
+def test_a_program_that_forgets_to_close_its_client_ends(endpoint: str, forgotten: str) -> None:
     command = [sys.executable, "-c", FORGETFUL, endpoint, forgotten]
     done = subprocess.run(command, capture_output=True, text=True, timeout=servers.WAIT_S)
     assert done.stdout == "(7,)\n", done.stderr
@@ -422,7 +376,7 @@ def test_a_program_that_forgets_to_close_its_client_ends(endpoint, forgotten):
     assert "Traceback" not in done.stderr
 
 
-def test_two_event_loops_have_a_client_each(endpoint):
+def test_two_event_loops_have_a_client_each(endpoint: str) -> None:
     meeting = threading.Barrier(2)
     epochs = []
 
@@ -439,7 +393,7 @@ def test_two_event_loops_have_a_client_each(endpoint):
     assert len(epochs) == 200
 
 
-def test_other_tasks_run_while_a_program_waits():
+def test_other_tasks_run_while_a_program_waits() -> None:
     """The reply is sent by a task of the same loop."""
     held = Held()
 
@@ -462,14 +416,19 @@ def test_other_tasks_run_while_a_program_waits():
         (triquad_client.Client, AsyncClient),
         (triquad_client.PinnedMap, triquad_client.AsyncPinnedMap),
         (triquad_client.SyncedMap, triquad_client.AsyncSyncedMap),
+        (triquad_client.MeshWatch, triquad_client.AsyncMeshWatch),
     ],
 )
-def test_both_clients_are_asked_alike(blocking, awaited):
-    def parameters(kind: type) -> dict[str, list[tuple[str, object]]]:
+def test_both_clients_are_asked_alike_and_documented_alike(blocking: type, awaited: type) -> None:
+    def methods(kind: type) -> dict[str, tuple[object, ...]]:
         return {
-            name: [(one.name, one.default) for one in inspect.signature(method).parameters.values()]
+            name: (
+                inspect.getdoc(method),
+                *((one.name, one.default) for one in inspect.signature(method).parameters.values()),
+            )
             for name, method in inspect.getmembers(kind, inspect.isfunction)
             if not name.startswith("_")
         }
 
-    assert parameters(awaited) == parameters(blocking)
+    assert methods(awaited) == methods(blocking)
+    assert all(documentation for documentation, *_ in methods(awaited).values())

@@ -2,22 +2,22 @@
 
 import asyncio
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 import pytest
 import triquad_client
 import zenoh
 from support import servers
+from support.event_loop import connected
 from triquad_client import (
     AsyncClient,
     AsyncMeshWatch,
     Client,
     ClosedError,
-    HeldTiles,
     InvalidInputError,
+    KnownTiles,
     MeshWatch,
     RequestTimeoutError,
 )
@@ -25,9 +25,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_server.settings import MeshSettings
 
-SETTINGS = replace(servers.SMALL, mesh=MeshSettings(tile_cells=16, tolerance_m=0.1))
-
-ResultT = TypeVar("ResultT")
+SETTINGS = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16, tolerance_m=0.1)})
 
 
 def half(side: int) -> np.ndarray:
@@ -50,18 +48,6 @@ def endpoint() -> Iterator[str]:
         with triquad_client.connect(endpoint) as client:
             learn(client, half(1))
         yield endpoint
-
-
-def connected(
-    endpoint: str, use: Callable[[AsyncClient], Awaitable[ResultT]], timeout_s: float = 10.0
-) -> ResultT:
-    """What ``use`` returns of a client in an event loop of its own."""
-
-    async def main() -> ResultT:
-        async with triquad_client.connect_async(endpoint, timeout_s=timeout_s) as client:
-            return await asyncio.wait_for(use(client), servers.WAIT_S)
-
-    return asyncio.run(main())
 
 
 def digests(watch: MeshWatch | AsyncMeshWatch) -> dict[tuple[int, int, int], str]:
@@ -103,23 +89,23 @@ def test_what_changes_is_told_while_the_loop_goes_on() -> None:
         connected(endpoint, use)
 
 
-def test_held_tiles_go_from_one_kind_of_watch_to_the_other(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> HeldTiles:
+def test_known_tiles_go_from_one_kind_of_watch_to_the_other(endpoint: str) -> None:
+    async def use(client: AsyncClient) -> KnownTiles:
         async with client.watch_mesh(level=1) as watch:
             assert watch.level == 1
             await watch.catch_up(servers.WAIT_S)
-            held = watch.held()
-        async with client.watch_mesh(level=1, held=held) as watch:
-            assert watch.tiles.keys() == held.tiles.keys()
+            known = watch.known_tiles()
+        async with client.watch_mesh(level=1, known=known) as watch:
+            assert watch.tiles.keys() == known.tiles.keys()
             assert await watch.next(0.0) is None
             assert watch.complete
-        return held
+        return known
 
-    held = connected(endpoint, use)
-    assert held.tiles
+    known = connected(endpoint, use)
+    assert known.tiles
     with (
         triquad_client.connect(endpoint) as client,
-        client.watch_mesh(level=1, held=held) as watch,
+        client.watch_mesh(level=1, known=known) as watch,
     ):
         assert watch.next(0.0) is None
 
@@ -144,7 +130,7 @@ def test_iteration_ends_with_the_watch(endpoint: str) -> None:
         assert await watch.next() is None
         with pytest.raises(ClosedError, match="the watch is closed"):
             await watch.catch_up()
-        assert len((await watch.mesh()).faces), "what is held stays"
+        assert len((await watch.mesh()).faces), "the tiles stay"
 
     connected(endpoint, use)
 
@@ -215,17 +201,17 @@ def removed(index: int, revision: int) -> bytes:
     )  # fmt: skip
 
 
-def held_tiles(endpoint: str) -> HeldTiles:
+def known_tiles(endpoint: str) -> KnownTiles:
     with triquad_client.connect(endpoint) as client, client.watch_mesh() as watch:
         watch.catch_up(servers.WAIT_S)
-        return watch.held()
+        return watch.known_tiles()
 
 
 def test_an_old_reply_does_not_undo_what_a_later_one_told(endpoint: str) -> None:
     """Two tasks ask at the same time; the reply to the one that asked first comes last."""
-    tile = next(iter(held_tiles(endpoint).tiles.values()))
+    tile = next(iter(known_tiles(endpoint).tiles.values()))
     tiles = {(x, 0, 0): replace(tile, index=(x, 0, 0)) for x in range(2)}
-    held = HeldTiles("s", 0, 1.6, tiles)
+    known = KnownTiles("s", 0, 1.6, tiles)
     first: list[zenoh.Query] = []
     came = threading.Event()
 
@@ -241,7 +227,7 @@ def test_an_old_reply_does_not_undo_what_a_later_one_told(endpoint: str) -> None
     with servers.answering({keys.TILE_UPDATES: answer}) as endpoint:
 
         async def use(client: AsyncClient) -> None:
-            async with client.watch_mesh(held=held) as watch:
+            async with client.watch_mesh(known=known) as watch:
                 early = asyncio.ensure_future(watch.next(0.0))
                 assert await asyncio.to_thread(came.wait, servers.WAIT_S)
                 late = await watch.next(0.0)
@@ -256,38 +242,21 @@ def test_an_old_reply_does_not_undo_what_a_later_one_told(endpoint: str) -> None
         connected(endpoint, use)
 
 
-def test_a_server_that_does_not_answer_is_an_error_and_what_is_held_stays(endpoint: str) -> None:
-    held = held_tiles(endpoint)
+def test_a_server_that_does_not_answer_is_an_error_and_its_tiles_stay(endpoint: str) -> None:
+    known = known_tiles(endpoint)
     silent: list[zenoh.Query] = []
     answers = {keys.TILE_UPDATES: lambda query, key: silent.append(query)}
     with servers.answering(answers) as endpoint:
 
         async def use(client: AsyncClient) -> None:
-            async with client.watch_mesh(held=held) as watch:
+            async with client.watch_mesh(known=known) as watch:
                 with pytest.raises(RequestTimeoutError):
                     await watch.next(0.0)
-                assert watch.tiles.keys() == held.tiles.keys()
+                assert watch.tiles.keys() == known.tiles.keys()
 
         connected(endpoint, use, timeout_s=0.5)
         for query in silent:
             query.drop()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"level": 3},
-        {"max_bytes_per_s": 0},
-        {"bounds": ((np.nan, 0, 0), (1, 1, 1))},
-        {"held": HeldTiles("s", 1, 6.4)},
-    ],
-)
-def test_bad_arguments_are_refused(endpoint: str, arguments: dict[str, object]) -> None:
-    async def use(client: AsyncClient) -> None:
-        with pytest.raises(InvalidInputError):
-            client.watch_mesh(**arguments)  # type: ignore[arg-type]
-
-    connected(endpoint, use)
 
 
 def test_both_clients_fetch_all_levels(endpoint: str) -> None:

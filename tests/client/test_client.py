@@ -4,6 +4,9 @@ import hashlib
 import socket
 import threading
 import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ import zenoh
 from support import servers
 from triquad_client import (
     BadReplyError,
+    Client,
     ClosedError,
     ConnectError,
     DownloadError,
@@ -40,25 +44,25 @@ CLOUD = np.ones((10, 3), np.float32)
 
 
 @pytest.fixture(scope="module")
-def endpoint():
+def endpoint() -> Iterator[str]:
     with servers.running_service() as endpoint:
         yield endpoint
 
 
 @pytest.fixture(scope="module")
-def client(endpoint):
+def client(endpoint: str) -> Iterator[Client]:
     with triquad_client.connect(endpoint) as client:
         yield client
 
 
-def test_where_nothing_listens_the_error_names_the_endpoint_and_the_remedy():
+def test_where_nothing_listens_the_error_names_the_endpoint_and_the_remedy() -> None:
     endpoint = servers.free_endpoint()
     with pytest.raises(ConnectError, match="Start triquad-server") as caught:
         triquad_client.connect(endpoint)
     assert endpoint in str(caught.value)
 
 
-def test_something_else_that_listens_is_a_connect_error():
+def test_something_else_that_listens_is_a_connect_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
         with pytest.raises(ConnectError, match="cannot connect"):
@@ -66,18 +70,18 @@ def test_something_else_that_listens_is_a_connect_error():
 
 
 @pytest.mark.parametrize("endpoint", ["", "nonsense", "tcp/", "carrier-pigeon/1"])
-def test_an_endpoint_that_is_none_is_a_connect_error(endpoint):
+def test_an_endpoint_that_is_none_is_a_connect_error(endpoint: str) -> None:
     with pytest.raises(ConnectError):
         triquad_client.connect(endpoint, timeout_s=1.0)
 
 
-def test_an_unknown_map_lists_the_maps_there_are(endpoint):
+def test_an_unknown_map_lists_the_maps_there_are(endpoint: str) -> None:
     with pytest.raises(UnknownMapError, match="available: default") as caught:
         triquad_client.connect(endpoint, "kitchen")
     assert caught.value.available == ["default"]
 
 
-def test_a_router_without_maps_is_told_apart():
+def test_a_router_without_maps_is_told_apart() -> None:
     endpoint = servers.free_endpoint()
     with (
         servers.raw_session("router", listen=endpoint),
@@ -86,12 +90,12 @@ def test_a_router_without_maps_is_told_apart():
         triquad_client.connect(endpoint)
 
 
-def test_a_map_name_that_cannot_be_is_refused(endpoint):
+def test_a_map_name_that_cannot_be_is_refused(endpoint: str) -> None:
     with pytest.raises(InvalidInputError, match="map name"):
         triquad_client.connect(endpoint, "a/b")
 
 
-def test_two_maps_on_one_network_do_not_disturb_each_other():
+def test_two_maps_on_one_network_do_not_disturb_each_other() -> None:
     with (
         servers.running_service(map_name="ground") as ground,
         servers.running_service(map_name="cellar", connect=(ground,)),
@@ -115,14 +119,14 @@ def wait_for_maps(client: triquad_client.Client, names: list[str]) -> None:
         pause.wait(0.05)
 
 
-def test_a_map_that_goes_away_is_noticed():
+def test_a_map_that_goes_away_is_noticed() -> None:
     with servers.running_service() as endpoint:
         client = triquad_client.connect(endpoint, timeout_s=5.0)
     with client, pytest.raises(TriquadError):
         client.status()
 
 
-def test_a_closed_client_says_so(endpoint):
+def test_a_closed_client_says_so(endpoint: str) -> None:
     client = triquad_client.connect(endpoint)
     client.close()
     client.close()
@@ -143,7 +147,7 @@ def test_a_closed_client_says_so(endpoint):
         (None, "points are not"),
     ],
 )
-def test_points_that_are_no_scan_are_refused_here(client, points, text):
+def test_points_that_are_no_scan_are_refused_here(client: Client, points: Any, text: str) -> None:
     with pytest.raises(InvalidScanError, match=text):
         client.publish_scan(points, POSE)
 
@@ -159,18 +163,18 @@ def test_points_that_are_no_scan_are_refused_here(client, points, text):
         ("pose", "not a matrix"),
     ],
 )
-def test_poses_that_are_not_rigid_are_refused_here(client, pose, text):
+def test_poses_that_are_not_rigid_are_refused_here(client: Client, pose: Any, text: str) -> None:
     with pytest.raises(InvalidScanError, match=text):
         client.publish_scan(CLOUD, pose)
 
 
 @pytest.mark.parametrize("stamp", [np.nan, np.inf, -1.0, 1e30])
-def test_stamps_that_are_no_time_are_refused_here(client, stamp):
+def test_stamps_that_are_no_time_are_refused_here(client: Client, stamp: float) -> None:
     with pytest.raises(InvalidScanError, match="stamp"):
         client.publish_scan(CLOUD, POSE, stamp)
 
 
-def test_time_that_runs_backwards_is_refused_here_per_source(client):
+def test_time_that_runs_backwards_is_refused_here_per_source(client: Client) -> None:
     client.publish_scan(servers.sphere(10), POSE, 1000.5, "a")
     client.publish_scan(servers.sphere(10), POSE, 1000.5, "a")
     client.publish_scan(servers.sphere(10), POSE, 10.0, "b")
@@ -178,12 +182,12 @@ def test_time_that_runs_backwards_is_refused_here_per_source(client):
         client.publish_scan(CLOUD, POSE, 1000.4, "a")
 
 
-def test_sources_that_are_no_names_are_refused_here(client):
+def test_sources_that_are_no_names_are_refused_here(client: Client) -> None:
     with pytest.raises(InvalidScanError, match="source name 'a/b'"):
         client.publish_scan(CLOUD, POSE, source="a/b")
 
 
-def test_lists_and_other_numbers_are_taken(client):
+def test_lists_and_other_numbers_are_taken(client: Client) -> None:
     taken = client.flush(servers.WAIT_S).taken
     client.publish_scan(servers.sphere(100).tolist(), np.eye(4, dtype=int).tolist())
     client.publish_scan(np.asfortranarray(servers.sphere(100).astype(np.float64))[::-1], POSE)
@@ -193,7 +197,7 @@ def test_lists_and_other_numbers_are_taken(client):
     assert client.query_sdf([[0, 0, 0], [1, 2, 3]]).sdf.shape == (2,)
 
 
-def test_points_that_are_not_finite_are_refused_by_index(client):
+def test_points_that_are_not_finite_are_refused_by_index(client: Client) -> None:
     points = np.zeros((5, 3))
     points[3, 1] = np.nan
     with pytest.raises(InvalidInputError, match="point 3 is not finite"):
@@ -201,25 +205,27 @@ def test_points_that_are_not_finite_are_refused_by_index(client):
     with pytest.raises(InvalidInputError, match="point 1 is .* metres of the map frame"):
         client.query_sdf([[0, 0, 0], [0, 2e9, 0]])
     with pytest.raises(ValueError, match="not finite"):
-        client.query_gradient([[np.inf, 0, 0]])
+        client.query_sdf([[np.inf, 0, 0]], gradient=True)
 
 
 @pytest.mark.parametrize(
     "bounds",
     [((0, 0), (1, 1)), ((1, 0, 0), (0, 1, 1)), ((np.nan, 0, 0), (1, 1, 1)), (1, 2, 3), 5],
 )
-def test_bounds_that_are_no_box_are_refused_here(client, bounds):
+def test_bounds_that_are_no_box_are_refused_here(client: Client, bounds: Any) -> None:
     with pytest.raises(InvalidInputError, match="bounds"):
         client.mesh(bounds)
 
 
 @pytest.mark.parametrize("arguments", [(-1.0, 0), (1.0, -1)])
-def test_a_flush_of_negative_length_is_refused_here(client, arguments):
+def test_a_flush_of_negative_length_is_refused_here(
+    client: Client, arguments: tuple[float, int]
+) -> None:
     with pytest.raises(InvalidInputError):
         client.flush(*arguments)
 
 
-def test_far_coordinates_keep_their_precision(client):
+def test_far_coordinates_keep_their_precision(client: Client) -> None:
     """Offsets travel in single precision from an origin in double precision."""
     far = np.array([[50_000.0, 0, 0]]) + servers.sphere(20)
     pose = np.eye(4)
@@ -229,7 +235,7 @@ def test_far_coordinates_keep_their_precision(client):
     assert (client.query_sdf(far).status == triquad_client.Status.SURFACE).all()
 
 
-def test_silence_though_the_map_is_there_is_told_apart():
+def test_silence_though_the_map_is_there_is_told_apart() -> None:
     with (
         servers.answering({}) as endpoint,
         triquad_client.connect(endpoint) as client,
@@ -238,7 +244,7 @@ def test_silence_though_the_map_is_there_is_told_apart():
         client.status()
 
 
-def test_a_reply_that_never_comes_is_a_timeout():
+def test_a_reply_that_never_comes_is_a_timeout() -> None:
     held = []
     with (
         servers.answering({keys.SDF: lambda query, _: held.append(query)}) as endpoint,
@@ -249,7 +255,7 @@ def test_a_reply_that_never_comes_is_a_timeout():
         held[0].drop()
 
 
-def test_a_reply_of_other_bytes_is_told_apart():
+def test_a_reply_of_other_bytes_is_told_apart() -> None:
     def answer(query: zenoh.Query, key: str) -> None:
         with query:
             query.reply(key, b"\xff\x00")
@@ -262,7 +268,7 @@ def test_a_reply_of_other_bytes_is_told_apart():
         client.query_sdf(CLOUD)
 
 
-def test_a_refusal_carries_its_code():
+def test_a_refusal_carries_its_code() -> None:
     def answer(query: zenoh.Query, _: str) -> None:
         with query:
             query.reply_err(codec.encode(ErrorReply("busy", "try later")))
@@ -276,7 +282,7 @@ def test_a_refusal_carries_its_code():
         assert caught.value.code == "busy"
 
 
-def test_a_query_whose_epoch_goes_starts_again_and_gives_up_after_three_tries():
+def test_a_query_whose_epoch_goes_starts_again_and_gives_up_after_three_tries() -> None:
     first_parts = []
 
     def answer(query: zenoh.Query, key: str) -> None:
@@ -299,7 +305,7 @@ def test_a_query_whose_epoch_goes_starts_again_and_gives_up_after_three_tries():
     assert len(first_parts) == 3
 
 
-def test_a_download_with_wrong_bytes_leaves_nothing(tmp_path):
+def test_a_download_with_wrong_bytes_leaves_nothing(tmp_path: Path) -> None:
     data = b"x" * 100
 
     def info(query: zenoh.Query, key: str) -> None:
@@ -325,7 +331,7 @@ def test_a_download_with_wrong_bytes_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_zenoh_configuration_file_is_used(endpoint, tmp_path):
+def test_a_zenoh_configuration_file_is_used(endpoint: str, tmp_path: Path) -> None:
     file = tmp_path / "client.json5"
     file.write_text('{ mode: "client", scouting: { multicast: { enabled: false } } }')
     with triquad_client.connect(endpoint, config=file) as client:
@@ -337,7 +343,7 @@ def test_a_zenoh_configuration_file_is_used(endpoint, tmp_path):
         open_connection(endpoint, servers.MAP, 1.0, tmp_path / "missing.json5")
 
 
-def test_only_the_expected_refusal_is_asked_again_and_not_for_ever():
+def test_only_the_expected_refusal_is_asked_again_and_not_for_ever() -> None:
     asked = []
 
     def refuse(code: str, times: int) -> Call[int]:

@@ -1,8 +1,10 @@
-import json
+import io
 import struct
+import sys
 
 import numpy as np
 import pytest
+import trimesh
 from triquad_client import InvalidInputError, Mesh
 
 FAR = np.array([500_000.25, 4_000_000.5, 10.125])
@@ -25,51 +27,56 @@ def test_ply_is_exact(tmp_path):
     assert len(body) == 96 + 4 * 13
 
 
-def read_glb(data: bytes) -> tuple[dict, bytes]:
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON"
-    assert size % 4 == 0
-    document = json.loads(data[20 : 20 + size])
-    if len(data) == 20 + size:
-        return document, b""
-    length, kind = struct.unpack_from("<I4s", data, 20 + size)
-    assert kind == b"BIN\0"
-    return document, data[28 + size : 28 + size + length]
-
-
 def test_glb_puts_the_vertices_back_with_y_upwards(tmp_path):
     MESH.save(tmp_path / "mesh.glb")
-    document, binary = read_glb((tmp_path / "mesh.glb").read_bytes())
-    local = np.frombuffer(binary[:48], "<f4").reshape(4, 3)
-    matrix = np.array(document["nodes"][0]["matrix"]).reshape(4, 4).T
-    placed = local @ matrix[:3, :3].T + matrix[:3, 3]
+    scene = trimesh.load_scene(tmp_path / "mesh.glb")
+    (name,) = scene.graph.nodes_geometry
+    matrix, geometry = scene.graph[name]
+    local = scene.geometry[geometry].vertices
+    assert np.abs(local).max() < 2, "single precision is exact there"
     x, y, z = MESH.vertices.T
-    assert np.allclose(placed, np.stack([x, z, -y], axis=1), rtol=0, atol=1e-6)
+    placed = local @ matrix[:3, :3].T + matrix[:3, 3]
+    np.testing.assert_allclose(placed, np.stack([x, z, -y], axis=1), rtol=0, atol=1e-6)
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
-    assert np.array_equal(np.frombuffer(binary[48:], "<u4").reshape(4, 3), MESH.faces)
-    assert document["buffers"][0]["byteLength"] == len(binary)
 
 
-@pytest.mark.parametrize("name", ["mesh.glb", "mesh.ply"])
+def test_what_is_done_to_a_copy_does_not_change_the_mesh():
+    before = MESH.vertices.copy()
+    MESH.to_trimesh().vertices *= 2
+    np.testing.assert_array_equal(MESH.vertices, before)
+
+
+def test_obj_keeps_large_coordinates(tmp_path):
+    MESH.save(tmp_path / "mesh.obj")
+    back = trimesh.load_mesh(tmp_path / "mesh.obj", process=False)
+    np.testing.assert_allclose(back.vertices, MESH.vertices, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["mesh.glb", "mesh.ply", "mesh.obj", "mesh.stl"])
 def test_other_programs_read_the_files(tmp_path, name):
-    trimesh = pytest.importorskip("trimesh")
-    MESH.save(tmp_path / name)
-    mesh = trimesh.load(tmp_path / name, force="mesh")
+    near = Mesh(MESH.vertices - FAR, MESH.faces, MESH.epoch)
+    near.save(tmp_path / name)
+    mesh = trimesh.load_mesh(tmp_path / name)
     assert len(mesh.faces) == 4
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(1.0)
 
 
-def test_empty_meshes_are_files_too(tmp_path):
-    EMPTY.save(tmp_path / "mesh.ply")
-    EMPTY.save(tmp_path / "mesh.GLB")
-    document, binary = read_glb((tmp_path / "mesh.GLB").read_bytes())
-    assert binary == b""
-    assert "meshes" not in document
+@pytest.mark.parametrize("suffix", [".ply", ".GLB", ".obj", ".stl"])
+def test_empty_meshes_are_files_too(tmp_path, suffix):
+    EMPTY.save(tmp_path / f"mesh{suffix}")
+    scene = trimesh.load_scene(io.BytesIO(EMPTY.file_bytes(suffix)), file_type=suffix[1:].lower())
+    assert sum(len(getattr(geometry, "faces", ())) for geometry in scene.geometry.values()) == 0
 
 
 def test_other_names_are_refused(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"\.ply or \.glb"):
-        MESH.save(tmp_path / "mesh.obj")
+    with pytest.raises(InvalidInputError, match=r"'\.las': use one of \.ply, \.glb, \.obj, \.stl"):
+        MESH.save(tmp_path / "mesh.las")
+
+
+def test_without_trimesh_ply_is_written_and_the_others_name_the_remedy(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    MESH.save(tmp_path / "mesh.ply")
+    with pytest.raises(InvalidInputError, match=r"pip install 'triquad\[mesh\]'"):
+        MESH.save(tmp_path / "mesh.glb")
+    assert not (tmp_path / "mesh.glb").exists()

@@ -28,10 +28,10 @@ from triquad_format.wire.messages import (
     TileUpdatesRequest,
 )
 from triquad_format.wire.tile_codec import decode_tile
-from triquad_server.settings import MeshSettings
+from triquad_server.settings import MeshSettings, ServiceSettings
 
 POSE = np.eye(4)
-SETTINGS = replace(servers.SMALL, mesh=MeshSettings(tile_cells=16, tolerance_m=0.1))
+SETTINGS = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16, tolerance_m=0.1)})
 
 
 def digests(watch: MeshWatch) -> dict[tuple[int, int, int], str]:
@@ -118,23 +118,23 @@ def test_late_joiners_hold_the_same_bytes(client: Client, endpoint: str) -> None
             assert len(set(tile.version for tile in early.tiles.values())) > 1
 
 
-def test_of_held_tiles_only_the_difference_travels(client: Client) -> None:
+def test_of_known_tiles_only_the_difference_travels(client: Client) -> None:
     learn(client)
     with client.watch_mesh() as watch:
         watch.catch_up()
-        held = watch.held()
+        known = watch.known_tiles()
         whole = digests(watch)
-    with client.watch_mesh(held=held) as watch:
+    with client.watch_mesh(known=known) as watch:
         assert digests(watch) == whole
         assert watch.next(0.0) is None, "nothing changed"
         assert watch.complete
-    lost = min(held.tiles)
-    fewer = replace(held, tiles={i: tile for i, tile in held.tiles.items() if i != lost})
-    with client.watch_mesh(held=fewer) as watch:
+    lost = min(known.tiles)
+    fewer = replace(known, tiles={i: tile for i, tile in known.tiles.items() if i != lost})
+    with client.watch_mesh(known=fewer) as watch:
         assert watch.next(servers.WAIT_S).changed == (lost,)
         assert digests(watch) == whole
     client.reset(((1.0, -9, -9), (9, 9, 9)))
-    with client.watch_mesh(held=held) as watch:
+    with client.watch_mesh(known=known) as watch:
         watch.catch_up()
         gone = whole.keys() - digests(watch).keys()
         assert {index for index in whole if index[0] >= 1} <= gone
@@ -176,11 +176,11 @@ def test_a_cap_makes_replies_small(client: Client) -> None:
     learn(client)
     with client.watch_mesh() as free, client.watch_mesh(max_bytes_per_s=20_000) as capped:
         free.catch_up()
-        largest = max(tile.size for tile in free.tiles.values())
+        largest = max(tile.size_bytes for tile in free.tiles.values())
         sizes = []
         while not capped.complete:
             update = capped.next(servers.WAIT_S)
-            sizes.append(update.size)
+            sizes.append(update.size_bytes)
         assert len(sizes) > 1
         assert max(sizes) <= max(20_000, largest)
         assert digests(capped) == digests(free)
@@ -276,7 +276,7 @@ def test_single_tiles_have_levels_too(client: Client, endpoint: str) -> None:
         {"max_bytes_per_s": 0},
         {"max_bytes_per_s": -5},
         {"bounds": ((np.nan, 0, 0), (1, 1, 1))},
-        {"held": triquad_client.HeldTiles("s", 1, 6.4)},
+        {"known": triquad_client.KnownTiles("s", 1, 6.4)},
     ],
 )
 def test_bad_arguments_are_refused_before_anything_is_sent(
@@ -296,7 +296,7 @@ def held_by(session: zenoh.Session) -> "zenoh.handlers.FifoChannel":
 
 
 def test_too_many_followers_are_told_to_come_back() -> None:
-    few = replace(SETTINGS, service=replace(SETTINGS.service, request_queue=2))
+    few = SETTINGS.model_copy(update={"service": ServiceSettings(request_queue=2)})
     with servers.running_service(few) as endpoint, servers.raw_session(connect=endpoint) as session:
         held = [held_by(session) for _ in range(2)]
         assert servers.RawPeer(session).refusal(keys.TILE_UPDATES, request()) == "busy"
@@ -367,24 +367,24 @@ def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
         with triquad_client.connect(server.endpoint) as client, client.watch_mesh() as watch:
             learn(client)
             watch.catch_up()
-            held = watch.held()
+            known = watch.known_tiles()
             client.checkpoint()
         server.process.send_signal(signal.SIGTERM)
         assert server.wait() == 0
-    assert len(held.tiles) > 50
+    assert len(known.tiles) > 50
     with (
         servers.server_process(arguments) as server,
         triquad_client.connect(server.endpoint) as client,
-        client.watch_mesh(held=held) as watch,
+        client.watch_mesh(known=known) as watch,
         client.watch_mesh() as fresh,
     ):
         update = watch.next(servers.WAIT_S)
         assert update.changed
-        assert held.tiles.keys() <= watch.tiles.keys(), "nothing goes before all is there"
+        assert known.tiles.keys() <= watch.tiles.keys(), "nothing goes before all is there"
         watch.catch_up()
         fresh.catch_up()
         assert digests(watch) == digests(fresh)
-        assert watch.held().server != held.server
+        assert watch.known_tiles().server != known.server
 
 
 FROZEN = """
@@ -417,7 +417,7 @@ def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
     ):
         learn(client, half(1))
         watch.catch_up()
-        size = sum(tile.size for tile in watch.tiles.values())
+        size = sum(tile.size_bytes for tile in watch.tiles.values())
         assert size > 500_000
         command = [sys.executable, "-c", FROZEN, server.endpoint]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as frozen:

@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,14 @@ from triquad_client import (
     Client,
     ClosedError,
     InvalidInputError,
+    OfflineMap,
     RefusedError,
     UnknownSpaceError,
     open_map,
 )
 from triquad_client.calls.queries import MapQueries
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.mapfile import write_map
+from triquad_format.mapfile.writer import write_map
 
 POSE = np.eye(4)
 BOX = ((-5.0, -5.0, -1.0), (5.0, 5.0, 1.0))
@@ -32,16 +33,15 @@ ENDS = np.random.default_rng(1).uniform(-6, 6, (200, 3))
 Question = Callable[[MapQueries], Any]
 
 QUESTIONS: dict[str, Question] = {
-    "query_sdf": lambda view: view.query_sdf(POINTS),
-    "query_gradient": lambda view: view.query_gradient(POINTS),
+    "query_sdf": lambda view: view.query_sdf(POINTS, gradient=True),
     "query_distance": lambda view: view.query_distance(
         POINTS, 3.0, unknown="obstacle", surface_point=True, unknown_distance=True
     ),
     "query_spheres": lambda view: view.query_spheres(POINTS, 0.3),
-    "query_segments": lambda view: view.query_segments(POINTS[:200], ENDS, radius=0.1),
-    "query_polyline": lambda view: view.query_polyline(0.3 * ENDS[:40], radius=0.1),
+    "query_segments": lambda view: view.query_segments(POINTS[:200], ENDS, radius_m=0.1),
+    "query_polyline": lambda view: view.query_polyline(0.3 * ENDS[:40], radius_m=0.1),
     "query_rays": lambda view: view.query_rays([0, 0, 0], ENDS),
-    "query_grid": lambda view: view.query_grid(BOX, cell=0.5),
+    "query_grid": lambda view: view.query_grid(BOX, cell_m=0.5),
     "align": lambda view: view.align(servers.sphere(3000), moved(0.2)),
 }
 """One of each kind."""
@@ -55,7 +55,7 @@ def moved(x_m: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Twins:
+class Pair:
     """A server that has learnt a sphere, and its map as a file."""
 
     client: Client
@@ -63,20 +63,20 @@ class Twins:
 
 
 @pytest.fixture(scope="module")
-def twins(tmp_path_factory):
-    path = tmp_path_factory.mktemp("twin") / "map.triquad"
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
+    path = tmp_path_factory.mktemp("pair") / "map.triquad"
     with servers.service_and_client() as client:
         for _ in range(3):
-            client.publish_scan(servers.sphere(20_000), POSE, stamp=1.7e9)
+            client.publish_scan(servers.sphere(20_000), POSE, stamp_s=1.7e9)
         client.flush(servers.WAIT_S)
         client.settle(servers.WAIT_S)
         client.download_map(path)
-        yield Twins(client, path)
+        yield Pair(client, path)
 
 
 @pytest.fixture(scope="module")
-def offline(twins):
-    with open_map(twins.path) as offline:
+def offline(pair: Pair) -> Iterator[OfflineMap]:
+    with open_map(pair.path) as offline:
         yield offline
 
 
@@ -103,31 +103,33 @@ def assert_close(have: Any, want: Any, name: str) -> None:
         assert have == want, name
 
 
-def test_every_query_of_a_client_is_compared():
+def test_every_query_of_a_client_is_compared() -> None:
     assert set(QUESTIONS) == {name for name in vars(MapQueries) if not name.startswith("_")}
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
-def test_the_file_answers_as_the_server(twins, offline, name):
+def test_the_file_answers_as_the_server(pair: Pair, offline: OfflineMap, name: str) -> None:
     assert offline.compiled
-    assert_close(QUESTIONS[name](offline), QUESTIONS[name](twins.client), name)
+    assert_close(QUESTIONS[name](offline), QUESTIONS[name](pair.client), name)
 
 
-def test_it_tells_what_it_is(twins, offline):
-    status = twins.client.status()
+def test_it_tells_what_it_is(pair: Pair, offline: OfflineMap) -> None:
+    status = pair.client.status()
     assert (offline.name, offline.epoch) == (status.map_name, status.epoch)
     assert offline.stamp_ns > 1.7e18
     assert offline.query_distance(POINTS).epoch == offline.epoch
 
 
-def test_large_questions_are_one_call(offline):
+def test_large_questions_are_one_call(offline: OfflineMap) -> None:
     many = np.tile(POINTS, (60, 1))  # more than go into one request
     answer = offline.query_distance(many)
-    np.testing.assert_array_equal(answer.distance[: len(POINTS)], answer.distance[-len(POINTS) :])
+    np.testing.assert_array_equal(
+        answer.distance_m[: len(POINTS)], answer.distance_m[-len(POINTS) :]
+    )
     assert len(offline.query_sdf(many).sdf) == len(many)
 
 
-def test_only_its_own_epoch_can_be_asked_for(offline):
+def test_only_its_own_epoch_can_be_asked_for(offline: OfflineMap) -> None:
     here = offline.query_sdf(POINTS, at_epoch=offline.epoch)
     np.testing.assert_array_equal(here.sdf, offline.query_sdf(POINTS).sdf)
     for question in (offline.query_sdf, offline.query_distance):
@@ -147,28 +149,30 @@ def test_only_its_own_epoch_can_be_asked_for(offline):
         lambda view: view.query_spheres(POINTS, -1.0),
         lambda view: view.query_segments(POINTS, ENDS),
         lambda view: view.query_rays([0, 0, 0], [[0, 0, 0]]),
-        lambda view: view.query_grid(BOX, cell=0.0),
+        lambda view: view.query_grid(BOX, cell_m=0.0),
         lambda view: view.query_sdf(POINTS, at_epoch=0),
         lambda view: view.query_distance([[9.0, 9, 9]], unknown="error"),
     ],
 )
-def test_what_the_server_does_not_answer_the_file_does_not_either(twins, offline, ask):
+def test_what_the_server_does_not_answer_the_file_does_not_either(
+    pair: Pair, offline: OfflineMap, ask: Question
+) -> None:
     errors = (InvalidInputError, RefusedError, UnknownSpaceError)
     with pytest.raises(errors) as online:
-        ask(twins.client)
+        ask(pair.client)
     with pytest.raises(type(online.value)) as refusal:
         ask(offline)
     assert str(refusal.value) == str(online.value)
 
 
-def test_a_closed_map_says_so(twins):
-    offline = open_map(twins.path)
+def test_a_closed_map_says_so(pair: Pair) -> None:
+    offline = open_map(pair.path)
     offline.close()
     with pytest.raises(ClosedError):
         offline.query_sdf(POINTS)
 
 
-def test_of_a_store_the_newest_checkpoint_is_opened(tmp_path):
+def test_of_a_store_the_newest_checkpoint_is_opened(tmp_path: Path) -> None:
     folder = tmp_path / "store" / "site"
     folder.mkdir(parents=True)
     write_checkpoints(folder, (3, 5, 8))
@@ -181,7 +185,7 @@ def test_of_a_store_the_newest_checkpoint_is_opened(tmp_path):
     np.testing.assert_array_equal(whole.query_sdf(POINTS).sdf, delta.query_sdf(POINTS).sdf)
 
 
-def test_damaged_and_foreign_files_are_refused_by_name(tmp_path):
+def test_damaged_and_foreign_files_are_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
     write_map(exact_map(flat(0.0)), path)
     whole = path.read_bytes()
@@ -205,13 +209,13 @@ import triquad_client
 with triquad_client.open_map(sys.argv[1]) as offline:
     assert not offline.compiled
     above = offline.query_distance([[0.0, 0.0, 1.0]], surface_point=True)
-    print(above.distance[0], above.surface_point[0, 2], offline.query_sdf([[0, 0, 0.1]]).sdf[0])
+    print(above.distance_m[0], above.surface_point[0, 2], offline.query_sdf([[0, 0, 0.1]]).sdf[0])
 loaded = {"zenoh", "triquad_server"} & {n for n, m in sys.modules.items() if m is not None}
 assert loaded <= {"zenoh"}, loaded
 """
 
 
-def test_without_numba_and_torch_it_answers_the_same(tmp_path):
+def test_without_numba_and_torch_it_answers_the_same(tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
     write_map(exact_map(flat(0.07)), path)
     done = subprocess.run(
@@ -222,6 +226,6 @@ def test_without_numba_and_torch_it_answers_the_same(tmp_path):
     with open_map(path) as offline:
         above = offline.query_distance([[0.0, 0.0, 1.0]], surface_point=True)
         sdf = offline.query_sdf([[0, 0, 0.1]]).sdf
-    compiled = [above.distance[0], above.surface_point[0, 2], sdf[0]]
+    compiled = [above.distance_m[0], above.surface_point[0, 2], sdf[0]]
     np.testing.assert_allclose(plain, compiled, atol=1e-5)
     np.testing.assert_allclose(plain, [0.93, 0.07, 0.03], atol=5e-3)

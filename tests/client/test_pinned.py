@@ -2,23 +2,26 @@
 
 import asyncio
 from collections.abc import Iterator
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
 from triquad_client import Client, InvalidInputError, RefusedError
+from triquad_server.settings import ServiceSettings
 
 POSE = np.eye(4)
 POINTS = servers.sphere(300).astype(np.float64)
-LIMITS = replace(servers.SMALL.service, epochs_kept=1, epochs_pinned=2)
+SETTINGS = servers.SMALL.model_copy(
+    update={"service": ServiceSettings(epochs_kept=1, epochs_pinned=2)}
+)
 
 
 @pytest.fixture
 def client() -> Iterator[Client]:
     """Of a service that keeps the newest epoch, and two that are asked for."""
-    with servers.service_and_client(replace(servers.SMALL, service=LIMITS)) as client:
+    with servers.service_and_client(SETTINGS) as client:
         learn_more(client)
         yield client
 
@@ -30,13 +33,13 @@ def learn_more(client: Client) -> None:
     client.settle(servers.WAIT_S)
 
 
-def test_a_pinned_map_stays_as_it_was(client):
+def test_a_pinned_map_stays_as_it_was(client: Client) -> None:
     view = client.pinned()
-    before = view.query_gradient(POINTS)
+    before = view.query_sdf(POINTS, gradient=True)
     assert before.epoch == view.epoch == client.status().epoch
     for _ in range(3):
         learn_more(client)
-        after = view.query_gradient(POINTS)
+        after = view.query_sdf(POINTS, gradient=True)
         assert after.epoch == view.epoch
         np.testing.assert_array_equal(after.sdf, before.sdf)
         np.testing.assert_array_equal(after.gradient, before.gradient)
@@ -46,7 +49,7 @@ def test_a_pinned_map_stays_as_it_was(client):
     assert client.pinned().epoch == newest.epoch
 
 
-def test_all_parts_of_a_big_query_come_from_the_epoch_that_is_asked_for(client):
+def test_all_parts_of_a_big_query_come_from_the_epoch_that_is_asked_for(client: Client) -> None:
     view = client.pinned()
     learn_more(client)
     big = client.query_sdf(np.tile(POINTS, (1000, 1)), at_epoch=view.epoch)
@@ -55,7 +58,7 @@ def test_all_parts_of_a_big_query_come_from_the_epoch_that_is_asked_for(client):
     np.testing.assert_allclose(big.sdf, np.tile(expected, 1000), atol=1e-6)
 
 
-def test_an_epoch_that_is_gone_is_refused_and_no_other_answers(client):
+def test_an_epoch_that_is_gone_is_refused_and_no_other_answers(client: Client) -> None:
     view = client.pinned()
     for _ in range(2):  # two others are asked for since
         learn_more(client)
@@ -69,18 +72,18 @@ def test_an_epoch_that_is_gone_is_refused_and_no_other_answers(client):
 
 
 @pytest.mark.parametrize("epoch", [0, -1, 2**63, 1.5, "newest"])
-def test_what_is_no_epoch_is_refused_here(client, epoch):
+def test_what_is_no_epoch_is_refused_here(client: Client, epoch: Any) -> None:
     with pytest.raises(InvalidInputError, match="at_epoch"):
         client.query_sdf(POINTS, at_epoch=epoch)
 
 
-def test_an_epoch_may_be_any_integer(client):
+def test_an_epoch_may_be_any_integer(client: Client) -> None:
     epoch = client.query_sdf(POINTS).epoch
-    assert client.query_gradient(POINTS, at_epoch=np.int64(epoch)).epoch == epoch
+    assert client.query_sdf(POINTS, at_epoch=np.int64(epoch)).epoch == epoch
 
 
-def test_the_other_client_pins_alike():
-    with servers.running_service(replace(servers.SMALL, service=LIMITS)) as endpoint:
+def test_the_other_client_pins_alike() -> None:
+    with servers.running_service(SETTINGS) as endpoint:
         asyncio.run(asyncio.wait_for(pin_with(endpoint), servers.WAIT_S))
 
 
@@ -91,7 +94,7 @@ async def pin_with(endpoint: str) -> None:
             view = await client.pinned()
             before = await view.query_sdf(POINTS)
             await asyncio.to_thread(learn_more, learner)
-            after = await asyncio.gather(*(view.query_gradient(POINTS) for _ in range(50)))
+            after = await asyncio.gather(*(view.query_sdf(POINTS) for _ in range(50)))
             assert {result.epoch for result in after} == {view.epoch}
             np.testing.assert_array_equal(after[0].sdf, before.sdf)
             assert (await client.query_sdf(POINTS)).epoch > view.epoch

@@ -4,10 +4,13 @@ import asyncio
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import triquad_client
+import zenoh
 from support import servers
 from triquad_client import (
     Client,
@@ -29,7 +32,7 @@ POINTS = np.random.default_rng(0).uniform(-6, 6, (3000, 3))
 
 
 @pytest.fixture
-def endpoint():
+def endpoint() -> Iterator[str]:
     """Of a server that has learnt two rooms."""
     with servers.running_service() as endpoint:
         with triquad_client.connect(endpoint) as client:
@@ -39,7 +42,7 @@ def endpoint():
 
 
 @pytest.fixture
-def client(endpoint):
+def client(endpoint: str) -> Iterator[Client]:
     with triquad_client.connect(endpoint) as client:
         yield client
 
@@ -53,14 +56,14 @@ def learn(client: Client, x_m: float, radius_m: float = 4.0) -> None:
     client.settle(servers.WAIT_S)
 
 
-def assert_same_answers(local, client, points=POINTS):
+def assert_same_answers(local: SyncedMap, client: Client, points: np.ndarray = POINTS) -> None:
     have, want = local.query_distance(points), client.query_distance(points)
     assert have.epoch == want.epoch
     np.testing.assert_array_equal(have.status, want.status)
-    assert np.quantile(np.abs(have.distance - want.distance), 0.99) < 1e-3
+    assert np.quantile(np.abs(have.distance_m - want.distance_m), 0.99) < 1e-3
 
 
-def test_a_copy_answers_as_the_server(client, tmp_path):
+def test_a_copy_answers_as_the_server(client: Client, tmp_path: Path) -> None:
     path = tmp_path / "copy.triquad"
     local = client.sync(WHOLE, path)
     assert local.epoch == client.status().epoch
@@ -68,17 +71,17 @@ def test_a_copy_answers_as_the_server(client, tmp_path):
     assert_same_answers(local, client, POINTS + (FAR_M, 0, 0))
     with triquad_client.open_map(path) as offline:
         again = offline.query_distance(POINTS)
-    np.testing.assert_array_equal(again.distance, local.query_distance(POINTS).distance)
+    np.testing.assert_array_equal(again.distance_m, local.query_distance(POINTS).distance_m)
 
 
-def test_a_copy_holds_what_its_box_needs_and_no_more(client, tmp_path):
+def test_a_copy_holds_what_its_box_needs_and_no_more(client: Client, tmp_path: Path) -> None:
     whole, first = (client.sync(box, tmp_path / "copy.triquad") for box in (WHOLE, FIRST))
     assert_same_answers(first, client)
     assert 0 < first.report.parts < whole.report.parts
     assert not first.query_distance(POINTS + (FAR_M, 0, 0)).found.any()
 
 
-def test_only_what_changed_travels(client, tmp_path):
+def test_only_what_changed_travels(client: Client, tmp_path: Path) -> None:
     local = client.sync(WHOLE, tmp_path / "copy.triquad")
     everything = local.report
     assert everything.parts_kept == 0
@@ -94,7 +97,7 @@ def test_only_what_changed_travels(client, tmp_path):
     assert_same_answers(local, client, POINTS + (FAR_M, 0, 0))
 
 
-def test_the_copy_of_an_earlier_run_is_taken_up(client, tmp_path):
+def test_the_copy_of_an_earlier_run_is_taken_up(client: Client, tmp_path: Path) -> None:
     path = tmp_path / "copy.triquad"
     before = client.sync(WHOLE, path).report
     again = client.sync(WHOLE, path)
@@ -104,7 +107,9 @@ def test_the_copy_of_an_earlier_run_is_taken_up(client, tmp_path):
     assert_same_answers(again, client)
 
 
-def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(client, tmp_path):
+def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(
+    client: Client, tmp_path: Path
+) -> None:
     path = tmp_path / "copy.triquad"
     parts = client.sync(WHOLE, path).report.parts
     data = bytearray(path.read_bytes())
@@ -120,7 +125,7 @@ def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(client, tmp_path):
         assert triquad_client.open_map(path).epoch == client.status().epoch
 
 
-def test_it_goes_on_answering_while_the_server_is_gone(tmp_path):
+def test_it_goes_on_answering_while_the_server_is_gone(tmp_path: Path) -> None:
     path, store = tmp_path / "copy.triquad", tmp_path / "store"
     settings = tmp_path / "settings.toml"
     settings.write_text(servers.SMALL_TOML)
@@ -137,7 +142,7 @@ def test_it_goes_on_answering_while_the_server_is_gone(tmp_path):
     with pytest.raises(ConnectError, match="down"):
         local.refresh()
     assert local.age_s > age_s
-    np.testing.assert_array_equal(local.query_distance(POINTS).distance, before.distance)
+    np.testing.assert_array_equal(local.query_distance(POINTS).distance_m, before.distance_m)
     assert triquad_client.open_map(path).epoch == before.epoch
     with client, servers.server_process(options, endpoint=server.endpoint):
         assert refreshed_once_linked(local).parts_kept > 0
@@ -158,7 +163,9 @@ def refreshed_once_linked(local: SyncedMap) -> SyncReport:
             time.sleep(0.1)
 
 
-def test_its_age_counts_from_when_the_server_had_nothing_newer(client, tmp_path):
+def test_its_age_counts_from_when_the_server_had_nothing_newer(
+    client: Client, tmp_path: Path
+) -> None:
     local = client.sync(FIRST, tmp_path / "copy.triquad")
     age_s = local.age_s
     assert local.age_s > age_s >= 0
@@ -167,7 +174,7 @@ def test_its_age_counts_from_when_the_server_had_nothing_newer(client, tmp_path)
     assert local.age_s <= time.monotonic() - started
 
 
-def test_a_copy_has_one_epoch(client, tmp_path):
+def test_a_copy_has_one_epoch(client: Client, tmp_path: Path) -> None:
     local = client.sync(FIRST, tmp_path / "copy.triquad")
     before = local.epoch
     local.query_sdf(POINTS, at_epoch=before)
@@ -180,7 +187,7 @@ def test_a_copy_has_one_epoch(client, tmp_path):
     assert refusal.value.code == "epoch_gone"
 
 
-def test_of_an_unknown_place_nothing_is_known_until_it_is(tmp_path):
+def test_of_an_unknown_place_nothing_is_known_until_it_is(tmp_path: Path) -> None:
     with servers.service_and_client() as client:
         local = client.sync(FIRST, tmp_path / "copy.triquad")
         assert not local.query_distance(POINTS).status.any()
@@ -192,14 +199,14 @@ def test_of_an_unknown_place_nothing_is_known_until_it_is(tmp_path):
         assert not local.query_distance(POINTS).status.any()
 
 
-def test_bounds_that_hold_nothing_are_refused(client, tmp_path):
+def test_bounds_that_hold_nothing_are_refused(client: Client, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="hold nothing"):
         client.sync(((0, 0, 0), (0, 1, 1)), tmp_path / "copy.triquad")
     with pytest.raises(OSError, match="nowhere"):
         client.sync(FIRST, tmp_path / "nowhere" / "copy.triquad")
 
 
-def test_what_arrives_damaged_replaces_nothing(client, tmp_path):
+def test_what_arrives_damaged_replaces_nothing(client: Client, tmp_path: Path) -> None:
     path, whole = tmp_path / "copy.triquad", tmp_path / "whole.triquad"
     client.sync(FIRST, path)
     client.download_map(whole)
@@ -207,12 +214,12 @@ def test_what_arrives_damaged_replaces_nothing(client, tmp_path):
     for place in range(100, len(sent) // 2, 5000):
         sent[place] ^= 0xFF
 
-    def info(query, key):
+    def info(query: zenoh.Query, key: str) -> None:
         message = MapInfo(99, len(sent), "0" * 64, 2**20)
         with query:
             query.reply(key, codec.encode(message))
 
-    def chunk(query, key):
+    def chunk(query: zenoh.Query, key: str) -> None:
         request = codec.decode(MapChunkRequest, query.payload.to_bytes())
         data = bytes(sent[request.offset : request.offset + request.length])
         with query:
@@ -240,7 +247,7 @@ with triquad_client.connect(sys.argv[1]) as client:
 """
 
 
-def test_a_process_that_is_killed_leaves_a_whole_copy(tmp_path):
+def test_a_process_that_is_killed_leaves_a_whole_copy(tmp_path: Path) -> None:
     path = tmp_path / "copy.triquad"
     with servers.running_service() as endpoint, triquad_client.connect(endpoint) as client:
         learn(client, 0.0)
@@ -255,14 +262,14 @@ def test_a_process_that_is_killed_leaves_a_whole_copy(tmp_path):
             assert triquad_client.open_map(path).epoch == epoch
 
 
-def test_copies_for_event_loops(endpoint, client, tmp_path):
+def test_copies_for_event_loops(endpoint: str, client: Client, tmp_path: Path) -> None:
     async def follow() -> None:
         async with triquad_client.connect_async(endpoint) as awaited:
             local = await awaited.sync(WHOLE, tmp_path / "copy.triquad")
             answers = await asyncio.gather(*(local.query_distance(POINTS) for _ in range(4)))
             want = client.query_distance(POINTS)
             for answer in answers:
-                assert np.quantile(np.abs(answer.distance - want.distance), 0.99) < 1e-3
+                assert np.quantile(np.abs(answer.distance_m - want.distance_m), 0.99) < 1e-3
             assert (await local.refresh()).bytes_received == 0
             assert local.age_s >= 0
         with pytest.raises(ClosedError):

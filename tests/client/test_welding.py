@@ -18,14 +18,14 @@ def test_rounding_boundaries_do_not_leave_cracks():
     edge = np.stack([np.full(2000, 6.4), rng.uniform(0, 6.4, 2000), np.full(2000, 0.3)], axis=1)
     edge[:, 1] = np.round(edge[:, 1] / 1e-3) * 1e-3 + 0.5e-4  # on boundaries of the rounding
     edge = np.unique(edge, axis=0)
-    twin = edge + rng.normal(0, 1e-7, edge.shape) * (0, 1, 0)
+    copy = edge + rng.normal(0, 1e-7, edge.shape) * (0, 1, 0)
     apexes = np.array([[6.0, 3.0, 0.5], [6.8, 3.0, 0.5]])
     count = len(edge)
     index = np.arange(count - 1)
     first = np.stack([index, index + 1, np.full(count - 1, 2 * count)], axis=1)
     second = np.stack([index + 1, index, np.full(count - 1, count + 1)], axis=1) + count
     vertices, _ = welded(
-        np.concatenate([edge, twin, apexes]),
+        np.concatenate([edge, copy, apexes]),
         np.concatenate([first, second]).astype(np.int32),
         6.4,
     )

@@ -10,6 +10,7 @@ import triquad_client
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support import servers
+from support.operations import OPERATIONS
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ResetRequest,
@@ -204,7 +205,7 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
             SdfRequest(ORIGIN, np.zeros((10_000_000, 3), np.float32), False, 0),
             "too_large",
         ),
-        *((operation, bytes(12_010_000), "too_large") for operation in keys.OPERATIONS),
+        *((operation, bytes(12_010_000), "too_large") for operation in OPERATIONS),
         (keys.SEGMENTS, segments(2_000, 900.0), "too_large"),
         (keys.SEGMENTS, segments(1, 1_001.0), "bad_request"),
         (keys.RAYS, rays(100_000, 1_000.0), "too_large"),
@@ -214,7 +215,7 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
         (keys.TILE_LIST, TileListRequest(ORIGIN * np.nan, ORIGIN, 0), "bad_request"),
         (keys.RESET, ResetRequest(ORIGIN, ORIGIN * np.nan), "bad_request"),
         (keys.RESET, ResetRequest(ORIGIN, ORIGIN - 1), "bad_request"),
-        *((operation, b"\x00", "bad_request") for operation in keys.OPERATIONS),
+        *((operation, b"\x00", "bad_request") for operation in OPERATIONS),
     ],
 )
 def test_bad_requests_are_refused_with_a_code(peer, client, operation, request_, code):
@@ -225,7 +226,7 @@ def test_bad_requests_are_refused_with_a_code(peer, client, operation, request_,
 
 
 def test_a_request_without_payload_is_refused(peer):
-    for operation in keys.OPERATIONS:
+    for operation in OPERATIONS:
         assert peer.ask(operation, None).code == "bad_request"
 
 
@@ -237,14 +238,14 @@ def test_a_request_for_another_map_gets_no_reply(peer):
 def test_far_tiles_and_far_points_are_empty(client):
     tile = client.mesh_tile(1_000_000, -1_000_000, 0)
     assert len(tile.faces) == 0
-    result = client.query_gradient([[1e9, 0, 0], [-1e9, 1e9, 1e9]])
+    result = client.query_sdf([[1e9, 0, 0], [-1e9, 1e9, 1e9]], gradient=True)
     assert (result.status == triquad_client.Status.UNKNOWN).all()
     assert np.isnan(result.sdf).all()
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
-    st.sampled_from(keys.OPERATIONS),
+    st.sampled_from(OPERATIONS),
     st.one_of(
         st.binary(max_size=100),
         st.dictionaries(

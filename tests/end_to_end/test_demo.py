@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from support import servers
 from triquad_client import RequestTimeoutError, SdfResult
-from triquad_format.mapfile.mapfile import read_map
-from triquad_tools.demo import demo, demo_steps
-from triquad_tools.demo.demo_probe import Probe, ProbeError, ProbeReport, ask_until
-from triquad_tools.demo.demo_results import (
+from triquad_format.mapfile.reader import read_map
+from triquad_tools.commands import demo
+from triquad_tools.demo import steps
+from triquad_tools.demo.probe import Probe, ProbeError, ProbeReport, ask_until
+from triquad_tools.demo.results import (
     DemoResults,
     Intake,
     MapSize,
@@ -19,10 +20,10 @@ from triquad_tools.demo.demo_results import (
     broken_promises,
     table_rows,
 )
-from triquad_tools.demo.demo_server import DemoServer, DemoServerError, ServerOptions
+from triquad_tools.demo.server import DemoServer, DemoServerError, ServerOptions
 from triquad_tools.evaluation.map_scores import StreetScores
-from triquad_tools.evaluation.meshfile import read_mesh
 from triquad_tools.evaluation.metrics import MeshScores
+from triquad_tools.mapfiles.meshfile import read_mesh
 
 GOOD = DemoResults(
     seed=1,
@@ -40,8 +41,8 @@ QUALITY = ("SDF error", "gradient angle", "mesh F-score", "houses UNKNOWN")
 
 
 def test_a_few_scans_leave_all_results(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(demo_steps, "_SETTLE_LIMIT_S", 1.0)
-    monkeypatch.setattr(demo_steps, "_MESH_SAMPLES", 100_000)
+    monkeypatch.setattr(steps, "_SETTLE_LIMIT_S", 3.0)
+    monkeypatch.setattr(steps, "_MESH_SAMPLES", 100_000)
     out = tmp_path / "out"
     before = signal.getsignal(signal.SIGTERM)
     code = demo.main(["--out", str(out), "--scans", "2"])

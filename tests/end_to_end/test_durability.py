@@ -11,8 +11,8 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import RefusedError
-from triquad_format.mapfile.history import checkpoint_files
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files
+from triquad_format.mapfile.reader import read_map
 
 POSE = np.eye(4)
 

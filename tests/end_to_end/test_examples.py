@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 import triquad_client
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageColor
 from support import servers
-from triquad_tools.plots.slice_view import main as draw_slice
+from triquad_tools.commands.inspect import main as inspect_map
+from triquad_tools.plots.plan import FREE, UNKNOWN
+from triquad_tools.plots.slice_plan import SURFACE
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
 DOCS = Path(__file__).parents[2] / "docs"
 EXAMPLES = DOCS / "examples"
-SETTINGS = "[training]\nbatch = 4096\nvisits = 15.0\n"
+SETTINGS = "[training]\nbatch = 4096\nsamples_per_ray = 15.0\n"
 SCENE = street(1)  # of triquad-demo, which the guides begin with
 DRIVE = SimulatedDrive(SCENE, Lidar(columns=360), drive(SCENE, 20, 1.5), seed=1)
 RADIUS_M = 0.4  # of what the planners move
@@ -170,7 +172,8 @@ def test_a_scan_finds_its_place_in_a_file(endpoint: str, run: Run, tmp_path: Pat
 def test_a_slice_shows_what_is_known(endpoint: str, tmp_path: Path) -> None:
     box = ("--box", "0", "-10", "20", "10")
     out = tmp_path / "slice.png"
-    assert draw_slice([str(out), "--connect", endpoint, *box]) == 0
+    command = [endpoint, "--map", "demo", "--slice", "1", *box, "--plot", str(out)]
+    assert inspect_map(command) == 0
     with Image.open(out) as picture:
-        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
-    assert {(0x7D, 0x87, 0x94), (0xF4, 0xF1, 0xE8), (0xA3, 0x34, 0x1F)} <= colours
+        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24)}
+    assert {ImageColor.getrgb(colour) for colour in (UNKNOWN, FREE, SURFACE)} <= colours

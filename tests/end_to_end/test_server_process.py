@@ -8,7 +8,7 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import SdfResult
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
 POSE = np.eye(4)
@@ -36,12 +36,12 @@ def learn(endpoint: str) -> SdfResult:
             client.publish_scan(servers.sphere(), POSE)
         assert client.flush(servers.WAIT_S).taken == 2
         client.settle(servers.WAIT_S)
-        return client.query_gradient(PROBES)
+        return client.query_sdf(PROBES, gradient=True)
 
 
 def ask(endpoint: str) -> SdfResult:
     with triquad_client.connect(endpoint) as client:
-        return client.query_gradient(PROBES)
+        return client.query_sdf(PROBES, gradient=True)
 
 
 def assert_same_map(before: SdfResult, after: SdfResult) -> None:
@@ -172,7 +172,10 @@ def test_a_store_in_use_is_exit_code_4(tmp_path, arguments):
 @pytest.mark.parametrize(
     ("toml", "text"),
     [
-        ("[service]\nscan_que = 3\n", "unknown key 'scan_que'"),
+        (
+            "[service]\nscan_que = 3\n",
+            "unknown setting service.scan_que: did you mean service.scan_queue?",
+        ),
         ("[service]\nscan_queue = -3\n", "scan_queue = -3 is out of range"),
         ("[service\n", "settings file"),
     ],

@@ -1,4 +1,5 @@
 import pytest
+from support.operations import OPERATIONS
 from triquad_format.errors import FormatError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import Scan
@@ -15,7 +16,7 @@ def test_keys_are_those_of_the_specification():
 
 
 def test_each_operation_has_a_key_of_its_own():
-    assert len(set(keys.OPERATIONS)) == len(keys.OPERATIONS) == 16
+    assert len(set(OPERATIONS)) == len(OPERATIONS) == 16
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "*", "**", "a b", "$x", "@x", "_x", "é", "a" * 65])

@@ -7,8 +7,10 @@ import shutil
 
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
+from support.file_damage import flipped
 from support.map_records import assert_same, random_record, with_integers
 from support.mapfile_edit import (
+    MemoryBytes,
     file_bytes,
     metadata_of,
     parts_of,
@@ -20,9 +22,9 @@ from support.mapfile_edit import (
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
 from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import FileRef
-from triquad_format.mapfile.mapfile import read_map
-from triquad_format.mapfile.random_access import FileBytes, MemoryBytes
-from triquad_format.recovery.recover import recover
+from triquad_format.mapfile.mcap.random_access import FileBytes
+from triquad_format.mapfile.reader import read_map
+from triquad_format.recovery.recovered_map import recover
 from triquad_map.stored_map import StoredMap
 
 BASE = random_record(30, indices=((0, 0, 0), (1, 0, 0)), epoch=3)
@@ -72,7 +74,7 @@ def test_a_delta_of_a_delta_names_each_file_that_it_needs(pair):
     index.close()
     known = {e.key: dataclasses.replace(e, file=e.file or here) for e in manifest.entries}
     record = dataclasses.replace(next_record(), epoch=9)
-    written = write_record(pair / "third.triquad", record, None, known)
+    written = write_record(pair / "third.triquad", record, known=known)
     assert {file.name for file in written.manifest.files} == {"base.triquad", "next.triquad"}
     assert len(written.manifest.own) == 1
     for read in both_readers(pair / "third.triquad"):
@@ -104,10 +106,6 @@ DAMAGED_BASES = {
     ),
     "a part altered": lambda data: flipped(data, len(data) // 3),
 }
-
-
-def flipped(data, at):
-    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
 
 
 @pytest.mark.parametrize("case", DAMAGED_BASES)

@@ -25,17 +25,10 @@ from support.mapfile_edit import (
     write_pair,
 )
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.map_facts import MapFacts
-from triquad_format.mapfile.mapfile import MapFileInfo, read_map, read_map_file, write_map
-from triquad_format.mapfile.parts.shuffle import (
-    join_integers,
-    shuffle,
-    shuffle_codes,
-    split_integers,
-    unshuffle,
-    unshuffle_codes,
-)
-from triquad_format.mapfile.writer import Previews, record_parts, write_parts
+from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.parts.pack import pack_record
+from triquad_format.mapfile.reader import read_map, read_map_file
+from triquad_format.mapfile.writer import MapFileInfo, Previews, write_map, write_parts
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
@@ -209,32 +202,6 @@ def test_info_of_parts():
     assert file.manifest == manifest_of(data)
 
 
-# Columns
-
-
-@given(st.lists(st.integers(0, 2**47), unique=True))
-def test_codes_round_trip(codes):
-    array = np.array(sorted(codes), np.int64)
-    np.testing.assert_array_equal(unshuffle_codes(shuffle_codes(array)), array)
-
-
-@given(st.lists(st.integers(-MAX_INTEGER, MAX_INTEGER), min_size=1))
-def test_integers_round_trip(integers):
-    array = np.array(integers, np.int16)[:, None]
-    np.testing.assert_array_equal(join_integers(split_integers(array)), array)
-
-
-def test_literal_bytes_of_columns():
-    assert shuffle_codes(np.array([1, 3, 300])).tolist() == [[1, 2, 41], [0, 0, 1]]
-    assert shuffle_codes(np.array([], np.int64)).shape == (1, 0)
-    halves = np.array([[1.0, -2.0]], "<f2")  # 0x3c00, 0xc000
-    assert shuffle(halves).tolist() == [[[0x00, 0x00]], [[0x3C, 0xC0]]]
-    np.testing.assert_array_equal(unshuffle(shuffle(halves), "<f2"), halves)
-    assert split_integers(np.array([[1, -128], [2, 127]])).tolist() == [[[1, 2], [-128, 127]]]
-    wide = np.array([[128, -300, MAX_INTEGER]])
-    assert split_integers(wide).tolist() == [[[-128], [-44], [127]], [[1], [-1], [127]]]
-
-
 # The golden files
 
 
@@ -249,7 +216,7 @@ def test_golden_files_read_back():
 @pytest.fixture
 def golden_pairs(monkeypatch, tmp_path):
     """The golden files, and what the writer writes now, under the name that it had then."""
-    monkeypatch.setattr("triquad_format.mapfile.writer.__version__", GOLDEN_PRODUCER)
+    monkeypatch.setattr("triquad_format.mapfile.metadata.__version__", GOLDEN_PRODUCER)
     write_golden(tmp_path)
     names = (*GOLDEN_NAMES, GOLDEN_LEVELS)
     return [((GOLDEN / name).read_bytes(), (tmp_path / name).read_bytes()) for name in names]
@@ -302,9 +269,9 @@ def test_previews_are_written_with_their_schema_only():
     record = random_record(6)
     previews = previews_of(record)
     facts = MapFacts(record.name, record.epoch, record.settings)
-    parts = record_parts(record, "<f2", previews.parts)
+    parts = pack_record(record, "<f2", previews.parts)
     with pytest.raises(FormatError, match="give preview_schema"):
-        write_parts(io.BytesIO(), facts, None, parts, {})
+        write_parts(io.BytesIO(), facts, parts)
 
 
 @pytest.mark.parametrize(

@@ -24,11 +24,12 @@ from support.mapfile_edit import (
     rebuild,
     set_array,
     stored,
+    stored_record,
     with_manifest,
 )
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.manifest import FileRef
-from triquad_format.mapfile.mcap.records import MAX_CHUNK_BYTES
+from triquad_format.mapfile.mcap.chunks import MAX_CHUNK_BYTES
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, VERTICES, PartKey
 from triquad_format.records.region import MapRecord
 
@@ -110,11 +111,6 @@ BOMBS = {
     "times": lambda: bomb_of_evidence("seen_s", (1, 11 * 2**20)),
     "parts": lambda: bomb_of_parts(2**18),
 }
-
-
-def stored_record(data):
-    with stored(data) as map_file:
-        return map_file.record()
 
 
 @pytest.mark.parametrize("name", BOMBS)

@@ -17,6 +17,7 @@ from support.mapfile_edit import (
     read_bytes,
     rebuild,
     stored,
+    stored_record,
     with_metadata,
 )
 from triquad_format.errors import (
@@ -28,7 +29,7 @@ from triquad_format.errors import (
     UnsupportedMapFileError,
 )
 from triquad_format.mapfile import reader
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 
@@ -36,11 +37,6 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "map_v1.triquad"
 @pytest.fixture(scope="module")
 def golden():
     return read_map(GOLDEN)
-
-
-def stored_record(data):
-    with stored(data) as map_file:
-        return map_file.record()
 
 
 def is_refused(data, record, read=read_bytes):
@@ -216,6 +212,7 @@ def test_another_mcap_file():
         ({"epoch": "8"}, DamagedMapFileError, "epoch"),
         ({"frame_id": "odom"}, DamagedMapFileError, "frame_id"),
         ({"map": "other"}, DamagedMapFileError, "map"),
+        ({"units": "ft"}, DamagedMapFileError, "units"),
     ],
 )
 def test_metadata_is_checked(changes, error, text):

@@ -6,7 +6,8 @@ import pytest
 from support.map_records import SMALL, assert_same, random_record, with_integers
 from support.mapfile_edit import write_pair, write_record
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_INTEGER, MAX_SEEN_S
@@ -20,7 +21,7 @@ def with_table(record, **changes):
     return dataclasses.replace(record, regions=(region, *record.regions[1:]))
 
 
-UNSOUND = {
+INVALID = {
     "epoch": lambda r: dataclasses.replace(r, epoch=-1),
     "name": lambda r: dataclasses.replace(r, name="a/b"),
     "a region twice": lambda r: dataclasses.replace(r, regions=r.regions * 2),
@@ -39,15 +40,15 @@ UNSOUND = {
 }
 
 
-@pytest.mark.parametrize("case", UNSOUND)
-def test_unsound_records_are_not_written(tmp_path, case):
+@pytest.mark.parametrize("case", INVALID)
+def test_invalid_records_are_not_written(tmp_path, case):
     path = tmp_path / "map.triquad"
     with pytest.raises(FormatError):
-        write_map(UNSOUND[case](random_record(15)), path)
+        write_map(INVALID[case](random_record(15)), path)
     assert not list(tmp_path.iterdir())
 
 
-UNSOUND_EVIDENCE = {
+INVALID_EVIDENCE = {
     "a level less": ("levels", np.zeros(39, np.uint8), r"levels: expected an array \[40\]"),
     "wide levels": ("levels", np.zeros(40, np.int64), r"levels: expected .* of \|u1"),
     "a level too high": ("levels", np.full(40, 8, np.uint8), "levels: one exceeds 7"),
@@ -65,9 +66,9 @@ def with_evidence(record, **changes):
     return dataclasses.replace(record, regions=(region,))
 
 
-@pytest.mark.parametrize("case", UNSOUND_EVIDENCE)
-def test_unsound_evidence_is_not_written(tmp_path, case):
-    field, array, message = UNSOUND_EVIDENCE[case]
+@pytest.mark.parametrize("case", INVALID_EVIDENCE)
+def test_invalid_evidence_is_not_written(tmp_path, case):
+    field, array, message = INVALID_EVIDENCE[case]
     with pytest.raises(FormatError, match=message):
         write_map(with_evidence(random_record(15), **{field: array}), tmp_path / "map.triquad")
     assert not list(tmp_path.iterdir())
@@ -165,9 +166,9 @@ def test_an_unchanged_part_keeps_its_epoch_and_time(tmp_path):
         ),
     )
     record = dataclasses.replace(base, epoch=5, regions=(one, changed))
-    first = write_record(tmp_path / "first.triquad", base, 10**9, {})
+    first = write_record(tmp_path / "first.triquad", base, stamp_ns=10**9)
     known = {entry.key: entry for entry in first.manifest.entries}
-    written = write_record(tmp_path / "second.triquad", record, 2 * 10**9, known)
+    written = write_record(tmp_path / "second.triquad", record, stamp_ns=2 * 10**9, known=known)
     assert_same(read_map(tmp_path / "second.triquad"), record)
     assert not written.manifest.files
     for entry in written.manifest.entries:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from support.checkpoint_folder import FIRST, SECOND, map_at, write_checkpoints
+from support.file_damage import chunks, flipped, zeroed
 from support.map_records import SMALL, assert_same, random_record
 from support.mapfile_edit import file_bytes, manifest_of, rebuild, with_metadata
 from triquad_format.errors import MapFileError, UnsupportedMapFileError
-from triquad_format.mapfile.mapfile import read_map
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     FIELD_TOPICS,
@@ -29,9 +29,8 @@ from triquad_format.records.crop import without_training
 from triquad_format.records.evidence_voxels import seen_voxels
 from triquad_format.records.region import region_centre, region_corner
 from triquad_format.records.status import Status
-from triquad_format.recovery.recover import recover
+from triquad_format.recovery.recovered_map import recover
 from triquad_map.reference.evaluator import MapEvaluator
-from triquad_tools.commands.pack import main
 
 SQUARES = dataclasses.replace(SMALL, depth=9)
 """A region of 128 m, of 2 x 2 squares."""
@@ -39,38 +38,6 @@ SQUARES = dataclasses.replace(SMALL, depth=9)
 INDICES = ((0, 0, 0), (1, 0, 0))
 RECORD = random_record(5, settings=SQUARES, indices=INDICES, points=600)
 DATA = file_bytes(RECORD, preview=True, stamp_ns=10**18)
-
-
-@dataclasses.dataclass(frozen=True)
-class Chunk:
-    """Where a part lies in a file."""
-
-    topic: str
-    start: int
-    end: int
-
-
-def chunks(data):
-    summary = make_reader(io.BytesIO(data)).get_summary()
-    return [
-        Chunk(
-            summary.channels[next(iter(index.message_index_offsets))].topic,
-            index.chunk_start_offset,
-            index.chunk_start_offset + index.chunk_length,
-        )
-        for index in summary.chunk_indexes
-    ]
-
-
-def flipped(data, *places):
-    corrupt = bytearray(data)
-    for place in places:
-        corrupt[place] ^= 0x10
-    return bytes(corrupt)
-
-
-def zeroed(data, first, last):
-    return data[:first] + bytes(len(data[first:last])) + data[last:]
 
 
 @pytest.fixture
@@ -313,30 +280,3 @@ def test_a_delta_without_its_base(tmp_path):
     assert [region.index for region in recovery.record.regions] == [SECOND]
     assert (REGION, FIRST) in [(loss.key.topic, loss.key.region) for loss in recovery.losses]
     assert 0 < recovery.parts_intact < torn.parts_intact < recovery.parts_listed
-
-
-def test_tool(tmp_path, capsys):
-    broken, out = tmp_path / "broken.triquad", tmp_path / "out.triquad"
-    broken.write_bytes(DATA[:-100])
-    assert main([str(broken), str(out)]) == 1
-    assert "triquad-pack --recover" in capsys.readouterr().err
-    assert not out.exists()
-    assert main(["--recover", str(broken), str(out)]) == 0
-    assert "saved all" in capsys.readouterr().out
-    assert_same(read_map(out), RECORD)
-    chunk = next(chunk for chunk in chunks(DATA) if chunk.topic == VERTICES)
-    broken.write_bytes(flipped(DATA, chunk.end - 20))
-    assert main(["--recover", "--force", str(broken), str(out)]) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("lost: training state of region 0 0 0")
-    assert lines[1] == (
-        "lost: vertices of plane XY of region 0 0 0: now UNKNOWN, "
-        "x -65.0 to 0.5 m, y -65.0 to 0.5 m, z -64.5 to 64.5 m"
-    )
-    assert lines[2].startswith("saved ")
-    assert_same(read_map(out), recover(broken).record)
-    before = out.read_bytes()
-    broken.write_bytes(DATA[:100])
-    assert main(["--recover", "--force", str(broken), str(out)]) == 2
-    assert "nothing can be saved" in capsys.readouterr().err
-    assert out.read_bytes() == before

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support import map_records, spec_reader
+from support.file_damage import flipped
 from support.map_records import SMALL
 from support.spec_parts import Map, RefusedError
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.region import MapRecord
 from triquad_map.reference.evaluator import MapEvaluator
@@ -174,7 +176,7 @@ def test_a_damaged_part_is_refused_by_the_index(tmp_path: Path) -> None:
     row = next(row for row in file.manifest.own if row.key[0] == "/triquad/region")
     assert file.read(row)
     start, size = file.chunks[file.manifest.own.index(row)]
-    flip(path, start + size - 1)
+    path.write_bytes(flipped(path.read_bytes(), start + size - 1))
     with pytest.raises((RefusedError, spec_reader.zstandard.ZstdError)):
         spec_reader.IndexedFile(path).read(row)
 
@@ -182,18 +184,11 @@ def test_a_damaged_part_is_refused_by_the_index(tmp_path: Path) -> None:
 # What must be refused
 
 
-def flip(path: Path, at: int) -> None:
-    data = bytearray(path.read_bytes())
-    data[at] ^= 0x10
-    path.write_bytes(data)
-
-
 @pytest.mark.parametrize("at", [1000, -1000])
 def test_a_flipped_bit_of_data_or_summary_is_refused(tmp_path: Path, at: int) -> None:
     path = tmp_path / "map.triquad"
-    shutil.copyfile(GOLDEN / "map_v1.triquad", path)
-    flip(path, at)
-    assert_both_refuse(path)
+    path.write_bytes(flipped((GOLDEN / "map_v1.triquad").read_bytes(), at))
+    assert_refused(path)
 
 
 def test_a_file_without_its_base_is_refused(tmp_path: Path) -> None:
@@ -201,8 +196,6 @@ def test_a_file_without_its_base_is_refused(tmp_path: Path) -> None:
     shutil.copyfile(GOLDEN / "map_v1_next.triquad", path)
     with pytest.raises(FileNotFoundError):
         spec_reader.load(path)
-    with pytest.raises(FormatError):
-        read_map(path)
 
 
 def test_another_base_with_the_same_parts_is_refused(tmp_path: Path) -> None:
@@ -215,14 +208,13 @@ def test_another_base_with_the_same_parts_is_refused(tmp_path: Path) -> None:
     write_map(later, tmp_path / "map_v1.triquad", stamp_ns=stamp_ns)
     same = spec_reader.read_whole(tmp_path / "map_v1.triquad")[0]
     assert [row.digest for row in same.rows[1:]] == [row.digest for row in base.rows[1:]]
-    assert_both_refuse(path)
+    assert_refused(path)
 
 
-def assert_both_refuse(path: Path) -> None:
+def assert_refused(path: Path) -> None:
+    """The reader of the page refuses the file; test_mapfile_damage has the project's do so."""
     with pytest.raises((RefusedError, spec_reader.zstandard.ZstdError)):
         spec_reader.load(path)
-    with pytest.raises(FormatError):
-        read_map(path)
 
 
 # Files as another MCAP tool may write them
@@ -264,8 +256,7 @@ def sample() -> tuple[dict[str, str], list[tuple[str, bytes]]]:
 
 def test_a_copy_without_chunks(tmp_path: Path, sample: tuple) -> None:
     path = tmp_path / "map.triquad"
-    later = {"format_version": "9", "weather": "fine"}
-    path.write_bytes(unchunked_copy(*sample, extra=later))
+    path.write_bytes(unchunked_copy(*sample, extra={"format_version": "9", "weather": "fine"}))
     answers = spec_reader.load(path)
     assert_agree(answers, read_map(GOLDEN / "map_v1.triquad"), probes(answers))
     assert_agree(answers, read_map(path), probes(answers))
@@ -277,7 +268,9 @@ def test_digests_stand_alone(tmp_path: Path, sample: tuple) -> None:
         path = tmp_path / f"{i}.triquad"
         altered = (topic, payload[:-1] + bytes([payload[-1] ^ 1]))
         path.write_bytes(unchunked_copy(metadata, [*parts[:i], altered, *parts[i + 1 :]]))
-        assert_both_refuse(path)
+        assert_refused(path)
+        with pytest.raises(FormatError):
+            read_map(path)
 
 
 @pytest.mark.parametrize(
@@ -294,7 +287,7 @@ def test_digests_stand_alone(tmp_path: Path, sample: tuple) -> None:
 def test_facts_that_must_be_refused(tmp_path: Path, sample: tuple, extra: dict[str, str]) -> None:
     path = tmp_path / "map.triquad"
     path.write_bytes(unchunked_copy(*sample, extra=extra))
-    assert_both_refuse(path)
+    assert_refused(path)
 
 
 def test_parts_that_are_missing_doubled_or_moved(tmp_path: Path, sample: tuple) -> None:
@@ -304,4 +297,4 @@ def test_parts_that_are_missing_doubled_or_moved(tmp_path: Path, sample: tuple) 
     for i, some in enumerate(wrong):
         path = tmp_path / f"{i}.triquad"
         path.write_bytes(unchunked_copy(metadata, [*some, manifest]))
-        assert_both_refuse(path)
+        assert_refused(path)

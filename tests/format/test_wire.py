@@ -38,7 +38,7 @@ STATUS = ServerStatus(
     points_dropped={},
     requests_refused={},
     samples_trained=9,
-    segments_kept=9,
+    rays_kept=9,
     loss=0.5,
     regions=1,
     vertices=2,
@@ -65,7 +65,7 @@ def all_messages() -> list[type[Message]]:
     return [
         kind
         for kind in vars(messages).values()
-        if isinstance(kind, type) and issubclass(kind, Message) and kind is not Message
+        if isinstance(kind, type) and issubclass(kind, Message) and not kind.__subclasses__()
     ]
 
 

@@ -26,7 +26,7 @@ from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
 
 CAMPAIGN = os.environ.get("TRIQUAD_FUZZ")
-COUNT = int(CAMPAIGN or 220)
+COUNT = int(CAMPAIGN or 80)
 LIMIT_BYTES = 64 * 2**20
 """Memory that a reader may take beside the size of the file."""
 

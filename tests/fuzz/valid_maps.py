@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from support.map_records import random_record, with_integers, with_levels
 from support.mapfile_edit import write_pair
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap

@@ -11,7 +11,7 @@ from support.exact_view import ExactView
 from support.small_world import settings, settled_mapper, world
 from triquad_map.questions.align import Alignment, AlignOptions, align
 from triquad_map.questions.thinning import thinned
-from triquad_tools.benchmarks.bench_align import Offset, attempts, displaced, recorded
+from triquad_tools.benchmarks.align import Offset, attempts, displaced, recorded
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Label, Solid, box, cylinder, half_space

@@ -2,7 +2,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.status import Status
-from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.surface.confidence import LEVELS
 
@@ -15,49 +16,49 @@ def voxel(*xyz: float) -> np.ndarray:
 
 
 def test_nothing_is_known_at_first() -> None:
-    evidence = Evidence(SIDE)
-    assert (evidence.status(RNG.uniform(-5, SIDE + 5, (1000, 3))) == Status.UNKNOWN).all()
+    evidence = LiveEvidence(SIDE)
+    assert (evidence.freeze().status(RNG.uniform(-5, SIDE + 5, (1000, 3))) == Status.UNKNOWN).all()
 
 
 def test_surface_reaches_half_a_voxel() -> None:
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     evidence.mark_surface(voxel(10.5, 20.5, 30.5))
     near = voxel(11.49, 20.5, 30.5), voxel(9.51, 19.51, 29.51), voxel(10.01, 20.99, 30.5)
     far = voxel(11.51, 20.5, 30.5), voxel(10.5, 20.5, 29.49)
-    assert [int(evidence.status(p)[0]) for p in near] == [Status.SURFACE] * 3
-    assert [int(evidence.status(p)[0]) for p in far] == [Status.UNKNOWN] * 2
-    assert evidence.status(far[0], reach=1.0)[0] == Status.SURFACE
+    assert [int(evidence.freeze().status(p)[0]) for p in near] == [Status.SURFACE] * 3
+    assert [int(evidence.freeze().status(p)[0]) for p in far] == [Status.UNKNOWN] * 2
+    assert evidence.freeze().status(far[0], reach=1.0)[0] == Status.SURFACE
 
 
 def test_a_ray_carves_the_voxels_it_crosses_and_stops_short() -> None:
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     origin, end = np.array([2.2, 3.3, 4.4]), np.array([[50.7, 31.1, 17.9]])
     evidence.carve(origin, end, stop_short=0.5)
     direction = (end[0] - origin) / np.linalg.norm(end[0] - origin)
     length = np.linalg.norm(end[0] - origin)
     along = origin + np.linspace(0, length - 0.51, 5000)[:, None] * direction
-    assert (evidence.status(along) == Status.FREE).all()
+    assert (evidence.freeze().status(along) == Status.FREE).all()
     beyond = origin + np.linspace(length + 1.5, length + 9, 50)[:, None] * direction
-    assert (evidence.status(beyond) == Status.UNKNOWN).all()
+    assert (evidence.freeze().status(beyond) == Status.UNKNOWN).all()
     crossed = len(np.unique(np.floor(along), axis=0))
     everywhere = np.stack(np.meshgrid(*[np.arange(SIDE) + 0.5] * 3, indexing="ij"), -1)
-    free = (evidence.status(everywhere.reshape(-1, 3)) == Status.FREE).sum()
+    free = (evidence.freeze().status(everywhere.reshape(-1, 3)) == Status.FREE).sum()
     assert crossed <= free <= crossed + 2, "no voxel beside the ray is carved"
 
 
 def test_a_ray_from_outside_carves_inside_only() -> None:
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     evidence.carve(np.array([-20.0, 30.2, 30.2]), voxel(90, 31.1, 30.7), stop_short=0.5)
-    assert evidence.status(voxel(5, 30.43, 30.3))[0] == Status.FREE
-    assert evidence.status(voxel(SIDE - 0.5, 30.85, 30.6))[0] == Status.FREE
-    assert evidence.status(voxel(SIDE + 2, 31, 30.6))[0] == Status.UNKNOWN
+    assert evidence.freeze().status(voxel(5, 30.43, 30.3))[0] == Status.FREE
+    assert evidence.freeze().status(voxel(SIDE - 0.5, 30.85, 30.6))[0] == Status.FREE
+    assert evidence.freeze().status(voxel(SIDE + 2, 31, 30.6))[0] == Status.UNKNOWN
 
 
 def test_a_short_ray_carves_nothing() -> None:
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     evidence.carve(np.array([5.0, 5, 5]), voxel(5.2, 5, 5), stop_short=0.5)
     evidence.carve(np.array([5.0, 5, 5]), voxel(5, 5, 5), stop_short=0.0)
-    assert (evidence.status(voxel(5.1, 5, 5)) == Status.UNKNOWN).all()
+    assert (evidence.freeze().status(voxel(5.1, 5, 5)) == Status.UNKNOWN).all()
 
 
 @settings(max_examples=25, deadline=None)
@@ -65,58 +66,59 @@ def test_a_short_ray_carves_nothing() -> None:
 def test_it_remembers_exactly_the_marked_voxels(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-4, SIDE + 4, (count, 3))
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     evidence.mark_surface(points)
     inside = points[((points >= 0) & (points < SIDE)).all(axis=1)]
     marked = {tuple(cell) for cell in np.floor(inside).astype(int).tolist()}
     asked = rng.integers(0, SIDE, (2000, 3))
     expected = [tuple(cell) in marked for cell in asked.tolist()]
-    status = evidence.status(asked + 0.5, reach=0.4)
+    status = evidence.freeze().status(asked + 0.5, reach=0.4)
     assert (status == Status.SURFACE).tolist() == expected
 
 
 def test_a_record_restores_it() -> None:
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     evidence.mark_surface(RNG.uniform(0, SIDE, (5000, 3)))
     evidence.carve(np.full(3, 32.0), RNG.uniform(0, SIDE, (300, 3)), 0.5)
-    record = evidence.record()
+    record = evidence.freeze().record()
     assert (np.diff(record.codes) > 0).all()
-    twin = Evidence.restore(SIDE, record)
+    restored = LiveEvidence.from_record(SIDE, record)
     asked = RNG.uniform(-2, SIDE + 2, (20_000, 3))
-    np.testing.assert_array_equal(twin.status(asked), evidence.status(asked))
-    twin.mark_surface(RNG.uniform(0, SIDE, (3000, 3)))
-    assert twin.blocks >= len(record.codes)
+    for again in (restored.freeze(), FrozenEvidence.from_record(SIDE, record)):
+        np.testing.assert_array_equal(again.status(asked), evidence.freeze().status(asked))
+    restored.mark_surface(RNG.uniform(0, SIDE, (3000, 3)))
+    assert restored.blocks >= len(record.codes)
 
 
 def test_clearing_forgets_a_box_and_no_more() -> None:
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     grid = np.stack(np.meshgrid(*[np.arange(SIDE) + 0.5] * 3, indexing="ij"), -1).reshape(-1, 3)
     evidence.mark_surface(grid)
     low, high = np.array([3.0, 10.0, 20.0]), np.array([17.0, 30.0, 21.0])
     evidence.clear(low, high)
     inside = ((grid > low) & (grid < high)).all(axis=1)
-    status = evidence.status(grid, reach=0.1)
+    status = evidence.freeze().status(grid, reach=0.1)
     assert (status[inside] == Status.UNKNOWN).all()
     assert (status[~inside] == Status.SURFACE).all()
 
 
-def test_a_copy_does_not_change() -> None:
-    evidence = Evidence(SIDE)
+def test_what_is_frozen_does_not_change() -> None:
+    evidence = LiveEvidence(SIDE)
     evidence.mark_surface(voxel(1.5, 1.5, 1.5))
-    twin = evidence.copy()
+    frozen = evidence.freeze()
     evidence.mark_surface(voxel(40.5, 40.5, 40.5))
-    assert twin.status(voxel(40.5, 40.5, 40.5))[0] == Status.UNKNOWN
-    assert twin.status(voxel(1.5, 1.5, 1.5))[0] == Status.SURFACE
+    assert frozen.status(voxel(40.5, 40.5, 40.5))[0] == Status.UNKNOWN
+    assert frozen.status(voxel(1.5, 1.5, 1.5))[0] == Status.SURFACE
 
 
 def test_support_rises_with_each_look_from_near_and_from_other_sides():
     ends = np.array([[20.5, 20.5, 20.5], [60.5, 20.5, 20.5]])
 
     def level_after(*origins):
-        evidence = Evidence(SIDE)
+        evidence = LiveEvidence(SIDE)
         for origin in origins:
             evidence.mark_surface(ends[:1], Sighting(np.array(origin), 0.2, 1_000))
-        return int(evidence.levels()[0])
+        return int(evidence.freeze().levels[0])
 
     near, far = (25.0, 20.5, 20.5), (120.0, 20.5, 20.5)
     assert level_after(near) > level_after(far)
@@ -127,31 +129,31 @@ def test_support_rises_with_each_look_from_near_and_from_other_sides():
 
 
 def test_levels_and_times_survive_a_record():
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     origins = [np.array([64.0, 64, 64]), np.array([10.0, 64, 64])]
     rng = np.random.default_rng(5)
     for stamp_s, origin in zip((6_000, 9_000), origins, strict=True):
         ends = rng.uniform(0, SIDE, (3_000, 3)) ** 2 / SIDE  # many in some blocks
         evidence.mark_surface(ends, Sighting(origin, 0.2, stamp_s))
-    record = evidence.record()
-    again = Evidence.restore(SIDE, record).record()
+    record = evidence.freeze().record()
+    again = LiveEvidence.from_record(SIDE, record).freeze().record()
     np.testing.assert_array_equal(again.levels, record.levels)
     np.testing.assert_array_equal(again.seen_s, record.seen_s)
     assert len(np.unique(record.levels)) > 2
     assert set(np.unique(record.seen_s)) == {6_000, 9_000}
-    twin = evidence.copy()
+    frozen = evidence.freeze()
     evidence.mark_surface(ends, Sighting(origins[0], 0.2, 12_000))
-    np.testing.assert_array_equal(twin.record().seen_s, record.seen_s)
+    np.testing.assert_array_equal(frozen.record().seen_s, record.seen_s)
 
 
 def test_what_is_forgotten_has_no_support():
-    evidence = Evidence(SIDE)
+    evidence = LiveEvidence(SIDE)
     end = np.array([[20.5, 20.5, 20.5]])
     for _ in range(50):
         evidence.mark_surface(end, Sighting(np.array([25.0, 20, 20]), 0.2, 60))
     evidence.clear(np.zeros(3), np.full(3, float(SIDE)))
-    record = evidence.record()
+    record = evidence.freeze().record()
     assert len(record.levels) == 0
     assert not record.seen_s.any()
     evidence.mark_surface(end, Sighting(np.array([200.0, 20, 20]), 0.2, 120))
-    assert evidence.levels().tolist() == [0]
+    assert evidence.freeze().levels.tolist() == [0]

@@ -17,7 +17,7 @@ def client() -> Iterator[Client]:
     """Of a server that has seen a sphere from its middle, and learnt all of it."""
     with servers.service_and_client() as client:
         for turn in range(3):
-            client.publish_scan(even_sphere(60_000, turn), POSE, stamp=1.7e9)
+            client.publish_scan(even_sphere(60_000, turn), POSE, stamp_s=1.7e9)
         client.flush(servers.WAIT_S)
         client.settle(servers.WAIT_S)
         yield client
@@ -43,7 +43,7 @@ def test_distances_are_true_at_any_range(client):
     answer = client.query_distance(radii * ways, surface_point=True)
     assert answer.found.all()
     assert (answer.status == Status.FREE).all()
-    error = answer.distance - (RADIUS_M - radii[:, 0])
+    error = answer.distance_m - (RADIUS_M - radii[:, 0])
     assert np.abs(error).mean() < 0.03
     assert error.max() < 0.1
     off_centre = radii[:, 0] > 1.0  # in the middle all directions are nearly as near
@@ -51,15 +51,15 @@ def test_distances_are_true_at_any_range(client):
     feet = np.linalg.norm(answer.surface_point, axis=1)
     np.testing.assert_allclose(feet, RADIUS_M, atol=0.15)
     np.testing.assert_allclose(
-        np.linalg.norm(answer.surface_point - radii * ways, axis=1), answer.distance, atol=0.05
+        np.linalg.norm(answer.surface_point - radii * ways, axis=1), answer.distance_m, atol=0.05
     )
     assert (answer.confidence > 0).all()
 
 
 def test_what_lies_farther_than_asked_is_not_found(client):
-    answer = client.query_distance([[0.0, 0, 0]], max_distance=1.0, surface_point=True)
+    answer = client.query_distance([[0.0, 0, 0]], max_distance_m=1.0, surface_point=True)
     assert not answer.found[0]
-    assert answer.distance[0] == 1.0
+    assert answer.distance_m[0] == 1.0
     assert not answer.gradient.any()
     assert answer.confidence[0] == 0
     np.testing.assert_array_equal(answer.surface_point, [[0, 0, 0]])
@@ -68,26 +68,26 @@ def test_what_lies_farther_than_asked_is_not_found(client):
 def test_behind_the_surface_the_distance_is_negative(client):
     ways = directions()
     behind = client.query_distance((RADIUS_M + 0.08) * ways)
-    assert (behind.distance < 0).mean() > 0.95
+    assert (behind.distance_m < 0).mean() > 0.95
     before = client.query_distance((RADIUS_M - 0.08) * ways)
-    assert (before.distance > 0).mean() > 0.95
+    assert (before.distance_m > 0).mean() > 0.95
 
 
 def test_unknown_space_is_near_where_nothing_was_seen(client):
     outside = (RADIUS_M + 3.0) * directions()
     answer = client.query_distance(outside, unknown_distance=True)
-    assert (answer.unknown_distance == 0).all()
+    assert (answer.unknown_distance_m == 0).all()
     assert (answer.status == Status.UNKNOWN).all()
     assert not answer.confidence.any()
-    middle = client.query_distance([[0.0, 0, 0]], max_distance=6.0, unknown_distance=True)
-    assert RADIUS_M - 0.8 < middle.unknown_distance[0] < RADIUS_M + 0.8
+    middle = client.query_distance([[0.0, 0, 0]], max_distance_m=6.0, unknown_distance=True)
+    assert RADIUS_M - 0.8 < middle.unknown_distance_m[0] < RADIUS_M + 0.8
 
 
 def test_unknown_space_counts_as_a_planner_wants(client):
     outside = np.array([[0, 0, RADIUS_M + 1.0]])
-    assert client.query_distance(outside).distance[0] > 0.5
+    assert client.query_distance(outside).distance_m[0] > 0.5
     wary = client.query_distance(outside, unknown="obstacle", surface_point=True)
-    assert wary.distance[0] == 0
+    assert wary.distance_m[0] == 0
     assert wary.found[0]
     assert wary.confidence[0] == 0
     with pytest.raises(UnknownSpaceError, match="point 0"):
@@ -113,58 +113,58 @@ def test_spheres(client):
 
 def test_a_ball_meets_the_surface_where_its_radius_says(client):
     ways = directions()
-    answer = client.query_segments(np.zeros_like(ways), 6.0 * ways, radius=0.5)
+    answer = client.query_segments(np.zeros_like(ways), 6.0 * ways, radius_m=0.5)
     assert answer.blocked.all()
-    np.testing.assert_allclose(answer.contact, RADIUS_M - 0.5, atol=0.15)
-    assert (answer.clearance <= 0.5 + 1e-3).all()
+    np.testing.assert_allclose(answer.contact_m, RADIUS_M - 0.5, atol=0.15)
+    assert (answer.clearance_m <= 0.5 + 1e-3).all()
     assert not answer.free().any()
 
 
 def test_clearance_along_a_way(client):
-    way = client.query_segments([[-2.0, 1, 0]], [[2.0, 1, 0]], radius=0.3)
+    way = client.query_segments([[-2.0, 1, 0]], [[2.0, 1, 0]], radius_m=0.3)
     assert way.free().all()
     expected = RADIUS_M - np.hypot(2, 1)  # at both ends
-    np.testing.assert_allclose(way.clearance, expected, atol=0.1)
-    assert min(way.clearance_at[0], 4 - way.clearance_at[0]) < 0.2
+    np.testing.assert_allclose(way.clearance_m, expected, atol=0.1)
+    assert min(way.clearance_at_m[0], 4 - way.clearance_at_m[0]) < 0.2
 
 
 def test_a_polyline_is_its_segments_one_after_the_other(client):
     corners = [[-1.0, 0, 0], [1.0, 0, 0], [1.0, 0, 6.0], [0, 0, 0]]
-    answer = client.query_polyline(corners, radius=0.4)
+    answer = client.query_polyline(corners, radius_m=0.4)
     assert answer.blocked
     assert not answer.free()
     height = np.sqrt(RADIUS_M**2 - 1)
-    assert abs(answer.contact - (2 + height - 0.4)) < 0.2
-    assert answer.length == pytest.approx(2 + 6 + np.hypot(1, 6))
-    inside = client.query_polyline(corners[:2], radius=0.4)
+    assert abs(answer.contact_m - (2 + height - 0.4)) < 0.2
+    assert answer.length_m == pytest.approx(2 + 6 + np.hypot(1, 6))
+    inside = client.query_polyline(corners[:2], radius_m=0.4)
     assert inside.free()
-    assert inside.contact == inside.length
+    assert inside.contact_m == inside.length_m
 
 
 def test_rays_reach_the_surface(client):
     ways = directions()
     start = np.array([0.5, -0.7, 0.3])
-    answer = client.query_rays(start, ways * 3.0, max_range=20.0)
+    answer = client.query_rays(start, ways * 3.0, max_range_m=20.0)
     assert (answer.status == Status.SURFACE).mean() > 0.95
     hit = answer.status == Status.SURFACE
-    ends = start + answer.range[:, None] * ways
+    ends = start + answer.range_m[:, None] * ways
     np.testing.assert_allclose(np.linalg.norm(ends[hit], axis=1), RADIUS_M, atol=0.15)
 
 
 def test_rays_end_where_they_may_go_no_farther(client):
-    short = client.query_rays([0.0, 0, 0], [[1.0, 0, 0]], max_range=2.0)
+    short = client.query_rays([0.0, 0, 0], [[1.0, 0, 0]], max_range_m=2.0)
     assert short.status[0] == Status.FREE
-    assert short.range[0] == 2.0
+    assert short.range_m[0] == 2.0
     outside = client.query_rays([0.0, 0, 9.0], [[0, 0, 1.0]])
     assert outside.status[0] == Status.UNKNOWN
-    assert outside.range[0] == 0
+    assert outside.range_m[0] == 0
     through = client.query_rays([0.0, 0, 9.0], [[0, 0, 1.0]], 10.0, through_unknown=True)
     assert through.status[0] == Status.FREE
 
 
 def test_a_slice_shows_the_wall(client):
     low, high = [-6.0, -6.0, 0.0], [6.0, 6.0, 0.0]
-    grid = client.query_grid((low, high), cell=0.2)
+    grid = client.query_grid((low, high), cell_m=0.2)
     assert grid.status.shape == (60, 60, 1)
     middles = grid.shape.middles()
     assert (middles[:, 2] == 0).all()
@@ -174,7 +174,7 @@ def test_a_slice_shows_the_wall(client):
     ring = np.abs(radius - RADIUS_M) < 0.05
     assert (grid.status[ring] == Status.SURFACE).mean() > 0.9
     np.testing.assert_allclose(
-        grid.distance[(radius < 3.5) & (radius > 0.5)],
+        grid.distance_m[(radius < 3.5) & (radius > 0.5)],
         (RADIUS_M - radius)[(radius < 3.5) & (radius > 0.5)],
         atol=0.15,
     )
@@ -184,25 +184,25 @@ def test_parts_and_the_whole_agree(client):
     points = np.random.default_rng(2).uniform(-5, 5, (45_000, 3))
     whole = client.query_distance(points, unknown_distance=True, surface_point=True)
     some = client.query_distance(points[::100], unknown_distance=True, surface_point=True)
-    np.testing.assert_allclose(whole.distance[::100], some.distance, atol=1e-4)
+    np.testing.assert_allclose(whole.distance_m[::100], some.distance_m, atol=1e-4)
     np.testing.assert_allclose(whole.surface_point[::100], some.surface_point, atol=1e-3)
-    np.testing.assert_allclose(whole.unknown_distance[::100], some.unknown_distance, atol=1e-4)
+    np.testing.assert_allclose(whole.unknown_distance_m[::100], some.unknown_distance_m, atol=1e-4)
     np.testing.assert_array_equal(whole.status[::100], some.status)
 
 
 def test_no_points_are_no_error(client):
-    assert len(client.query_distance(np.zeros((0, 3)), surface_point=True).distance) == 0
+    assert len(client.query_distance(np.zeros((0, 3)), surface_point=True).distance_m) == 0
     assert len(client.query_spheres(np.zeros((0, 3)), 1.0).status) == 0
-    assert len(client.query_segments(np.zeros((0, 3)), np.zeros((0, 3))).contact) == 0
-    assert len(client.query_rays(np.zeros((0, 3)), np.zeros((0, 3))).range) == 0
+    assert len(client.query_segments(np.zeros((0, 3)), np.zeros((0, 3))).contact_m) == 0
+    assert len(client.query_rays(np.zeros((0, 3)), np.zeros((0, 3))).range_m) == 0
 
 
 @pytest.mark.parametrize(
     ("ask", "words"),
     [
         (lambda c: c.query_distance([[0, 0, np.nan]]), "point 0 is not finite"),
-        (lambda c: c.query_distance([[0.0, 0, 0]], max_distance=0), "max_distance = 0"),
-        (lambda c: c.query_distance([[0.0, 0, 0]], max_distance=1e3), "max_distance_m = 1000"),
+        (lambda c: c.query_distance([[0.0, 0, 0]], max_distance_m=0), "max_distance_m = 0"),
+        (lambda c: c.query_distance([[0.0, 0, 0]], max_distance_m=1e3), "max_distance_m = 1000"),
         (lambda c: c.query_spheres([[0.0, 0, 0]], [1.0, 2.0]), "radii"),
         (lambda c: c.query_spheres([[0.0, 0, 0]], -1.0), "radius 0 is -1"),
         (lambda c: c.query_segments([[0.0, 0, 0]], np.zeros((2, 3))), "1 starts and 2 ends"),
@@ -244,10 +244,10 @@ def test_answers_do_not_hang_on_what_else_is_asked(client):
     """Places on the faces of voxels, as people type them."""
     places = np.round(np.random.default_rng(6).uniform(-5, 5, (300, 3)), 1)
     ways = np.tile([1.0, 0, 0], (len(places), 1))
-    together = client.query_rays(places, ways, max_range=20.0)
+    together = client.query_rays(places, ways, max_range_m=20.0)
     status = client.query_spheres(places, 0.3).status
     for i in range(0, len(places), 10):
-        alone = client.query_rays(places[i], ways[:1], max_range=20.0)
+        alone = client.query_rays(places[i], ways[:1], max_range_m=20.0)
         assert alone.status[0] == together.status[i]
-        assert alone.range[0] == pytest.approx(together.range[i], abs=1e-3)
+        assert alone.range_m[0] == pytest.approx(together.range_m[i], abs=1e-3)
         assert client.query_spheres(places[i : i + 1], 0.3).status[0] == status[i]

@@ -10,8 +10,8 @@ from support.exact_maps import exact_map, flat, table
 from support.map_records import SMALL, random_record, with_levels
 from triquad_format.records.region import MapRecord
 from triquad_map.compiled.compiled_view import CompiledView
-from triquad_map.compiled.evidence.evidence import Evidence
-from triquad_map.compiled.recorded_view import recorded_view
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.recorded_view import RecordedView
 from triquad_map.compiled.surfels.surfel_index import surfel_index, surfel_places
 from triquad_map.compiled.surfels.surfel_search import find_nearest
 from triquad_map.nearest import no_surfels
@@ -20,7 +20,7 @@ from triquad_map.questions.grid import GridShape, grid
 from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_map.questions.spheres import spheres
-from triquad_map.reference.recorded_map import RecordedMap
+from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.reference.surfel_cloud import SurfelCloud
 from triquad_map.surface.surfels import SurfelKind, Surfels
 from triquad_map.view import MapView
@@ -30,8 +30,8 @@ APART = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (-4, 2, 1))
 """Neighbours by a face and by an edge, and one far away."""
 
 
-def both(record: MapRecord) -> tuple[CompiledView, RecordedMap]:
-    return recorded_view(record), RecordedMap(record)
+def both(record: MapRecord) -> tuple[CompiledView, MapEvaluator]:
+    return RecordedView(record), MapEvaluator(record)
 
 
 def around(record: MapRecord, count: int, seed: int) -> np.ndarray:
@@ -61,20 +61,22 @@ def test_the_nearest_unknown_space_is_the_same(seed, indices, reach_m):
 @settings(max_examples=40, deadline=None)
 def test_the_nearest_surfel_is_the_same(seed, count, reach):
     rng = np.random.default_rng(seed)
-    evidence = Evidence(64)
-    evidence.mark_surface(rng.uniform(0, 64, (count, 3)) * (1, 1, 0.3))
+    live = LiveEvidence(64)
+    live.mark_surface(rng.uniform(0, 64, (count, 3)) * (1, 1, 0.3))
+    evidence = live.freeze()
     places = surfel_places(evidence.cells, evidence.surface)
     surfels = random_surfels(rng, len(places.voxels))
     points = rng.uniform(-20, 84, (400, 3))
     points[:200] = rng.uniform(0, 64, (200, 3)) * (1, 1, 0.3)
     fast = no_surfels(np.full(400, reach))
     find_nearest(points, surfel_index(places, surfels), fast)
-    slow = SurfelCloud(places.voxels, surfels).nearest(points, np.full(400, reach))
+    slow = no_surfels(np.full(400, reach))
+    SurfelCloud(places.voxels, surfels).find_nearest(points, slow)
     np.testing.assert_allclose(fast.distances, slow.distances, atol=1e-4)
     np.testing.assert_array_equal(fast.rows >= 0, slow.rows >= 0)
     hit = slow.rows >= 0
     for found in (fast, slow):
-        gaps = np.linalg.norm(points - found.feet, axis=1)
+        gaps = np.linalg.norm(points - found.closest, axis=1)
         np.testing.assert_allclose(gaps[hit], found.distances[hit], atol=1e-4)
     same = hit & (fast.rows == slow.rows)
     assert (same == hit).mean() > 0.99  # but for ties
@@ -92,7 +94,7 @@ def random_surfels(rng: np.random.Generator, count: int) -> Surfels:
 
 
 @pytest.fixture(scope="module", params=["flat", "table"])
-def ground(request) -> tuple[CompiledView, RecordedMap]:
+def ground(request) -> tuple[CompiledView, MapEvaluator]:
     """The views of a ground whose field is exact."""
     return both(exact_map(flat(0.07) if request.param == "flat" else table(0.0, 1.3)))
 
@@ -119,8 +121,8 @@ def test_distances_are_the_same(ground):
     assert not want.found.all()
     np.testing.assert_array_equal(have.found, want.found)
     np.testing.assert_array_equal(have.status, want.status)
-    np.testing.assert_allclose(have.distance, want.distance, atol=1e-5)
-    np.testing.assert_allclose(have.unknown_distance, want.unknown_distance, atol=1e-5)
+    np.testing.assert_allclose(have.distance_m, want.distance_m, atol=1e-5)
+    np.testing.assert_allclose(have.unknown_distance_m, want.unknown_distance_m, atol=1e-5)
     np.testing.assert_allclose(have.confidence, want.confidence, atol=1e-6)
     gaps = np.linalg.norm(points - have.surface_point, axis=1)
     wanted_gaps = np.linalg.norm(points - want.surface_point, axis=1)
@@ -140,14 +142,27 @@ def test_answers_of_planners_are_the_same(ground):
     for through in (False, True):
         have, want = (rays(v, starts, ways, RayOptions(15.0, through)) for v in ground)
         np.testing.assert_array_equal(have.status, want.status)
-        np.testing.assert_allclose(have.range, want.range, atol=1e-3)
+        np.testing.assert_allclose(have.range_m, want.range_m, atol=1e-3)
     have, want = (segments(v, starts, ends, SegmentOptions(0.2, 2.0)) for v in ground)
     for name, value in vars(want).items():
         np.testing.assert_allclose(getattr(have, name), value, atol=1e-3, err_msg=name)
     shape = GridShape(np.array([-3.0, -3.0, -1.0]), 0.5, (12, 12, 4))
     have, want = (grid(view, shape, 3.0) for view in ground)
-    np.testing.assert_allclose(have.distance, want.distance, atol=1e-5)
+    np.testing.assert_allclose(have.distance_m, want.distance_m, atol=1e-5)
     np.testing.assert_array_equal(have.status, want.status)
+
+
+@given(st.integers(0, 10**6), st.sampled_from([TWO, APART]))
+@settings(max_examples=10, deadline=None)
+def test_the_blended_field_of_several_regions_is_the_same(seed, indices):
+    record = random_record(seed, indices=indices, points=80, training=False)
+    points = around(record, 300, seed)
+    have, want = (view.query(points, gradient=True) for view in both(record))
+    np.testing.assert_allclose(have.sdf, want.sdf, atol=1e-4)
+    np.testing.assert_array_equal(have.status, want.status)
+    # At the kinks of a random field the last bit tells which side's gradient is taken.
+    same = np.isclose(have.gradient, want.gradient, atol=1e-3, equal_nan=True).all(axis=1)
+    assert same.mean() > 0.98
 
 
 @given(st.integers(0, 10**6), st.sampled_from([((0, 0, 0),), TWO, APART]))
@@ -158,7 +173,7 @@ def test_maps_of_several_regions_answer_alike(seed, indices):
     have, want = (distances(v, points, DistanceOptions(6.0)) for v in both(record))
     np.testing.assert_array_equal(have.status, want.status)
     # Where a random field makes a surfel a disc or a point may hang on the last bit.
-    same = np.abs(have.distance - want.distance) < 1e-3
+    same = np.abs(have.distance_m - want.distance_m) < 1e-3
     assert same.mean() > 0.98
     assert (np.abs(have.confidence - want.confidence) < 1e-6)[same].mean() > 0.98
 
@@ -166,10 +181,10 @@ def test_maps_of_several_regions_answer_alike(seed, indices):
 def test_a_map_of_which_nothing_is_known(ground):
     for view in both(MapRecord("empty", 3, SMALL, ())):
         answer = distances(view, places(10), DistanceOptions(2.0, unknown_distance=True))
-        assert view.number == 3
+        assert view.epoch == 3
         assert not answer.found.any()
         assert not answer.status.any()
-        assert not answer.unknown_distance.any()
+        assert not answer.unknown_distance_m.any()
         assert np.isnan(view.query(places(10)).sdf).all()
 
 
@@ -187,12 +202,30 @@ def test_points_far_from_the_map_are_unknown_however_far_apart(ground):
 def test_no_points_get_no_answers(ground):
     for view in ground:
         answer = distances(view, np.zeros((0, 3)), DistanceOptions(unknown_distance=True))
-        assert len(answer.distance) == len(answer.gradient) == 0
+        assert len(answer.distance_m) == len(answer.gradient) == 0
+
+
+@pytest.mark.parametrize("reach_m", [0.0, 0.1, 0.35, 0.7])
+def test_the_status_is_the_same_however_far_surfaces_reach(ground, reach_m):
+    points = places(1000)
+    have, want = (view.status(points, reach_m) for view in ground)
+    np.testing.assert_array_equal(have, want)
+
+
+def test_a_closed_map_answers_on_the_callers_thread():
+    view = RecordedView(exact_map(flat(0.07)))
+    view.close()
+    points = places(20_000)
+    again = RecordedView(exact_map(flat(0.07)))
+    have, want = (v.query(points, gradient=True) for v in (view, again))
+    np.testing.assert_array_equal(have.sdf, want.sdf)
+    np.testing.assert_array_equal(have.gradient, want.gradient)
+    again.close()
 
 
 def test_surfels_are_fitted_once_however_many_threads_ask(ground):
     """And each of them gets the same answer."""
-    view = recorded_view(exact_map(flat(0.0)))
+    view = RecordedView(exact_map(flat(0.0)))
     points = places(3000)
     asked: list[MapView] = [view] * 8
     with ThreadPoolExecutor(8) as threads:

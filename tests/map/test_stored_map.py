@@ -7,8 +7,9 @@ import pytest
 from support.map_records import SMALL, assert_same, random_record, with_integers
 from support.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
-from triquad_format.mapfile.mapfile import read_map, write_map
-from triquad_format.mapfile.random_access import FileBytes
+from triquad_format.mapfile.mcap.random_access import FileBytes
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.crop import crop_record, without_training
 from triquad_format.records.field_settings import FieldSettings
@@ -242,7 +243,7 @@ def test_damage_in_one_region_leaves_the_others(tmp_path):
 
 def test_errors_name_the_file(tmp_path):
     path = tmp_path / "broken.triquad"
-    write_record(path, random_record(50), None, {})
+    write_record(path, random_record(50))
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(DamagedMapFileError, match=r"broken.triquad.*triquad-pack"):
         StoredMap.open(path)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from support import small_world
-from triquad_map.compiled.compiled_view import field_samples, in_one
-from triquad_map.compiled.evidence.evidence import Evidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, SurfelTask, first_surfels
+from triquad_map.composition.field_samples import field_samples
+from triquad_map.composition.split import in_one
 from triquad_map.nearest import NearestSurfels, no_surfels
 from triquad_map.surface.surfels import FieldSample, SurfelKind, fit_surfels
 from triquad_server.epochs.epoch import FrozenRegion
@@ -63,8 +64,8 @@ def nearest(surfels: SurfelMap, points: np.ndarray) -> NearestSurfels:
     return found
 
 
-def random_evidence(rng: np.random.Generator, count: int) -> Evidence:
-    evidence = Evidence(SIDE)
+def random_evidence(rng: np.random.Generator, count: int) -> LiveEvidence:
+    evidence = LiveEvidence(SIDE)
     evidence.mark_surface(rng.uniform((0, 0, 28), (SIDE, SIDE, 33), (count, 3)))
     return evidence
 
@@ -73,11 +74,11 @@ def test_surfels_kept_up_to_date_are_those_made_anew():
     rng = np.random.default_rng(0)
     evidence = random_evidence(rng, 300)
     before, after = (plane(np.array([0.6, 0, 0.8]), height) for height in (43.0, 43.3))
-    surfels = first_surfels(evidence.copy(), before, SurfelTask(1, None))
+    surfels = first_surfels(evidence.freeze(), before, SurfelTask(1, None))
     evidence.mark_surface(rng.uniform((0, 0, 25), (SIDE, SIDE, 35), (200, 3)))
     evidence.clear(np.array([0.0, 0, 0]), np.array([20.0, 20, 64]))
-    kept = surfels.updated(evidence.copy(), after, SurfelTask(2, None))
-    anew = first_surfels(evidence.copy(), after, SurfelTask(2, None))
+    kept = surfels.updated(evidence.freeze(), after, SurfelTask(2, None))
+    anew = first_surfels(evidence.freeze(), after, SurfelTask(2, None))
     assert len(kept) == len(anew) > 300
     points = rng.uniform(0, SIDE, (500, 3))
     for mine, wanted in zip(nearest(kept, points), nearest(anew, points), strict=True):
@@ -88,14 +89,14 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
     rng = np.random.default_rng(1)
     evidence = random_evidence(rng, 400)
     low, high = (plane(np.array([0.0, 0, 1]), height) for height in (29.5, 31.5))
-    surfels = first_surfels(evidence.copy(), low, SurfelTask(1, None))
+    surfels = first_surfels(evidence.freeze(), low, SurfelTask(1, None))
     new = np.array([[10.5, 10.5, 50.5]])
     evidence.mark_surface(new)
     points = np.concatenate([new + (0, 0, 3.0), rng.uniform((0, 0, 36), (SIDE, SIDE, 40), (50, 3))])
-    wanted = first_surfels(evidence.copy(), high, SurfelTask(1, None))
+    wanted = first_surfels(evidence.freeze(), high, SurfelTask(1, None))
     rounds = 0
-    while not np.array_equal(nearest(surfels, points).feet, nearest(wanted, points).feet):
-        surfels = surfels.updated(evidence.copy(), high, SurfelTask(2 + rounds, 100))
+    while not np.array_equal(nearest(surfels, points).closest, nearest(wanted, points).closest):
+        surfels = surfels.updated(evidence.freeze(), high, SurfelTask(2 + rounds, 100))
         rounds += 1
         np.testing.assert_allclose(nearest(surfels, points[:1]).distances, 3.0)
         assert rounds < 10
@@ -121,4 +122,4 @@ def test_a_settled_map_answers_from_the_field_as_it_is():
     for region in epoch.frozen_regions:
         points = rng.uniform(0, 1 << chosen.field.depth, (200, 3))
         expected = nearest(surfels_of(region, chosen.field), points)
-        np.testing.assert_array_equal(nearest(region.surfels, points).feet, expected.feet)
+        np.testing.assert_array_equal(nearest(region.surfels, points).closest, expected.closest)

@@ -8,14 +8,13 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from support.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.mapfile.history import checkpoint_at, checkpoint_files
-from triquad_format.mapfile.mapfile import read_map, read_map_file
+from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files
+from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.records.region import MapRecord, RegionIndex
-from triquad_format.recovery.recover import recover
+from triquad_format.recovery.recovered_map import recover
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.settings import Settings
-from triquad_server.store.file_identity import file_identity
 from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
 
@@ -130,7 +129,7 @@ def test_a_base_that_vanished_makes_the_next_checkpoint_complete(store):
     assert_same(read_map(paths(store)[3]), third)
 
 
-def spoil(path):
+def corrupt(path):
     """Overwrite the middle of a file, and put its time back."""
     before = path.stat()
     data = path.read_bytes()
@@ -140,14 +139,14 @@ def spoil(path):
 
 def rot(store, path):
     """Damage a file as a disk does: nothing but its bytes tells."""
-    spoil(path)
-    store._identities[path.name] = file_identity(path)
+    corrupt(path)
+    store._files.record([path.name])
 
 
-def test_after_its_base_was_spoilt_a_checkpoint_is_complete(store):
+def test_after_its_base_was_corrupted_a_checkpoint_is_complete(store):
     first = grown(1, 1)
     store.write(changes(first))
-    spoil(paths(store)[1])
+    corrupt(paths(store)[1])
     assert store.base_epoch is None
     second = grown(2, 2)
     store.write(changes(second))
@@ -155,7 +154,7 @@ def test_after_its_base_was_spoilt_a_checkpoint_is_complete(store):
 
 
 def test_a_damaged_base_is_not_copied_from(store):
-    """What is damaged must not be written again as if it were sound; then all is asked for."""
+    """What is damaged must not be written again as if it were valid; then all is asked for."""
     first = grown(1, 1)
     store.write(changes(first))
     rot(store, paths(store)[1])
@@ -179,7 +178,7 @@ def test_a_damaged_base_is_found_when_folding(store):
     assert store.base_epoch is None
 
 
-def test_a_sound_delta_serves_where_the_complete_file_of_its_epoch_is_damaged(store):
+def test_a_valid_delta_serves_where_the_complete_file_of_its_epoch_is_damaged(store):
     records = drive(store, 2)
     (store.folder / "epoch-000000003.triquad").write_bytes(b"half a fi")
     restored = store.newest()

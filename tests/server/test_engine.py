@@ -5,14 +5,21 @@ import pytest
 import torch
 from support import small_world
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.batch import load, new_tile
+from triquad_map.compiled.field.batch import load, new_batch
 from triquad_map.compiled.field.encoding import locate
-from triquad_server.engine.adam import Betas, Parameter
-from triquad_server.engine.engine import CompiledEngine, GradientSums, TorchEngine, make_engine
-from triquad_server.engine.field import Field
-from triquad_server.mapping.sampling import Batch
+from triquad_map.compiled.field.frozen_field import make_field
+from triquad_server.engine.adam import Rates, step_rows, step_where
+from triquad_server.engine.batch import Batch
+from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
+from triquad_server.engine.live_field import LiveField, initial_field
+from triquad_server.engine.parameter import Parameter
+from triquad_server.engine.tensor_field import TensorField
+from triquad_server.engine.tensor_trainer import TensorTrainer
+from triquad_server.threads import Teams
 
 CPU = torch.device("cpu")
+RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99)
+TEAM = Teams().mapping
 CASES = [
     FieldSettings(depth=8, frequencies=4),
     FieldSettings(depth=12),
@@ -22,13 +29,18 @@ CASES = [
 ]
 
 
-def trained(settings: FieldSettings) -> Field:
-    field = Field(settings, CPU, 3)
+def trained(settings: FieldSettings) -> LiveField:
+    field = initial_field(settings, CPU, 3)
     batch = samples(settings, 4000)
     field.grow(leaves(settings, batch))
+    trainer = TensorTrainer(field)
     for _ in range(3):
-        field.train(batch.points, batch.labels, 0.01, Betas(0.9, 0.99))
+        trainer.train(batch, RATES)
     return field
+
+
+def in_tensors(field: LiveField) -> TensorField:
+    return TensorField(field.settings, field.tree, field.tensors)
 
 
 def leaves(settings: FieldSettings, batch: Batch) -> np.ndarray:
@@ -48,13 +60,13 @@ def samples(settings: FieldSettings, count: int, seed: int = 0) -> Batch:
 def test_values_and_gradients_are_equal(settings: FieldSettings) -> None:
     field = trained(settings)
     points = samples(settings, 3000, seed=1).points.numpy()
-    slow = TorchEngine(field).evaluate(points, gradient=True)
-    fast = CompiledEngine(field).evaluate(points, gradient=True)
+    slow = in_tensors(field).evaluate(points, gradient=True)
+    fast = field.freeze().evaluate(points, gradient=True)
     np.testing.assert_allclose(fast.sdf, slow.sdf, atol=2e-6)
     # At a kink, rounding may choose the other side: all but a few must agree.
     error = np.abs(fast.gradient - slow.gradient).max(axis=1)
     assert np.quantile(error, 0.99) < 1e-4 * np.abs(slow.gradient).max()
-    values_only = CompiledEngine(field).evaluate(points, gradient=False)
+    values_only = field.freeze().evaluate(points, gradient=False)
     np.testing.assert_array_equal(values_only.sdf, fast.sdf)
     assert len(values_only.gradient) == 0
 
@@ -63,10 +75,10 @@ def test_values_and_gradients_are_equal(settings: FieldSettings) -> None:
 def test_a_training_step_is_equal(settings: FieldSettings) -> None:
     slow, fast = trained(settings), trained(settings)
     batch = samples(settings, 4096, seed=2)
-    engine = CompiledEngine(fast, GradientSums())
+    reference, trainer = TensorTrainer(slow), CompiledTrainer(fast, GradientSums(), TEAM)
     for step in range(3):
-        loss = float(TorchEngine(slow).train(batch, 0.01, Betas(0.9, 0.99)))
-        assert engine.train(batch, 0.01, Betas(0.9, 0.99)) == pytest.approx(loss, rel=1e-4), step
+        loss = float(reference.train(batch, RATES))
+        assert trainer.train(batch, RATES) == pytest.approx(loss, rel=1e-4), step
     assert torch.equal(slow.features.steps, fast.features.steps)
     # The gradient's moments are what the step is made of.
     scale = float(slow.features.means.abs().max())
@@ -76,15 +88,16 @@ def test_a_training_step_is_equal(settings: FieldSettings) -> None:
         torch.testing.assert_close(part.values, other.values, atol=1e-3, rtol=0)
 
 
-def test_training_goes_on_after_growth() -> None:
+@pytest.mark.parametrize("compiled", [True, False])
+def test_training_goes_on_after_growth(compiled: bool) -> None:
     settings = FieldSettings(depth=8, frequencies=4)
     field = trained(settings)
-    engine = make_engine(field, GradientSums())
+    trainer = CompiledTrainer(field, GradientSums(), TEAM) if compiled else TensorTrainer(field)
     batch = samples(settings, 2048, seed=5)
     before = len(field.features)
     field.grow(leaves(settings, batch))
     assert len(field.features) > before
-    losses = [engine.train(batch, 0.01, Betas(0.9, 0.99)) for _ in range(60)]
+    losses = [float(trainer.train(batch, RATES)) for _ in range(60)]
     assert losses[-1] < losses[0]
     assert field.features.steps[before:].min() > 0
 
@@ -93,9 +106,9 @@ def test_points_outside_the_cube_get_values_without_features() -> None:
     settings = FieldSettings(depth=8, frequencies=4)
     field = trained(settings)
     points = np.array([[100.0, 0, 0], [0, -26.0, 1], [25.6, 25.6, 25.6]], np.float32)
-    slow = TorchEngine(field).evaluate(points, gradient=False)
+    slow = in_tensors(field).evaluate(points, gradient=False)
     np.testing.assert_allclose(
-        CompiledEngine(field).evaluate(points, gradient=False).sdf,
+        field.freeze().evaluate(points, gradient=False).sdf,
         slow.sdf,
         atol=2e-6,
     )
@@ -106,24 +119,24 @@ def test_the_faces_of_the_cube_are_no_trap(levels: int) -> None:
     """Where rounding takes a point just outside, no vertex is looked for beyond its block."""
     for leaf_m in np.linspace(0.1, 0.5, 201):
         settings = FieldSettings(leaf_m=float(leaf_m), depth=6, feature_levels=levels, hidden=4)
-        field = Field(settings, CPU, 3)
-        compiled = CompiledEngine(field)._compiled()
+        field = initial_field(settings, CPU, 3)
+        compiled = make_field(settings, field.tree, field.arrays)
         face = np.float32(-settings.region_side_m / 2)
         points = np.array([[face, face, face], [0, face, face], [face, 0, 0]], np.float32)
         near = np.concatenate([points, np.nextafter(points, np.float32(-1e9)), -points])
-        tile = new_tile(levels, settings.feature_size, settings.input_size, settings.hidden)
-        load(tile, near, 0)
-        locate(tile, compiled.geometry, compiled.vertices, compiled.features)
+        batch = new_batch(levels, settings.feature_size, settings.input_size, settings.hidden)
+        load(batch, near, 0)
+        locate(batch, compiled.geometry, compiled.vertices, compiled.features)
         sides = np.array([(1 << (at % levels)) + 1 for at in range(3 * levels)])
         ends = np.cumsum([(1 << h) ** 2 + 2 * (1 << h) + 1 for h in range(levels)])
         last = ends[np.arange(3 * levels) % levels]
-        assert (tile.corners.max(axis=1) + sides + 1 < last).all()
+        assert (batch.corners.max(axis=1) + sides + 1 < last).all()
 
 
 def test_no_points_give_no_values() -> None:
     field = trained(CASES[0])
     none = np.zeros((0, 3), np.float32)
-    assert CompiledEngine(field).evaluate(none, gradient=True).gradient.shape == (0, 3)
+    assert field.freeze().evaluate(none, gradient=True).gradient.shape == (0, 3)
 
 
 def test_a_step_over_all_rows_is_that_of_the_chosen() -> None:
@@ -134,8 +147,8 @@ def test_a_step_over_all_rows_is_that_of_the_chosen() -> None:
         mask = torch.rand(50, generator=generator) < 0.4
         gradient = torch.randn((50, 8), generator=generator)
         rows = mask.nonzero()[:, 0]
-        chosen.step(rows, gradient[rows], 0.01, Betas(0.9, 0.99))
-        masked.step_where(mask, gradient, 0.01, Betas(0.9, 0.99))
+        step_rows(chosen, rows, gradient[rows], RATES)
+        step_where(masked, mask, gradient, RATES)
     assert torch.equal(chosen.steps, masked.steps)
     for name in ("values", "means", "variances"):
         torch.testing.assert_close(getattr(masked, name), getattr(chosen, name))

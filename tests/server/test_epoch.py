@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.small_world import settings, settled_mapper, world
@@ -7,14 +5,13 @@ from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import MeshSettings
 
 RNG = np.random.default_rng(0)
 
 
 @pytest.fixture(scope="module")
 def epoch() -> Epoch:
-    return settled_mapper(settings(visits=3.0), world(3)).publish()
+    return settled_mapper(settings(samples_per_ray=3.0), world(3)).publish()
 
 
 def test_the_numpy_evaluator_gives_the_same_answers(epoch: Epoch) -> None:
@@ -62,36 +59,7 @@ def test_no_points_give_an_empty_answer(epoch: Epoch) -> None:
     assert answer.gradient.shape == (0, 3)
 
 
-def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
-    chosen = settings(visits=1.2)
-    small = replace(chosen, mesh=MeshSettings(cell_m=0.05, tile_cells=16, reach_m=0.2))
-    mapper = Mapper("test", small, "cpu")
-    scan = world(1).scans[0]
-    mapper.ingest(scan.points, scan.world_from_sensor)
-    epoch = mapper.publish()
-    low, high = np.array([3.0, -2.0, -1.0]), np.array([5.0, 2.0, 1.0])
-    listed = {tuple(tile) for tile in epoch.tiles(low, high).tolist()}
-    side = small.mesh.tile_side_m
-    for offset in np.ndindex(3, 6, 3):
-        x, y, z = (np.floor(low / side).astype(int) + offset).tolist()
-        if len(epoch.mesh((x, y, z)).faces):
-            assert (x, y, z) in listed
-
-
 def test_an_empty_map_knows_nothing() -> None:
     epoch = Mapper("test", settings(), "cpu").publish()
     answer = epoch.query(np.zeros((3, 3)), gradient=False)
     assert (answer.status == Status.UNKNOWN).all()
-    assert len(epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf))) == 0
-    assert len(epoch.mesh((0, 0, 0)).vertices) == 0
-
-
-def test_tiles_are_those_that_meet_the_bounds(epoch: Epoch) -> None:
-    everything = epoch.tiles(np.full(3, -np.inf), np.full(3, np.inf))
-    side = settings().mesh.tile_side_m
-    tiles = {tuple(tile) for tile in everything.tolist()}
-    seen = {tuple(tile) for tile in np.floor(world(3).hits / side).astype(int).tolist()}
-    assert seen <= tiles
-    low, high = np.array([0.1, 0.1, -1.0]), np.array([side + 0.1, side - 0.1, 1.0])
-    some = epoch.tiles(low, high)
-    assert {tuple(tile) for tile in some[:, :2].tolist()} == {(0, 0), (1, 0)}

@@ -3,11 +3,11 @@ from dataclasses import dataclass
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
+from triquad_map.compiled.compiled_view import in_one
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.epochs.epochs import EpochShelf, ShelfLimits
-from triquad_server.errors import RequestError
-from triquad_server.settings import MeshSettings
+from triquad_server.epochs.history import EpochHistory, EpochLimits
 
 
 @dataclass
@@ -19,44 +19,44 @@ class Clock:
 
 
 def epoch(number: int) -> Epoch:
-    return Epoch("lab", number, FieldSettings(), MeshSettings(), ())
+    return Epoch("lab", number, FieldSettings(), (), in_one)
 
 
-def shelf(
+def history(
     kept: int, pinned: int = 0, pin_s: float = 30.0, clock: Clock | None = None
-) -> EpochShelf:
-    return EpochShelf(epoch(1), ShelfLimits(kept, pinned, pin_s), clock or Clock())
+) -> EpochHistory:
+    return EpochHistory(epoch(1), EpochLimits(kept, pinned, pin_s), clock or Clock())
 
 
-def is_gone(shelf: EpochShelf, number: int) -> bool:
+def is_gone(epochs: EpochHistory, number: int) -> bool:
     try:
-        found = shelf.get(number)
-    except RequestError as error:
+        found = epochs.get(number)
+    except RefusedError as error:
         return error.code == "epoch_gone"
     assert found.number == number  # never another one
     return False
 
 
 def test_zero_asks_for_the_newest():
-    epochs = shelf(kept=2)
+    epochs = history(kept=2)
     epochs.add(epoch(2))
     assert epochs.get(0).number == epochs.newest.number == 2
     assert epochs.get(1).number == 1
 
 
 def test_older_epochs_that_nobody_asked_for_go():
-    epochs = shelf(kept=2, pinned=8)
+    epochs = history(kept=2, pinned=8)
     for number in (2, 3):
         epochs.get(0)
         epochs.add(epoch(number))
-    with pytest.raises(RequestError, match=r"epoch 1 is not kept; kept are \[2, 3\]") as caught:
+    with pytest.raises(RefusedError, match=r"epoch 1 is not kept; kept are \[2, 3\]") as caught:
         epochs.get(1)
     assert caught.value.code == "epoch_gone"
 
 
 def test_an_epoch_that_is_asked_for_stays_for_its_time_and_each_time_renews_it():
     clock = Clock()
-    epochs = shelf(kept=1, pinned=1, pin_s=30.0, clock=clock)
+    epochs = history(kept=1, pinned=1, pin_s=30.0, clock=clock)
     for number in range(2, 20):
         assert not is_gone(epochs, 1)
         clock.now += 30.0
@@ -69,7 +69,7 @@ def test_an_epoch_that_is_asked_for_stays_for_its_time_and_each_time_renews_it()
 
 def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
     clock = Clock()
-    epochs = shelf(kept=1, pinned=1, pin_s=30.0, clock=clock)
+    epochs = history(kept=1, pinned=1, pin_s=30.0, clock=clock)
     epochs.get(1)
     epochs.add(epoch(2))
     clock.now = 31.0
@@ -79,7 +79,7 @@ def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
 
 def test_of_too_many_pinned_ones_that_which_was_asked_longest_ago_goes():
     clock = Clock()
-    epochs = shelf(kept=1, pinned=2, clock=clock)
+    epochs = history(kept=1, pinned=2, clock=clock)
     for number in range(1, 4):
         epochs.add(epoch(number))
         epochs.get(number)
@@ -89,7 +89,7 @@ def test_of_too_many_pinned_ones_that_which_was_asked_longest_ago_goes():
 
 
 def test_the_newest_never_goes():
-    epochs = shelf(kept=1)
+    epochs = history(kept=1)
     epochs.add(epoch(2))
     assert epochs.get(0).number == epochs.get(2).number == 2
     assert is_gone(epochs, 1)
@@ -106,7 +106,7 @@ DEEDS = st.one_of(
 def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, deeds):
     pin_s = 10.0
     clock = Clock()
-    epochs = shelf(kept, pinned, pin_s, clock)
+    epochs = history(kept, pinned, pin_s, clock)
     newest = 1
     asked: dict[int, float] = {}  # in the order of asking
     for deed in deeds:
@@ -131,7 +131,7 @@ def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, de
 
 @given(st.integers(1, 4), st.integers(0, 4), st.integers(5, 30), st.data())
 def test_no_more_stay_than_may(kept, pinned, count, data):
-    epochs = shelf(kept, pinned)
+    epochs = history(kept, pinned)
     for number in range(2, count):
         epochs.get(number - 1)
         epochs.add(epoch(number))

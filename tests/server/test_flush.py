@@ -1,18 +1,19 @@
 import math
 import queue
+import threading
 from contextlib import closing
 
 import pytest
 from support import servers
+from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import FlushReply, FlushRequest
-from triquad_server.errors import RequestError
 from triquad_server.intake import flush, sources
-from triquad_server.intake.flush import FlushDesk
+from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.sources import SourceLedger
 
 
-class HeldRequest:
-    """Stands for a Zenoh query; notes its one answer."""
+class PendingRequest:
+    """Stands for a Zenoh query; keeps its one answer."""
 
     def __init__(self, defect: Exception | None = None) -> None:
         self._defect = defect
@@ -37,11 +38,11 @@ def ledger():
 
 
 @pytest.fixture
-def desk(ledger, monkeypatch):
+def handler(ledger, monkeypatch):
     monkeypatch.setattr(flush, "ARRIVAL_GRACE_S", 0.0)
-    with closing(FlushDesk(ledger, lambda: None, 600.0, 8)) as desk:
-        desk.start()
-        yield desk
+    with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
+        handler.start()
+        yield handler
 
 
 def asks(sequence: int = 0, **changes: object) -> FlushRequest:
@@ -64,29 +65,58 @@ def asks(sequence: int = 0, **changes: object) -> FlushRequest:
         asks(timeout_s=-1.0),
     ],
 )
-def test_requests_out_of_range_are_refused_and_the_desk_goes_on(desk, request_):
-    with pytest.raises(RequestError) as caught:
-        desk.hold(HeldRequest(), request_)
+def test_requests_out_of_range_are_refused_and_others_are_answered(handler, request_):
+    with pytest.raises(RefusedError) as caught:
+        handler.add(PendingRequest(), request_)
     assert caught.value.code == "bad_request"
-    good = HeldRequest()
-    desk.hold(good, asks(2))
+    good = PendingRequest()
+    handler.add(good, asks(2))
     assert good.reply == FlushReply(0, 0, 3, None)
 
 
-def test_a_defect_ends_one_request_and_not_the_desk(desk):
-    bad, good = HeldRequest(RuntimeError("a defect")), HeldRequest()
-    desk.hold(bad, asks())
+def test_an_internal_error_ends_one_request_and_no_other(handler):
+    bad, good = PendingRequest(RuntimeError("a defect")), PendingRequest()
+    handler.add(bad, asks())
     assert bad.reply == "internal"
-    desk.hold(good, asks())
+    handler.add(good, asks())
     assert good.reply == FlushReply(0, 0, 1, None)
 
 
-def test_questions_about_strangers_push_nobody_out(desk, ledger, monkeypatch):
+def test_a_scan_that_stays_out_of_the_map_ends_in_a_timeout(handler, ledger):
+    ledger.arrive(servers.scan(0))
+    request = PendingRequest()
+    handler.add(request, asks(timeout_s=0.01))
+    assert request.reply == "timeout"
+
+
+def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
+    asked = threading.Event()
+    with closing(FlushHandler(ledger, asked.set, 600.0, 8)) as handler:
+        handler.start()
+        request = PendingRequest()
+        ledger.arrive(servers.scan(0))
+        handler.add(request, asks())
+        ledger.take(servers.scan(0))
+        assert asked.wait(servers.WAIT_S)
+        ledger.publish()
+        assert request.reply == FlushReply(1, 0, 0, None)
+
+
+def test_pending_requests_are_refused_when_the_server_stops(ledger):
+    request = PendingRequest()
+    with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
+        handler.start()
+        ledger.arrive(servers.scan(0))
+        handler.add(request, asks())
+    assert request.reply == "timeout"
+
+
+def test_questions_about_strangers_push_nobody_out(handler, ledger, monkeypatch):
     monkeypatch.setattr(sources, "MAX_SESSIONS", 2)
     ledger.arrive(servers.scan(0))
     for session in range(100, 110):
-        stranger = HeldRequest()
-        desk.hold(stranger, asks(4, session=session))
+        stranger = PendingRequest()
+        handler.add(stranger, asks(4, session=session))
         assert stranger.reply == FlushReply(0, 0, 5, None)
     assert ledger.arrived("lidar", 7, 0)
     assert ledger.lost() == {}

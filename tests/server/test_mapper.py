@@ -2,11 +2,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from support.small_world import settings, settle, settled_mapper, surface_error, world
 from triquad_format.records.status import Status
+from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.intake.scan import ScanRefusedError
+from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import parse_settings
+from triquad_server.settings import Settings
+from triquad_server.threads import Teams
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
@@ -72,7 +76,9 @@ def test_ghost_cells_are_unknown(mapped: Mapper) -> None:
 
 def test_regions_meet_without_hole_or_step() -> None:
     """The sensor drives over the border of two regions; the ground must go on."""
-    chosen = parse_settings({"field": {"depth": 7}, "training": {"batch": 4096, "visits": 18.0}})
+    chosen = Settings.model_validate(
+        {"field": {"depth": 7}, "training": {"batch": 4096, "samples_per_ray": 18.0}}
+    )
     border = chosen.field.region_pitch_m / 2
     drive_through = world(8)
     moved = np.eye(4)
@@ -94,7 +100,7 @@ def test_regions_meet_without_hole_or_step() -> None:
 
 def test_free_space_is_seen_in_all_regions_that_rays_pass() -> None:
     """A wall beyond the border of two regions, seen from this side of it."""
-    chosen = parse_settings({"field": {"depth": 8}})
+    chosen = Settings.model_validate({"field": {"depth": 8}})
     half = chosen.field.region_side_m / 2
     mapper = Mapper("test", chosen, "cpu")
     across = np.mgrid[-2:2:0.1, -2:2:0.1].reshape(2, -1).T
@@ -152,7 +158,7 @@ def test_epochs_share_what_did_not_change_between_them() -> None:
     assert len(changed) == 1, "only the region that was trained"
     old, new = changed[0]
     assert new.evidence is old.evidence
-    assert new.field.tree is old.field.tree
+    assert new.engine.tree is old.engine.tree
     mapper.ingest(second.points, second.world_from_sensor)
     assert all(region.evidence is not new.evidence for region in mapper.publish().frozen_regions), (
         "a scan was taken in since"
@@ -168,6 +174,24 @@ def test_the_number_of_regions_is_bounded() -> None:
     assert mapper.publish().regions == 0
 
 
+def test_neighbouring_regions_start_differently() -> None:
+    """Numbers that are hashed alike, such as -1 and -2, are no exception."""
+    chosen = settings()
+    setup = RegionSetup(
+        field=chosen.field,
+        scan=chosen.scan,
+        training=chosen.training,
+        device=torch.device("cpu"),
+        sums=GradientSums(),
+        team=Teams().mapping,
+    )
+    indices = [(x, y, 0) for x in range(-3, 3) for y in range(-3, 3)]
+    starts = [LiveRegion.unseen(index, setup).field.frequencies for index in indices]
+    assert len({tuple(start.tolist()) for start in starts}) == len(indices)
+    again = LiveRegion.unseen(indices[0], setup).field.frequencies
+    assert torch.equal(again, starts[0])
+
+
 def test_a_refused_scan_changes_nothing() -> None:
     mapper = Mapper("test", settings(), "cpu")
     epoch = mapper.publish()
@@ -179,8 +203,8 @@ def test_a_refused_scan_changes_nothing() -> None:
 
 def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
     epoch = mapped.publish()
-    twin = Mapper("test", settings(), "cpu", mapped.changes_since(None).record)
-    restored = twin.publish()
+    restarted = Mapper("test", settings(), "cpu", mapped.changes_since(None).record)
+    restored = restarted.publish()
     assert restored.number == epoch.number
     points = world().hits[::40] + [0, 0, 0.02]
     np.testing.assert_allclose(
@@ -189,19 +213,19 @@ def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
         atol=1e-5,
     )
     np.testing.assert_array_equal(restored.status(points), epoch.status(points))
-    assert twin.segments_kept > 0
+    assert restarted.rays_kept > 0
     scan = world().scans[0]
     before = surface_error(restored, world())
-    twin.ingest(scan.points, scan.world_from_sensor)
-    twin.train()
-    during = surface_error(twin.publish(), world())
-    settle(twin)
-    after = surface_error(twin.publish(), world())
+    restarted.ingest(scan.points, scan.world_from_sensor)
+    restarted.train()
+    during = surface_error(restarted.publish(), world())
+    settle(restarted)
+    after = surface_error(restarted.publish(), world())
     assert during < before + 0.005, "the optimiser goes on where it was"
     assert after < before + 0.002, "what the scan did not see is not forgotten"
 
 
-def test_a_record_without_samples_owes_nothing() -> None:
+def test_a_record_without_samples_has_no_training_budget() -> None:
     mapper = Mapper("test", settings(), "cpu")
     scan = world().scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
@@ -216,11 +240,11 @@ def test_a_record_without_samples_owes_nothing() -> None:
             sample_labels=state.sample_labels[:0],
         )
         emptied.append(replace(region, training=state))
-    twin = Mapper("test", settings(), "cpu", replace(record, regions=tuple(emptied)))
-    assert twin.settled
-    twin.ingest(scan.points, scan.world_from_sensor)
-    twin.train()
-    assert twin.samples_trained > 0
+    restarted = Mapper("test", settings(), "cpu", replace(record, regions=tuple(emptied)))
+    assert restarted.settled
+    restarted.ingest(scan.points, scan.world_from_sensor)
+    restarted.train()
+    assert restarted.samples_trained > 0
 
 
 def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
@@ -229,25 +253,25 @@ def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
         mapper.ingest(scan.points, scan.world_from_sensor)
     record = mapper.changes_since(None).record
     assert len(record.regions) > 1
-    bounded = settings(pool_segments=4000)
-    twin = Mapper("test", bounded, "cpu", record)
-    assert twin.segments_kept <= 4000
-    twin.reset(np.array([5.0, -np.inf, -np.inf]), np.full(3, np.inf))
+    bounded = settings(pool_rays=4000)
+    restarted = Mapper("test", bounded, "cpu", record)
+    assert restarted.rays_kept <= 4000
+    restarted.reset(np.array([5.0, -np.inf, -np.inf]), np.full(3, np.inf))
     for scan in world(2).scans:
-        twin.ingest(scan.points, scan.world_from_sensor)
-    assert 1000 < twin.segments_kept <= 4000
+        restarted.ingest(scan.points, scan.world_from_sensor)
+    assert 1000 < restarted.rays_kept <= 4000
 
 
-def test_what_is_owed_survives_a_restart() -> None:
+def test_the_training_budget_survives_a_restart() -> None:
     mapper = Mapper("test", settings(), "cpu")
     scan = world().scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
-    twin = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
-    assert not twin.settled
+    restarted = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
+    assert not restarted.settled
 
 
 def test_a_place_left_behind_is_not_forgotten() -> None:
-    chosen = settings(pool_segments=75_000)
+    chosen = settings(pool_rays=75_000)
     here = world(3)
     mapper = settled_mapper(chosen, here)
     before = surface_error(mapper.publish(), here)
@@ -256,12 +280,12 @@ def test_a_place_left_behind_is_not_forgotten() -> None:
         for _ in range(10):
             mapper.train()
     settle(mapper)
-    assert mapper.segments_kept <= 75_000
+    assert mapper.rays_kept <= 75_000
     assert surface_error(mapper.publish(), here) < before + 0.004
 
 
 def test_reset_forgets_a_box_and_everything() -> None:
-    mapper = settled_mapper(settings(visits=3.0), world(2))
+    mapper = settled_mapper(settings(samples_per_ray=3.0), world(2))
     hits = world(2).hits
     low, high = np.array([-5.0, -50, -5]), np.array([0.0, 50, 50])
     mapper.reset(low, high)
@@ -273,7 +297,7 @@ def test_reset_forgets_a_box_and_everything() -> None:
     assert (status[outside] == Status.SURFACE).mean() > 0.99
     mapper.reset(*EVERYWHERE)
     assert mapper.publish().regions == 0
-    assert mapper.segments_kept == 0
+    assert mapper.rays_kept == 0
     scan = world(2).scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
     assert mapper.publish().regions > 0
@@ -281,7 +305,7 @@ def test_reset_forgets_a_box_and_everything() -> None:
 
 @pytest.mark.parametrize("encoding", ["features", "fourier"])
 def test_the_parts_of_the_field_can_be_switched(encoding: str) -> None:
-    chosen = settings(visits=3.0)
+    chosen = settings(samples_per_ray=3.0)
     field = type(chosen.field)(depth=8, encoding=encoding)
     mapper = Mapper("test", type(chosen)(field=field, training=chosen.training), "cpu")
     scan = world().scans[0]

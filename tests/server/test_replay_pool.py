@@ -1,16 +1,18 @@
 import numpy as np
 import torch
-from triquad_server.mapping.ray_labels import sample_segments
+from triquad_server.mapping.ray_intervals import sample_intervals
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.mapping.sampling import Placement
+from triquad_server.threads import Teams
 
 CPU = torch.device("cpu")
 PLACEMENT = Placement(surface_share=0.5, spread_m=0.08, truncation_m=0.3, half_side_m=400.0)
+TEAM = Teams().mapping
 RNG = np.random.default_rng(0)
 
 
 def new_pool(capacity: int) -> ReplayPool:
-    return ReplayPool(capacity, PLACEMENT, CPU, 0)
+    return ReplayPool(capacity, PLACEMENT, CPU, 0, TEAM)
 
 
 def place(x: float, count: int) -> np.ndarray:
@@ -18,7 +20,7 @@ def place(x: float, count: int) -> np.ndarray:
 
 
 def labelled(points: np.ndarray, label: float = 0.0) -> np.ndarray:
-    return sample_segments(points, np.full(len(points), label, np.float32))
+    return sample_intervals(points, np.full(len(points), label, np.float32))
 
 
 def test_it_is_bounded() -> None:
@@ -33,7 +35,7 @@ def test_it_is_bounded() -> None:
 def test_samples_come_back_as_they_were() -> None:
     pool = new_pool(10_000)
     points = place(0, 8000)
-    pool.add(sample_segments(points, points[:, 0] * 3))
+    pool.add(sample_intervals(points, points[:, 0] * 3))
     batch = pool.draw(500, 0)
     torch.testing.assert_close(batch.labels, batch.points[:, 0] * 3)
     assert len(torch.unique(batch.points[:, 0])) > 400
@@ -52,7 +54,7 @@ def test_of_a_scan_that_is_too_large_any_part_is_kept() -> None:
     pool = new_pool(3000)
     for _ in range(5):
         points = place(0, 6000)
-        pool.add(sample_segments(points, np.arange(6000, dtype=np.float32)))
+        pool.add(sample_intervals(points, np.arange(6000, dtype=np.float32)))
     labels = pool.sample(3000).labels.numpy()
     shares = np.histogram(labels, bins=6, range=(0, 6000))[0] / len(labels)
     assert shares.min() > 0.1

@@ -1,31 +1,34 @@
 import numpy as np
 import pytest
 import torch
-from triquad_server.intake.scan import IngestReport, Rays
-from triquad_server.mapping.ray_labels import ray_segments
-from triquad_server.mapping.sampling import Batch, Placement, draw_ordered_samples, draw_samples
+from triquad_server.engine.batch import Batch
+from triquad_server.intake.scan import ScanRays
+from triquad_server.mapping.ray_intervals import ray_intervals
+from triquad_server.mapping.sampling import Placement, draw_ordered_samples, draw_samples
 from triquad_server.settings import ScanSettings
+from triquad_server.threads import Teams
 
 HALF_SIDE_M = 400.0
+TEAM = Teams().mapping
 CENTRE = np.array([10.0, -20.0, 3.0])
 
 
-def rays_to_ground(count: int = 500, height_m: float = 2.0) -> Rays:
+def rays_to_ground(count: int = 500, height_m: float = 2.0) -> ScanRays:
     rng = np.random.default_rng(0)
     ends = np.column_stack([rng.uniform(2, 30, (count, 1)), rng.uniform(-9, 9, (count, 1))])
     ends = np.column_stack([ends, np.zeros(count)])
-    return Rays(np.array([0, 0, height_m]), ends, IngestReport(count, {}))
+    return ScanRays(np.array([0, 0, height_m]), ends, points_dropped={})
 
 
 def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placement:
     return Placement(settings.surface_share, settings.spread_m, settings.truncation_m, half_side_m)
 
 
-def draw(engine: str, segments: np.ndarray, chosen: np.ndarray, placement: Placement) -> Batch:
+def draw(engine: str, intervals: np.ndarray, chosen: np.ndarray, placement: Placement) -> Batch:
     if engine == "compiled":
-        return draw_ordered_samples(segments, chosen, placement, np.random.default_rng(1))
+        return draw_ordered_samples(intervals, chosen, placement, np.random.default_rng(1), TEAM)
     generator = torch.Generator().manual_seed(1)
-    return draw_samples(torch.from_numpy(segments[chosen]), placement, generator)
+    return draw_samples(torch.from_numpy(intervals[chosen]), placement, generator)
 
 
 ENGINES = pytest.mark.parametrize("engine", ["compiled", "tensors"])
@@ -36,8 +39,8 @@ def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> Non
     settings = ScanSettings()
     rays = rays_to_ground()
     down = np.tile([0.0, 0.0, -1.0], (500, 1))
-    segments = ray_segments(rays, down, CENTRE, HALF_SIDE_M, settings)
-    batch = draw(engine, segments, np.arange(500).repeat(20), placed(settings))
+    intervals = ray_intervals(rays, down, CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, intervals, np.arange(500).repeat(20), placed(settings))
     heights = batch.points[:, 2].numpy() + CENTRE[2]
     labels = batch.labels.numpy()
     assert abs(labels - heights).max() < 0.05, "up to the least cosine"
@@ -49,8 +52,8 @@ def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> Non
 def test_without_normals_the_label_is_the_distance_along_the_ray(engine: str) -> None:
     settings = ScanSettings()
     rays = rays_to_ground(1)
-    segments = ray_segments(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
-    batch = draw(engine, segments, np.zeros(3000, np.int64), placed(settings))
+    intervals = ray_intervals(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, intervals, np.zeros(3000, np.int64), placed(settings))
     points = batch.points.numpy() + CENTRE
     distance = np.linalg.norm(points - rays.ends[0], axis=1)
     np.testing.assert_allclose(np.abs(batch.labels.numpy()), distance, atol=1e-4)
@@ -62,8 +65,8 @@ def test_samples_lie_where_the_settings_say(engine: str) -> None:
     settings = ScanSettings(surface_share=0.7, spread_m=0.1)
     rays = rays_to_ground(1)
     range_m = np.linalg.norm(rays.ends[0] - rays.origin)
-    segments = ray_segments(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
-    batch = draw(engine, segments, np.zeros(20_000, np.int64), placed(settings))
+    intervals = ray_intervals(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
+    batch = draw(engine, intervals, np.zeros(20_000, np.int64), placed(settings))
     reach = np.linalg.norm(batch.points.numpy() + CENTRE - rays.origin, axis=1)
     assert reach.min() >= 0.3 * range_m - 1e-4
     assert reach.max() <= range_m + 0.8 + 1e-4
@@ -78,15 +81,15 @@ def test_samples_stay_inside_the_cube(engine: str) -> None:
     settings = ScanSettings()
     half = 8.0
     rays = rays_to_ground()
-    segments = ray_segments(rays, np.full((500, 3), np.nan), np.zeros(3), half, settings)
+    intervals = ray_intervals(rays, np.full((500, 3), np.nan), np.zeros(3), half, settings)
     ending = (np.abs(rays.ends) < half).all(axis=1).sum()
-    assert len(segments) > ending, "rays that only pass through teach free space"
-    batch = draw(engine, segments, np.arange(len(segments)).repeat(10), placed(settings, half))
+    assert len(intervals) > ending, "rays that only pass through teach free space"
+    batch = draw(engine, intervals, np.arange(len(intervals)).repeat(10), placed(settings, half))
     assert np.abs(batch.points.numpy()).max() <= half + 1e-4
 
 
 def test_rays_that_miss_the_cube_teach_nothing() -> None:
     far = np.array([0.0, 500.0, 0.0])
     rays = rays_to_ground()
-    segments = ray_segments(rays, np.full((500, 3), np.nan), far, 20.0, ScanSettings())
-    assert len(segments) == 0
+    intervals = ray_intervals(rays, np.full((500, 3), np.nan), far, 20.0, ScanSettings())
+    assert len(intervals) == 0

@@ -1,10 +1,12 @@
-import dataclasses
 import re
+import runpy
 from pathlib import Path
 
 import pytest
 from triquad_format.errors import SettingsError
-from triquad_server.settings import Settings, load_settings, parse_settings
+from triquad_server import cli
+from triquad_server.settings import Settings, setting_schemas
+from triquad_server.settings_sources import load_settings, settings_toml
 
 ROOT = Path(__file__).parents[2]
 
@@ -26,22 +28,83 @@ def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
     assert settings.training == Settings().training
 
 
+def test_the_environment_goes_before_the_file_and_the_command_line_before_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[training]\nbatch = 1\nseed = 1\nmax_regions = 1\n")
+    monkeypatch.setenv("TRIQUAD_TRAINING__BATCH", "2")
+    monkeypatch.setenv("TRIQUAD_TRAINING__SEED", "2")
+    training = load_settings(path, ["training.batch=3"]).training
+    assert (training.batch, training.seed, training.max_regions) == (3, 2, 1)
+
+
+def test_settings_that_are_printed_can_be_read(tmp_path: Path) -> None:
+    settings = load_settings(
+        assignments=["field.encoding=fourier", "scan.thin_m=0.001", "mesh.reach_m=1e-5"]
+    )
+    path = tmp_path / "settings.toml"
+    path.write_text(settings_toml(settings))
+    assert load_settings(path) == settings
+
+
+def test_the_command_prints_the_settings_in_effect(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--print-settings", "--set", "training.batch=4096"]) == cli.OK
+    assert "[training]\nbatch = 4096\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("variable", "words"),
+    [
+        ("TRIQUAD_TRAINING__BACTH", ["training.bacth", "did you mean training.batch?"]),
+        ("TRIQUAD_TRIANING__BATCH", ["trianing.batch", "did you mean training.batch?"]),
+        ("TRIQUAD_TRAINING__BATCH", ["training.batch = '0.5'", "integer"]),
+        ("TRIQUAD_STORE", ["store = '0.5'", "[store]"]),
+    ],
+)
+def test_errors_name_the_environment(
+    monkeypatch: pytest.MonkeyPatch, variable: str, words: list[str]
+) -> None:
+    monkeypatch.setenv(variable, "0.5")
+    with pytest.raises(SettingsError) as error:
+        load_settings()
+    assert all(word in str(error.value) for word in ["environment", *words])
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("training.bacth=1", ["unknown setting training.bacth: did you mean training.batch?"]),
+        ("training.batch=0", ["training.batch = '0' is out of range: use 1 to 10000000"]),
+        ("training.batch", ["training.batch", "SECTION.KEY=VALUE"]),
+        ("batch=4096", ["batch=4096", "SECTION.KEY=VALUE"]),
+    ],
+)
+def test_errors_name_the_command_line(assignment: str, words: list[str]) -> None:
+    with pytest.raises(SettingsError) as error:
+        load_settings(assignments=[assignment])
+    assert all(word in str(error.value) for word in ["--set", *words])
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("[field]\nleaf = 0.3\n", ["leaf", "leaf_m"]),
         ("[filed]\nleaf_m = 0.3\n", ["filed", "field"]),
-        ("[field]\nleaf_m = 'big'\n", ["field.leaf_m", "big", "float"]),
+        ("[field]\nleaf_m = 'big'\n", ["field.leaf_m", "big", "number"]),
         ("[field]\nleaf_m = -1\n", ["leaf_m", "-1", "0.01"]),
         ("[field]\ndepth = true\n", ["field.depth", "True"]),
         ("[field]\nencoding = 'all'\n", ["encoding", "all", "both"]),
-        ("[training]\nbatch = 0\n", ["batch", "0"]),
+        ("[training]\nbatch = 0\n", ["training.batch = 0", "use 1 to 10000000"]),
+        ("[training]\nbatch = 2.5\n", ["training.batch = 2.5", "integer"]),
+        ("[training]\nbatch = 0\nseed = -1\n", ["training.batch = 0", "training.seed = -1"]),
+        ("[scan]\nrange_max_m = 1\n", ["range_max_m = 1", "range_min_m = 1.5"]),
         ("field = 3\n", ["field", "3"]),
         ("[field\n", ["settings.toml"]),
         ("[scan]\nrange_min_m = nan\n", ["range_min_m", "nan"]),
         ("[training]\nseed = -1\n", ["seed", "-1"]),
-        (f"[field]\nleaf_m = 1{'0' * 400}\n", ["leaf_m", "64 bits"]),
-        (f"[field]\ndepth = 1{'0' * 400}\n", ["depth", "64 bits"]),
+        (f"[field]\nleaf_m = 1{'0' * 400}\n", ["leaf_m", "number"]),
+        (f"[field]\ndepth = 1{'0' * 400}\n", ["depth", "use 6 to 15"]),
         (f"[field]\ndepth = 1{'0' * 5000}\n", ["settings.toml"]),
         (f"a = {'[' * 5000}\n", ["settings.toml"]),
     ],
@@ -67,7 +130,13 @@ def test_settings_that_do_not_go_together_are_refused(
     words: list[str],
 ) -> None:
     with pytest.raises(SettingsError) as error:
-        parse_settings(sections)
+        load_settings(
+            assignments=[
+                f"{section}.{key}={value}"
+                for section, table in sections.items()
+                for key, value in table.items()
+            ]
+        )
     assert all(word in str(error.value) for word in words)
 
 
@@ -83,25 +152,17 @@ def test_every_setting_is_read_somewhere() -> None:
         for path in (ROOT / folder).rglob("*.py")
         if path.name not in ("settings.py",)
     )
-    for part in dataclasses.fields(Settings):
-        for entry in dataclasses.fields(type(getattr(Settings(), part.name))):
-            assert re.search(rf"\.{entry.name}\b", code), f"{part.name}.{entry.name} is unread"
+    for section, schemas in setting_schemas().items():
+        for key in schemas:
+            assert re.search(rf"\.{key}\b", code), f"{section}.{key} is unread"
 
 
-def test_parse_takes_nothing_as_defaults() -> None:
-    assert parse_settings({}) == Settings()
-
-
-def test_the_document_lists_every_setting_with_its_default() -> None:
-    document = (ROOT / "docs" / "settings.md").read_text()
-    for part in dataclasses.fields(Settings):
-        section = document.split(f"## `[{part.name}]`")[1].split("\n## ")[0]
-        record = getattr(Settings(), part.name)
-        for entry in dataclasses.fields(type(record)):
-            value = repr(getattr(record, entry.name)).replace("'", '"')
-            assert f"| `{entry.name}` | `{value}` |" in section, f"{part.name}.{entry.name}"
+def test_the_page_is_the_one_that_the_settings_make() -> None:
+    page = (ROOT / "docs" / "settings.md").read_text()
+    with_tables = runpy.run_path(str(ROOT / "docs" / "settings_tables.py"))["with_tables"]
+    assert with_tables(page) == page, "run `make docs`"
 
 
 def test_an_optimiser_that_would_diverge_is_refused() -> None:
-    with pytest.raises(SettingsError, match="beta2 = 0.1 is too small for beta1 = 0.9"):
-        parse_settings({"training": {"beta2": 0.1}})
+    with pytest.raises(SettingsError, match="beta2 = 0.1 is too small for training.beta1 = 0.9"):
+        load_settings(assignments=["training.beta2=0.1"])

@@ -5,10 +5,11 @@ from contextlib import closing
 import pytest
 from support import servers
 from triquad_format.errors import MapFileError, TooLargeMapFileError
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 from triquad_format.records.region import MapRecord
 from triquad_server.errors import StoreError
 from triquad_server.mapping.mapper import MapChanges, Mapper
+from triquad_server.store import restore
 from triquad_server.store import store as store_module
 from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
@@ -79,7 +80,7 @@ def test_a_truncated_checkpoint_is_damaged(store):
         TooLargeMapFileError("it is larger than the limit"),
     ],
 )
-def test_a_sound_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkeypatch, error):
+def test_a_valid_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkeypatch, error):
     for epoch in (1, 2):
         store.write(record(epoch))
     before = names(store)
@@ -87,7 +88,7 @@ def test_a_sound_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkey
     def fail(path):
         raise error
 
-    monkeypatch.setattr(store_module, "read_map_file", fail)
+    monkeypatch.setattr(restore, "read_map_file", fail)
     with pytest.raises(StoreError, match="000000002.triquad cannot be read"):
         store.newest()
     assert names(store) == before
@@ -113,7 +114,7 @@ def test_what_keeps_a_checkpoint_from_being_written_is_an_error_of_the_store(
         store.write(record(1))
 
 
-def test_a_damaged_file_of_a_higher_number_does_not_push_out_a_sound_one(store):
+def test_a_damaged_file_of_a_higher_number_does_not_push_out_a_valid_one(store):
     store.write(record(1))
     for epoch in (8, 9):
         (store.folder / f"epoch-00000000{epoch}.triquad").write_bytes(b"damaged")
@@ -172,8 +173,8 @@ def test_a_failed_write_leaves_the_older_checkpoints(store):
 
 def test_a_checkpoint_under_a_wrong_number_does_not_pass_for_a_later_one(store, caplog):
     store.write(record(3))
-    sound = store.folder / "epoch-000000003.triquad"
-    (store.folder / "epoch-000000009.triquad").write_bytes(sound.read_bytes())
+    valid = store.folder / "epoch-000000003.triquad"
+    (store.folder / "epoch-000000009.triquad").write_bytes(valid.read_bytes())
     with caplog.at_level(logging.WARNING):
         restored = store.newest()
     assert restored.info.epoch == restored.record.epoch == 3
@@ -184,6 +185,6 @@ def test_a_checkpoint_under_a_wrong_number_does_not_pass_for_a_later_one(store, 
 
 def test_a_number_of_more_than_64_bits_is_not_a_checkpoint(store):
     store.write(record(3))
-    sound = store.folder / "epoch-000000003.triquad"
-    (store.folder / "epoch-9999999999999999999.triquad").write_bytes(sound.read_bytes())
+    valid = store.folder / "epoch-000000003.triquad"
+    (store.folder / "epoch-9999999999999999999.triquad").write_bytes(valid.read_bytes())
     assert store.newest().info.epoch == 3

@@ -5,8 +5,8 @@ from contextlib import closing, suppress
 
 from support.map_records import assert_same
 from support.store_writer import KEPT, record_at, write_for_ever
-from triquad_format.mapfile.history import checkpoint_files, newest_of_each
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files, newest_of_each
+from triquad_format.mapfile.reader import read_map
 from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
 

@@ -4,10 +4,11 @@ import dataclasses
 from pathlib import Path
 
 from support.map_records import random_record
-from triquad_format.mapfile.history import checkpoint_name
+from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.mapfile.manifest import FileRef
-from triquad_format.mapfile.map_facts import MapFacts
-from triquad_format.mapfile.writer import record_parts, write_parts
+from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.parts.pack import pack_record
+from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.region import MapRecord
 
 START_NS = 1_769_860_800 * 10**9  # 2026-01-31T12:00:00Z
@@ -30,8 +31,8 @@ def write_checkpoints(folder: Path, epochs: tuple[int, ...]) -> list[Path]:
         stamp_ns = START_NS + hours * HOUR_NS
         path = folder / checkpoint_name(epoch, complete=not known)
         facts = MapFacts(record.name, epoch, record.settings)
-        parts = record_parts(record, "<f2", {})
-        written = write_parts(path, facts, stamp_ns, parts, known)
+        parts = pack_record(record, "<f2", {})
+        written = write_parts(path, facts, parts, stamp_ns=stamp_ns, known=known)
         known = written.manifest.elsewhere(FileRef(path.name, written.manifest_sha256))
         paths.append(path)
     return paths

@@ -117,5 +117,5 @@ def _training(
         mlp_steps=0,
         sample_points=np.column_stack([places, ground]).astype(np.float32),
         sample_labels=np.full(len(places), label_error_m, np.float32),
-        visits_owed=0,
+        budget_samples=0,
     )

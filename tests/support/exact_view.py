@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.status import Status
 from triquad_map.nearest import NearestSurface, NearestUnknown
-from triquad_map.reference.evaluator import Answer
+from triquad_map.view import FieldAnswer
 from triquad_tools.simulation.scene import Scene
 
 
@@ -18,14 +18,16 @@ class ExactView:
     map_from_scene: NDArray[np.float64]  # [4, 4]
     seen_low: NDArray[np.float64]  # [3] corner of the box, scene frame
     seen_high: NDArray[np.float64]  # [3]
-    number: int = 7
+    epoch: int = 7
     voxel_m: float = 0.2
 
-    def query(self, points: NDArray[np.float64], gradient: bool = False) -> Answer:
+    def query(self, points: NDArray[np.float64], gradient: bool = False) -> FieldAnswer:
         local = self._local(points)
         sdf = self.scene.sdf(local).astype(np.float32)
         slopes = self.scene.gradient(local) @ self.map_from_scene[:3, :3].T
-        return Answer(sdf, self.status(points), slopes.astype(np.float32) if gradient else None)
+        return FieldAnswer(
+            sdf, self.status(points), slopes.astype(np.float32) if gradient else None
+        )
 
     def status(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
         local = self._local(points)
@@ -37,9 +39,9 @@ class ExactView:
     def nearest_surface(self, points: NDArray[np.float64], max_distance_m: float) -> NearestSurface:
         local = self._local(points)
         sdf = self.scene.sdf(local)
-        feet = local - sdf[:, None] * self.scene.gradient(local)
-        found = (np.abs(sdf) <= max_distance_m) & self._seen(feet)
-        world = feet @ self.map_from_scene[:3, :3].T + self.map_from_scene[:3, 3]
+        closest = local - sdf[:, None] * self.scene.gradient(local)
+        found = (np.abs(sdf) <= max_distance_m) & self._seen(closest)
+        world = closest @ self.map_from_scene[:3, :3].T + self.map_from_scene[:3, 3]
         world[~found] = 0.0
         distance = np.where(found, np.abs(sdf), max_distance_m)
         return NearestSurface(found, distance, world, world, found.astype(np.float32))

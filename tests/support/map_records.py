@@ -1,4 +1,4 @@
-"""Small random map records, sound in every field, for any test that needs a map."""
+"""Small random map records, valid in every field, for any test that needs a map."""
 
 import dataclasses
 import math
@@ -125,7 +125,7 @@ def _training(
         mlp_steps=int(rng.randint(0, 10**6, dtype=np.int64)),
         sample_points=_floats(rng, samples, 3),
         sample_labels=_floats(rng, samples).astype(np.float16),
-        visits_owed=int(rng.randint(0, 10**6, dtype=np.int64)),
+        budget_samples=int(rng.randint(0, 10**6, dtype=np.int64)),
     )
 
 

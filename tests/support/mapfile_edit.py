@@ -7,17 +7,37 @@ from typing import NamedTuple
 
 import msgpack
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.manifest import FileRef, pack_manifest, unpack_manifest
-from triquad_format.mapfile.map_facts import MapFacts
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_format.mapfile.mcap.random_access import check_range
+from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import MANIFEST
-from triquad_format.mapfile.random_access import MemoryBytes
-from triquad_format.mapfile.writer import record_parts, write_parts
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map, write_parts
 from triquad_format.wire.array import pack_array, unpack_array
 from triquad_map.stored_map import StoredMap
 from triquad_server.mesh.preview import previews_of
+
+
+class MemoryBytes:
+    """A map file's bytes in memory, read at random."""
+
+    def __init__(self, data: bytes | bytearray | memoryview, name: str = "map file") -> None:
+        self.name = name
+        self.size = len(data)
+        self._data = memoryview(data)
+
+    def read(self, offset: int, length: int) -> bytes:
+        """As :meth:`RandomAccess.read`."""
+        check_range(offset, length, self.size)
+        return bytes(self._data[offset : offset + length])
+
+    def close(self) -> None:
+        """Do nothing: there is no file."""
 
 
 class RawPart(NamedTuple):
@@ -43,6 +63,20 @@ def read_bytes(data):
 def stored(data):
     """The map of a file's bytes, by random access."""
     return StoredMap(MemoryBytes(data))
+
+
+def stored_record(data):
+    """The record in a file's bytes, part by part."""
+    with stored(data) as map_file:
+        return map_file.record()
+
+
+def assert_refused(data):
+    """Both ways of reading refuse the file as damaged, with a text."""
+    for read, error in ((read_bytes, DamagedMapFileError), (stored_record, MapFileError)):
+        with pytest.raises(error) as refusal:
+            read(data)
+        assert str(refusal.value)
 
 
 def parts_of(data):
@@ -167,13 +201,14 @@ def write_pair(
 ):
     """A complete file of ``base``, and one of what ``record`` changes of it."""
     options = {"preview_schema": preview_schema}
-    first = write_record(folder / names[0], base, stamps[0], {}, **options)
+    first = write_record(folder / names[0], base, stamp_ns=stamps[0], **options)
     known = first.manifest.elsewhere(FileRef(names[0], first.manifest_sha256))
-    return first, write_record(folder / names[1], record, stamps[1], known, **options)
+    later = write_record(folder / names[1], record, stamp_ns=stamps[1], known=known, **options)
+    return first, later
 
 
-def write_record(path, record, stamp_ns, known, *, preview_schema=None):
-    """A file of all parts of a record that no file of ``known`` holds."""
+def write_record(path, record, **options):
+    """A file of all parts of a record; options are those of ``write_parts``."""
     facts = MapFacts(record.name, record.epoch, record.settings)
-    parts = record_parts(record, "<f2", {})
-    return write_parts(path, facts, stamp_ns, parts, known, preview_schema=preview_schema)
+    parts = pack_record(record, "<f2", {})
+    return write_parts(path, facts, parts, **options)

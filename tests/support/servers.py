@@ -24,17 +24,20 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.session import NetworkOptions, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
+from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.retention import Retention
-from triquad_server.store.store import Restored, Store
+from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
 
 MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
 SMALL = Settings(
     field=FieldSettings(depth=7),
-    training=TrainingSettings(batch=2048, visits=6.0, pool_segments=20_000),
+    training=TrainingSettings(batch=2048, samples_per_ray=6.0, pool_rays=20_000),
 )
-SMALL_TOML = "[field]\ndepth = 7\n[training]\nbatch = 2048\nvisits = 6.0\npool_segments = 20000\n"
+SMALL_TOML = (
+    "[field]\ndepth = 7\n[training]\nbatch = 2048\nsamples_per_ray = 6.0\npool_rays = 20000\n"
+)
 RADIUS_M = 4.0
 
 
@@ -69,12 +72,12 @@ def running_service(
     endpoint = free_endpoint()
     network = NetworkOptions((endpoint,), connect, multicast_scouting=False)
     opened = Store(store, map_name, Retention.chosen(settings.store)) if store else None
-    restored: Restored | None = opened.newest() if opened else None
+    restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
     info = restored.info if restored else None
     session = open_session(network)
     try:
-        with Service(session, ServedMap(map_name, mapper, "cpu", opened, info), settings):
+        with closing(Service(session, ServedMap(map_name, mapper, "cpu", opened, info), settings)):
             yield endpoint
     finally:
         session.close()

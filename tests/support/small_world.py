@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import Settings, parse_settings
+from triquad_server.settings import Settings
 from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.street import street
@@ -38,8 +38,8 @@ def world(scans: int = 6, step_m: float = 1.5) -> World:
 
 def settings(**training: object) -> Settings:
     """Small regions, so that a street has several."""
-    return parse_settings(
-        {"field": {"depth": 8}, "training": {"batch": 4096, "visits": 18.0, **training}}
+    return Settings.model_validate(
+        {"field": {"depth": 8}, "training": {"batch": 4096, "samples_per_ray": 18.0, **training}}
     )
 
 

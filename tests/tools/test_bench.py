@@ -2,8 +2,8 @@ import math
 from pathlib import Path
 
 import pytest
-from triquad_tools.benchmarks import bench
-from triquad_tools.benchmarks.bench_figures import Figure, compare, markdown
+from triquad_tools.benchmarks.figures import Figure, compare, markdown
+from triquad_tools.commands import bench
 
 
 def test_a_figure_keeps_to_its_bounds_or_not() -> None:

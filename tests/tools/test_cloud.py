@@ -1,9 +1,9 @@
 from pathlib import Path
 
 import numpy as np
-from triquad_tools.evaluation.cloud import is_withheld, points_in_range, world_points
-from triquad_tools.evaluation.kitti import read_folder, write_folder
-from triquad_tools.simulation.voxel import merged
+from support.kitti_folder import write_folder
+from triquad_tools.recordings.cloud import is_withheld, merged, points_in_range, world_points
+from triquad_tools.recordings.kitti import read_folder
 
 
 def test_the_last_of_every_few_scans_is_withheld() -> None:

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
+from support.kitti_folder import write_folder
 from triquad_tools.commands import evaluate, replay
-from triquad_tools.evaluation.kitti import write_folder
-from triquad_tools.simulation.street_drive import street_drive
+from triquad_tools.simulation.street import street_drive
 
 SCANS = 9
 EVERY = 3  # withheld

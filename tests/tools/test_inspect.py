@@ -9,7 +9,7 @@ import pytest
 from support.checkpoint_folder import write_checkpoints
 from support.exact_maps import SEEN_M, exact_map, flat
 from support.map_records import random_record, with_integers
-from triquad_format.mapfile.mapfile import write_map
+from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands.inspect import main
 
 
@@ -228,7 +228,7 @@ def test_no_state_left_on_streams():
 
 def test_format_needs_neither_server_nor_torch():
     code = (
-        "import sys, triquad_format.mapfile.mapfile, triquad_map.reference.evaluator\n"
+        "import sys, triquad_format.mapfile.reader, triquad_map.reference.evaluator\n"
         "import triquad_format.records.crop\n"
         "bad = {'torch', 'numba', 'zenoh', 'skimage', 'triquad_server'} & set(sys.modules)\n"
         "assert not bad, bad"

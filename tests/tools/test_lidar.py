@@ -2,11 +2,11 @@ import math
 
 import numpy as np
 import pytest
+from triquad_tools.recordings.cloud import thin
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Label, box, half_space, sphere
 from triquad_tools.simulation.street import street
-from triquad_tools.simulation.voxel import thin
 
 SMALL = Lidar(beams=32, columns=180)
 QUIET = Lidar(beams=32, columns=180, noise_m=0.0)

@@ -6,11 +6,10 @@ import pytest
 from support.exact_maps import exact_map, flat, table
 from support.map_records import random_record
 from support.small_world import settings, settled_mapper, world
-from triquad_format.mapfile.mapfile import write_map
+from triquad_format.mapfile.writer import write_map
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.inspect import main
-from triquad_tools.mapfiles.map_diff import compare, difference
-from triquad_tools.mapfiles.surface_points import surface_points
+from triquad_tools.mapfiles.diff import compare, difference, surface_points
 
 GROUND = exact_map(flat(0.1))
 RAISED = exact_map(table(0.1, 0.15))  # by 5 cm, in a square of 4 m
@@ -84,8 +83,8 @@ def test_maps_of_different_places_have_seen_nothing_of_each_other():
 
 
 def test_the_same_scans_give_maps_that_differ_by_their_noise_alone():
-    few = settled_mapper(settings(visits=9.0), world()).changes_since(None).record
-    many = settled_mapper(settings(visits=18.0), world()).changes_since(None).record
+    few = settled_mapper(settings(samples_per_ray=9.0), world()).changes_since(None).record
+    many = settled_mapper(settings(samples_per_ray=18.0), world()).changes_since(None).record
     total = diff(few, many, 6.4).total
     assert total.points_a > 10_000
     assert total.moved_median_m < 0.01
@@ -111,7 +110,7 @@ def test_table(files, capsys):
     assert lines[:2] == [
         f"{letter}  {path}: map 'ground', epoch 1" for letter, path in zip("AB", files, strict=True)
     ]
-    assert lines[2].split()[:3] == ["x", "m", "y"]
+    assert lines[2].split()[:3] == ["from", "x", "m"]
     assert len(lines) == 7
     assert lines[5].startswith("  all")
     assert "more: --limit" in lines[6]

@@ -3,15 +3,21 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 from support.map_records import random_record
 from support.mapfile_edit import file_bytes
 from support.small_world import settings, settled_mapper, world
-from triquad_format.mapfile.mapfile import read_map, write_map
+from triquad_client import Mesh
+from triquad_client.mesh.welding import joined
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.epoch_mesh import EpochMesh
 from triquad_tools.commands.pack import main
-from triquad_tools.evaluation.meshfile import read_mesh
+from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapfiles.seen_space import surface_voxels
 
 BOX = ["0.1", "-4.7", "-2", "12.3", "4.1", "3"]
@@ -45,6 +51,33 @@ def test_meshes_lie_on_the_surface(map_file, tmp_path):
     assert np.quantile(np.abs(answer.sdf), 0.95) < 0.01
     mesh = trimesh.Trimesh(ply.vertices, ply.faces, process=False)
     assert len(mesh.edges_unique) < 2 * len(ply.faces)  # tiles are joined
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl"])
+def test_other_programs_meshes_are_the_same(map_file, tmp_path, suffix):
+    options = ("--cell", "0.4")
+    ply = read_mesh(export(map_file, tmp_path, "mesh.ply", *options))
+    (tmp_path / "mesh.ply").unlink()
+    other = read_mesh(export(map_file, tmp_path, f"mesh{suffix}", *options))
+    assert len(other.faces) == len(ply.faces)
+    corners = [mesh.vertices[mesh.faces] for mesh in (ply, other)]
+    np.testing.assert_allclose(corners[0], corners[1], atol=1e-5)
+
+
+def test_a_mesh_is_the_one_that_a_server_gives(map_file, tmp_path):
+    record = read_map(map_file)
+    epoch = Mapper("street", settings(), "cpu", record).publish()
+    everywhere = np.full(3, -np.inf), np.full(3, np.inf)
+    mesh = EpochMesh(epoch, settings().mesh)
+    tiles = [mesh.tile(tuple(index)) for index in mesh.tiles(*everywhere).tolist()]
+    parts = [(tile.origin + tile.vertices, tile.faces) for tile in tiles]
+    served = Mesh(*joined(parts, settings().mesh.tile_side_m, *everywhere))
+    written = read_mesh(export(map_file, tmp_path, "mesh.ply"))
+    assert len(written.faces) == pytest.approx(len(served.faces), rel=0.01)
+    for one, other in ((written, served), (served, written)):
+        distances = cKDTree(other.vertices).query(one.vertices)[0]
+        # But for cells that can be filled in several ways, and single faces at the border.
+        assert np.quantile(distances, 0.99) < 1e-4
 
 
 def test_a_mesh_within_a_box(map_file, tmp_path):
@@ -136,15 +169,16 @@ def test_refusals(map_file, tmp_path, capsys):
     refused("4000 x 4000 x 4000 = 6.4e+10 points", "grid.npz", *wide)
     refused("--crop, --sparse or a larger --cell", "grid.npz", *wide)
     refused("--cell = 0.001 is out of range: use 0.01 to 10", "mesh.ply", "--cell", "0.001")
-    refused(".triquad, .ply, .glb, .npz", "mesh.obj")
+    refused(".triquad, .ply, .glb, .obj, .stl, .npz", "mesh.gltf")
     refused("--sparse is of .npz", "mesh.ply", "--sparse")
     refused("of map files", "mesh.ply", "--max-error", "2mm")
     refused("nowhere is not a folder", "nowhere/mesh.ply")
 
 
-def test_regions_too_far_for_a_mesh_are_told(tmp_path, capsys):
-    record = random_record(0, indices=((2**31 - 1, 0, 0),))
-    write_map(record, tmp_path / "far.triquad")
-    assert main([str(tmp_path / "far.triquad"), str(tmp_path / "far.ply")]) == 2
+@pytest.mark.parametrize("suffix", [".ply", ".npz"])
+def test_regions_too_far_for_compiled_code_are_told(tmp_path, capsys, suffix):
+    source, out = tmp_path / "far.triquad", tmp_path / f"far{suffix}"
+    write_map(random_record(0, indices=((2**31 - 1, 0, 0),)), source)
+    assert main([str(source), str(out), "--cell", "1"]) == 2
     assert "too far from the origin" in capsys.readouterr().err
-    assert not (tmp_path / "far.ply").exists()
+    assert not out.exists()

@@ -13,7 +13,7 @@ from triquad_tools.evaluation.map_scores import (
     street_probes,
 )
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.street_drive import street_drive
+from triquad_tools.simulation.street import street_drive
 
 DRIVE = street_drive(3, 2)
 

@@ -3,8 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from triquad_client import Mesh
-from triquad_tools.console.errors import MeshFileError
-from triquad_tools.evaluation.meshfile import read_mesh
+from triquad_tools.mapfiles.meshfile import MeshFileError, read_mesh
 
 TETRAHEDRON = Mesh(
     np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]]),
@@ -36,9 +35,9 @@ def test_glb_round_trip_has_z_up_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.faces, TETRAHEDRON.faces)
 
 
-@pytest.mark.parametrize("name", ["a.obj", "a", "a.pkl"])
+@pytest.mark.parametrize("name", ["a.gltf", "a", "a.pkl"])
 def test_other_formats_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(MeshFileError, match=r"\.ply or \.glb"):
+    with pytest.raises(MeshFileError, match=r"\.ply, \.glb, \.obj, \.stl"):
         read_mesh(tmp_path / name)
 
 

@@ -10,7 +10,8 @@ from support.checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoin
 from support.map_records import SMALL, assert_same, random_record
 from support.mapfile_edit import file_bytes, with_metadata, without_index
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.mapfile import read_map, read_map_file, write_map
+from triquad_format.mapfile.reader import read_map, read_map_file
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record, without_training
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.reference.evaluator import MapEvaluator
@@ -71,17 +72,17 @@ def test_crop_at_default_settings():
     assert len(cropped.regions[0].evidence.codes) < len(record.regions[0].evidence.codes) / 10
 
 
-def test_crop_owes_visits_only_to_the_samples_it_keeps():
+def test_crop_keeps_the_training_budget_of_the_samples_it_keeps():
     record = random_record(4, points=100)
     before = record.regions[0].training
     after = crop_record(record, [-100, -100, 0], [100, 100, 100]).regions[0].training
     kept = len(after.sample_points)
     assert 0 < kept < 100
-    assert after.visits_owed == math.ceil(before.visits_owed * kept / 100)
+    assert after.budget_samples == math.ceil(before.budget_samples * kept / 100)
     empty = crop_record(record, [7.9, 7.9, 7.9], [7.95, 7.95, 7.95]).regions[0].training
-    assert len(empty.sample_points) == empty.visits_owed == 0
+    assert len(empty.sample_points) == empty.budget_samples == 0
     everything = crop_record(record, [-100] * 3, [100] * 3).regions[0].training
-    assert everything.visits_owed == before.visits_owed
+    assert everything.budget_samples == before.budget_samples
 
 
 def test_crop_can_be_written_and_keeps_training_rows(tmp_path):

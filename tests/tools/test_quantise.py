@@ -8,12 +8,12 @@ from support.map_records import SMALL, assert_same, random_record
 from support.mapfile_edit import file_bytes, read_bytes
 from support.small_world import settings, settled_mapper, world
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.mapfile import read_map
+from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.field_change import draw_probes, field_change
-from triquad_tools.mapfiles.map_packing import INTEGER_ERROR_M
+from triquad_tools.mapfiles.packing import INTEGER_ERROR_M
 from triquad_tools.mapfiles.quantise import dequantised, quantise
 from triquad_tools.mapfiles.region_probes import RegionProbes
 

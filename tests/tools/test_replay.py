@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
+from support.kitti_folder import write_folder
 from triquad_client import FlushReport
 from triquad_tools.commands.replay import Pace, ReplayReport, due_times, main
-from triquad_tools.evaluation.kitti import write_folder
 
 
 @pytest.fixture(scope="module")

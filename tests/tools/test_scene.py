@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from support.surface_samples import surface_samples
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Label, Solid, box, cylinder, gable, half_space, sphere
 from triquad_tools.simulation.street import street
@@ -23,7 +24,7 @@ def world() -> Scene:
 
 def _near_surface(scene: Scene, count: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    samples = scene.surface_samples(0.2, rng)
+    samples = surface_samples(scene, 0.2, rng)
     chosen = samples[rng.integers(len(samples), size=count)]
     return chosen + rng.uniform(-0.3, 0.3, chosen.shape)
 
@@ -32,7 +33,7 @@ def _near_surface(scene: Scene, count: int, seed: int) -> np.ndarray:
 def test_distance_of_a_solid_agrees_with_the_distance_to_samples_of_its_surface(name: str) -> None:
     rng = np.random.default_rng(0)
     scene = Scene((ONE_SOLID[name],), BOUNDS)
-    samples = scene.surface_samples(0.01, rng)
+    samples = surface_samples(scene, 0.01, rng)
     points = rng.uniform(-1.8, 1.8, (20_000, 3))
     brute = cKDTree(samples).query(points)[0]
     exact = np.abs(scene.sdf(points))
@@ -65,13 +66,13 @@ def test_surface_samples_have_uniform_density() -> None:
         "sphere": 4.0 * np.pi * 0.8**2,
     }
     for name, area in areas.items():
-        samples = Scene((ONE_SOLID[name],), BOUNDS).surface_samples(0.02, rng)
+        samples = surface_samples(Scene((ONE_SOLID[name],), BOUNDS), 0.02, rng)
         assert len(samples) * 0.02**2 == pytest.approx(area, rel=0.02), name
 
 
 def test_samples_of_a_half_space_fill_the_bounds() -> None:
     scene = Scene((half_space(0.0),), BOUNDS)
-    samples = scene.surface_samples(0.1, np.random.default_rng(0))
+    samples = surface_samples(scene, 0.1, np.random.default_rng(0))
     assert len(samples) * 0.1**2 == pytest.approx(64.0, rel=0.05)
     assert np.all(samples[:, 2] == 0.0)
 
@@ -85,7 +86,7 @@ def test_grid_of_candidates_changes_no_answer(world: Scene) -> None:
 
 def test_distance_in_a_street_agrees_with_the_distance_to_its_surface(world: Scene) -> None:
     spacing_m = 0.05
-    samples = world.surface_samples(spacing_m, np.random.default_rng(4))
+    samples = surface_samples(world, spacing_m, np.random.default_rng(4))
     points = _near_surface(world, 20_000, seed=5)
     inner = np.all((points > world.bounds[0] + 1.0) & (points < world.bounds[1] - 1.0), axis=1)
     points = points[inner & world.is_exact(points)]
@@ -128,11 +129,6 @@ def test_street_depends_on_its_seed_alone() -> None:
     assert street(1, 20.0).solids == street(1, 20.0).solids
     assert street(1, 20.0).solids != street(2, 20.0).solids
     assert {solid.label for solid in street(1).solids} == set(Label)
-
-
-def test_labels_name_what_is_nearest(world: Scene) -> None:
-    labels = world.labels(np.array([[15.0, 0.0, 0.1], [15.0, 6.5, 0.2]]))
-    assert labels.tolist() == [Label.GROUND, Label.PAVEMENT]
 
 
 @pytest.mark.parametrize("shape", [(3,), (4, 2), (2, 2, 3)])

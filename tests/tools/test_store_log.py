@@ -5,7 +5,7 @@ import pytest
 from support.checkpoint_folder import write_checkpoints
 from support.map_records import random_record
 from support.mapfile_edit import file_bytes, without_index
-from triquad_format.mapfile.mapfile import read_map_file
+from triquad_format.mapfile.reader import read_map_file
 from triquad_tools.commands.inspect import main
 from triquad_tools.commands.pack import main as pack
 

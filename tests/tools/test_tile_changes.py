@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from triquad_client import Mesh
 from triquad_tools.benchmarks.tile_changes import changed_tiles
-from triquad_tools.evaluation.meshfile import Mesh
 
 CELL_M = 0.1
 TOLERANCE_M = 0.01

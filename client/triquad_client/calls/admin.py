@@ -40,11 +40,11 @@ def settle(timeout_s: float) -> Call[ServerStatus]:
 
 def checkpoint() -> Call[CheckpointInfo]:
     """A checkpoint that is written now."""
-    return ask(Ask(keys.CHECKPOINT, CheckpointRequest(), CheckpointInfo, at_least_s=_SLOW_S))
+    return ask(Ask(keys.CHECKPOINT, CheckpointRequest(), CheckpointInfo, min_timeout_s=_SLOW_S))
 
 
 def reset(bounds: Bounds | None) -> Call[int]:
     """The first epoch without what was learnt in the bounds."""
     request = ResetRequest(*checks.box(bounds))
-    done = yield from ask(Ask(keys.RESET, request, ResetReply, at_least_s=_SLOW_S))
+    done = yield from ask(Ask(keys.RESET, request, ResetReply, min_timeout_s=_SLOW_S))
     return done.epoch

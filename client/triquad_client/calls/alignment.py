@@ -8,7 +8,7 @@ from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions
 from triquad_map.questions.thinning import thinned
 
 from triquad_client import checks
-from triquad_client.net.call import Ask, Call, ask, worked
+from triquad_client.net.call import Ask, Call, ask, offload
 from triquad_client.net.parts import NEWEST
 
 
@@ -22,22 +22,22 @@ def query(
     epoch = checks.chosen_epoch(at_epoch)
     cloud = checks.scan_points(points)
     # Here, not only where it is answered: a hundredth of a scan travels.
-    few = yield from worked(lambda _: thinned(cloud.astype(np.float64), FINE_POINTS))
+    few = yield from offload(lambda _: thinned(cloud.astype(np.float64), FINE_POINTS))
     request = AlignRequest(
-        few.astype(np.float32),
-        checks.rigid_pose(guess),
-        checks.positive("max_distance", options.max_distance_m),
-        options.max_iterations,
-        NEWEST if epoch is None else epoch,
+        points=few.astype(np.float32),
+        world_from_sensor=checks.rigid_pose(guess),
+        max_distance_m=checks.within("max_distance_m", options.max_distance_m),
+        max_iterations=options.max_iterations,
+        epoch=NEWEST if epoch is None else epoch,
     )
     reply = yield from ask(Ask(keys.ALIGN, request, AlignReply))
     return Alignment(
-        reply.world_from_sensor,
-        reply.covariance,
-        reply.inlier_share,
-        reply.rms_m,
-        reply.converged,
-        reply.iterations,
-        reply.points,
-        reply.epoch,
+        world_from_sensor=reply.world_from_sensor,
+        covariance=reply.covariance,
+        inlier_share=reply.inlier_share,
+        rms_m=reply.rms_m,
+        converged=reply.converged,
+        iterations=reply.iterations,
+        points=reply.points,
+        epoch=reply.epoch,
     )

@@ -1,33 +1,26 @@
 """Questions about the map, to be awaited."""
 
-from typing import Protocol
-
 from numpy.typing import ArrayLike
 from triquad_map.questions.align import Alignment, AlignOptions
 from triquad_map.questions.distance import DistanceOptions, Distances
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.polyline import Polyline
-from triquad_map.questions.rays import RayOptions, Rays
+from triquad_map.questions.rays import RayOptions, RayRanges
 from triquad_map.questions.segments import SegmentOptions, Segments
 from triquad_map.questions.spheres import Spheres
 from triquad_map.unknown import Unknown
 
 from triquad_client.calls import alignment, distance, grid, rays, sdf, segments, spheres
+from triquad_client.calls.queries import MapQueries
 from triquad_client.calls.sdf import SdfResult
 from triquad_client.checks import Bounds
-from triquad_client.net.call import Call, ResultT
+from triquad_client.documentation import documented_as
+from triquad_client.net.call import AsyncRun
 
 
-class AsyncRun(Protocol):
-    """Runs calls to their end, without holding up the event loop."""
-
-    async def __call__(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
-        ...
-
-
+@documented_as(MapQueries)
 class AsyncMapQueries:
-    """As :class:`MapQueries`, to be awaited."""
+    """Asks about the map: :class:`MapQueries` to be awaited."""
 
     def __init__(self, run: AsyncRun, epoch: int | None = None) -> None:
         """``run`` answers the calls; ``epoch`` is asked where a query names none."""
@@ -37,87 +30,75 @@ class AsyncMapQueries:
     async def query_sdf(
         self, points: ArrayLike, gradient: bool = False, at_epoch: int | None = None
     ) -> SdfResult:
-        """As :meth:`MapQueries.query_sdf`."""
         return await self._run(sdf.query(points, gradient, self._chosen(at_epoch)))
-
-    async def query_gradient(self, points: ArrayLike, at_epoch: int | None = None) -> SdfResult:
-        """As :meth:`MapQueries.query_gradient`."""
-        return await self.query_sdf(points, gradient=True, at_epoch=at_epoch)
 
     async def query_distance(
         self,
         points: ArrayLike,
-        max_distance: float = 5.0,
+        max_distance_m: float = 5.0,
         *,
         unknown: Unknown | str = Unknown.FREE,
         surface_point: bool = False,
         unknown_distance: bool = False,
         at_epoch: int | None = None,
     ) -> Distances:
-        """As :meth:`MapQueries.query_distance`."""
-        options = DistanceOptions(max_distance, surface_point, unknown_distance)
+        options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
         return await self._run(distance.query(points, options, unknown, self._chosen(at_epoch)))
 
     async def query_spheres(
-        self, centres: ArrayLike, radii: ArrayLike, at_epoch: int | None = None
+        self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Spheres:
-        """As :meth:`MapQueries.query_spheres`."""
-        return await self._run(spheres.query(centres, radii, self._chosen(at_epoch)))
+        return await self._run(spheres.query(centres, radii_m, self._chosen(at_epoch)))
 
     async def query_segments(
         self,
         starts: ArrayLike,
         ends: ArrayLike,
-        radius: float = 0.0,
-        max_distance: float = 5.0,
+        radius_m: float = 0.0,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Segments:
-        """As :meth:`MapQueries.query_segments`."""
-        options = SegmentOptions(radius, max_distance)
+        options = SegmentOptions(radius_m, max_distance_m)
         return await self._run(segments.query(starts, ends, options, self._chosen(at_epoch)))
 
     async def query_polyline(
         self,
         points: ArrayLike,
-        radius: float = 0.0,
-        max_distance: float = 5.0,
+        radius_m: float = 0.0,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Polyline:
-        """As :meth:`MapQueries.query_polyline`."""
-        options = SegmentOptions(radius, max_distance)
+        options = SegmentOptions(radius_m, max_distance_m)
         return await self._run(segments.query_polyline(points, options, self._chosen(at_epoch)))
 
     async def query_rays(
         self,
         origins: ArrayLike,
         directions: ArrayLike,
-        max_range: float = 50.0,
+        max_range_m: float = 50.0,
         through_unknown: bool = False,
         at_epoch: int | None = None,
-    ) -> Rays:
-        """As :meth:`MapQueries.query_rays`."""
-        options = RayOptions(max_range, through_unknown)
+    ) -> RayRanges:
+        options = RayOptions(max_range_m, through_unknown)
         return await self._run(rays.query(origins, directions, options, self._chosen(at_epoch)))
 
     async def query_grid(
         self,
         bounds: Bounds,
-        cell: float = 0.1,
-        max_distance: float = 5.0,
+        cell_m: float = 0.1,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Grid:
-        """As :meth:`MapQueries.query_grid`."""
-        return await self._run(grid.query(bounds, cell, max_distance, self._chosen(at_epoch)))
+        return await self._run(grid.query(bounds, cell_m, max_distance_m, self._chosen(at_epoch)))
 
     async def align(
         self,
         points: ArrayLike,
         world_from_sensor_guess: ArrayLike,
-        max_distance: float = 6.0,
+        max_distance_m: float = 6.0,
         at_epoch: int | None = None,
     ) -> Alignment:
-        """As :meth:`MapQueries.align`."""
-        options = AlignOptions(max_distance)
+        options = AlignOptions(max_distance_m)
         call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
         return await self._run(call)
 
@@ -126,7 +107,7 @@ class AsyncMapQueries:
 
 
 class AsyncPinnedMap(AsyncMapQueries):
-    """As :class:`PinnedMap`, to be awaited."""
+    """The map as it was in one epoch: :class:`PinnedMap` to be awaited."""
 
     def __init__(self, run: AsyncRun, epoch: int) -> None:
         """Use ``AsyncClient.pinned``."""

@@ -11,7 +11,7 @@ from triquad_map.unknown import Unknown
 
 from triquad_client import checks
 from triquad_client.net.call import Ask, Call
-from triquad_client.net.parts import in_parts, placed
+from triquad_client.net.parts import in_parts, relative
 
 PART_POINTS = 20_000
 """Points of one request: it takes the server some tens of milliseconds, and others wait as long."""
@@ -26,18 +26,18 @@ def query(
     """Distances at ``points`` [N, 3] of the map frame, metres."""
     checked = checks.query_points(points)
     policy = checks.unknown_policy(unknown)
-    reach_m = checks.positive("max_distance", options.max_distance_m)
+    reach_m = checks.within("max_distance_m", options.max_distance_m)
     with_unknown_space = options.unknown_distance or policy is not Unknown.FREE
 
     def request(part: slice, number: int) -> Ask[DistanceReply]:
-        place = placed(checked[part])
+        sent = relative(checked[part])
         message = DistanceRequest(
-            place.origin,
-            place.offsets,
-            reach_m,
-            options.surface_point,
-            with_unknown_space,
-            number,
+            origin=sent.origin,
+            points=sent.offsets,
+            max_distance_m=reach_m,
+            surface_point=options.surface_point,
+            unknown_distance=with_unknown_space,
+            epoch=number,
         )
         return Ask(keys.DISTANCE, message, DistanceReply)
 
@@ -48,7 +48,7 @@ def query(
 
 def _joined(parts: Sequence[DistanceReply], points: NDArray[np.float64]) -> Distances:
     origins = [
-        placed(points[start : start + PART_POINTS]).origin
+        relative(points[start : start + PART_POINTS]).origin
         for start in range(0, max(1, len(points)), PART_POINTS)
     ]
 
@@ -63,15 +63,15 @@ def _joined(parts: Sequence[DistanceReply], points: NDArray[np.float64]) -> Dist
         ]
         return np.concatenate(given) if given else None
 
-    unknown = [part.unknown_distance for part in parts if part.unknown_distance is not None]
+    unknown = [part.unknown_distance_m for part in parts if part.unknown_distance_m is not None]
     return Distances(
-        np.concatenate([part.distance for part in parts]),
-        np.concatenate([part.gradient for part in parts]),
-        np.concatenate([part.found for part in parts]).astype(np.bool_),
-        np.concatenate([part.status for part in parts]),
-        np.concatenate([part.confidence for part in parts]),
-        positions(lambda part: part.surface_point),
-        np.concatenate(unknown) if unknown else None,
-        positions(lambda part: part.unknown_point),
-        parts[0].epoch,
+        distance_m=np.concatenate([part.distance_m for part in parts]),
+        gradient=np.concatenate([part.gradient for part in parts]),
+        found=np.concatenate([part.found for part in parts]).astype(np.bool_),
+        status=np.concatenate([part.status for part in parts]),
+        confidence=np.concatenate([part.confidence for part in parts]),
+        surface_point=positions(lambda part: part.surface_point),
+        unknown_distance_m=np.concatenate(unknown) if unknown else None,
+        unknown_point=positions(lambda part: part.unknown_point),
+        epoch=parts[0].epoch,
     )

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.durable_file import replacing
-from triquad_format.mapfile.writer import write_map
-from triquad_format.mapfile.written_map import MapFileInfo
+from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MapInfo, MapInfoRequest
@@ -20,7 +19,7 @@ from triquad_client import checks
 from triquad_client.calls.remote_bytes import RemoteBytes
 from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError
-from triquad_client.net.call import Ask, Call, Run, ask, retried, worked
+from triquad_client.net.call import Ask, Call, Run, ask, offload, retried
 
 _PREPARE_S = 120.0
 """The server writes the file before it answers."""
@@ -35,18 +34,18 @@ def fetch(path: Path, training: bool) -> Call[MapInfo]:
         DownloadError: the bytes are not those the server announced.
     """
     # Newer map files may push this one out of the server: then the newest is taken.
-    return retried("chunk_gone", lambda: worked(lambda run: _fetch(run, path, training)))
+    return retried("chunk_gone", lambda: offload(lambda run: _fetch(run, path, training)))
 
 
 def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
     """Write what answers in the bounds; only its parts travel.
 
     Raises:
-        DownloadError: nothing of the map lies in the box, or its parts are not sound.
+        DownloadError: nothing of the map lies in the box, or its parts are not valid.
     """
-    minimum, maximum = checks.filled_box(bounds)
+    minimum, maximum = checks.finite_box(bounds)
     job = partial(_fetch_box, path=path, minimum=minimum, maximum=maximum)
-    return (yield from retried("chunk_gone", lambda: worked(job)))
+    return (yield from retried("chunk_gone", lambda: offload(job)))
 
 
 def _fetch(run: Run, path: Path, training: bool) -> MapInfo:
@@ -74,7 +73,7 @@ def _fetch_box(
 def newest_file(training: bool) -> Call[MapInfo]:
     """The file of the newest epoch, which the server keeps for a while."""
     request = MapInfoRequest(training)
-    return ask(Ask(keys.MAP_INFO, request, MapInfo, background=True, at_least_s=_PREPARE_S))
+    return ask(Ask(keys.MAP_INFO, request, MapInfo, background=True, min_timeout_s=_PREPARE_S))
 
 
 def _copy(remote: RemoteBytes, file: BinaryIO, sha256: str) -> None:

@@ -17,10 +17,10 @@ PART_CELLS = 20_000
 MAX_CELLS = 100_000_000
 
 
-def query(bounds: Bounds, cell: float, max_distance: float, at_epoch: int | None) -> Call[Grid]:
-    """The map at cells of side ``cell`` that fill ``bounds``; a flat box is one layer of cells."""
-    shape = _shape(bounds, checks.positive("cell", cell))
-    reach_m = checks.positive("max_distance", max_distance)
+def query(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | None) -> Call[Grid]:
+    """The map at the cells that fill ``bounds``; a flat box is one layer of them."""
+    shape = _shape(bounds, checks.within("cell_m", cell_m))
+    reach_m = checks.within("max_distance_m", max_distance_m)
     columns, *layer = shape.counts
     at_once = max(1, PART_CELLS // (layer[0] * layer[1]))
 
@@ -28,16 +28,18 @@ def query(bounds: Bounds, cell: float, max_distance: float, at_epoch: int | None
         corner = shape.corner + (part.start * shape.cell_m, 0.0, 0.0)
         count = min(part.stop, columns) - part.start
         counts = np.array([count, *layer], np.int32)
-        message = GridRequest(corner, shape.cell_m, counts, reach_m, number)
+        message = GridRequest(
+            corner=corner, cell_m=shape.cell_m, counts=counts, max_distance_m=reach_m, epoch=number
+        )
         return Ask(keys.GRID, message, GridReply)
 
     epoch = checks.chosen_epoch(at_epoch)
     parts = yield from in_parts(columns, at_once, request, epoch)
     return Grid(
-        shape,
-        np.concatenate([part.distance for part in parts]),
-        np.concatenate([part.status for part in parts]),
-        parts[0].epoch,
+        shape=shape,
+        distance_m=np.concatenate([part.distance_m for part in parts]),
+        status=np.concatenate([part.status for part in parts]),
+        epoch=parts[0].epoch,
     )
 
 

@@ -8,8 +8,8 @@ from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRe
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.welding import joined
-from triquad_client.net.call import Ask, Call, Run, ask, ask_each, retried, worked
+from triquad_client.mesh.welding import Triangles, joined
+from triquad_client.net.call import Ask, Call, Run, ask, ask_each, offload, retried
 
 
 def tiles(bounds: Bounds | None, level: int) -> Call[TileList]:
@@ -36,16 +36,17 @@ def _mesh(minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int
     tiles = yield from ask_each(indices, lambda index: _tile(index, listed.epoch, level))
 
     def join(_: Run) -> Mesh:
-        triangles = [(tile.origin + tile.vertices, tile.faces) for tile in tiles]
-        return Mesh(*joined(triangles, listed.tile_side_m, minimum, maximum), listed.epoch)
+        parts = [Triangles(tile.origin + tile.vertices, tile.faces) for tile in tiles]
+        whole = joined(parts, listed.tile_side_m, minimum, maximum)
+        return Mesh(whole.vertices, whole.faces, listed.epoch)
 
-    return (yield from worked(join))
+    return (yield from offload(join))
 
 
 def _tiles(
     minimum: NDArray[np.float64], maximum: NDArray[np.float64], level: int
 ) -> Call[TileList]:
-    request = TileListRequest(minimum, maximum, 0, level)
+    request = TileListRequest(minimum=minimum, maximum=maximum, epoch=0, level=level)
     return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
 
 

@@ -5,7 +5,7 @@ from triquad_map.questions.align import Alignment, AlignOptions
 from triquad_map.questions.distance import DistanceOptions, Distances
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.polyline import Polyline
-from triquad_map.questions.rays import RayOptions, Rays
+from triquad_map.questions.rays import RayOptions, RayRanges
 from triquad_map.questions.segments import SegmentOptions, Segments
 from triquad_map.questions.spheres import Spheres
 from triquad_map.unknown import Unknown
@@ -19,9 +19,10 @@ from triquad_client.net.call import Run
 class MapQueries:
     """Asks about the map: of its newest epoch, or always of the same one.
 
-    Positions are metres in the map frame. Questions of any size are answered from one epoch:
-    ``at_epoch`` is its number, ``None`` is the newest; once the server does not keep it any more,
-    :class:`RefusedError` ``epoch_gone`` is raised.
+    Positions are metres in the map frame. Questions of any size are answered from one epoch,
+    a published state of the map that never changes. ``at_epoch`` is its number, ``None`` is the
+    newest; once the server does not keep it any more, :class:`RefusedError` with the code
+    ``epoch_gone`` is raised.
     """
 
     def __init__(self, run: Run, epoch: int | None = None) -> None:
@@ -41,14 +42,10 @@ class MapQueries:
         """
         return self._run(sdf.query(points, gradient, self._chosen(at_epoch)))
 
-    def query_gradient(self, points: ArrayLike, at_epoch: int | None = None) -> SdfResult:
-        """As :meth:`query_sdf`, with the gradient."""
-        return self.query_sdf(points, gradient=True, at_epoch=at_epoch)
-
     def query_distance(
         self,
         points: ArrayLike,
-        max_distance: float = 5.0,
+        max_distance_m: float = 5.0,
         *,
         unknown: Unknown | str = Unknown.FREE,
         surface_point: bool = False,
@@ -59,7 +56,7 @@ class MapQueries:
 
         Args:
             points: metres, map frame.
-            max_distance: surfaces are looked for up to here, at most 100 m.
+            max_distance_m: surfaces are looked for up to here, at most 100 m.
             unknown: ``"obstacle"`` lets unknown space count as a surface, ``"error"`` refuses
                 points to which it is nearer.
             surface_point: whether the nearest points of the surface are wanted.
@@ -69,21 +66,21 @@ class MapQueries:
         Raises:
             UnknownSpaceError: ``unknown`` is ``"error"`` and unknown space is nearer somewhere.
         """
-        options = DistanceOptions(max_distance, surface_point, unknown_distance)
+        options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
         return self._run(distance.query(points, options, unknown, self._chosen(at_epoch)))
 
     def query_spheres(
-        self, centres: ArrayLike, radii: ArrayLike, at_epoch: int | None = None
+        self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Spheres:
-        """What spheres around ``centres`` [N, 3] hold; ``radii`` are one number or [N]."""
-        return self._run(spheres.query(centres, radii, self._chosen(at_epoch)))
+        """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one number or [N]."""
+        return self._run(spheres.query(centres, radii_m, self._chosen(at_epoch)))
 
     def query_segments(
         self,
         starts: ArrayLike,
         ends: ArrayLike,
-        radius: float = 0.0,
-        max_distance: float = 5.0,
+        radius_m: float = 0.0,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Segments:
         """What a ball meets that moves straight from each of ``starts`` to ``ends`` [N, 3].
@@ -91,66 +88,66 @@ class MapQueries:
         Args:
             starts: metres, map frame.
             ends: as many.
-            radius: of the ball.
-            max_distance: clearance is looked for up to here, at most 100 m.
+            radius_m: of the ball.
+            max_distance_m: clearance is looked for up to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
-        options = SegmentOptions(radius, max_distance)
+        options = SegmentOptions(radius_m, max_distance_m)
         return self._run(segments.query(starts, ends, options, self._chosen(at_epoch)))
 
     def query_polyline(
         self,
         points: ArrayLike,
-        radius: float = 0.0,
-        max_distance: float = 5.0,
+        radius_m: float = 0.0,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Polyline:
         """What a ball meets that moves along ``points`` [N, 3], as :meth:`query_segments`."""
-        options = SegmentOptions(radius, max_distance)
+        options = SegmentOptions(radius_m, max_distance_m)
         return self._run(segments.query_polyline(points, options, self._chosen(at_epoch)))
 
     def query_rays(
         self,
         origins: ArrayLike,
         directions: ArrayLike,
-        max_range: float = 50.0,
+        max_range_m: float = 50.0,
         through_unknown: bool = False,
         at_epoch: int | None = None,
-    ) -> Rays:
+    ) -> RayRanges:
         """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3].
 
         Args:
             origins: metres, map frame.
             directions: of any length but 0.
-            max_range: at most 1,000 m.
+            max_range_m: at most 1,000 m.
             through_unknown: let unknown space not stop them.
             at_epoch: see :class:`MapQueries`.
         """
-        options = RayOptions(max_range, through_unknown)
+        options = RayOptions(max_range_m, through_unknown)
         return self._run(rays.query(origins, directions, options, self._chosen(at_epoch)))
 
     def query_grid(
         self,
         bounds: Bounds,
-        cell: float = 0.1,
-        max_distance: float = 5.0,
+        cell_m: float = 0.1,
+        max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Grid:
-        """Distance and status at the cells of side ``cell`` that fill ``bounds``.
+        """Distance and status at the cubic cells that fill ``bounds``.
 
         Args:
             bounds: corners of a box; where both have the same z, the grid is a slice there.
-            cell: metres.
-            max_distance: surfaces are looked for up to here, at most 100 m.
+            cell_m: side of a cell.
+            max_distance_m: surfaces are looked for up to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
-        return self._run(grid.query(bounds, cell, max_distance, self._chosen(at_epoch)))
+        return self._run(grid.query(bounds, cell_m, max_distance_m, self._chosen(at_epoch)))
 
     def align(
         self,
         points: ArrayLike,
         world_from_sensor_guess: ArrayLike,
-        max_distance: float = 6.0,
+        max_distance_m: float = 6.0,
         at_epoch: int | None = None,
     ) -> Alignment:
         """Where a scan was taken: its points are moved until they lie on surfaces of the map.
@@ -158,10 +155,10 @@ class MapQueries:
         Args:
             points: [N, 3] metres, sensor frame; any number, of which some 2,000 are used.
             world_from_sensor_guess: [4, 4]; off by a metre and ten degrees or so at most.
-            max_distance: points farther than this from any surface do not count.
+            max_distance_m: points farther than this from any surface do not count.
             at_epoch: see :class:`MapQueries`.
         """
-        options = AlignOptions(max_distance)
+        options = AlignOptions(max_distance_m)
         call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
         return self._run(call)
 

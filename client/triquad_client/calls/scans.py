@@ -53,7 +53,7 @@ class ScanPublisher:
         self,
         points: ArrayLike,
         world_from_sensor: ArrayLike,
-        stamp: float | None,
+        stamp_s: float | None,
         source: str,
     ) -> None:
         """Send a scan; arguments as in ``Client.publish_scan``."""
@@ -63,18 +63,25 @@ class ScanPublisher:
             raise InvalidScanError(str(error)) from error
         pose = checks.rigid_pose(world_from_sensor)
         cloud = np.ascontiguousarray(checks.scan_points(points))
-        stamp_ns = time.time_ns() if stamp is None else checks.stamp_ns(stamp)
+        stamp_ns = time.time_ns() if stamp_s is None else checks.stamp_ns(stamp_s)
         # Held while sending: the server takes a scan that is overtaken by its successor for lost.
         with self._sending:
             state = self._source(source)
-            if stamp_ns < state.stamp_ns and stamp is None:
+            if stamp_ns < state.stamp_ns and stamp_s is None:
                 stamp_ns = state.stamp_ns  # the system's clock was set back
             if stamp_ns < state.stamp_ns:
                 raise InvalidScanError(
-                    f"stamp = {stamp!r} lies before {state.stamp_ns / 1e9!r}, that of an earlier "
-                    f"scan of source {source!r}; publish in order",
+                    f"stamp_s = {stamp_s!r} lies before {state.stamp_ns / 1e9!r}, that of an "
+                    f"earlier scan of source {source!r}; publish in order",
                 )
-            scan = Scan(cloud, pose, stamp_ns, source, self._session, state.next_sequence)
+            scan = Scan(
+                points=cloud,
+                world_from_sensor=pose,
+                stamp_ns=stamp_ns,
+                source=source,
+                session=self._session,
+                sequence=state.next_sequence,
+            )
             self._connection.put(key, scan)
             state.next_sequence += 1
             state.stamp_ns = stamp_ns
@@ -82,16 +89,16 @@ class ScanPublisher:
     def flush(self, timeout_s: float, pending: int) -> Call[FlushReport]:
         """Wait for the server; arguments as in ``Client.flush``."""
         if timeout_s < 0 or pending < 0:
-            raise InvalidInputError(f"timeout = {timeout_s!r}, pending = {pending!r}: negative")
+            raise InvalidInputError(f"timeout_s = {timeout_s!r}, pending = {pending!r}: negative")
         requests = list(self._requests(timeout_s, pending))
         # All at once: each waits for its source, and they share the time.
         replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
         refusals = [reply.last_refusal for reply in replies if reply.last_refusal is not None]
         return FlushReport(
-            sum(reply.taken for reply in replies),
-            sum(reply.refused for reply in replies),
-            sum(reply.lost for reply in replies),
-            refusals[-1] if refusals else None,
+            taken=sum(reply.taken for reply in replies),
+            refused=sum(reply.refused for reply in replies),
+            lost=sum(reply.lost for reply in replies),
+            last_refusal=refusals[-1] if refusals else None,
         )
 
     def _source(self, name: str) -> _Source:
@@ -105,9 +112,14 @@ class ScanPublisher:
         for source, sequence in last.items():
             target = sequence - pending // len(last)
             if target >= 0:
-                yield FlushRequest(source, self._session, target, float(timeout_s))
+                yield FlushRequest(
+                    source=source,
+                    session=self._session,
+                    sequence=target,
+                    timeout_s=float(timeout_s),
+                )
 
 
 def _ask_flush(request: FlushRequest) -> Ask[FlushReply]:
     wait_s = request.timeout_s + _REPLY_MARGIN_S
-    return Ask(keys.FLUSH, request, FlushReply, at_least_s=wait_s)
+    return Ask(keys.FLUSH, request, FlushReply, min_timeout_s=wait_s)

@@ -9,8 +9,8 @@ from triquad_format.wire import keys
 from triquad_format.wire.messages import SdfReply, SdfRequest
 
 from triquad_client import checks
-from triquad_client.net.call import Ask, Call, ask, retried, worked
-from triquad_client.net.parts import NEWEST, in_parts, placed
+from triquad_client.net.call import Ask, Call, ask, offload, retried
+from triquad_client.net.parts import NEWEST, in_parts, relative
 
 PART_POINTS = 100_000
 """Points of one request; a message of this size takes some milliseconds."""
@@ -29,7 +29,7 @@ class SdfResult:
 def query(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResult]:
     """Distances at ``points`` [N, 3] of the map frame, metres; ``None`` is the newest epoch."""
     if isinstance(points, np.ndarray) and points.size > 3 * PART_POINTS:
-        checked = yield from worked(lambda _: checks.query_points(points))
+        checked = yield from offload(lambda _: checks.query_points(points))
     else:
         checked = checks.query_points(points)
     epoch = checks.chosen_epoch(at_epoch)
@@ -38,7 +38,7 @@ def query(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfRe
         return _ask(checked[part], gradient, number)
 
     parts = yield from in_parts(len(checked), PART_POINTS, request, epoch)
-    return _joined(parts) if len(parts) == 1 else (yield from worked(lambda _: _joined(parts)))
+    return _joined(parts) if len(parts) == 1 else (yield from offload(lambda _: _joined(parts)))
 
 
 def pin_newest() -> Call[int]:
@@ -53,16 +53,16 @@ def pin_newest() -> Call[int]:
 
 
 def _ask(points: NDArray[np.float64], gradient: bool, epoch: int) -> Ask[SdfReply]:
-    place = placed(points)
-    request = SdfRequest(place.origin, place.offsets, gradient, epoch)
+    sent = relative(points)
+    request = SdfRequest(origin=sent.origin, points=sent.offsets, gradient=gradient, epoch=epoch)
     return Ask(keys.SDF, request, SdfReply)
 
 
 def _joined(parts: Sequence[SdfReply]) -> SdfResult:
     gradients = [part.gradient for part in parts if part.gradient is not None]
     return SdfResult(
-        np.concatenate([part.sdf for part in parts]),
-        np.concatenate([part.status for part in parts]),
-        np.concatenate(gradients) if gradients else None,
-        parts[0].epoch,
+        sdf=np.concatenate([part.sdf for part in parts]),
+        status=np.concatenate([part.status for part in parts]),
+        gradient=np.concatenate(gradients) if gradients else None,
+        epoch=parts[0].epoch,
     )

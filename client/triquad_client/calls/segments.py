@@ -10,7 +10,7 @@ from triquad_map.questions.segments import SegmentOptions, Segments
 from triquad_client import checks
 from triquad_client.errors import InvalidInputError
 from triquad_client.net.call import Ask, Call
-from triquad_client.net.parts import in_parts, placed
+from triquad_client.net.parts import in_parts, relative
 
 PART_SEGMENTS = 2_000
 """Segments of one request."""
@@ -42,24 +42,31 @@ def _query(
     options: SegmentOptions,
     at_epoch: int | None,
 ) -> Call[Segments]:
-    radius_m = checks.not_negative("radius", options.radius_m)
-    reach_m = checks.positive("max_distance", options.max_distance_m)
+    radius_m = checks.within("radius_m", options.radius_m, least=0.0)
+    reach_m = checks.within("max_distance_m", options.max_distance_m)
 
     def request(part: slice, number: int) -> Ask[SegmentsReply]:
-        place = placed(starts[part])
-        offsets = (ends[part] - place.origin).astype(np.float32)
-        message = SegmentsRequest(place.origin, place.offsets, offsets, radius_m, reach_m, number)
+        sent = relative(starts[part])
+        offsets = (ends[part] - sent.origin).astype(np.float32)
+        message = SegmentsRequest(
+            origin=sent.origin,
+            starts=sent.offsets,
+            ends=offsets,
+            radius_m=radius_m,
+            max_distance_m=reach_m,
+            epoch=number,
+        )
         return Ask(keys.SEGMENTS, message, SegmentsReply)
 
     epoch = checks.chosen_epoch(at_epoch)
     parts = yield from in_parts(len(starts), PART_SEGMENTS, request, epoch)
     return Segments(
-        np.concatenate([part.length for part in parts]),
-        np.concatenate([part.blocked for part in parts]).astype(np.bool_),
-        np.concatenate([part.contact for part in parts]),
-        np.concatenate([part.clearance for part in parts]),
-        np.concatenate([part.clearance_at for part in parts]),
-        np.concatenate([part.meets_unknown for part in parts]).astype(np.bool_),
-        np.concatenate([part.unknown_contact for part in parts]),
-        parts[0].epoch,
+        length_m=np.concatenate([part.length_m for part in parts]),
+        blocked=np.concatenate([part.blocked for part in parts]).astype(np.bool_),
+        contact_m=np.concatenate([part.contact_m for part in parts]),
+        clearance_m=np.concatenate([part.clearance_m for part in parts]),
+        clearance_at_m=np.concatenate([part.clearance_at_m for part in parts]),
+        meets_unknown=np.concatenate([part.meets_unknown for part in parts]).astype(np.bool_),
+        unknown_contact_m=np.concatenate([part.unknown_contact_m for part in parts]),
+        epoch=parts[0].epoch,
     )

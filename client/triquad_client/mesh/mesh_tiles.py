@@ -1,4 +1,4 @@
-"""Mesh tiles as a client holds them."""
+"""Mesh tiles as a client keeps them."""
 
 import hashlib
 import math
@@ -23,15 +23,17 @@ class MeshTile:
     index: TileIndex
     version: int  # epoch of which it is
     digest: str  # SHA-256 of the bytes as they came, 64 hexadecimal digits
-    size: int  # bytes as they came
+    size_bytes: int  # as they came
     origin: NDArray[np.float64]  # [3] metres, map frame: the minimum corner
     vertices: NDArray[np.float32]  # [V, 3] metres, relative to the origin
     faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
 
 
 @dataclass(frozen=True)
-class HeldTiles:
-    """Tiles to go on with: :meth:`MeshWatch.held` gives them, :meth:`Client.watch_mesh` takes them.
+class KnownTiles:
+    """Tiles for a later watch to go on with.
+
+    :meth:`MeshWatch.known_tiles` gives them, :meth:`Client.watch_mesh` takes them.
 
     They are of one level of one server process. Where that was restarted they are fetched anew.
     """
@@ -46,7 +48,7 @@ def unpacked(updates: TileUpdates) -> list[MeshTile]:
     """The tiles of a reply.
 
     Raises:
-        BadReplyError: they are not sound.
+        BadReplyError: they are not valid.
     """
     if not (math.isfinite(updates.tile_side_m) and updates.tile_side_m > 0):
         raise BadReplyError(f"tiles of side {updates.tile_side_m}")
@@ -65,13 +67,13 @@ def unpacked(updates: TileUpdates) -> list[MeshTile]:
             raise BadReplyError(f"tile {(x, y, z)}: {error}") from error
         tiles.append(
             MeshTile(
-                (x, y, z),
-                int(updates.versions[row]),
-                hashlib.sha256(data).hexdigest(),
-                len(data),
-                np.array((x, y, z)) * updates.tile_side_m,
-                surface.positions(updates.cell_m),
-                surface.faces,
+                index=(x, y, z),
+                version=int(updates.versions[row]),
+                digest=hashlib.sha256(data).hexdigest(),
+                size_bytes=len(data),
+                origin=np.array((x, y, z)) * updates.tile_side_m,
+                vertices=surface.positions(updates.cell_m),
+                faces=surface.faces,
             )
         )
     return tiles

@@ -1,109 +1,23 @@
-"""Following the mesh of a box: only what changed travels."""
+"""Following the mesh of a box, in the thread that asks."""
 
-import asyncio
-import math
-import threading
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
-from types import MappingProxyType, TracebackType
-from typing import Any
 
 import zenoh
-from triquad_format.wire import keys
-from triquad_format.wire.messages import TileUpdates
-from triquad_map.errors import TriquadError
+from triquad_format.errors import TriquadError
 
-from triquad_client.calls.async_queries import AsyncRun
-from triquad_client.errors import ClosedError, RequestTimeoutError
 from triquad_client.mesh.followed_mesh import FollowedMesh, MeshUpdate
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_tiles import HeldTiles, MeshTile, TileIndex, unpacked
-from triquad_client.net.blocking import BlockingDriver
-from triquad_client.net.call import Ask, Call, ResultT, ask, worked
+from triquad_client.mesh.watched_mesh import WatchClosedError, WatchedMesh
+from triquad_client.net.call import Call, ResultT
 from triquad_client.net.connection import Connection
-
-_LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
-
-
-class _WatchClosedError(ClosedError):
-    """The watch was closed, before the call or meanwhile."""
-
-    def __init__(self) -> None:
-        super().__init__("the watch is closed")
+from triquad_client.net.remote_driver import RemoteDriver
 
 
-class _Watch:
-    """What a watch holds, and the calls that change it; no matter who waits for the replies."""
-
-    def __init__(self, followed: FollowedMesh) -> None:
-        self._followed = followed
-        self._changing = threading.Lock()
-
-    @property
-    def tiles(self) -> Mapping[TileIndex, MeshTile]:
-        """The tiles as of the last update, by their indices; later updates do not change it."""
-        return MappingProxyType(self._followed.tiles)
-
-    @property
-    def complete(self) -> bool:
-        """Whether the last reply left nothing waiting."""
-        return self._followed.complete
-
-    @property
-    def level(self) -> int:
-        """Level of detail."""
-        return self._followed.level
-
-    def held(self) -> HeldTiles:
-        """The tiles, for a later watch to go on with."""
-        return self._followed.held()
-
-    def _next(self, timeout: float | None) -> Call[MeshUpdate | None]:
-        ends = math.inf if timeout is None else time.monotonic() + timeout
-        while True:
-            left_s = max(0.0, ends - time.monotonic())
-            update = yield from self._update(min(left_s, _LONGEST_WAIT_S))
-            if update.changed or update.removed:
-                return update
-            if time.monotonic() >= ends:
-                return None
-
-    def _catch_up(self, timeout: float) -> Call[None]:
-        ends = time.monotonic() + timeout
-        wait_s = 0.0
-        while not (update := (yield from self._update(wait_s))).complete:
-            if time.monotonic() > ends:
-                raise RequestTimeoutError(f"the mesh is not complete after {timeout:g} s")
-            # Nothing came although there is something: the bandwidth is used up for a while.
-            wait_s = 0.0 if update.changed else 1.0
-
-    def _update(self, wait_s: float) -> Call[MeshUpdate]:
-        """What one reply changed: nothing where that of another call came first."""
-        before = self._followed
-        request = Ask(
-            keys.TILE_UPDATES,
-            before.request(wait_s),
-            TileUpdates,
-            background=True,
-            held_s=wait_s,
-        )
-        reply = yield from ask(request)
-        tiles = yield from worked(lambda _: unpacked(reply))
-        changed = {tile.index: tile for tile in tiles}
-        after = before.after(reply, changed)
-        with self._changing:
-            if self._followed is not before:  # by what is known now, the reply may be old
-                return MeshUpdate((), (), self._followed.epoch, self._followed.complete, 0)
-            self._followed = after
-        removed = tuple(sorted(before.tiles.keys() - after.tiles.keys()))
-        return MeshUpdate(tuple(changed), removed, after.epoch, after.complete, len(reply.data))
-
-
-class MeshWatch(_Watch):
+class MeshWatch(WatchedMesh):
     """The mesh tiles of a box, kept up to date by :meth:`next`; nothing is asked in between.
 
-    Use it in a ``with`` statement, or :meth:`close` it. Where a method raises, what is held stays,
+    Use it in a ``with`` statement, or :meth:`close` it. Where a method raises, the tiles stay,
     and it may be called again: after the server was restarted, all tiles are fetched anew, and the
     old ones stay until then. Several threads may use it: each change is told to one of them.
     """
@@ -113,28 +27,23 @@ class MeshWatch(_Watch):
         super().__init__(followed)
         self._closed = False
         self._cancellation = zenoh.CancellationToken()
-        self._driver = BlockingDriver(connection, self._cancellation)
+        self._driver = RemoteDriver(connection, self._cancellation)
 
     def __enter__(self) -> "MeshWatch":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __iter__(self) -> Iterator[MeshUpdate]:
         """Updates as they come, until the watch is closed."""
         return iter(self.next, None)
 
-    def next(self, timeout: float | None = None) -> MeshUpdate | None:
+    def next(self, timeout_s: float | None = None) -> MeshUpdate | None:
         """Wait for the next change.
 
         Args:
-            timeout: seconds; ``None``: for ever.
+            timeout_s: how long; ``None``: for ever.
 
         Returns:
             What changed; ``None`` where nothing did in that time, or the watch was closed.
@@ -143,21 +52,18 @@ class MeshWatch(_Watch):
             RefusedError: the server refused.
             RequestTimeoutError: it does not answer.
         """
-        with suppress(_WatchClosedError):
-            return self._run(self._next(timeout))
+        with suppress(WatchClosedError):
+            return self._run(self._next(timeout_s))
         return None
 
-    def catch_up(self, timeout: float = 60.0) -> None:
+    def catch_up(self, timeout_s: float = 60.0) -> None:
         """Fetch all that changed until now.
-
-        Args:
-            timeout: seconds.
 
         Raises:
             RequestTimeoutError: that was not all of it.
             ClosedError: the watch was closed.
         """
-        self._run(self._catch_up(timeout))
+        self._run(self._catch_up(timeout_s))
 
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""
@@ -173,73 +79,5 @@ class MeshWatch(_Watch):
             return self._driver.run(call)
         except TriquadError as error:
             if self._closed:
-                raise _WatchClosedError from error
+                raise WatchClosedError from error
             raise
-
-
-class AsyncMeshWatch(_Watch):
-    """As :class:`MeshWatch`, to be awaited: ``async with``, ``async for``.
-
-    Where the client is closed, what is awaited raises :class:`ClosedError`. Several tasks may use
-    it: each change is told to one of them. A task that is cancelled may take a change with it,
-    which then is in :attr:`tiles` without having been told; a ``timeout`` does not.
-    """
-
-    def __init__(self, run: AsyncRun, followed: FollowedMesh) -> None:
-        """Use :meth:`AsyncClient.watch_mesh`."""
-        super().__init__(followed)
-        self._drive = run
-        self._closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-
-    async def __aenter__(self) -> "AsyncMeshWatch":
-        return self
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        await self.close()
-
-    def __aiter__(self) -> "AsyncMeshWatch":
-        """Updates as they come, until the watch is closed."""
-        return self
-
-    async def __anext__(self) -> MeshUpdate:
-        update = await self.next()
-        if update is None:
-            raise StopAsyncIteration
-        return update
-
-    async def next(self, timeout: float | None = None) -> MeshUpdate | None:
-        """As :meth:`MeshWatch.next`."""
-        with suppress(_WatchClosedError):
-            return await self._run(self._next(timeout))
-        return None
-
-    async def catch_up(self, timeout: float = 60.0) -> None:
-        """As :meth:`MeshWatch.catch_up`."""
-        await self._run(self._catch_up(timeout))
-
-    async def mesh(self) -> Mesh:
-        """As :meth:`MeshWatch.mesh`; the tiles are joined in a thread."""
-        followed = self._followed
-        return await self._drive(worked(lambda _: followed.mesh()))
-
-    async def close(self) -> None:
-        """As :meth:`MeshWatch.close`, in other tasks."""
-        if not self._closed.done():
-            self._closed.set_result(None)
-
-    async def _run(self, call: Call[ResultT]) -> ResultT:
-        asking = asyncio.ensure_future(self._drive(call))
-        either: set[asyncio.Future[Any]] = {asking, self._closed}
-        try:
-            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-            if asking.done():
-                return asking.result()
-            raise _WatchClosedError
-        finally:
-            asking.cancel()
-            await asyncio.wait({asking})  # until its requests are cancelled

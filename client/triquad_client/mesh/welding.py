@@ -1,6 +1,7 @@
 """Joining the meshes of tiles: vertices on common faces become one."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,11 @@ _SHIFTS = np.array([(0.5, 0.5, 0.5), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0)
 along it only: a second round, shifted along that axis, brings them together."""
 
 
-Triangles = tuple[NDArray[np.float64], NDArray[np.int32]]
-"""Vertices [V, 3] in the map frame, metres, and faces [F, 3]."""
+class Triangles(NamedTuple):
+    """A surface in the map frame."""
+
+    vertices: NDArray[np.float64]  # [V, 3] metres
+    faces: NDArray[np.int32]  # [F, 3]
 
 
 def joined(
@@ -49,7 +53,7 @@ def welded(
         tile_side_m: side of the tiles; only vertices on their faces are looked at.
 
     Returns:
-        Vertices [W, 3] and faces [G, 3], without faces that welding made degenerate.
+        The mesh without faces that welding made degenerate.
     """
     steps = vertices / tile_side_m
     border = (np.abs(steps - np.round(steps)) < WELD_M / tile_side_m).any(axis=1)
@@ -69,7 +73,7 @@ def compacted(
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     number = np.cumsum(used) - 1
-    return vertices[used], number[faces].astype(np.int32).reshape(-1, 3)
+    return Triangles(vertices[used], number[faces].astype(np.int32).reshape(-1, 3))
 
 
 def _representatives(points: NDArray[np.float64]) -> NDArray[np.intp]:

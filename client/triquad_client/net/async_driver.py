@@ -6,19 +6,20 @@ for where a program ends without closing its client.
 """
 
 import asyncio
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
 import zenoh
 
-from triquad_client.net.blocking import BlockingDriver
-from triquad_client.net.call import Ask, Batch, Call, Pause, ResultT, Run, Step
+from triquad_client.net.call import Ask, Batch, Run
 from triquad_client.net.connection import Connection, Receiver, closed_error, map_names
+from triquad_client.net.driver import Driver, exchange
+from triquad_client.net.remote_driver import RemoteDriver
 
 REQUESTS_IN_FLIGHT = 32
 """Requests of one operation, over all calls, that wait for their replies at the same time. Servers
@@ -30,7 +31,7 @@ _WORKERS = 32
 DoneT = TypeVar("DoneT")
 
 
-class AsyncDriver:
+class AsyncDriver(Driver):
     """Runs calls over a connection; for one event loop."""
 
     def __init__(self, connection: Connection, sender: ThreadPoolExecutor) -> None:
@@ -38,28 +39,13 @@ class AsyncDriver:
         self._connection = connection
         self._sender = sender
         self._workers = ThreadPoolExecutor(_WORKERS, "triquad-worker")
-        self._turns: defaultdict[str, asyncio.Semaphore] = defaultdict(
+        self._slots: defaultdict[str, asyncio.Semaphore] = defaultdict(
             lambda: asyncio.Semaphore(REQUESTS_IN_FLIGHT)
         )
 
-    async def run(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
-        with closing(call):
-            resume = partial(call.send, None)
-            while True:
-                try:
-                    step = resume()
-                except StopIteration as end:
-                    result: ResultT = end.value
-                    return result
-                try:
-                    resume = partial(call.send, await self._take(step))
-                except Exception as error:
-                    resume = partial(call.throw, error)
-
     async def in_order(self, job: Callable[[], DoneT]) -> DoneT:
         """What ``job`` returns, run in the sending thread after all that was sent before."""
-        return await _awaited(self._sender, job)
+        return await _in_thread(self._sender, job)
 
     async def maps(self) -> list[str]:
         """Names of the maps of all servers that can be reached."""
@@ -81,30 +67,18 @@ class AsyncDriver:
             self._sender.shutdown(wait=False)
             self._workers.shutdown(wait=False)
 
-    async def _take(self, step: Step) -> Any:
-        if isinstance(step, Batch):
-            return await self._replies(step)
-        if isinstance(step, Pause):
-            return await asyncio.sleep(step.seconds)
-        return await self._work(step.job)
-
     async def _replies(self, batch: Batch) -> list[Any]:
-        waiting: deque[_Pending] = deque()
-        replies = []
         with _cancelled_on_error() as cancellation:
-            for item in batch.items:
-                waiting.append(await self._send(batch.request(item), cancellation))
-                if len(waiting) >= batch.at_once:
-                    replies.append(await self._result(waiting.popleft()))
-            while waiting:
-                replies.append(await self._result(waiting.popleft()))
-        return replies
+            return await exchange(batch, partial(self._send, cancellation), self._receive)
 
-    async def _send(self, ask: Ask[Any], cancellation: zenoh.CancellationToken) -> "_Pending":
-        turn = self._turns[ask.operation]
-        await turn.acquire()
+    async def _pause(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
+    async def _send(self, cancellation: zenoh.CancellationToken, ask: Ask[Any]) -> "_Pending":
+        slot = self._slots[ask.operation]
+        await slot.acquire()
         arrival = _Arrival.expected()
-        arrival.replies.add_done_callback(lambda _: turn.release())
+        arrival.replies.add_done_callback(lambda _: slot.release())
         try:
             await self.in_order(lambda: self._connection.send(ask, arrival.receiver, cancellation))
         except BaseException:
@@ -112,18 +86,18 @@ class AsyncDriver:
             raise
         return _Pending(ask, arrival)
 
-    async def _result(self, pending: "_Pending") -> Any:
+    async def _receive(self, pending: "_Pending") -> Any:
         for reply in await pending.arrival.replies:
             return self._connection.read(pending.ask, reply)
         if self._connection.closed:
             raise closed_error()
-        raise self._connection.silence(pending.ask, await self.maps())
+        raise self._connection.no_reply_error(pending.ask, await self.maps())
 
     async def _work(self, job: Callable[[Run], Any]) -> Any:
         """What a job returns; where the task is cancelled, so are the requests of the job."""
         with _cancelled_on_error() as cancellation:
-            run = BlockingDriver(self._connection, cancellation).run
-            working = asyncio.ensure_future(_awaited(self._workers, lambda: job(run)))
+            run = RemoteDriver(self._connection, cancellation).run
+            working = asyncio.ensure_future(_in_thread(self._workers, lambda: job(run)))
             try:
                 return await asyncio.shield(working)
             except asyncio.CancelledError:
@@ -165,7 +139,7 @@ class _Pending:
     arrival: _Arrival
 
 
-async def _awaited(threads: ThreadPoolExecutor, job: Callable[[], DoneT]) -> DoneT:
+async def _in_thread(threads: ThreadPoolExecutor, job: Callable[[], DoneT]) -> DoneT:
     try:
         done = threads.submit(job)
     except RuntimeError as error:  # they were shut down

@@ -1,19 +1,16 @@
 """Calls: what a client asks a server and makes of the replies, without the waiting.
 
 A call is a generator. It yields steps, is sent what became of each, and returns the result. Who
-runs it decides how to wait: ``blocking.py`` holds up the thread, ``async_driver.py`` a task. To add
-a call, write its generator with the helpers below, and a line in ``Client`` and ``AsyncClient``.
+runs it decides how to wait (:mod:`triquad_client.net.driver`). To add a call, write its generator
+with the helpers below, and a line in ``Client`` and ``AsyncClient``.
 """
 
 from collections.abc import Callable, Generator, Iterable
-from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
+from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
-
-from triquad_client.errors import RefusedError
 
 PARTS_IN_FLIGHT = 4
 """Requests of one call that wait for their replies at the same time."""
@@ -37,8 +34,8 @@ class Ask(Generic[ReplyT]):
     message: Message
     kind: type[ReplyT]  # of the reply
     background: bool = False
-    at_least_s: float = 0.0  # waits that long for the reply, where the connection would not
-    held_s: float = 0.0  # and so much longer, as the server is asked to hold it for that time
+    min_timeout_s: float = 0.0  # waits that long for the reply, where the connection would not
+    server_wait_s: float = 0.0  # and so much longer: the server may answer as late as that
 
 
 @dataclass(frozen=True)
@@ -72,27 +69,19 @@ Call: TypeAlias = Generator[Step, Any, ResultT]
 
 
 class Run(Protocol):
-    """Runs calls to their end."""
+    """Runs calls to their end, in the thread that makes them."""
 
     def __call__(self, call: Call[ResultT]) -> ResultT:
         """What the call returns; raises what it raises."""
         ...
 
 
-def finished(call: Call[ResultT], take: Callable[[Step], Any]) -> ResultT:
-    """What a call returns whose steps ``take`` deals with, in the thread that makes it."""
-    with closing(call):
-        resume = partial(call.send, None)
-        while True:
-            try:
-                step = resume()
-            except StopIteration as end:
-                result: ResultT = end.value
-                return result
-            try:
-                resume = partial(call.send, take(step))
-            except Exception as error:
-                resume = partial(call.throw, error)
+class AsyncRun(Protocol):
+    """Runs calls to their end, without holding up the event loop."""
+
+    async def __call__(self, call: Call[ResultT]) -> ResultT:
+        """What the call returns; raises what it raises."""
+        ...
 
 
 def ask(request: Ask[ReplyT]) -> Call[ReplyT]:
@@ -111,7 +100,7 @@ def ask_each(
     return replies
 
 
-def worked(job: Callable[[Run], ResultT]) -> Call[ResultT]:
+def offload(job: Callable[[Run], ResultT]) -> Call[ResultT]:
     """What ``job`` returns: long computing, or files."""
     result: ResultT = yield Work(job)
     return result

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import zenoh
-from triquad_format.errors import FormatError, WireError
+from triquad_format.errors import FormatError, RefusedError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
@@ -17,7 +17,6 @@ from triquad_client.errors import (
     ConnectError,
     InvalidInputError,
     NoReplyError,
-    RefusedError,
     RequestTimeoutError,
     UnknownMapError,
 )
@@ -90,7 +89,7 @@ class Connection:
             raise BadReplyError(f"reply on {self._key(ask)}: {error}") from error
         raise RefusedError(reason.code, reason.message)
 
-    def silence(self, ask: Ask[Any], available: list[str]) -> Exception:
+    def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
         if not self._linked:
             return ConnectError(
@@ -144,7 +143,7 @@ class Connection:
         return keys.operation_key(self.map_name, ask.operation)
 
     def _timeout_s(self, ask: Ask[Any]) -> float:
-        return max(self.timeout_s, ask.at_least_s) + ask.held_s
+        return max(self.timeout_s, ask.min_timeout_s) + ask.server_wait_s
 
     def _broken(self, error: Exception) -> Exception:
         if self.closed:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import FormatError, MapFileError
+from triquad_format.mapfile.parts.body import repack_part
 from triquad_format.mapfile.parts.part import PartKey
-from triquad_format.mapfile.parts.part_body import repack_part
-from triquad_format.mapfile.parts.unpack import assemble
+from triquad_format.mapfile.reader import assemble
 from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
@@ -23,9 +23,8 @@ from triquad_client.calls.download import newest_file
 from triquad_client.calls.remote_bytes import RemoteBytes
 from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError
-from triquad_client.net.call import Call, ResultT, Run, retried, worked
-from triquad_client.net.local_driver import LocalDriver
-from triquad_client.offline.view import view_of
+from triquad_client.net.call import Call, ResultT, Run, offload, retried
+from triquad_client.offline.local_driver import LocalDriver
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class _State:
 
 
 class LocalCopy:
-    """The copy; for several threads. It is empty until :meth:`update` has run."""
+    """The copy; for several threads. It is empty until :meth:`_update` has run."""
 
     def __init__(self, path: Path, bounds: Bounds) -> None:
         """``path`` is the file, ``bounds`` are the corners of the box.
@@ -64,64 +63,82 @@ class LocalCopy:
             InvalidInputError: the bounds are not a box, or hold nothing.
         """
         self._path = path
-        self._low, self._high = checks.filled_box(bounds)
+        self._low, self._high = checks.finite_box(bounds)
         self._updating = threading.Lock()
         self._state: _State | None = None
 
     @property
     def epoch(self) -> int:
-        """Number of the epoch that it was made from."""
-        return self._there().epoch
+        """The server's epoch, a published state of its map, that the copy was made from."""
+        return self._current().epoch
 
     @property
     def age_s(self) -> float:
-        """Seconds since the server had nothing newer."""
-        return time.monotonic() - self._there().checked_s
+        """Seconds since the server had nothing newer: how old the copy may be at most."""
+        return time.monotonic() - self._current().checked_s
 
     @property
     def report(self) -> SyncReport:
-        """What its last update took."""
-        return self._there().report
+        """What it took to bring the copy up to date the last time."""
+        return self._current().report
 
-    def run(self, call: Call[ResultT]) -> ResultT:
+    def _answer(self, call: Call[ResultT]) -> ResultT:
         """Answer a call, all of it from one epoch."""
-        return self._there().driver.run(call)
+        return self._current().driver.run(call)
 
-    def update(self) -> Call[SyncReport]:
+    def _update(self) -> Call[SyncReport]:
         """Fetch what changed; where that fails, the copy stays as it was.
 
         Raises:
-            DownloadError: what arrived is not sound.
+            DownloadError: what arrived is not valid.
             OSError: the file cannot be written.
         """
-        return retried("chunk_gone", lambda: worked(self._update))
+        return retried("chunk_gone", lambda: offload(self._fetch))
 
-    def _there(self) -> _State:
-        assert self._state is not None, "update() comes first"
+    def _current(self) -> _State:
+        assert self._state is not None, "_update() comes first"
         return self._state
 
-    def _update(self, run: Run) -> SyncReport:
+    def _fetch(self, run: Run) -> SyncReport:
         with self._updating:
             asked_s = time.monotonic()
             info = run(newest_file(training=False))
             known = self._state
             if known is not None and known.sha256 == info.sha256:
-                report = SyncReport(info.epoch, 0, 0, known.report.parts)
+                report = SyncReport(
+                    epoch=info.epoch,
+                    bytes_received=0,
+                    parts_received=0,
+                    parts_kept=known.report.parts,
+                )
                 self._state = dataclasses.replace(known, checked_s=asked_s, report=report)
                 return report
             remote = RemoteBytes(run, info)
             try:
                 parts = _Parts(StoredMap(remote), self._low, self._high)
-                parts.take_up(self._path)
+                parts.reuse(self._path)
                 parts.fetch()
                 record = parts.record()
                 parts.write(self._path)
             except FormatError as error:
                 raise DownloadError(str(error)) from error
             received = len(parts.wanted) - parts.kept
-            report = SyncReport(info.epoch, remote.bytes_read, received, parts.kept)
-            driver = LocalDriver(view_of(record))
-            self._state = _State(info.sha256, driver, info.epoch, asked_s, report)
+            report = SyncReport(
+                epoch=info.epoch,
+                bytes_received=remote.bytes_read,
+                parts_received=received,
+                parts_kept=parts.kept,
+            )
+            driver = LocalDriver(record)
+            self._state = _State(
+                sha256=info.sha256,
+                driver=driver,
+                epoch=info.epoch,
+                checked_s=asked_s,
+                report=report,
+            )
+            if known is not None:
+                known.driver.close()
             return report
 
 
@@ -136,8 +153,8 @@ class _Parts:
         self._payloads: dict[PartKey, bytes] = {}
         self.kept = 0
 
-    def take_up(self, path: Path) -> None:
-        """Take what is there already, whatever the file is."""
+    def reuse(self, path: Path) -> None:
+        """Take the parts that the file has already; it may be no map file."""
         try:
             with StoredMap.open(path) as older:
                 known = {entry.key: entry for entry in older.manifest.entries}
@@ -172,4 +189,4 @@ class _Parts:
         manifest = self._stored.manifest
         own = {entry.key: dataclasses.replace(entry, file=None) for entry in self.wanted}
         parts = (repack_part(entry.key, self._payloads[entry.key]) for entry in self.wanted)
-        write_parts(path, manifest.facts, manifest.stamp_ns or None, parts, own)
+        write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns or None, known=own)

@@ -12,7 +12,7 @@ from triquad_format.errors import (
     UnsupportedMapFileError,
 )
 
-_REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be sound"
+_REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be intact"
 
 
 @contextlib.contextmanager

@@ -10,18 +10,16 @@ from triquad_format.errors import (
     MapFileError,
     NoIndexError,
 )
-from triquad_format.mapfile.container import METADATA_NAME
-from triquad_format.mapfile.file_metadata import (
-    check_agreement,
-    check_features,
-    check_readable,
-    one_metadata,
-)
 from triquad_format.mapfile.manifest import Entry, FileRef, unpack_manifest
-from triquad_format.mapfile.map_facts import check_map_part
 from triquad_format.mapfile.mcap.index import McapIndex
+from triquad_format.mapfile.mcap.random_access import FileBytes, RandomAccess
+from triquad_format.mapfile.metadata import (
+    METADATA_NAME,
+    check_agreement,
+    check_map_part,
+    readable_metadata,
+)
 from triquad_format.mapfile.parts.part import MANIFEST, MAP, PartKey
-from triquad_format.mapfile.random_access import FileBytes, RandomAccess
 
 DAMAGED_SUFFIX = ".damaged"
 """Added to the names of files that are set aside."""
@@ -33,7 +31,7 @@ OpenFile = Callable[[FileRef], RandomAccess]
 def files_in(folder: Path) -> OpenFile:
     """Opens the other files that hold parts of a map, in the folder of the map file.
 
-    One that was set aside as damaged still serves with those of its parts that are sound.
+    One that was set aside as damaged is opened, too: its parts are checked one by one.
     """
 
     return lambda file: FileBytes(file_in(folder, file.name))
@@ -111,19 +109,18 @@ class MapIndex:
         self._source = source
         self._others = OtherFiles(open_file)
         self._mcap = McapIndex(source)
-        self.metadata = one_metadata(self._mcap.metadata(METADATA_NAME))
-        check_readable(self.metadata)
+        self.metadata = readable_metadata(self._mcap.metadata(METADATA_NAME))
         last = self._mcap.chunks - 1
         message = self._mcap.message(last) if last >= 0 else None
-        if message is None or message.topic != MANIFEST:
+        if message is None or message.channel.topic != MANIFEST:
             raise NoIndexError("its last chunk is not its manifest: triquad-pack rewrites it")
         self.manifest = unpack_manifest(message.data, source.size)
         self.manifest_sha256 = hashlib.sha256(message.data).digest()
         own = self.manifest.own
         if len(own) != last:
             raise DamagedMapFileError(f"{last} parts, but its manifest lists {len(own)}")
-        check_agreement(self.metadata, self.manifest.facts)
-        check_features(self.metadata, self.manifest)
+        needs_others = bool(self.manifest.files)
+        check_agreement(self.metadata, self.manifest.facts, needs_other_files=needs_others)
         self._numbers = {entry.key: number for number, entry in enumerate(own)}
         self._own = {entry.key: entry for entry in own}
         if (stated := self._own.get(PartKey(MAP))) is not None:
@@ -144,11 +141,15 @@ class MapIndex:
             return self._others.payload(entry)
         number = self._numbers[entry.key]
         message = self._mcap.message(number)
-        entry.check(number, message.topic, message.data)
+        entry.check(number, message.channel.topic, message.data)
         return message.data
 
     def find(self, entry: Entry) -> Entry:
-        """The part of this file that another file's ``entry`` is about."""
+        """The part of this file that another file's ``entry`` is about.
+
+        Raises:
+            DamagedMapFileError: the file does not hold it.
+        """
         own = self._own.get(entry.key)
         if own is None or own.sha256 != entry.sha256:
             raise DamagedMapFileError(f"it does not hold {entry.key}")

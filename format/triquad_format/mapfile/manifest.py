@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError, FormatError
-from triquad_format.mapfile.map_facts import MapFacts, pack_facts, unpack_facts
+from triquad_format.mapfile.metadata import MapFacts, pack_facts, unpack_facts
+from triquad_format.mapfile.parts.body import PartBody, pack_part, unpack_body
 from triquad_format.mapfile.parts.part import (
     MANIFEST,
     MAP,
@@ -20,12 +21,13 @@ from triquad_format.mapfile.parts.part import (
     Part,
     PartKey,
 )
-from triquad_format.mapfile.parts.part_body import PartBody, pack_part
 from triquad_format.wire.array import pack_array
 
 MAX_ENTRIES = 1 << 20
 MAX_FILES = 4096
 DIGEST_BYTES = 32
+"""Bytes of a SHA-256."""
+
 _MAX_FILE_NAME = 255
 _COLUMNS = {
     "topic": ("|u1", ()),
@@ -54,7 +56,7 @@ class Entry:
 
     key: PartKey
     size: int  # bytes of its payload
-    sha256: bytes
+    sha256: bytes  # of its payload
     epoch: int  # in which it last changed
     stamp_ns: int  # time of that epoch, nanoseconds since 1970; 0 if not known
     file: FileRef | None = None  # None: the file that holds the manifest
@@ -133,18 +135,22 @@ def _packed(name: str, values: Iterable[Any]) -> dict[str, object]:
 
 
 def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
-    """The manifest in a payload, which lies in a file of so many bytes.
+    """The manifest in a payload.
+
+    Args:
+        payload: of the part ``/triquad/manifest``.
+        file_bytes: size of its file, which bounds how many parts it can list.
 
     Raises:
         FormatError: it is malformed, lists a part twice, or parts of a region that it lacks.
     """
-    body = PartBody(MANIFEST, payload, max_items=MAX_FILES)
+    body = unpack_body(MANIFEST, payload, max_items=MAX_FILES)
     facts = unpack_facts(body)
     files: list[FileRef | None] = [None, *_files(body.value("files", list))]
     topics = body.texts("topics")
-    packed = PartBody.of(MANIFEST, body.mapping("parts"))
+    packed = PartBody(MANIFEST, body.mapping("parts"))
     columns = {
-        name: packed.array(name, dtype, None, *row) for name, (dtype, row) in _COLUMNS.items()
+        name: packed.array(name, dtype, (None, *row)) for name, (dtype, row) in _COLUMNS.items()
     }
     count = len(columns["topic"])
     # Digests cannot be compressed: where the file has no room for them, they are not digests.
@@ -162,7 +168,7 @@ def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
 def _files(listed: list[Any]) -> list[FileRef]:
     files = []
     for item in listed:
-        file = PartBody.of(MANIFEST, item)
+        file = PartBody(MANIFEST, item)
         name, digest = file.value("name", str), file.value("manifest", bytes)
         # A name, not a path: a manifest must not lead a reader to other folders.
         if name in ("", ".", "..") or len(name) > _MAX_FILE_NAME or set(name) & set("/\\\0"):
@@ -204,12 +210,17 @@ def _entries(
     listed = {name: columns[name].tolist() for name in columns if name != "sha256"}
     for i in range(len(columns["topic"])):
         x, y, z = listed["region"][i]
-        key = PartKey(topics[listed["topic"][i]], (x, y, z), listed["plane"][i], listed["cell"][i])
+        key = PartKey(
+            topics[listed["topic"][i]],
+            (x, y, z),
+            plane=listed["plane"][i],
+            cell=listed["cell"][i],
+        )
         yield Entry(
             key,
-            listed["bytes"][i],
-            columns["sha256"][i].tobytes(),
-            listed["epoch"][i],
-            listed["stamp_ns"][i],
-            files[listed["file"][i]],
+            size=listed["bytes"][i],
+            sha256=columns["sha256"][i].tobytes(),
+            epoch=listed["epoch"][i],
+            stamp_ns=listed["stamp_ns"][i],
+            file=files[listed["file"][i]],
         )

@@ -1,34 +1,40 @@
-"""Reading map files whole: nothing is believed before it is checked."""
+"""Reading map files whole: nothing of a file is used before it is checked."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 from triquad_format.errors import DamagedMapFileError, TooLargeMapFileError
-from triquad_format.mapfile.container import (
-    MAX_MAP_BYTES,
-    MAX_PART_BYTES,
-    MESSAGE_ENCODING,
-    METADATA_NAME,
-)
 from triquad_format.mapfile.file_errors import named
-from triquad_format.mapfile.file_metadata import (
-    check_agreement,
-    check_features,
-    check_readable,
-    one_metadata,
-)
 from triquad_format.mapfile.index import OtherFiles, files_in
 from triquad_format.mapfile.manifest import DIGEST_BYTES, Entry, Manifest, unpack_manifest
-from triquad_format.mapfile.map_facts import MapFacts
-from triquad_format.mapfile.mcap.records import McapFile, Message, total_limit
-from triquad_format.mapfile.parts.part import MANIFEST, PREFIX, PREVIEW, TOPICS
-from triquad_format.mapfile.parts.unpack import assemble
-from triquad_format.mapfile.random_access import open_regular
+from triquad_format.mapfile.mcap.chunks import total_limit
+from triquad_format.mapfile.mcap.random_access import open_regular
+from triquad_format.mapfile.mcap.reader import McapFile
+from triquad_format.mapfile.mcap.records import Message
+from triquad_format.mapfile.metadata import (
+    MAX_MAP_BYTES,
+    METADATA_NAME,
+    check_agreement,
+    check_map_part,
+    readable_metadata,
+)
+from triquad_format.mapfile.parts.part import (
+    MANIFEST,
+    MAP,
+    MAX_PART_BYTES,
+    MESSAGE_ENCODING,
+    PREFIX,
+    PREVIEW,
+    REGION,
+    REGION_TOPICS,
+    TOPICS,
+)
+from triquad_format.mapfile.parts.region_parts import RegionParts
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapRecord, RegionIndex
 
 _BLOCK_BYTES = 1 << 20
 
@@ -54,7 +60,7 @@ class MapFile:
 
 
 def read_map(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYTES) -> MapRecord:
-    """The record in a map file; see :func:`read_map_file`."""
+    """The record in a map file; arguments and errors are those of :func:`read_map_file`."""
     return read_map_file(source, max_bytes=max_bytes).record
 
 
@@ -75,11 +81,12 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
     """
     if isinstance(source, (str, Path)):
         with open_regular(Path(source)) as stream:
-            return _read(str(source), stream, max_bytes, Path(source).parent)
-    return _read(str(getattr(source, "name", "map file")), source, max_bytes, None)
+            return _read(stream, str(source), max_bytes=max_bytes, folder=Path(source).parent)
+    name = str(getattr(source, "name", "map file"))
+    return _read(source, name, max_bytes=max_bytes, folder=None)
 
 
-def _read(name: str, stream: BinaryIO, max_bytes: int, folder: Path | None) -> MapFile:
+def _read(stream: BinaryIO, name: str, *, max_bytes: int, folder: Path | None) -> MapFile:
     with named(name):
         # Block by block: one read of the limit's size would reserve all of it.
         data = bytearray()
@@ -92,19 +99,25 @@ def _read(name: str, stream: BinaryIO, max_bytes: int, folder: Path | None) -> M
 
 def _parse(data: memoryview, max_bytes: int, folder: Path | None) -> MapFile:
     mcap = McapFile(data)
-    metadata = one_metadata([entries for name, entries in mcap.metadata if name == METADATA_NAME])
-    check_readable(metadata)
-    messages = list(_parts(mcap.messages(max_bytes), len(data) // DIGEST_BYTES))
-    if not messages or messages[-1].topic != MANIFEST:
+    found = [entries for name, entries in mcap.metadata if name == METADATA_NAME]
+    metadata = readable_metadata(found)
+    parts = list(_parts(mcap.messages(max_bytes), len(data) // DIGEST_BYTES))
+    if not parts or parts[-1].channel.topic != MANIFEST:
         raise DamagedMapFileError(f"the part {MANIFEST} is missing at the end")
-    packed = messages.pop().data
+    packed = parts.pop().data
     manifest = unpack_manifest(packed, len(data))
-    parts = tuple(StoredPart(message.topic, message.stored_bytes) for message in messages)
-    record = _assemble(manifest, messages, folder)
-    check_features(metadata, manifest)
-    check_agreement(metadata, MapFacts(record.name, record.epoch, record.settings))
+    check_agreement(metadata, manifest.facts, needs_other_files=bool(manifest.files))
+    stored = tuple(StoredPart(part.channel.topic, part.stored_bytes) for part in parts)
+    record = _record(manifest, parts, folder)
     check_record(record)
-    return MapFile(record, metadata, parts, len(data), manifest, hashlib.sha256(packed).digest())
+    return MapFile(
+        record,
+        metadata=metadata,
+        parts=stored,
+        size=len(data),
+        manifest=manifest,
+        manifest_sha256=hashlib.sha256(packed).digest(),
+    )
 
 
 def _parts(messages: Iterator[Message], most: int) -> Iterator[Message]:
@@ -112,31 +125,32 @@ def _parts(messages: Iterator[Message], most: int) -> Iterator[Message]:
     after = False
     count = 0
     for message in messages:
-        if message.topic != PREVIEW and not message.topic.startswith(PREFIX):
+        topic, encoding = message.channel
+        if topic != PREVIEW and not topic.startswith(PREFIX):
             continue
         count += 1
         if count > most:
             raise DamagedMapFileError("it has more parts than its manifest has room to list")
         if after:
-            raise DamagedMapFileError(f"the part {message.topic:.80} follows the manifest")
-        after = message.topic == MANIFEST
+            raise DamagedMapFileError(f"the part {topic:.80} follows the manifest")
+        after = topic == MANIFEST
         if len(message.data) > MAX_PART_BYTES:
-            raise DamagedMapFileError(f"a part {message.topic:.80} exceeds {MAX_PART_BYTES} bytes")
-        if message.topic in TOPICS and message.encoding != MESSAGE_ENCODING:
-            raise DamagedMapFileError(f"{message.topic} is encoded in {message.encoding!r:.40}")
+            raise DamagedMapFileError(f"a part {topic:.80} exceeds {MAX_PART_BYTES} bytes")
+        if topic in TOPICS and encoding != MESSAGE_ENCODING:
+            raise DamagedMapFileError(f"{topic} is encoded in {encoding!r:.40}")
         yield message
 
 
-def _assemble(manifest: Manifest, messages: list[Message], folder: Path | None) -> MapRecord:
-    """The record of all parts, those in other files included; empties ``messages``."""
+def _record(manifest: Manifest, parts: list[Message], folder: Path | None) -> MapRecord:
+    """The record of all parts, those in other files included; empties ``parts``."""
     own = manifest.own
-    if len(own) != len(messages):
-        raise DamagedMapFileError(f"{len(messages)} parts, but its manifest lists {len(own)}")
+    if len(own) != len(parts):
+        raise DamagedMapFileError(f"{len(parts)} parts, but its manifest lists {len(own)}")
     payloads: dict[Entry, bytes] = {}
-    for number, (entry, message) in enumerate(zip(own, messages, strict=True)):
-        entry.check(number, message.topic, message.data)
-        payloads[entry] = message.data
-    messages.clear()
+    for number, (entry, part) in enumerate(zip(own, parts, strict=True)):
+        entry.check(number, part.channel.topic, part.data)
+        payloads[entry] = part.data
+    parts.clear()
     others = OtherFiles(None if folder is None else files_in(folder))
     try:
         return assemble(
@@ -144,3 +158,32 @@ def _assemble(manifest: Manifest, messages: list[Message], folder: Path | None) 
         )
     finally:
         others.close()
+
+
+def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRecord:
+    """The record of the parts that a manifest lists.
+
+    Args:
+        manifest: the list; regions come in the order of their parts ``/triquad/region``.
+        payload_of: gives the checked payload of a part; it is asked once for each.
+
+    Raises:
+        FormatError: a part is missing, malformed or does not fit the others.
+    """
+    settings = manifest.facts.settings
+    by_region: dict[RegionIndex, list[Entry]] = {}
+    for entry in manifest.entries:
+        if entry.key.topic == REGION:
+            by_region[entry.key.region] = []
+    for entry in manifest.entries:
+        if entry.key.topic == MAP:
+            check_map_part(payload_of(entry), manifest.facts)
+        elif entry.key.topic in REGION_TOPICS:
+            by_region[entry.key.region].append(entry)
+    regions = []
+    for index, entries in by_region.items():
+        parts = RegionParts(index, settings)
+        for entry in entries:
+            parts.add(entry.key, payload_of(entry))
+        regions.append(parts.region())
+    return MapRecord(manifest.facts.name, manifest.facts.epoch, settings, tuple(regions))

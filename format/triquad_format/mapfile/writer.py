@@ -1,37 +1,35 @@
 """Writing map files: the same record gives the same bytes, and a path gets all of them or none."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
+from types import MappingProxyType
 from typing import BinaryIO
 
-from triquad_format import __version__
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.container import (
-    BASE_FILES,
-    ENCODINGS,
-    FORMAT_VERSION,
-    MAX_MAP_BYTES,
-    MAX_PART_BYTES,
-    METADATA_NAME,
-    MIN_READER_VERSION,
-    PREVIEW_ENCODING,
-    PREVIEW_SCHEMA,
-)
 from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
-from triquad_format.mapfile.map_facts import FRAME_ID, UNITS, MapFacts
-from triquad_format.mapfile.mcap.records import total_limit
+from triquad_format.mapfile.mcap.chunks import total_limit
 from triquad_format.mapfile.mcap.writer import ChannelSpec, McapWriter, SchemaSpec
-from triquad_format.mapfile.parts.pack import FEATURE_DTYPES, pack_map, pack_region
+from triquad_format.mapfile.metadata import (
+    MAX_MAP_BYTES,
+    METADATA_NAME,
+    MapFacts,
+    pack_map_part,
+    pack_metadata,
+)
+from triquad_format.mapfile.parts.pack import FEATURE_DTYPES, pack_record
 from triquad_format.mapfile.parts.part import (
+    ENCODINGS,
     EVIDENCE,
     MANIFEST,
     MAP,
+    MAX_PART_BYTES,
     MOMENTS,
     PREVIEW,
+    PREVIEW_ENCODING,
+    PREVIEW_SCHEMA,
     REGION,
     SAMPLES,
     TRAINING,
@@ -39,10 +37,8 @@ from triquad_format.mapfile.parts.part import (
     Part,
     PartKey,
 )
-from triquad_format.mapfile.written_map import MapFileInfo, WrittenMap
-from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord, Region, RegionIndex
+from triquad_format.records.region import MapRecord, RegionIndex
 
 # Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
 # good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
@@ -58,7 +54,13 @@ _LEVELS = {
     MANIFEST: 3,
 }
 _CHANNELS = tuple(
-    ChannelSpec(number, topic, encoding, _LEVELS[topic], PREVIEW_SCHEMA if topic == PREVIEW else "")
+    ChannelSpec(
+        number,
+        topic,
+        encoding=encoding,
+        level=_LEVELS[topic],
+        schema=PREVIEW_SCHEMA if topic == PREVIEW else "",
+    )
     for number, (topic, encoding) in enumerate(ENCODINGS.items(), start=1)
 )
 
@@ -69,6 +71,24 @@ class Previews:
 
     schema: bytes  # of foxglove.SceneUpdate, a FileDescriptorSet
     parts: Mapping[RegionIndex, Part]  # of the topic PREVIEW
+
+
+@dataclass(frozen=True)
+class MapFileInfo:
+    """Size, digest and epoch of a map file that was written."""
+
+    bytes: int  # size of the file
+    sha256: str  # of the whole file, hexadecimal
+    epoch: int
+
+
+@dataclass(frozen=True)
+class WrittenMap:
+    """A file that was written, and what its manifest lists."""
+
+    info: MapFileInfo
+    manifest: Manifest
+    manifest_sha256: bytes  # of the manifest's payload
 
 
 def write_map(
@@ -92,53 +112,27 @@ def write_map(
         previews: what MCAP viewers are to show; left out, the file holds nothing of the kind.
 
     Raises:
-        FormatError: the record is not sound, or exceeds a limit of the format.
+        FormatError: the record is not valid, or exceeds a limit of the format.
         OSError: the file cannot be written.
     """
-    _check_dtype(feature_dtype)
-    if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
-        raise FormatError(f"stamp_ns = {stamp_ns} is out of range")
-    check_record(record)
-    facts = MapFacts(record.name, record.epoch, record.settings)
-    parts = record_parts(record, feature_dtype, {} if previews is None else previews.parts)
-    schema = None if previews is None else previews.schema
-    return write_parts(file, facts, stamp_ns, parts, {}, preview_schema=schema).info
-
-
-def _check_dtype(feature_dtype: str) -> None:
     if feature_dtype not in FEATURE_DTYPES:
         raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FEATURE_DTYPES}")
-
-
-def record_parts(
-    record: MapRecord, feature_dtype: str, previews: Mapping[RegionIndex, Part]
-) -> Iterator[Part]:
-    """The parts of all regions of a checked record, each region's preview after them."""
-    for region in record.regions:
-        yield from region_parts(region, record.settings, feature_dtype)
-        if region.index in previews:
-            yield previews[region.index]
-
-
-def region_parts(region: Region, settings: FieldSettings, feature_dtype: str) -> Iterator[Part]:
-    """The parts of a checked region.
-
-    Raises:
-        FormatError: features do not fit ``feature_dtype``.
-    """
-    try:
-        yield from pack_region(region, settings, feature_dtype)
-    except FormatError as error:
-        raise FormatError(f"region {region.index}: {error}") from error
+    if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
+        raise FormatError(f"stamp_ns = {stamp_ns} is out of range: use 0 to 2**63 - 1")
+    check_record(record)
+    facts = MapFacts(record.name, record.epoch, record.settings)
+    parts = pack_record(record, feature_dtype, {} if previews is None else previews.parts)
+    schema = None if previews is None else previews.schema
+    return write_parts(file, facts, parts, stamp_ns=stamp_ns, preview_schema=schema).info
 
 
 def write_parts(
     file: BinaryIO | Path | str,
     facts: MapFacts,
-    stamp_ns: int | None,
     parts: Iterable[Part | Entry],
-    known: Mapping[PartKey, Entry],
     *,
+    stamp_ns: int | None = None,
+    known: Mapping[PartKey, Entry] = MappingProxyType({}),
     preview_schema: bytes | None = None,
 ) -> WrittenMap:
     """Write a map file from parts.
@@ -146,9 +140,9 @@ def write_parts(
     Args:
         file: as in :func:`write_map`.
         facts: what the file says of the whole map.
-        stamp_ns: time of its epoch.
         parts: what the map consists of. An entry stands for a part that lies in another file,
             and is one of ``known``.
+        stamp_ns: time of its epoch, nanoseconds since 1970; left out, the file holds no time.
         known: parts of earlier epochs: an equal one keeps its epoch and time, and is not stored
             again where the entry names a file.
         preview_schema: that of :class:`Previews`; needed where there are previews among ``parts``.
@@ -159,45 +153,53 @@ def write_parts(
     """
     if isinstance(file, (str, Path)):
         with replacing(Path(file)) as stream:
-            return _PartsWriter(stream, facts, stamp_ns, known, preview_schema).write(parts)
-    return _PartsWriter(file, facts, stamp_ns, known, preview_schema).write(parts)
+            return write_parts(
+                stream,
+                facts,
+                parts,
+                stamp_ns=stamp_ns,
+                known=known,
+                preview_schema=preview_schema,
+            )
+    # Where parts of other files are known, some of them are nearly always needed.
+    needs_others = any(entry.file is not None for entry in known.values())
+    metadata = pack_metadata(facts, stamp_ns=stamp_ns, needs_other_files=needs_others)
+    schemas, channels = _described(preview_schema)
+    mcap = McapWriter(file, metadata["producer"], schemas=schemas, channels=channels)
+    mcap.add_metadata(METADATA_NAME, metadata)
+    return _PartsWriter(mcap, facts, stamp_ns=stamp_ns, known=known).write(parts)
 
 
 class _PartsWriter:
-    """Writes one file, noting what its manifest is to list."""
+    """Writes the parts of one file, and keeps what its manifest is to list."""
 
     def __init__(
         self,
-        stream: BinaryIO,
+        mcap: McapWriter,
         facts: MapFacts,
+        *,
         stamp_ns: int | None,
         known: Mapping[PartKey, Entry],
-        preview_schema: bytes | None,
     ) -> None:
+        self._mcap = mcap
         self._facts = facts
-        self._stamp_ns = stamp_ns
+        self._stamp_ns = stamp_ns or 0
         self._known = known
         self._entries: list[Entry] = []
         self._total = 0
-        self._has_previews = preview_schema is not None
-        schemas, channels = _described(preview_schema)
-        self._mcap = McapWriter(stream, f"triquad {__version__}", schemas, channels)
 
     def write(self, parts: Iterable[Part | Entry]) -> WrittenMap:
-        # Where parts of other files are known, some of them are needed as good as always.
-        needs_others = any(entry.file is not None for entry in self._known.values())
-        self._mcap.add_metadata(METADATA_NAME, self._metadata(needs_others))
-        whole = pack_map(self._facts)
-        self._put(whole, self._stamp_ns or 0)
+        whole = pack_map_part(self._facts)
+        self._put(whole, self._stamp_ns)
         self._entries.append(self._changed(whole))
         for part in parts:
             if isinstance(part, Entry):
                 self._entries.append(part)
             else:
                 self._add(part)
-        manifest = Manifest(self._facts, self._stamp_ns or 0, tuple(self._entries))
+        manifest = Manifest(self._facts, self._stamp_ns, tuple(self._entries))
         packed = pack_manifest(manifest)
-        self._put(packed, self._stamp_ns or 0)
+        self._put(packed, self._stamp_ns)
         self._mcap.finish()
         _check_total(self._mcap.size)
         if self._total > total_limit(self._mcap.size):
@@ -221,12 +223,19 @@ class _PartsWriter:
     def _changed(self, part: Part) -> Entry:
         """The entry of a part that this epoch changed."""
         digest = hashlib.sha256(part.payload).digest()
-        stamp_ns = self._stamp_ns or 0
-        return Entry(part.key, len(part.payload), digest, self._facts.epoch, stamp_ns)
+        return Entry(
+            part.key,
+            size=len(part.payload),
+            sha256=digest,
+            epoch=self._facts.epoch,
+            stamp_ns=self._stamp_ns,
+        )
 
     def _put(self, part: Part, stamp_ns: int) -> None:
-        if part.key.topic == PREVIEW and not self._has_previews:
-            raise FormatError(f"{part.key} comes without its schema: give preview_schema as well")
+        if part.key.topic not in self._mcap.topics:
+            raise FormatError(
+                f"the file has no channel for {part.key}; for previews give preview_schema as well"
+            )
         if len(part.payload) > MAX_PART_BYTES:
             raise FormatError(
                 f"the part {part.key.topic} has {len(part.payload)} bytes; "
@@ -234,23 +243,7 @@ class _PartsWriter:
             )
         self._total += len(part.payload)
         _check_total(self._total)
-        self._mcap.add_message(part.key.topic, part.payload, stamp_ns, part.seams)
-
-    def _metadata(self, needs_others: bool) -> dict[str, str]:
-        entries = {
-            "format_version": str(FORMAT_VERSION),
-            "min_reader_version": str(MIN_READER_VERSION),
-            "required_features": BASE_FILES if needs_others else "",
-            "producer": f"triquad {__version__}",
-            "map": self._facts.name,
-            "epoch": str(self._facts.epoch),
-            "frame_id": FRAME_ID,
-            "units": UNITS,
-        }
-        if self._stamp_ns is not None:
-            created = datetime.fromtimestamp(self._stamp_ns // 10**9, timezone.utc)
-            entries["created"] = created.strftime("%Y-%m-%dT%H:%M:%SZ")
-        return entries
+        self._mcap.add_message(part.key.topic, part.payload, time_ns=stamp_ns, seams=part.seams)
 
 
 def _described(

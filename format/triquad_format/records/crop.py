@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from triquad_format.records import morton
-from triquad_format.records.evidence_voxels import masked, voxels_felt
+from triquad_format.records.evidence_voxels import masked, status_voxels
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.leaf_box import LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.region import (
@@ -23,7 +23,7 @@ def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> Ma
     """What a map needs to answer inside a box, to the last bit as before.
 
     Regions whose cube meets the box stay, with the vertices whose hat functions reach into it,
-    the evidence in it, and the replay samples in it with their share of the visits owed.
+    the evidence in it, and the replay samples in it with their share of the training budget.
 
     Args:
         record: the map.
@@ -57,7 +57,7 @@ def _crop_region(settings: FieldSettings, region: Region, box: LeafBox) -> Regio
     training = region.training
     if training is not None:
         training = _crop_training(settings, training, kept, box)
-    evidence = masked(region.evidence, voxels_felt(region.evidence, box))
+    evidence = masked(region.evidence, status_voxels(region.evidence, box))
     return dataclasses.replace(region, tables=tables, evidence=evidence, training=training)
 
 
@@ -79,7 +79,7 @@ def _crop_training(
 ) -> TrainingState:
     leaves = leaf_coordinates(settings, training.sample_points)
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))
-    owed = training.visits_owed * len(inside)  # rounded up below, so that none is forgotten
+    owed = training.budget_samples * len(inside)  # rounded up below, so that none is forgotten
     return dataclasses.replace(
         training,
         table_means=_rows(training.table_means, kept),
@@ -89,7 +89,7 @@ def _crop_training(
         ),
         sample_points=training.sample_points[inside],
         sample_labels=training.sample_labels[inside],
-        visits_owed=-(-owed // max(len(leaves), 1)),
+        budget_samples=-(-owed // max(len(leaves), 1)),
     )
 
 

@@ -22,8 +22,8 @@ def seen_voxels(evidence: Evidence, masks: NDArray[np.uint8]) -> NDArray[np.int6
     return blocks + inner
 
 
-def voxels_felt(evidence: Evidence, box: LeafBox) -> NDArray[np.uint8]:
-    """Bits [B, BLOCK_BYTES] of the voxels on which the status in a box hangs."""
+def status_voxels(evidence: Evidence, box: LeafBox) -> NDArray[np.uint8]:
+    """Bits [B, BLOCK_BYTES] of the voxels that decide the status in a box."""
     first = morton.decode(evidence.codes, 3) * BLOCK_VOXELS
     voxels = first[:, :, None] + np.arange(BLOCK_VOXELS)  # [B, 3, 8]
     low, high = box.low - _REACH_VOXELS, box.high + _REACH_VOXELS
@@ -53,4 +53,4 @@ def masked(evidence: Evidence, mask: NDArray[np.uint8]) -> Evidence:
         levels = levels[after[before]]
     if seen_s is not None:
         seen_s = np.where(surface.any(axis=1), seen_s, 0)[rows]
-    return Evidence(evidence.codes[rows], surface[rows], free[rows], levels, seen_s)
+    return Evidence(evidence.codes[rows], surface[rows], free[rows], levels=levels, seen_s=seen_s)

@@ -1,11 +1,16 @@
 """The settings that define a field: they travel with every map."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 from triquad_format.errors import SettingsError
 
-ENCODINGS = ("both", "features", "fourier")
+Encoding = Literal["both", "features", "fourier"]
+"""The parts of the MLP's input."""
+
+ENCODINGS: tuple[Encoding, ...] = get_args(Encoding)
 
 OVERLAP_LEAVES = 16
 """Leaf cells by which neighbouring regions overlap."""
@@ -17,31 +22,51 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
         raise SettingsError(f"{name} = {value!r} is out of range: use {low:g} to {high:g}")
 
 
+def _ranged(default: float, low: float, high: float) -> Any:
+    """A field with its range as metadata, named as pydantic names it: the server reads it there."""
+    return dataclasses.field(default=default, metadata={"ge": low, "le": high})
+
+
 @dataclass(frozen=True)
 class FieldSettings:
     """Shape of a tri-quadtree field; the defaults are those of 3QFP (ICRA 2024, section IV)."""
 
-    leaf_m: float = 0.2  # r: side of a leaf
-    depth: int = 12  # L_max
-    feature_levels: int = 3  # H: deepest levels that carry features
-    feature_size: int = 8  # d
-    feature_std: float = 0.05  # of new feature vectors
-    frequencies: int = 16  # m
-    frequency_variance: float = 50.0  # sigma^2, on coordinates normalised to [-1, 1]
-    hidden: int = 32  # width of the MLP's two hidden layers
-    encoding: str = "both"  # or "features" or "fourier": the parts of the MLP's input
-    logit_scale_m: float = 0.0275  # s: metres per unit of the MLP's output
+    leaf_m: float = _ranged(0.2, 0.01, 10.0)
+    """r: side of a leaf."""
+
+    depth: int = _ranged(12, 6, 15)
+    """L_max: depth of the quadtrees."""
+
+    feature_levels: int = _ranged(3, 1, 4)
+    """H: the deepest levels carry features, so many of them."""
+
+    feature_size: int = _ranged(8, 1, 64)
+    """d: length of a feature vector."""
+
+    feature_std: float = _ranged(0.05, 0.0, 10.0)
+    """Standard deviation of new feature vectors."""
+
+    frequencies: int = _ranged(16, 1, 256)
+    """m: number of Fourier frequencies."""
+
+    frequency_variance: float = _ranged(50.0, 0.0, 1e6)
+    """sigma^2 of the Fourier frequencies, on coordinates normalised to [-1, 1]."""
+
+    hidden: int = _ranged(32, 1, 1024)
+    """Width of the MLP's two hidden layers."""
+
+    encoding: Encoding = "both"
+    """The parts of the MLP's input: interpolated features, Fourier features of the position, or
+    both."""
+
+    logit_scale_m: float = _ranged(0.0275, 1e-4, 10.0)
+    """s: metres per unit of the MLP's output."""
 
     def __post_init__(self) -> None:
-        check_range("leaf_m", self.leaf_m, 0.01, 10.0)
-        check_range("depth", self.depth, 6, 15)
-        check_range("feature_levels", self.feature_levels, 1, 4)
-        check_range("feature_size", self.feature_size, 1, 64)
-        check_range("feature_std", self.feature_std, 0.0, 10.0)
-        check_range("frequencies", self.frequencies, 1, 256)
-        check_range("frequency_variance", self.frequency_variance, 0.0, 1e6)
-        check_range("hidden", self.hidden, 1, 1024)
-        check_range("logit_scale_m", self.logit_scale_m, 1e-4, 10.0)
+        for entry in dataclasses.fields(self):
+            if entry.metadata:
+                low, high = entry.metadata["ge"], entry.metadata["le"]
+                check_range(entry.name, getattr(self, entry.name), low, high)
         if self.encoding not in ENCODINGS:
             raise SettingsError(f"encoding = {self.encoding!r} is not one of {ENCODINGS}")
 

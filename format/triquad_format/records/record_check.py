@@ -1,4 +1,4 @@
-"""What a map record must hold to be sound: checked before it is written and after it is read."""
+"""What a map record must hold to be valid: checked before it is written and after it is read."""
 
 import math
 from collections.abc import Sequence
@@ -32,23 +32,28 @@ _FLOATS = ("<f2", "<f4")
 
 
 def check_record(record: MapRecord) -> None:
-    """Raise :class:`FormatError`, naming region and field, unless ``record`` is sound."""
+    """Raise :class:`FormatError`, naming region and field, unless ``record`` is valid."""
     check_name("map", record.name)
     _check_count("epoch", record.epoch)
     indices = [region.index for region in record.regions]
     if len(set(indices)) != len(indices):
         raise FormatError("two regions have the same index")
     for region in record.regions:
-        try:
-            _check_region(record.settings, region)
-        except FormatError as error:
-            raise FormatError(f"region {region.index}: {error}") from error
+        check_region(record.settings, region)
+
+
+def check_region(settings: FieldSettings, region: Region) -> None:
+    """Raise :class:`FormatError`, naming region and field, unless ``region`` is sound."""
+    try:
+        _check_region(settings, region)
+    except FormatError as error:
+        raise FormatError(f"region {region.index}: {error}") from error
 
 
 def _check_region(settings: FieldSettings, region: Region) -> None:
     if len(region.index) != 3 or any(not -(2**31) < number < 2**31 for number in region.index):
         raise FormatError("the index is out of range")
-    _check_floats("frequencies", region.frequencies, ("<f4",), (settings.frequencies,))
+    _check_floats("frequencies", region.frequencies, (settings.frequencies,))
     _check_mlp(settings, region.mlp)
     places = [(plane, level) for plane in range(len(AXES)) for level in settings.levels]
     if [(table.plane, table.level) for table in region.tables] != places:
@@ -82,7 +87,7 @@ def _check_table(settings: FieldSettings, table: VertexTable) -> None:
         raise FormatError(f"{name} codes: a vertex lies outside the level")
     shape = (len(table.codes), settings.feature_size)
     if table.scale is None:
-        _check_floats(f"{name} features", table.features, _FLOATS, shape)
+        _check_floats(f"{name} features", table.features, shape, dtypes=_FLOATS)
         return
     ArraySpec("<i2", shape).check(f"{name} features", table.features)
     if not (math.isfinite(table.scale) and table.scale > 0 and _is_single(table.scale)):
@@ -126,20 +131,20 @@ def _check_training(settings: FieldSettings, region: Region, training: TrainingS
         raise FormatError("the training state does not have one entry per vertex table")
     for table, mean, variance, steps in zip(region.tables, *columns, strict=True):
         shape = (len(table.codes), settings.feature_size)
-        _check_floats("table means", mean, _FLOATS, shape)
-        _check_floats("table variances", variance, _FLOATS, shape, low=0.0)
+        _check_floats("table means", mean, shape, dtypes=_FLOATS)
+        _check_floats("table variances", variance, shape, dtypes=_FLOATS, low=0.0)
         ArraySpec("<i4", shape[:1]).check("table steps", steps)
         if steps.min(initial=0) < 0:
             raise FormatError("table steps: a number is negative")
     _check_arrays("mlp means", training.mlp_means, _mlp_shapes(settings))
     _check_arrays("mlp variances", training.mlp_variances, _mlp_shapes(settings), low=0.0)
     _check_count("mlp steps", training.mlp_steps, 2**31)
-    _check_count("visits owed", training.visits_owed)
+    _check_count("training budget", training.budget_samples)
     samples = len(training.sample_points)
-    _check_floats("sample points", training.sample_points, ("<f4",), (samples, 3))
+    _check_floats("sample points", training.sample_points, (samples, 3))
     if np.abs(training.sample_points).max(initial=0) > settings.region_side_m:
         raise FormatError("sample points: one lies far outside its region")
-    _check_floats("sample labels", training.sample_labels, _FLOATS, (samples,))
+    _check_floats("sample labels", training.sample_labels, (samples,), dtypes=_FLOATS)
 
 
 def _check_count(name: str, count: int, limit: int = 2**63) -> None:
@@ -162,14 +167,15 @@ def _check_arrays(
     if len(arrays) != len(shapes):
         raise FormatError(f"{name}: {len(arrays)} arrays, expected {len(shapes)}")
     for i, (array, shape) in enumerate(zip(arrays, shapes, strict=True)):
-        _check_floats(f"{name} [{i}]", array, ("<f4",), shape, low)
+        _check_floats(f"{name} [{i}]", array, shape, low=low)
 
 
 def _check_floats(
     name: str,
     array: NDArray[np.floating | np.int16],
-    dtypes: tuple[str, ...],
     shape: tuple[int, ...],
+    *,
+    dtypes: tuple[str, ...] = ("<f4",),
     low: float = -np.inf,
 ) -> None:
     dtype = array.dtype.str if array.dtype.str in dtypes else dtypes[-1]

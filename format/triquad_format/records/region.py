@@ -112,7 +112,7 @@ class TrainingState:
     mlp_steps: int
     sample_points: NDArray[np.float32]  # [S, 3] replay samples, metres from the region's centre
     sample_labels: NDArray[np.floating]  # [S] signed distance, metres
-    visits_owed: int  # training visits still to be made, 0 where all is learnt
+    budget_samples: int  # training budget: samples still to be trained on; 0: all is learnt
 
 
 @dataclass(frozen=True)

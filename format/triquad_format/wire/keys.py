@@ -28,25 +28,6 @@ MAP_CHUNK = "query/map_chunk"
 CHECKPOINT = "admin/checkpoint"
 RESET = "admin/reset"
 
-OPERATIONS = (
-    SDF,
-    DISTANCE,
-    SPHERES,
-    SEGMENTS,
-    RAYS,
-    GRID,
-    ALIGN,
-    TILE,
-    TILE_LIST,
-    TILE_UPDATES,
-    STATUS,
-    FLUSH,
-    MAP_INFO,
-    MAP_CHUNK,
-    CHECKPOINT,
-    RESET,
-)
-
 
 def check_name(kind: str, name: str) -> str:
     """``name`` where it can stand in a key; a :class:`FormatError` names it otherwise."""

@@ -43,6 +43,13 @@ class Scan(Message):
 
 
 @dataclass(frozen=True)
+class MapReply(Message):
+    """What a question about the map is answered with, all of it from one epoch."""
+
+    epoch: int  # number of the published, immutable state of the map that answered
+
+
+@dataclass(frozen=True)
 class SdfRequest(Message):
     """Signed distance, status and, on request, gradient at points of the map frame."""
 
@@ -53,10 +60,9 @@ class SdfRequest(Message):
 
 
 @dataclass(frozen=True)
-class SdfReply(Message):
-    """Answer to :class:`SdfRequest`, all of it from one epoch."""
+class SdfReply(MapReply):
+    """Answer to :class:`SdfRequest`."""
 
-    epoch: int
     sdf: Values  # [N] metres, positive in free space; NaN where no region is
     status: StatusCodes  # [N] triquad_format.records.status.Status
     gradient: Positions | None  # [N, 3] d(sdf)/dx, map frame
@@ -73,10 +79,9 @@ class TileListRequest(Message):
 
 
 @dataclass(frozen=True)
-class TileList(Message):
+class TileList(MapReply):
     """Answer to :class:`TileListRequest`."""
 
-    epoch: int
     tile_side_m: float
     tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
     changed: Epochs  # [T] the surface of each tile last changed in this epoch
@@ -94,10 +99,9 @@ class TileRequest(Message):
 
 
 @dataclass(frozen=True)
-class Tile(Message):
+class Tile(MapReply):
     """Answer to :class:`TileRequest`."""
 
-    epoch: int
     changed: int  # as in TileList
     origin: Point  # metres, map frame: the tile's minimum corner
     vertices: Positions  # [V, 3] metres, relative to origin
@@ -172,7 +176,7 @@ class ServerStatus(Message):
     points_dropped: dict[str, int]  # by reason, points of scans that were taken
     requests_refused: dict[str, int]  # by error code
     samples_trained: int
-    segments_kept: int  # what so many rays taught is in the replay pool
+    rays_kept: int  # rays whose lessons are in the replay pools
     loss: float  # recent training loss, 0 before any training
     regions: int
     vertices: int
@@ -261,19 +265,5 @@ class MapChunk(Message):
 class ErrorReply(Message):
     """What an operation answers, as a Zenoh error reply, where it cannot do what was asked."""
 
-    code: str  # see ERROR_CODES
+    code: str  # one of triquad_format.errors.ERROR_CODES
     message: str
-
-
-ERROR_CODES = {
-    "bad_request": "the request is malformed or out of range",
-    "bad_version": "the request is of another protocol version",
-    "too_large": "the request exceeds a limit of the server; split it",
-    "epoch_gone": "the pinned epoch is no longer kept",
-    "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
-    "unknown_map": "the server has no map of this name",
-    "timeout": "the server could not finish in the time that the request allows",
-    "busy": "too many requests are waiting",
-    "store": "the checkpoint could not be written",
-    "internal": "a defect of the server; its log has the details",
-}

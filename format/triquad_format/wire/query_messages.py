@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from triquad_format.wire.array import ArraySpec
 from triquad_format.wire.codec import Message
-from triquad_format.wire.messages import Point, Pose, Positions, StatusCodes, Values
+from triquad_format.wire.messages import MapReply, Point, Pose, Positions, StatusCodes, Values
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Volume = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, None, None))]
@@ -34,17 +34,16 @@ class DistanceRequest(Message):
 
 
 @dataclass(frozen=True)
-class DistanceReply(Message):
+class DistanceReply(MapReply):
     """Answer to :class:`DistanceRequest`."""
 
-    epoch: int
-    distance: Values  # [N] metres, negative behind a surface; at most max_distance_m
+    distance_m: Values  # [N] metres, negative behind a surface; at most max_distance_m
     gradient: Positions  # [N, 3] its unit gradient, map frame; zero where nothing was found
     found: Flags  # [N] whether there is a surface within max_distance_m
     status: StatusCodes  # [N] of the points themselves
     confidence: Values  # [N] in [0, 1]
     surface_point: Positions | None  # [N, 3] relative to origin; the point where nothing was found
-    unknown_distance: Values | None  # [N] metres, at most max_distance_m
+    unknown_distance_m: Values | None  # [N] metres, at most max_distance_m
     unknown_point: Positions | None  # [N, 3] relative to origin; the point where there is none
 
 
@@ -54,15 +53,14 @@ class SpheresRequest(Message):
 
     origin: Point  # metres, map frame
     centres: Positions  # [N, 3] metres, relative to origin
-    radii: Values  # [N] metres
+    radii_m: Values  # [N] metres
     epoch: int
 
 
 @dataclass(frozen=True)
-class SpheresReply(Message):
+class SpheresReply(MapReply):
     """Answer to :class:`SpheresRequest`."""
 
-    epoch: int
     status: StatusCodes  # [N]
 
 
@@ -79,17 +77,16 @@ class SegmentsRequest(Message):
 
 
 @dataclass(frozen=True)
-class SegmentsReply(Message):
+class SegmentsReply(MapReply):
     """Answer to :class:`SegmentsRequest`; places are metres along the segment."""
 
-    epoch: int
-    length: Values  # [N]
+    length_m: Values  # [N]
     blocked: Flags  # [N] the ball touches a seen surface
-    contact: Values  # [N] where it first does; the length where it does not
-    clearance: Values  # [N] least distance of the centre to a surface, up to the contact
-    clearance_at: Values  # [N] where
+    contact_m: Values  # [N] where it first does; the length where it does not
+    clearance_m: Values  # [N] least distance of the centre to a surface, up to the contact
+    clearance_at_m: Values  # [N] where
     meets_unknown: Flags  # [N] the ball enters unknown space, before any contact
-    unknown_contact: Values  # [N] where it first does; the length where it does not
+    unknown_contact_m: Values  # [N] where it first does; the length where it does not
 
 
 @dataclass(frozen=True)
@@ -105,11 +102,10 @@ class RaysRequest(Message):
 
 
 @dataclass(frozen=True)
-class RaysReply(Message):
+class RaysReply(MapReply):
     """Answer to :class:`RaysRequest`."""
 
-    epoch: int
-    range: Values  # [N] metres
+    range_m: Values  # [N] metres
     status: StatusCodes  # [N] what it ends at: surface, unknown space, or the largest range (free)
 
 
@@ -125,11 +121,10 @@ class GridRequest(Message):
 
 
 @dataclass(frozen=True)
-class GridReply(Message):
+class GridReply(MapReply):
     """Answer to :class:`GridRequest`."""
 
-    epoch: int
-    distance: Volume  # [x, y, z] metres, as in DistanceReply
+    distance_m: Volume  # [x, y, z] metres, as in DistanceReply
     status: StatusVolume  # [x, y, z]
 
 
@@ -145,10 +140,9 @@ class AlignRequest(Message):
 
 
 @dataclass(frozen=True)
-class AlignReply(Message):
+class AlignReply(MapReply):
     """Answer to :class:`AlignRequest`."""
 
-    epoch: int
     world_from_sensor: Pose
     covariance: Covariance  # of translation (metres) and rotation vector (radians), map frame
     inlier_share: float

@@ -1,50 +1,36 @@
 """A map as a file holds it, answered by compiled code."""
 
-import threading
+from triquad_format.records.region import MapRecord, Region
 
-import numpy as np
-from numpy.typing import NDArray
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord, Region, region_centre
-
-from triquad_map.compiled.compiled_engine import RecordedEngine
-from triquad_map.compiled.compiled_view import CompiledView, field_samples
-from triquad_map.compiled.evidence.evidence import Evidence
-from triquad_map.compiled.surfels.surfel_map import SurfelMap, SurfelTask, first_surfels
+from triquad_map.compiled.compiled_view import CompiledView
+from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
+from triquad_map.compiled.field.frozen_field import recorded_field
+from triquad_map.compiled.surfels.surfel_map import SurfelTask, first_surfels
 from triquad_map.compiled.team import Team
-
-_QUESTIONS = Team("triquad-questions")
-
-
-class RecordedRegion:
-    """One region; its surfels are fitted when they are first asked for. For several threads."""
-
-    def __init__(self, settings: FieldSettings, region: Region, epoch: int) -> None:
-        self.index = region.index
-        self.centre: NDArray[np.float64] = region_centre(settings, region.index)
-        self.engine = RecordedEngine(settings, region)
-        self.evidence = Evidence.recorded(1 << settings.depth, region.evidence)
-        self._settings = settings
-        self._epoch = epoch
-        self._fitting = threading.Lock()
-        self._surfels: SurfelMap | None = None
-
-    @property
-    def surfels(self) -> SurfelMap:
-        """What stands for its surface; the first who asks waits until all are fitted."""
-        if self._surfels is None:
-            with self._fitting:
-                if self._surfels is None:
-                    self._surfels = self._fitted()
-        return self._surfels
-
-    def _fitted(self) -> SurfelMap:
-        samples = field_samples(self.engine, self._settings, _QUESTIONS.split)
-        task = SurfelTask(self._epoch, most=None)
-        return first_surfels(self.evidence, samples, task)
+from triquad_map.composition.field_samples import field_samples
+from triquad_map.composition.recorded_region import RecordedRegion
+from triquad_map.composition.split import Split
 
 
-def recorded_view(record: MapRecord) -> CompiledView:
-    """The map in a record. Questions are split over all cores."""
-    regions = [RecordedRegion(record.settings, region, record.epoch) for region in record.regions]
-    return CompiledView(record.epoch, record.settings, regions, _QUESTIONS.split)
+class RecordedView(CompiledView):
+    """The map in a record. Questions are split over all cores, by threads of its own."""
+
+    def __init__(self, record: MapRecord) -> None:
+        self._team = Team("triquad-questions")
+        regions = [_recorded(record, region, self._team.split) for region in record.regions]
+        super().__init__(record.epoch, record.settings, regions, self._team.split)
+
+    def close(self) -> None:
+        """End the threads; later questions are answered on the caller's alone."""
+        self._team.close()
+
+
+def _recorded(record: MapRecord, region: Region, split: Split) -> RecordedRegion:
+    settings = record.settings
+    engine = recorded_field(settings, region)
+    evidence = FrozenEvidence.from_record(1 << settings.depth, region.evidence)
+    samples = field_samples(engine, settings, split)
+    task = SurfelTask(record.epoch, most=None)
+    return RecordedRegion(
+        settings, region.index, engine, evidence, lambda: first_surfels(evidence, samples, task)
+    )

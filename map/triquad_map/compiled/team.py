@@ -15,15 +15,17 @@ _MIN_SHARE = 2048
 
 
 class Team:
-    """Threads that share work with the caller."""
+    """Threads that share work with the caller. Who makes a team closes it."""
 
-    def __init__(self, name: str, patience: int = 0) -> None:
+    def __init__(self, name: str, niceness: int = 0) -> None:
+        """Threads start with the first work; for ``niceness`` see :func:`lower_priority`."""
         self._pool = ThreadPoolExecutor(
-            THREADS,
-            thread_name_prefix=name,
-            initializer=be_patient,
-            initargs=(patience,),
+            THREADS, thread_name_prefix=name, initializer=lower_priority, initargs=(niceness,)
         )
+
+    def close(self) -> None:
+        """End the threads once their work is done; later work is left to the caller."""
+        self._pool.shutdown()
 
     def each(self, work: Callable[[int], None]) -> None:
         """Run ``work(part)`` for every part of ``range(THREADS)``, at the same time."""
@@ -49,7 +51,13 @@ class Team:
             work.result()
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
-        others = [self._pool.submit(work, part) for part in range(1, parts)]
+        others: list[Future[None]] = []
+        try:
+            for part in range(1, parts):
+                others.append(self._pool.submit(work, part))
+        except RuntimeError:  # closed
+            for part in range(1, parts):
+                work(part)
         try:
             work(0)
         finally:
@@ -63,13 +71,13 @@ def share(count: int, part: int, parts: int = THREADS) -> tuple[int, int]:
     return -(-count * part // parts), -(-count * (part + 1) // parts)
 
 
-def be_patient(patience: int) -> None:
-    """Have the calling thread leave the cores to threads of less patience, 0 being the least.
+def lower_priority(niceness: int) -> None:
+    """Have the calling thread leave the cores to threads of less ``niceness``, 0 being the least.
 
     Where the system does not know priorities of single threads, nothing happens.
     """
-    if patience and sys.platform == "linux":
+    if niceness and sys.platform == "linux":
         with contextlib.suppress(OSError):
             thread = threading.get_native_id()
-            nice = os.getpriority(os.PRIO_PROCESS, thread) + patience
+            nice = os.getpriority(os.PRIO_PROCESS, thread) + niceness
             os.setpriority(os.PRIO_PROCESS, thread, nice)

@@ -4,11 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.pose import orthonormal
 from triquad_format.records.status import Status
 
 from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.questions.pose import moved, orthonormal
+from triquad_map.questions.pose import moved
 from triquad_map.questions.thinning import thinned
 from triquad_map.view import MapView
 
@@ -78,8 +79,8 @@ class Alignment:
     corridor) the guess is kept and the variance is that of 100 m or half a turn.
     """
 
-    world_from_sensor: NDArray[np.float64]  # [4, 4]
-    covariance: NDArray[np.float64]  # [6, 6] of translation, rotation; see above
+    world_from_sensor: Doubles  # [4, 4]
+    covariance: Doubles  # [6, 6] of translation, rotation; see above
     inlier_share: float  # of the points that the map can tell about, those on a surface
     rms_m: float  # of their distances; 0 where there are none
     converged: bool  # it came to rest, most points are on surfaces, and these tell all directions
@@ -88,12 +89,7 @@ class Alignment:
     epoch: int
 
 
-def align(
-    view: MapView,
-    points: NDArray[np.float64],
-    guess: NDArray[np.float64],
-    options: AlignOptions,
-) -> Alignment:
+def align(view: MapView, points: Doubles, guess: Doubles, options: AlignOptions) -> Alignment:
     """Move a scan from where it is guessed to be to where it fits the map best.
 
     The squared distances of its points to the nearest seen surface are made small by Gauss-Newton
@@ -122,25 +118,25 @@ def align(
 class _Normal:
     """Normal equations of the motion ``(t, r * arm)`` that brings points to surfaces."""
 
-    matrix: NDArray[np.float64]  # [6, 6] of mean square: the trace is that of one point
-    vector: NDArray[np.float64]  # [6]
+    matrix: Doubles  # [6, 6] of mean square: the trace is that of one point
+    vector: Doubles  # [6]
     arm_m: float  # RMS range of the points
     weight: float  # sum of all points' weights
     variance: float  # of the weighted distances
 
-    def seen(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def seen(self) -> tuple[Doubles, Doubles]:
         """Directions [6, S] that the surfaces tell, as columns, and their information [S]."""
         values, vectors = np.linalg.eigh(self.matrix)
         seen = values > _OBSERVABLE
         return vectors[:, seen], values[seen]
 
-    def step(self) -> NDArray[np.float64]:
+    def step(self) -> Doubles:
         """The motion [6], none along what is not seen."""
         vectors, values = self.seen()
-        step: NDArray[np.float64] = -vectors @ ((vectors.T @ self.vector) / values)
+        step: Doubles = -vectors @ ((vectors.T @ self.vector) / values)
         return step
 
-    def covariance(self) -> NDArray[np.float64]:
+    def covariance(self) -> Doubles:
         """Of translation and rotation [6, 6]."""
         vectors, values = self.seen()
         scaling = np.repeat([1.0, self.arm_m], 3)
@@ -148,7 +144,7 @@ class _Normal:
         information *= self.weight / (_CORRELATED * max(self.variance, 1e-12))
         weak = np.repeat([1 / _UNSEEN_M**2, 1 / _UNSEEN_RAD**2], 3)
         covariance = np.linalg.inv(information + np.diag(weak))
-        symmetric: NDArray[np.float64] = (covariance + covariance.T) / 2
+        symmetric: Doubles = (covariance + covariance.T) / 2
         return symmetric
 
 
@@ -156,17 +152,12 @@ class _Normal:
 class _Found:
     """Where the search ended."""
 
-    pose: NDArray[np.float64]  # [4, 4]
+    pose: Doubles  # [4, 4]
     iterations: int
     settled: bool
 
 
-def _descend(
-    view: MapView,
-    fine: NDArray[np.float64],
-    pose: NDArray[np.float64],
-    options: AlignOptions,
-) -> _Found:
+def _descend(view: MapView, fine: Doubles, pose: Doubles, options: AlignOptions) -> _Found:
     points = thinned(fine, _COARSE_POINTS)
     final = _FINAL_VOXELS * view.voxel_m
     scale = max(options.max_distance_m, final)
@@ -176,7 +167,7 @@ def _descend(
         if normal is None:
             return _Found(pose, iteration, False)
         step = normal.step()
-        # Where it goes to and fro, shorter steps settle between.
+        # Where steps go back and forth, shorter ones settle between.
         overshoot = min(_OVERSHOOT, 1.25 * overshoot) if step @ last >= 0 else 0.5 * overshoot
         last = step
         taken = (overshoot if scale == final else 1.0) * step
@@ -194,8 +185,8 @@ def _descend(
 
 def _normal(
     view: MapView,
-    points: NDArray[np.float64],
-    pose: NDArray[np.float64],
+    points: Doubles,
+    pose: Doubles,
     scale: float,
     options: AlignOptions,
     is_final: bool,
@@ -204,7 +195,7 @@ def _normal(
     turned = points @ pose[:3, :3].T
     reach_m = min(options.max_distance_m, _REACH_SCALES * scale)
     answer = distances(view, turned + pose[:3, 3], DistanceOptions(reach_m))
-    distance = answer.distance.astype(np.float64)
+    distance = answer.distance_m.astype(np.float64)
     spread = 1.0 if is_final else 1.0 + _PER_RANGE * np.linalg.norm(points, axis=1)
     counts = answer.found.astype(np.float64)
     if scale <= _SURE_VOXELS * view.voxel_m:
@@ -219,26 +210,20 @@ def _normal(
     rows = np.hstack([slope, np.cross(turned, slope) / arm_m])
     weighted = share[:, None] * rows
     return _Normal(
-        weighted.T @ rows,
-        weighted.T @ distance,
-        arm_m,
-        weight,
-        float(share @ distance**2),
+        weighted.T @ rows, weighted.T @ distance, arm_m, weight, float(share @ distance**2)
     )
 
 
-def _judged(
-    view: MapView, points: NDArray[np.float64], found: _Found, options: AlignOptions
-) -> Alignment:
+def _judged(view: MapView, points: Doubles, found: _Found, options: AlignOptions) -> Alignment:
     """What to think of where the search ended."""
     final = _FINAL_VOXELS * view.voxel_m
     world = points @ found.pose[:3, :3].T + found.pose[:3, 3]
     answer = distances(view, world, DistanceOptions(options.max_distance_m))
     known = answer.status != Status.UNKNOWN
-    inliers = answer.found & known & (np.abs(answer.distance) <= _INLIER_SCALES * final)
+    inliers = answer.found & known & (np.abs(answer.distance_m) <= _INLIER_SCALES * final)
     count = int(inliers.sum())
     share = count / max(int((answer.found | known).sum()), 1)
-    squares = answer.distance[inliers].astype(np.float64) ** 2
+    squares = answer.distance_m[inliers].astype(np.float64) ** 2
     rms_m = math.sqrt(float(squares.sum()) / max(count, 1))
     normal = _normal(view, points, found.pose, final, options, is_final=True)
     covariance = np.diag(np.repeat([_UNSEEN_M**2, _UNSEEN_RAD**2], 3))
@@ -248,12 +233,12 @@ def _judged(
         all_seen = len(normal.seen()[1]) == 6
     enough = count >= _LEAST_INLIERS and share >= _LEAST_INLIER_SHARE
     return Alignment(
-        found.pose,
-        covariance,
-        share,
-        rms_m,
-        found.settled and enough and all_seen,
-        found.iterations,
-        len(points),
-        view.number,
+        world_from_sensor=found.pose,
+        covariance=covariance,
+        inlier_share=share,
+        rms_m=rms_m,
+        converged=found.settled and enough and all_seen,
+        iterations=found.iterations,
+        points=len(points),
+        epoch=view.epoch,
     )

@@ -9,8 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.errors import RefusedError
+from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.pose import is_rigid
 from triquad_format.wire.codec import Message
+from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_ITERATIONS, MAX_RANGE_M, MIN_LENGTH_M
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
     AlignReply,
@@ -30,15 +33,10 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.align import AlignOptions, align
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
-from triquad_map.questions.pose import is_rigid
 from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments, steps_at_most
 from triquad_map.questions.spheres import spheres
 from triquad_map.view import MapView
-
-MAX_DISTANCE_M = 100.0
-MAX_RANGE_M = 1_000.0
-MAX_ITERATIONS = 200
 
 _DECIMALS = 5  # of positions, metres
 _STEPS_EACH = 50
@@ -46,14 +44,6 @@ _STEPS_EACH = 50
 
 _RANGE_EACH_M = 10.0
 """Range of a ray that counts as much."""
-
-
-class QuestionError(Exception):
-    """Why a question is not answered; ``code`` is one of ``messages.ERROR_CODES``."""
-
-    def __init__(self, code: str, text: str) -> None:
-        super().__init__(text)
-        self.code = code
 
 
 @dataclass(frozen=True)
@@ -79,7 +69,7 @@ class Answers:
         """The answer to a question of any kind.
 
         Raises:
-            QuestionError: it is not answered.
+            RefusedError: it is not answered.
             KeyError: it is no question about the map.
         """
         return _ANSWERS[type(request)](self, request)
@@ -89,7 +79,9 @@ class Answers:
         points = _points("point", request.origin, request.points, self._limits.points)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
-            return SdfReply(view.number, answer.sdf, answer.status, answer.gradient)
+            return SdfReply(
+                epoch=view.epoch, sdf=answer.sdf, status=answer.status, gradient=answer.gradient
+            )
 
     def distance(self, request: DistanceRequest) -> DistanceReply:
         """Distances to the nearest surface."""
@@ -99,30 +91,30 @@ class Answers:
         with self._view(request.epoch) as view:
             answer = distances(view, points, options)
         return DistanceReply(
-            answer.epoch,
-            answer.distance,
-            answer.gradient,
-            answer.found.astype(np.uint8),
-            answer.status,
-            answer.confidence,
-            _relative(answer.surface_point, request.origin),
-            answer.unknown_distance,
-            _relative(answer.unknown_point, request.origin),
+            epoch=answer.epoch,
+            distance_m=answer.distance_m,
+            gradient=answer.gradient,
+            found=answer.found.astype(np.uint8),
+            status=answer.status,
+            confidence=answer.confidence,
+            surface_point=_relative(answer.surface_point, request.origin),
+            unknown_distance_m=answer.unknown_distance_m,
+            unknown_point=_relative(answer.unknown_point, request.origin),
         )
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
         """What spheres hold."""
         centres = self._searched("sphere", request.origin, request.centres)
-        _same_length(request.centres, "radii", request.radii)
-        good = (request.radii >= 0) & (request.radii <= MAX_DISTANCE_M)
+        _same_length(request.centres, "radii_m", request.radii_m)
+        good = (request.radii_m >= 0) & (request.radii_m <= MAX_DISTANCE_M)
         if not good.all():
             worst = int((~good).argmax())
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request",
-                f"radius {worst} is {request.radii[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
+                f"radius {worst} is {request.radii_m[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
             )
         with self._view(request.epoch) as view:
-            answer = spheres(view, centres, request.radii.astype(np.float64))
+            answer = spheres(view, centres, request.radii_m.astype(np.float64))
         return SpheresReply(answer.epoch, answer.status)
 
     def segments(self, request: SegmentsRequest) -> SegmentsReply:
@@ -140,14 +132,14 @@ class Answers:
             self._check_count(steps / _STEPS_EACH, f"segments of {steps} steps")
             answer = segments(view, starts, ends, options)
         return SegmentsReply(
-            answer.epoch,
-            answer.length,
-            answer.blocked.astype(np.uint8),
-            answer.contact,
-            answer.clearance,
-            answer.clearance_at,
-            answer.meets_unknown.astype(np.uint8),
-            answer.unknown_contact,
+            epoch=answer.epoch,
+            length_m=answer.length_m,
+            blocked=answer.blocked.astype(np.uint8),
+            contact_m=answer.contact_m,
+            clearance_m=answer.clearance_m,
+            clearance_at_m=answer.clearance_at_m,
+            meets_unknown=answer.meets_unknown.astype(np.uint8),
+            unknown_contact_m=answer.unknown_contact_m,
         )
 
     def rays(self, request: RaysRequest) -> RaysReply:
@@ -159,7 +151,7 @@ class Answers:
         bad = ~(np.abs(lengths - 1.0) < 1e-3)
         if bad.any():
             worst = int(bad.argmax())
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
             )
         reach_m = _within("max_range_m", request.max_range_m, MAX_RANGE_M)
@@ -169,14 +161,14 @@ class Answers:
         options = RayOptions(reach_m, request.through_unknown)
         with self._view(request.epoch) as view:
             answer = rays(view, starts, directions / lengths[:, None], options)
-        return RaysReply(answer.epoch, answer.range, answer.status)
+        return RaysReply(answer.epoch, answer.range_m, answer.status)
 
     def grid(self, request: GridRequest) -> GridReply:
         """Distance and status at a grid's cells."""
         counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
         cell_m = _within("cell_m", request.cell_m, MAX_DISTANCE_M)
         if min(counts) < 1 or not np.isfinite(request.corner).all():
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request", f"not a grid: counts {counts}, corner {request.corner}"
             )
         shape = GridShape(request.corner, cell_m, counts)
@@ -184,13 +176,13 @@ class Answers:
         reach_m = _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
             answer = grid(view, shape, reach_m)
-        return GridReply(answer.epoch, answer.distance, answer.status)
+        return GridReply(answer.epoch, answer.distance_m, answer.status)
 
     def align(self, request: AlignRequest) -> AlignReply:
         """The pose of a scan near a guess."""
         self._check_count(len(request.points), f"{len(request.points)} points")
         if not is_rigid(request.world_from_sensor):
-            raise QuestionError(
+            raise RefusedError(
                 "bad_request",
                 f"world_from_sensor is no rotation and translation: {request.world_from_sensor}",
             )
@@ -203,24 +195,22 @@ class Answers:
                 view, request.points.astype(np.float64), request.world_from_sensor, options
             )
         return AlignReply(
-            answer.epoch,
-            answer.world_from_sensor,
-            answer.covariance,
-            answer.inlier_share,
-            answer.rms_m,
-            answer.converged,
-            answer.iterations,
-            answer.points,
+            epoch=answer.epoch,
+            world_from_sensor=answer.world_from_sensor,
+            covariance=answer.covariance,
+            inlier_share=answer.inlier_share,
+            rms_m=answer.rms_m,
+            converged=answer.converged,
+            iterations=answer.iterations,
+            points=answer.points,
         )
 
-    def _searched(
-        self, what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
+    def _searched(self, what: str, origin: Doubles, offsets: Floats) -> Doubles:
         return _points(what, origin, offsets, self._limits.searches)
 
     def _check_count(self, count: float, what: str) -> None:
         if count > self._limits.searches:
-            raise QuestionError(
+            raise RefusedError(
                 "too_large",
                 f"{what} exceed the limit of {self._limits.searches} searches: split the request",
             )
@@ -237,16 +227,14 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
 }
 
 
-def _points(
-    what: str, origin: NDArray[np.float64], offsets: NDArray[np.float32], most: int
-) -> NDArray[np.float64]:
+def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
     """Points [N, 3] of the map frame.
 
     Raises:
-        QuestionError: they are too many, or not all finite.
+        RefusedError: they are too many, or not all finite.
     """
     if len(offsets) > most:
-        raise QuestionError(
+        raise RefusedError(
             "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
         )
     # Single precision from an origin is good to that. Unrounded, a point that somebody chose on a
@@ -254,32 +242,30 @@ def _points(
     points = np.round(origin + offsets.astype(np.float64), _DECIMALS)
     if not np.isfinite(points).all():
         index = int(np.isfinite(points).all(axis=1).argmin())
-        raise QuestionError("bad_request", f"{what} {index} is not finite: {points[index]}")
+        raise RefusedError("bad_request", f"{what} {index} is not finite: {points[index]}")
     return points
 
 
-def _within(name: str, value: float, most: float, least: float = 1e-6) -> float:
+def _within(name: str, value: float, most: float, least: float = MIN_LENGTH_M) -> float:
     if not least <= value <= most:
-        raise QuestionError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
+        raise RefusedError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
     return float(value)
 
 
-def _short(what: str, lengths: NDArray[np.float64]) -> None:
+def _short(what: str, lengths: Doubles) -> None:
     """Refuse ways [N] that are too long: each of their steps waits for the one before."""
     if lengths.max(initial=0.0) > MAX_RANGE_M:
         worst = int(lengths.argmax())
-        raise QuestionError(
+        raise RefusedError(
             "bad_request",
             f"{what} {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
         )
 
 
-def _same_length(first: NDArray[np.float32], name: str, second: NDArray[np.float32]) -> None:
+def _same_length(first: Floats, name: str, second: Floats) -> None:
     if len(first) != len(second):
-        raise QuestionError("bad_request", f"{len(second)} {name} for {len(first)} points")
+        raise RefusedError("bad_request", f"{len(second)} {name} for {len(first)} points")
 
 
-def _relative(
-    points: NDArray[np.float64] | None, origin: NDArray[np.float64]
-) -> NDArray[np.float32] | None:
+def _relative(points: Doubles | None, origin: Doubles) -> Floats | None:
     return None if points is None else (points - origin).astype(np.float32)

@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_map.nearest import NearestSurface
@@ -31,18 +31,18 @@ class DistanceOptions:
 class Distances:
     """Distances from N points to the nearest seen surface, metres, map frame, of one epoch."""
 
-    distance: NDArray[np.float32]  # [N] negative behind a surface; at most max_distance_m
-    gradient: NDArray[np.float32]  # [N, 3] its unit gradient, pointing to free space; 0: not found
-    found: NDArray[np.bool_]  # [N] False: no surface within max_distance_m, which distance then is
-    status: NDArray[np.uint8]  # [N] Status of the points themselves
-    confidence: NDArray[np.float32]  # [N] in [0, 1]; 0 where nothing was found or the point unknown
-    surface_point: NDArray[np.float64] | None  # [N, 3] nearest point; the point itself: not found
-    unknown_distance: NDArray[np.float32] | None  # [N] to unknown space, at most max_distance_m
-    unknown_point: NDArray[np.float64] | None  # [N, 3] nearest point of it, within max_distance_m
+    distance_m: Floats  # [N] negative behind a surface; at most max_distance_m
+    gradient: Floats  # [N, 3] its unit gradient, pointing to free space; 0: not found
+    found: Bools  # [N] False: no surface within max_distance_m, distance_m then
+    status: Bytes  # [N] Status of the points themselves
+    confidence: Floats  # [N] in [0, 1]; 0 where nothing was found or the point unknown
+    surface_point: Doubles | None  # [N, 3] nearest point; the point itself: not found
+    unknown_distance_m: Floats | None  # [N] at most max_distance_m, 0 in unknown space
+    unknown_point: Doubles | None  # [N, 3] nearest point of it, within max_distance_m
     epoch: int
 
 
-def distances(view: MapView, points: NDArray[np.float64], options: DistanceOptions) -> Distances:
+def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
     """Distances from ``points`` [N, 3] to the nearest seen surface."""
     nearest = view.nearest_surface(points, options.max_distance_m)
     status = view.status(points)
@@ -60,19 +60,19 @@ def distances(view: MapView, points: NDArray[np.float64], options: DistanceOptio
     if options.surface_point:
         surface_point = np.where(nearest.found[:, None], nearest.point, points)
     return Distances(
-        distance.astype(np.float32),
-        gradient.astype(np.float32),
-        nearest.found,
-        status,
-        np.where(status == Status.UNKNOWN, np.float32(0), nearest.confidence),
-        surface_point,
-        None if unknown is None else unknown.distance.astype(np.float32),
-        None if unknown is None else unknown.point,
-        view.number,
+        distance_m=distance.astype(np.float32),
+        gradient=gradient.astype(np.float32),
+        found=nearest.found,
+        status=status,
+        confidence=np.where(status == Status.UNKNOWN, np.float32(0), nearest.confidence),
+        surface_point=surface_point,
+        unknown_distance_m=None if unknown is None else unknown.distance.astype(np.float32),
+        unknown_point=None if unknown is None else unknown.point,
+        epoch=view.epoch,
     )
 
 
-def with_unknown(answer: Distances, points: NDArray[np.float64], unknown: Unknown) -> Distances:
+def with_unknown(answer: Distances, points: Doubles, unknown: Unknown) -> Distances:
     """The answer for ``points`` [N, 3] where unknown space counts as asked.
 
     As an obstacle it is a surface like others, of confidence 0.
@@ -82,9 +82,9 @@ def with_unknown(answer: Distances, points: NDArray[np.float64], unknown: Unknow
     """
     if unknown is Unknown.FREE:
         return answer
-    assert answer.unknown_distance is not None
+    assert answer.unknown_distance_m is not None
     assert answer.unknown_point is not None
-    nearer = answer.unknown_distance < answer.distance
+    nearer = answer.unknown_distance_m < answer.distance_m
     if unknown is Unknown.ERROR:
         refuse_unknown("point", nearer)
     away = points - answer.unknown_point
@@ -95,7 +95,7 @@ def with_unknown(answer: Distances, points: NDArray[np.float64], unknown: Unknow
         surface_point = np.where(nearer[:, None], answer.unknown_point, surface_point)
     return dataclasses.replace(
         answer,
-        distance=np.where(nearer, answer.unknown_distance, answer.distance),
+        distance_m=np.where(nearer, answer.unknown_distance_m, answer.distance_m),
         gradient=np.where(nearer[:, None], gradient, answer.gradient).astype(np.float32),
         found=answer.found | nearer,
         confidence=np.where(nearer, np.float32(0), answer.confidence),
@@ -105,13 +105,13 @@ def with_unknown(answer: Distances, points: NDArray[np.float64], unknown: Unknow
 
 def _join_field(
     view: MapView,
-    points: NDArray[np.float64],
+    points: Doubles,
     nearest: NearestSurface,
-    status: NDArray[np.uint8],
-    distance: NDArray[np.float64],
-    gradient: NDArray[np.float64],
+    status: Bytes,
+    distance: Doubles,
+    gradient: Doubles,
 ) -> None:
-    """Near a surface, take the side of it from the trained field, and by and by its value."""
+    """Near a surface, take the side of it from the trained field, and gradually its value."""
     low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
     rows = np.flatnonzero(nearest.found & (distance < high) & (status == Status.SURFACE))
     if not len(rows):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Bytes, Doubles, Floats
 
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.view import MapView
@@ -13,7 +13,7 @@ from triquad_map.view import MapView
 class GridShape:
     """Where the middles of a grid's cells are."""
 
-    corner: NDArray[np.float64]  # [3] the grid's least corner, metres, map frame
+    corner: Doubles  # [3] the grid's least corner, metres, map frame
     cell_m: float
     counts: tuple[int, int, int]  # cells along x, y and z; one along z is a slice
 
@@ -22,7 +22,7 @@ class GridShape:
         """How many there are."""
         return self.counts[0] * self.counts[1] * self.counts[2]
 
-    def middles(self) -> NDArray[np.float64]:
+    def middles(self) -> Doubles:
         """The middles [cells, 3], z running fastest."""
         axes = [np.arange(count) for count in self.counts]
         cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -34,8 +34,8 @@ class Grid:
     """A map at the middles of a grid's cells, of one epoch."""
 
     shape: GridShape
-    distance: NDArray[np.float32]  # [x, y, z] to the nearest seen surface, at most max_distance_m
-    status: NDArray[np.uint8]  # [x, y, z] Status
+    distance_m: Floats  # [x, y, z] to the nearest surface, at most max_distance_m
+    status: Bytes  # [x, y, z] Status
     epoch: int
 
 
@@ -44,7 +44,7 @@ def grid(view: MapView, shape: GridShape, max_distance_m: float) -> Grid:
     answer = distances(view, shape.middles(), DistanceOptions(max_distance_m))
     return Grid(
         shape,
-        answer.distance.reshape(shape.counts),
+        answer.distance_m.reshape(shape.counts),
         answer.status.reshape(shape.counts),
-        view.number,
+        view.epoch,
     )

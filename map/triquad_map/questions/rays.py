@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_map.questions.distance import DistanceOptions, distances
@@ -16,7 +16,7 @@ _TOUCH_M = 1e-5
 """A ray that comes as near to unknown space has reached it: its places are no more exact."""
 
 _LOOK_AHEAD_M = 3.0
-"""How far around a surface is looked for: farther costs more than shorter steps."""
+"""How far around a surface is searched for: farther costs more than shorter steps."""
 
 
 @dataclass(frozen=True)
@@ -28,24 +28,19 @@ class RayOptions:
 
 
 @dataclass(frozen=True)
-class Rays:
+class RayRanges:
     """How far N rays reach, metres, of one epoch.
 
     ``SURFACE``: to a seen surface. ``UNKNOWN``: to where unknown space begins. ``FREE``: to the
     largest range, through space that was seen to be free (or, where asked for, unknown).
     """
 
-    range: NDArray[np.float32]  # [N]
-    status: NDArray[np.uint8]  # [N] Status
+    range_m: Floats  # [N]
+    status: Bytes  # [N] Status
     epoch: int
 
 
-def rays(
-    view: MapView,
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    options: RayOptions,
-) -> Rays:
+def rays(view: MapView, origins: Doubles, directions: Doubles, options: RayOptions) -> RayRanges:
     """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach."""
     status = np.full(len(origins), Status.FREE, np.uint8)
     ranges = np.full(len(origins), options.max_range_m)
@@ -53,15 +48,10 @@ def rays(
     status[hit] = Status.SURFACE
     if not options.through_unknown:
         _stop_at_unknown(view, origins, directions, ranges, status)
-    return Rays(ranges.astype(np.float32), status, view.number)
+    return RayRanges(ranges.astype(np.float32), status, view.epoch)
 
 
-def _trace(
-    view: MapView,
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-) -> NDArray[np.bool_]:
+def _trace(view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles) -> Bools:
     """Shorten ``ranges`` [N] to the first surface (Hart 1996); whether each ray meets one."""
     hit = np.zeros(len(origins), np.bool_)
     at = np.zeros(len(origins))
@@ -71,7 +61,7 @@ def _trace(
     ask = DistanceOptions(min(_LOOK_AHEAD_M, float(ranges.max(initial=_HIT_M))))
     while len(going):
         points = origins[going] + at[going, None] * directions[going]
-        distance = distances(view, points, ask).distance.astype(np.float64)
+        distance = distances(view, points, ask).distance_m.astype(np.float64)
         inside = distance <= _HIT_M
         # Between the last place and this one the distance falls about evenly.
         share = np.clip(before[going] / np.maximum(before[going] - distance, 1e-9), 0.0, 1.0)
@@ -86,11 +76,7 @@ def _trace(
 
 
 def _stop_at_unknown(
-    view: MapView,
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    status: NDArray[np.uint8],
+    view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles, status: Bytes
 ) -> None:
     """Shorten the rays that enter unknown space."""
     step_m = STEP_VOXELS * view.voxel_m

@@ -4,22 +4,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Doubles, Floats
 
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.unknown import Unknown, refuse_unknown
 from triquad_map.view import MapView
 
 STEP_VOXELS = 0.5
-"""Between places that are looked at, where nothing allows a longer step."""
+"""Between places that are checked, where nothing allows a longer step."""
 
-_Gap = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+_Gap = Callable[[Doubles], Doubles]
 """Distances [N] at points [N, 3]."""
 
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """What moves along the segments, and how far around surfaces are looked for."""
+    """What moves along the segments, and how far around surfaces are searched for."""
 
     radius_m: float
     max_distance_m: float
@@ -29,20 +29,20 @@ class SegmentOptions:
 class Segments:
     """What a ball meets on N segments, metres, of one epoch.
 
-    Places are distances along the segment from its start. ``clearance`` is that of the ball's
+    Places are distances along the segment from its start. ``clearance_m`` is that of the ball's
     centre, up to where it first touches a surface; it is right within half a step of half a voxel.
     """
 
-    length: NDArray[np.float32]  # [N]
-    blocked: NDArray[np.bool_]  # [N] the ball touches a seen surface
-    contact: NDArray[np.float32]  # [N] where it first does; the length where it does not
-    clearance: NDArray[np.float32]  # [N] least distance to a surface, at most max_distance_m
-    clearance_at: NDArray[np.float32]  # [N] where
-    meets_unknown: NDArray[np.bool_]  # [N] the ball enters unknown space, before any contact
-    unknown_contact: NDArray[np.float32]  # [N] where it first does; the length where it does not
+    length_m: Floats  # [N]
+    blocked: Bools  # [N] the ball touches a seen surface
+    contact_m: Floats  # [N] where it first does; the length where it does not
+    clearance_m: Floats  # [N] least distance to a surface, at most max_distance_m
+    clearance_at_m: Floats  # [N] where
+    meets_unknown: Bools  # [N] the ball enters unknown space, before any contact
+    unknown_contact_m: Floats  # [N] where it first does; the length where it does not
     epoch: int
 
-    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> NDArray[np.bool_]:
+    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> Bools:
         """Whether the ball can pass each segment [N], where unknown space counts as asked.
 
         Raises:
@@ -59,34 +59,29 @@ class Segments:
 class _March:
     """How far a walk along N segments went."""
 
-    blocked: NDArray[np.bool_]
-    contact: NDArray[np.float64]
-    clearance: NDArray[np.float64]
-    clearance_at: NDArray[np.float64]
+    blocked: Bools
+    contact: Doubles
+    clearance: Doubles
+    clearance_at: Doubles
 
 
-def steps_at_most(view: MapView, starts: NDArray[np.float64], ends: NDArray[np.float64]) -> int:
-    """How many places may have to be looked at between ``starts`` and ``ends`` [N, 3]."""
+def steps_at_most(view: MapView, starts: Doubles, ends: Doubles) -> int:
+    """How many places may have to be checked between ``starts`` and ``ends`` [N, 3]."""
     lengths = np.linalg.norm(ends - starts, axis=1)
     return int(np.ceil(lengths / (STEP_VOXELS * view.voxel_m)).sum()) + 2 * len(starts)
 
 
-def segments(
-    view: MapView,
-    starts: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    options: SegmentOptions,
-) -> Segments:
+def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOptions) -> Segments:
     """What a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
     lengths = np.linalg.norm(ends - starts, axis=1)
     directions = (ends - starts) / np.maximum(lengths, 1e-12)[:, None]
     reach_m = max(options.max_distance_m, options.radius_m + view.voxel_m)
     step_m = STEP_VOXELS * view.voxel_m
 
-    def to_surface(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return distances(view, points, DistanceOptions(reach_m)).distance.astype(np.float64)
+    def to_surface(points: Doubles) -> Doubles:
+        return distances(view, points, DistanceOptions(reach_m)).distance_m.astype(np.float64)
 
-    def to_unknown(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_unknown(points: Doubles) -> Doubles:
         return view.nearest_unknown(points, reach_m).distance
 
     radius = options.radius_m
@@ -95,22 +90,22 @@ def segments(
     inside = np.nextafter(radius, 0.0) if radius > 0 else 0.0
     unknown = _march(to_unknown, starts, directions, solid.contact, inside, step_m, clearance=False)
     return Segments(
-        lengths.astype(np.float32),
-        solid.blocked,
-        solid.contact.astype(np.float32),
-        np.minimum(solid.clearance, options.max_distance_m).astype(np.float32),
-        solid.clearance_at.astype(np.float32),
-        unknown.blocked,
-        np.where(unknown.blocked, unknown.contact, lengths).astype(np.float32),
-        view.number,
+        length_m=lengths.astype(np.float32),
+        blocked=solid.blocked,
+        contact_m=solid.contact.astype(np.float32),
+        clearance_m=np.minimum(solid.clearance, options.max_distance_m).astype(np.float32),
+        clearance_at_m=solid.clearance_at.astype(np.float32),
+        meets_unknown=unknown.blocked,
+        unknown_contact_m=np.where(unknown.blocked, unknown.contact, lengths).astype(np.float32),
+        epoch=view.epoch,
     )
 
 
 def _march(
     gap: _Gap,
-    starts: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    lengths: NDArray[np.float64],
+    starts: Doubles,
+    directions: Doubles,
+    lengths: Doubles,
     radius_m: float,
     step_m: float,
     clearance: bool,
@@ -138,7 +133,7 @@ def _march(
         step = distance - radius_m
         if clearance:
             step = np.minimum(step, distance - march.clearance[going] + step_m)
-        # The end is looked at, too.
+        # The end is checked, too.
         there = place >= lengths[going]
         at[going] = np.minimum(place + np.maximum(step, step_m), lengths[going])
         going = going[~touches & ~there]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Bytes, Doubles
 from triquad_format.records.status import Status
 
 from triquad_map.questions.distance import DistanceOptions, distances
@@ -19,10 +19,10 @@ class Spheres:
     does, but unknown space. ``FREE``: all of it was seen to be free.
     """
 
-    status: NDArray[np.uint8]  # [N] Status
+    status: Bytes  # [N] Status
     epoch: int
 
-    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> NDArray[np.bool_]:
+    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> Bools:
         """Whether each sphere [N] can be entered, where unknown space counts as asked.
 
         Raises:
@@ -30,19 +30,19 @@ class Spheres:
             ValueError: ``unknown`` is no :class:`Unknown`.
         """
         meets = self.status == Status.UNKNOWN
-        free: NDArray[np.bool_] = self.status == Status.FREE
+        free: Bools = self.status == Status.FREE
         if Unknown(unknown) is Unknown.ERROR:
             refuse_unknown("sphere", meets)
         return free | meets if Unknown(unknown) is Unknown.FREE else free
 
 
-def spheres(view: MapView, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> Spheres:
+def spheres(view: MapView, centres: Doubles, radii: Doubles) -> Spheres:
     """What the spheres around ``centres`` [N, 3] of ``radii`` [N] hold, metres."""
     # A little beyond the largest, so that what touches it is found.
     reach_m = float(radii.max(initial=0.0)) + view.voxel_m
     answer = distances(view, centres, DistanceOptions(reach_m, unknown_distance=True))
-    assert answer.unknown_distance is not None
+    assert answer.unknown_distance_m is not None
     status = np.full(len(centres), Status.FREE, np.uint8)
-    status[(answer.unknown_distance < radii) | (answer.status == Status.UNKNOWN)] = Status.UNKNOWN
-    status[answer.found & (answer.distance <= radii)] = Status.SURFACE
-    return Spheres(status, view.number)
+    status[(answer.unknown_distance_m < radii) | (answer.status == Status.UNKNOWN)] = Status.UNKNOWN
+    status[answer.found & (answer.distance_m <= radii)] = Status.SURFACE
+    return Spheres(status, view.epoch)

@@ -3,14 +3,14 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 
 _CELLS = 1 << 20  # along an axis
 _MARGIN = 1.1
 """More than are wanted, by so much, are as good: to thin once more changes nothing."""
 
 
-def thinned(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+def thinned(points: Doubles, most: int) -> Doubles:
     """Some ``most`` of points [N, 3], evenly in space: the first of each cell of a grid.
 
     Points that are not finite are left out. What was thinned before stays as it is.

@@ -4,27 +4,20 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.region import BLOCK_VOXELS
 
-from triquad_map.nearest import NearestSurfels, no_surfels
-from triquad_map.surface.surfels import (
-    DISC_RADIUS,
-    OUTSIDE,
-    SMOOTHING,
-    SurfelKind,
-    Surfels,
-)
+from triquad_map.nearest import NearestSurfels
+from triquad_map.surface.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind, Surfels
 
 _PAIRS = 1 << 19
-"""Points with blocks or surfels that are looked at together: what bounds the memory."""
-
-Doubles = NDArray[np.float64]
+"""Points with blocks or surfels that are compared together: what bounds the memory."""
 
 
 class SurfelCloud:
     """Surfels by blocks of voxels."""
 
-    def __init__(self, voxels: NDArray[np.int64], surfels: Surfels) -> None:
+    def __init__(self, voxels: Longs, surfels: Surfels) -> None:
         """``surfels`` of ``voxels`` [S, 3], of which those of a block follow each other."""
         kept = np.flatnonzero(surfels.kinds != SurfelKind.NONE)
         self._rows = kept
@@ -37,24 +30,23 @@ class SurfelCloud:
         self._starts = np.append(np.flatnonzero(first), len(cells))
         self._corners = cells[first] * BLOCK_VOXELS
 
-    def nearest(self, points: Doubles, limits: Doubles) -> NearestSurfels:
-        """The surfels nearest to ``points`` [N, 3] and less than ``limits`` [N] away."""
+    def find_nearest(self, points: Doubles, found: NearestSurfels) -> None:
+        """Improve ``found`` where a surfel lies nearer to ``points`` [N, 3], voxels."""
         count = len(points)
-        found = no_surfels(limits)
         blocks = len(self._corners)
         if not blocks:
-            return found
+            return
         step = max(1, _PAIRS // blocks)
         for first in range(0, count, step):
             part = np.arange(first, min(first + step, count))
             gaps = self._block_gaps(points[part])
-            # The nearest block first: what it holds keeps most others from being looked at.
+            # The nearest block first: for what it holds, most others need no search.
             nearest = np.zeros(gaps.shape, np.bool_)
             nearest[np.arange(len(part)), gaps.argmin(axis=1)] = True
-            self._improve(found, points, part, nearest & (gaps < limits[part, None]))
+            limits = found.distances[part, None]
+            self._improve(found, points, part, nearest & (gaps < limits))
             reach = found.distances[part, None] + SMOOTHING
             self._improve(found, points, part, gaps <= reach)
-        return found
 
     def _block_gaps(self, points: Doubles) -> Doubles:
         """How far [N, B] the surfels of each block are at least from each point."""
@@ -66,13 +58,9 @@ class SurfelCloud:
         return np.asarray(np.sqrt(squares) - OUTSIDE, np.float64)
 
     def _improve(
-        self,
-        found: NearestSurfels,
-        points: Doubles,
-        part: NDArray[np.intp],
-        chosen: NDArray[np.bool_],
+        self, found: NearestSurfels, points: Doubles, part: NDArray[np.intp], chosen: Bools
     ) -> None:
-        """Look at the ``chosen`` [len(part), B] blocks of some points."""
+        """Compare the surfels of the ``chosen`` [len(part), B] blocks of some points."""
         sizes = np.diff(self._starts)
         for some in _portions(chosen.astype(np.int64) @ sizes):
             owners, blocks = np.nonzero(chosen[some])
@@ -92,8 +80,8 @@ class SurfelCloud:
         surfels: NDArray[np.intp],
     ) -> None:
         """Let ``surfels`` [P] count for the points ``owners`` [P], which are in order."""
-        feet = self._feet(points[owners], surfels)
-        distances = np.linalg.norm(points[owners] - feet, axis=1)
+        closest = self._closest_points(points[owners], surfels)
+        distances = np.linalg.norm(points[owners] - closest, axis=1)
         starts = np.flatnonzero(np.append(True, owners[1:] != owners[:-1]))
         counts = np.diff(np.append(starts, len(owners)))
         best = np.minimum.reduceat(distances, starts)
@@ -104,15 +92,15 @@ class SurfelCloud:
         winners = at_best[np.searchsorted(at_best, starts)]
         farther = distances - np.repeat(best, counts)
         weights = np.maximum(1.0 - farther / SMOOTHING, 0.0) ** 2
-        sums = np.add.reduceat(weights[:, None] * feet, starts)
+        sums = np.add.reduceat(weights[:, None] * closest, starts)
         means = sums / np.add.reduceat(weights, starts)[:, None]
         rows = asked[nearer]
         found.distances[rows] = best[nearer]
-        found.feet[rows] = feet[winners[nearer]]
+        found.closest[rows] = closest[winners[nearer]]
         found.means[rows] = means[nearer]
         found.rows[rows] = self._rows[surfels[winners[nearer]]]
 
-    def _feet(self, points: Doubles, surfels: NDArray[np.intp]) -> Doubles:
+    def _closest_points(self, points: Doubles, surfels: NDArray[np.intp]) -> Doubles:
         """The nearest point [P, 3] of each surfel to each point."""
         offsets = points - self._positions[surfels]
         normals = self._normals[surfels]
@@ -124,7 +112,7 @@ class SurfelCloud:
         return np.asarray(self._positions[surfels] + reached, np.float64)
 
 
-def _portions(sizes: NDArray[np.int64]) -> Iterator[slice]:
+def _portions(sizes: Longs) -> Iterator[slice]:
     """Cut ``range(len(sizes))`` so that the sizes of a portion add up to little."""
     ends = np.cumsum(sizes)
     first = 0

@@ -7,6 +7,7 @@ scale. ``docs/queries.md`` shows how far measured errors fall as the confidence 
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Bytes, Floats
 from triquad_format.records.region import MAX_LEVEL
 
 from triquad_map.surface.surfels import SurfelKind
@@ -29,18 +30,18 @@ POINT_SHARE = 0.5
 """Of the confidence, where rays ended but the field shows no surface."""
 
 
-def support_confidence(levels: NDArray[np.uint8], kinds: NDArray[np.uint8]) -> NDArray[np.float32]:
+def support_confidence(levels: Bytes, kinds: Bytes) -> Floats:
     """The confidence [N] of surfels of some :class:`SurfelKind` at these levels, just seen."""
     shares = np.where(kinds == SurfelKind.POINT, np.float32(POINT_SHARE), np.float32(1))
     return np.asarray(level_confidence()[levels] * shares, np.float32)
 
 
-def level_confidence() -> NDArray[np.float32]:
+def level_confidence() -> Floats:
     """The confidence [LEVELS] of each level, just seen."""
     strength = LEAST_STRENGTH * 2.0 ** (np.arange(LEVELS) - 0.5)
     return np.asarray(strength / (strength + 1.0), np.float32)
 
 
-def faded(age_s: NDArray[np.floating]) -> NDArray[np.float32]:
+def faded(age_s: NDArray[np.floating]) -> Floats:
     """The share [N] of its confidence that a surface keeps, seen last so many seconds ago."""
     return np.asarray(0.5 ** (np.maximum(age_s, 0.0) / HALF_LIFE_S), np.float32)

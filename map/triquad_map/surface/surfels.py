@@ -2,7 +2,7 @@
 
 The field is right within the band where it is trained and saturates beyond it. So distances over
 any range are measured to surfels: where the field crosses zero in a voxel with seen surface, and
-which way it faces there. A surfel hangs on the field around one voxel alone, which makes it cheap
+which way it faces there. A surfel depends on the field around one voxel alone, which makes it cheap
 to keep up to date.
 
 Everything here is in voxel units: one is the side of a leaf, and the voxel at integer coordinates
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 
 DISC_RADIUS = 0.45
 """Of a surfel, in voxels: discs of neighbours overlap where a surface goes on, and jut out little
@@ -51,30 +51,30 @@ class SurfelKind(IntEnum):
 class Surfels:
     """The surfels of N voxels."""
 
-    offsets: NDArray[np.float32]  # [N, 3] from the voxel's middle, voxels
-    normals: NDArray[np.float32]  # [N, 3] unit vectors to free space; of a POINT they mean little
-    kinds: NDArray[np.uint8]  # [N] SurfelKind
+    offsets: Floats  # [N, 3] from the voxel's middle, voxels
+    normals: Floats  # [N, 3] unit vectors to free space; of a POINT they mean little
+    kinds: Bytes  # [N] SurfelKind
 
 
 @dataclass(frozen=True)
 class FieldSample:
     """A field at N points, in voxels."""
 
-    values: NDArray[np.float32]  # [N]
-    gradients: NDArray[np.float32]  # [N, 3]
+    values: Floats  # [N]
+    gradients: Floats  # [N, 3]
 
 
-Field = Callable[[NDArray[np.float64]], FieldSample]
+SampleField = Callable[[Doubles], FieldSample]
 """The field at leaf coordinates [N, 3]."""
 
-Seen = Callable[[NDArray[np.int64]], NDArray[np.bool_]]
+Seen = Callable[[Longs], Bools]
 """Whether rays ended in voxels [N, 3]."""
 
 
-def fit_surfels(voxels: NDArray[np.int64], field: Field, seen: Seen) -> Surfels:
+def fit_surfels(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
     """The surfels of ``voxels`` [N, 3], by Newton's method from their middles."""
     middles = (voxels + 0.5).astype(np.float64)
-    points: NDArray[np.float64] = middles
+    points: Doubles = middles
     for _ in range(_STEPS):
         points = points + _step(field(points))
     at_end = field(points)
@@ -93,7 +93,7 @@ def fit_surfels(voxels: NDArray[np.int64], field: Field, seen: Seen) -> Surfels:
     return Surfels(offsets.astype(np.float32), normals.astype(np.float32), kinds)
 
 
-def _step(sample: FieldSample) -> NDArray[np.float64]:
+def _step(sample: FieldSample) -> Doubles:
     """The step [N, 3] to where the field is zero, if it were linear."""
     squares = np.maximum((sample.gradients**2).sum(axis=1), _FLATTEST**2)
     steps = -(sample.values / squares)[:, None] * sample.gradients

@@ -1,118 +1,64 @@
-"""Adam for parameters of which a step touches some rows (Kingma and Ba 2015, algorithm 1)."""
+"""Adam (Kingma and Ba 2015, algorithm 1) for parameters of which a step touches some rows.
+
+With its gradient ``g``, a row that takes its ``t``-th step changes by::
+
+    mean     += (1 - mean_decay) * (g - mean)
+    variance += (1 - variance_decay) * (g**2 - variance)
+    m, v      = mean / (1 - mean_decay**t), variance / (1 - variance_decay**t)
+    value    -= learning_rate * m / (sqrt(v) + EPSILON)
+
+Steps are counted row by row, so that the moments of a row that is new or seldom touched are
+corrected for its own age. Here the rule is in tensors, for any device;
+:mod:`triquad_server.engine.compiled_adam` is the same rule for the CPU.
+"""
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
+
+from triquad_server.engine.parameter import Parameter
 
 EPSILON = 1e-10
 
 
 @dataclass(frozen=True)
-class Betas:
-    """Decay rates of the two moments."""
+class Rates:
+    """How fast values and moments follow the gradients."""
 
-    mean: float
-    variance: float
+    learning_rate: float
+    mean_decay: float  # in [0, 1), as is the next
+    variance_decay: float
 
 
-class Parameter:
-    """Rows of values with their optimiser state; growing keeps both together.
+def step_rows(parameter: Parameter, rows: Tensor, gradient: Tensor, rates: Rates) -> None:
+    """One step of ``rows`` [T], all different, along their ``gradient`` [T, ...]."""
+    parameter.steps[rows] += 1
+    means = parameter.means[rows].lerp_(gradient, 1 - rates.mean_decay)
+    variances = parameter.variances[rows].lerp_(gradient.square(), 1 - rates.variance_decay)
+    parameter.means[rows] = means
+    parameter.variances[rows] = variances
+    direction = _direction(means, variances, parameter.steps[rows], rates)
+    parameter.values[rows] -= rates.learning_rate * direction
 
-    ``steps`` counts the steps of each row, so that the moments of a row that is new or seldom
-    touched are corrected for its own age.
+
+def step_where(parameter: Parameter, mask: Tensor, gradient: Tensor, rates: Rates) -> None:
+    """As :func:`step_rows` for the rows where ``mask`` [rows] is set; ``gradient`` [rows, ...].
+
+    It goes over all rows, but need not know how many are set, for which a GPU would have to be
+    waited for.
     """
-
-    def __init__(self, values: Tensor) -> None:
-        self._count = len(values)
-        self._values = values.clone()
-        self._means = torch.zeros_like(values)
-        self._variances = torch.zeros_like(values)
-        self._steps = torch.zeros(len(values), dtype=torch.int32, device=values.device)
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def values(self) -> Tensor:
-        """The parameter [rows, ...]; a view that :meth:`step` changes in place."""
-        return self._values[: self._count]
-
-    @property
-    def means(self) -> Tensor:
-        """First moments, shaped as ``values``."""
-        return self._means[: self._count]
-
-    @property
-    def variances(self) -> Tensor:
-        """Second moments, shaped as ``values``."""
-        return self._variances[: self._count]
-
-    @property
-    def steps(self) -> Tensor:
-        """Steps that each row took [rows] int32."""
-        return self._steps[: self._count]
-
-    def snapshot(self) -> "Parameter":
-        """A copy of the values for reading, without optimiser state."""
-        twin = Parameter(self.values[:0])
-        twin._count, twin._values = self._count, self.values.clone()
-        return twin
-
-    def append(self, values: Tensor) -> None:
-        """Add rows with fresh optimiser state; that of the others stays."""
-        count = self._count + len(values)
-        if count > len(self._values):
-            capacity = max(count, 2 * len(self._values))
-            self._values = _grown(self._values, capacity)
-            self._means = _grown(self._means, capacity)
-            self._variances = _grown(self._variances, capacity)
-            self._steps = _grown(self._steps, capacity)
-        new = slice(self._count, count)
-        self._values[new] = values
-        for state in (self._means, self._variances, self._steps):
-            state[new] = 0
-        self._count = count
-
-    def restore(self, means: Tensor, variances: Tensor, steps: Tensor) -> None:
-        """Take over optimiser state, shaped as this parameter's."""
-        self.means.copy_(means)
-        self.variances.copy_(variances)
-        self.steps.copy_(steps)
-
-    def step_where(self, mask: Tensor, gradient: Tensor, rate: float, betas: Betas) -> None:
-        """As :meth:`step` for the rows where ``mask`` [rows] is set; ``gradient`` [rows, ...].
-
-        It goes over all rows, but need not know how many are set, for which a GPU would have to be
-        waited for.
-        """
-        self.steps.add_(mask)
-        mask = mask.reshape(-1, *[1] * (gradient.dim() - 1))
-        self.means.lerp_(gradient, (1 - betas.mean) * mask)
-        self.variances.lerp_(gradient.square(), (1 - betas.variance) * mask)
-        move = _move(self.means, self.variances, self.steps.clamp(min=1), betas)
-        self.values.sub_(rate * mask * move)
-
-    def step(self, rows: Tensor, gradient: Tensor, rate: float, betas: Betas) -> None:
-        """One step of ``rows`` [T] along ``gradient`` [T, ...] at a learning ``rate``."""
-        self._steps[rows] += 1
-        means = self._means[rows].lerp_(gradient, 1 - betas.mean)
-        variances = self._variances[rows].lerp_(gradient.square(), 1 - betas.variance)
-        self._means[rows] = means
-        self._variances[rows] = variances
-        self._values[rows] -= rate * _move(means, variances, self._steps[rows], betas)
+    parameter.steps.add_(mask)
+    mask = mask.reshape(-1, *[1] * (gradient.dim() - 1))
+    parameter.means.lerp_(gradient, (1 - rates.mean_decay) * mask)
+    parameter.variances.lerp_(gradient.square(), (1 - rates.variance_decay) * mask)
+    steps = parameter.steps.clamp(min=1)
+    direction = _direction(parameter.means, parameter.variances, steps, rates)
+    parameter.values.sub_(rates.learning_rate * mask * direction)
 
 
-def _move(means: Tensor, variances: Tensor, steps: Tensor, betas: Betas) -> Tensor:
-    """How far rows [R, ...] of an age of ``steps`` [R] go, at a learning rate of 1."""
+def _direction(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) -> Tensor:
+    """What rows [R, ...] that took ``steps`` [R] lose at a learning rate of 1."""
     age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
-    mean = means / (1 - betas.mean**age)
-    deviation = (variances / (1 - betas.variance**age)).sqrt_()
+    mean = means / (1 - rates.mean_decay**age)
+    deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()
     return mean / (deviation + EPSILON)
-
-
-def _grown(tensor: Tensor, capacity: int) -> Tensor:
-    # What nothing has been written to takes no memory.
-    grown = tensor.new_empty((capacity, *tensor.shape[1:]))
-    grown[: len(tensor)] = tensor
-    return grown

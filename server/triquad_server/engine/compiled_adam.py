@@ -1,15 +1,16 @@
-"""Adam in compiled code: the step of :mod:`triquad_server.engine.adam`, on the touched rows."""
+"""Adam in compiled code: the rule of :mod:`triquad_server.engine.adam`, on the touched rows."""
 
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
 from triquad_map.compiled.field.field import Touched
+from triquad_map.compiled.kernel import kernel
 
-from triquad_server.engine.adam import EPSILON, Betas
+from triquad_server.engine.adam import EPSILON, Rates
+from triquad_server.engine.parameter import Parameter
 
 Floats = NDArray[np.float32]
 
@@ -18,8 +19,8 @@ _MAX_CORRECTED = 1 << 20
 _AHEAD = 12  # rows that are brought into the cache before their turn
 
 
-class Moments(NamedTuple):
-    """Rows of values with their optimiser state."""
+class ParameterRows(NamedTuple):
+    """The memory of a parameter, as kernels take it."""
 
     values: Floats  # [rows, size]
     means: Floats  # [rows, size]
@@ -27,59 +28,72 @@ class Moments(NamedTuple):
     steps: NDArray[np.int32]  # [rows]
 
 
-class Rates(NamedTuple):
-    """How far a step goes."""
+class CompiledRates(NamedTuple):
+    """Rates with their corrections by age, as kernels take them."""
 
-    rate: float  # learning rate
-    beta1: float
-    beta2: float
+    learning_rate: float
+    mean_decay: float
+    variance_decay: float
     mean_scales: Floats  # [n] correction of the mean after 1, 2, ... steps; the last for more
     variance_scales: Floats  # [n] and of the variance
 
 
-def rates(rate: float, betas: Betas) -> Rates:
-    """The numbers of a step."""
-    return Rates(rate, betas.mean, betas.variance, *_corrections(betas))
-
-
-@lru_cache(maxsize=4)
-def _corrections(betas: Betas) -> tuple[Floats, Floats]:
-    """Scales of mean and variance by age, tabulated until they no longer matter."""
-    slowest = max(betas.mean, betas.variance)
-    count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
-    ages = np.arange(1, count + 1)
-    return (
-        (1 / (1 - betas.mean**ages)).astype(np.float32),
-        (1 / (1 - betas.variance**ages)).astype(np.float32),
+def parameter_rows(parameter: Parameter) -> ParameterRows:
+    """A parameter's own memory, each row flattened."""
+    count = len(parameter)
+    return ParameterRows(
+        parameter.values.numpy().reshape(count, -1),
+        parameter.means.numpy().reshape(count, -1),
+        parameter.variances.numpy().reshape(count, -1),
+        parameter.steps.numpy(),
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
-def step_row(row: int, gradients: Floats, moments: Moments, rates: Rates) -> None:
+def compiled_rates(rates: Rates) -> CompiledRates:
+    """The numbers of a step."""
+    mean_decay, variance_decay = rates.mean_decay, rates.variance_decay
+    scales = _corrections(mean_decay, variance_decay)
+    return CompiledRates(rates.learning_rate, mean_decay, variance_decay, *scales)
+
+
+@lru_cache(maxsize=4)
+def _corrections(mean_decay: float, variance_decay: float) -> tuple[Floats, Floats]:
+    """Scales of mean and variance by age, tabulated until they no longer matter."""
+    slowest = max(mean_decay, variance_decay)
+    count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
+    ages = np.arange(1, count + 1)
+    return (
+        (1 / (1 - mean_decay**ages)).astype(np.float32),
+        (1 / (1 - variance_decay**ages)).astype(np.float32),
+    )
+
+
+@kernel(fastmath=True, error_model="numpy", inline="always")
+def step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: CompiledRates) -> None:
     """One step of a row along its gradient, which is cleared."""
-    moments.steps[row] += 1
-    age = min(moments.steps[row], len(rates.mean_scales)) - 1
+    parameter.steps[row] += 1
+    age = min(parameter.steps[row], len(rates.mean_scales)) - 1
     move_row(
         gradients,
-        moments.values,
-        moments.means,
-        moments.variances,
+        parameter.values,
+        parameter.means,
+        parameter.variances,
         row,
-        (np.float32(1 - rates.beta1), np.float32(1 - rates.beta2)),
-        (np.float32(rates.rate) * rates.mean_scales[age], rates.variance_scales[age]),
+        (np.float32(1 - rates.mean_decay), np.float32(1 - rates.variance_decay)),
+        (np.float32(rates.learning_rate) * rates.mean_scales[age], rates.variance_scales[age]),
         np.float32(EPSILON),
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True, error_model="numpy")
 def step_touched(
     part: int,
     count: int,
     step: int,
     touched: tuple[Touched, ...],
     sums: tuple[Floats, ...],
-    moments: Moments,
-    rates: Rates,
+    parameter: ParameterRows,
+    rates: CompiledRates,
 ) -> None:
     """Adam on the ``count`` rows that the thread ``part`` touched; clears their sums.
 
@@ -89,9 +103,9 @@ def step_touched(
     for i in range(count):
         ahead = rows[min(i + _AHEAD, count - 1)]
         prefetch_row(sums[part], ahead)
-        prefetch_row(moments.values, ahead)
-        prefetch_row(moments.means, ahead)
-        prefetch_row(moments.variances, ahead)
+        prefetch_row(parameter.values, ahead)
+        prefetch_row(parameter.means, ahead)
+        prefetch_row(parameter.variances, ahead)
         row = rows[i]
         mine = True
         for other in range(len(touched)):
@@ -104,4 +118,4 @@ def step_touched(
                 sums[part][row, k] += sums[other][row, k]
                 sums[other][row, k] = 0
         if mine:
-            step_row(row, sums[part], moments, rates)
+            step_row(row, sums[part], parameter, rates)

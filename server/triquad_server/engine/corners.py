@@ -7,8 +7,9 @@ from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.field import morton
-from triquad_map.compiled.field.quadtree import PLANE_BITS, TriQuadtree
-from triquad_map.compiled.voxel_index import MULTIPLIER, longest_probe
+from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
+from triquad_map.compiled.field.vertices import PLANE_BITS
+from triquad_map.compiled.sparse.voxel_index import MULTIPLIER, longest_probe
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,9 @@ class Corners:
 class CornerIndex:
     """A tree's blocks as tensors on a device; they do not grow when the tree does."""
 
-    def __init__(self, tree: TriQuadtree, settings: FieldSettings, device: torch.device) -> None:
+    def __init__(
+        self, tree: LiveQuadtree | FrozenQuadtree, settings: FieldSettings, device: torch.device
+    ) -> None:
         self._settings = settings
         blocks = tree.vertices.blocks
         self._keys = torch.as_tensor(blocks.keys, device=device)

@@ -1,4 +1,4 @@
-"""Flush requests: held, without holding up any worker, until their scans show in the map."""
+"""Flush requests: pending, without holding up any worker, until their scans show in the map."""
 
 import logging
 import threading
@@ -6,11 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from triquad_format.errors import FormatError
+from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
-from triquad_format.wire.messages import FlushRequest
+from triquad_format.wire.messages import FlushReply, FlushRequest
 
-from triquad_server.errors import RequestError
 from triquad_server.intake.sources import MAX_SEQUENCE, SourceLedger
 from triquad_server.net.request import Request
 
@@ -20,21 +19,41 @@ ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived so long after the flush request, which travels the same way behind
 it, is lost."""
 
-_PAUSE_S = 0.25
+Outcome = FlushReply | RefusedError
+"""What a request is answered with: a reply, or why there is none."""
 
 
 @dataclass(frozen=True)
-class _Held:
+class _Pending:
     """A flush request that waits."""
 
     request: Request
     asks: FlushRequest
-    give_up_at: float  # monotonic, seconds
+    give_up_at: float  # monotonic, seconds: a scan that has not arrived by then is lost
     deadline: float  # monotonic, seconds
 
+    @property
+    def scan(self) -> tuple[str, int, int]:
+        """Source, session and sequence of the scan."""
+        return self.asks.source, self.asks.session, self.asks.sequence
 
-class FlushDesk:
-    """Answers flush requests on a thread of its own."""
+    def send(self, outcome: Outcome) -> None:
+        """Answer the request; an internal error ends this one only, not the thread of all."""
+        try:
+            if isinstance(outcome, RefusedError):
+                self.request.refuse(outcome.code, str(outcome))
+            else:
+                self.request.answer(outcome)
+        except Exception as error:
+            _log.exception("a flush request met an internal error")
+            self.request.refuse("internal", f"{type(error).__name__}: {error}")
+
+
+class FlushHandler:
+    """Answers flush requests on a thread of its own.
+
+    All decisions are made under the ledger's lock, whose notifications end the waiting.
+    """
 
     def __init__(
         self,
@@ -43,12 +62,12 @@ class FlushDesk:
         timeout_max_s: float,
         limit: int,
     ) -> None:
-        """``limit`` requests are held at most; ``publish_soon`` asks the mapper for an epoch."""
+        """At most ``limit`` requests are pending; ``publish_soon`` asks the mapper for an epoch."""
         self._ledger = ledger
         self._publish_soon = publish_soon
         self._timeout_max_s = timeout_max_s
         self._limit = limit
-        self._held: list[_Held] = []
+        self._pending: list[_Pending] = []
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="flush")
 
@@ -57,91 +76,86 @@ class FlushDesk:
         self._thread.start()
 
     def close(self) -> None:
-        """Turn away what is held, and end."""
+        """Refuse what is pending, and end."""
         with self._ledger.changed:
             self._stopping = True
             self._ledger.changed.notify_all()
         if self._thread.ident is not None:
             self._thread.join()
 
-    def hold(self, request: Request, asks: FlushRequest) -> None:
+    def add(self, request: Request, asks: FlushRequest) -> None:
         """Take over a request; it is answered once its scan is settled.
 
         Raises:
-            RequestError: a field is out of range, or too many are held.
+            RefusedError: a field is out of range, or too many are pending.
         """
         self._check(asks)
         now = time.monotonic()
         with self._ledger.changed:
-            if self._stopping or len(self._held) >= self._limit:
-                raise RequestError("busy", f"{len(self._held)} flush requests wait already")
-            held = _Held(request, asks, now + ARRIVAL_GRACE_S, now + asks.timeout_s)
-            self._held.append(held)
+            if self._stopping or len(self._pending) >= self._limit:
+                text = f"{len(self._pending)} flush requests are pending already; try later"
+                raise RefusedError("busy", text)
+            times = now + ARRIVAL_GRACE_S, now + asks.timeout_s
+            self._pending.append(_Pending(request, asks, *times))
             self._ledger.changed.notify_all()
 
     def _check(self, asks: FlushRequest) -> None:
         try:
             keys.check_name("source", asks.source)
         except FormatError as error:
-            raise RequestError("bad_request", str(error)) from error
+            raise RefusedError("bad_request", str(error)) from error
         if not 0 <= asks.sequence < MAX_SEQUENCE:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"sequence = {asks.sequence} is out of range: use 0 to {MAX_SEQUENCE - 1}",
             )
         # Written so that NaN is refused as well.
         if not 0 <= asks.timeout_s <= self._timeout_max_s:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"timeout_s = {asks.timeout_s} is out of range: use 0 to {self._timeout_max_s:g}",
             )
 
     def _run(self) -> None:
-        while True:
+        stopping = False
+        while not stopping:
             with self._ledger.changed:
-                if not (self._stopping or any(self._ready(entry) for entry in self._held)):
-                    self._ledger.changed.wait(_PAUSE_S if self._held else None)
-                if self._stopping:
-                    break
-                held = list(self._held)
-            for entry in held:
-                if self._ended(entry):
-                    with self._ledger.changed:
-                        self._held.remove(entry)
-        for entry in self._held:
-            entry.request.refuse("timeout", "the server is stopping")
+                while not self._stopping and not (decided := self._decided()):
+                    self._ledger.changed.wait(self._time_left_s())
+                stopping = self._stopping
+                if stopping:
+                    why = RefusedError("timeout", "the server is stopping")
+                    decided = [(entry, why) for entry in self._pending]
+            for entry, outcome in decided:
+                entry.send(outcome)
 
-    def _ready(self, entry: _Held) -> bool:
-        asks = entry.asks
-        return self._ledger.outcome(asks.source, asks.session, asks.sequence) is not None
-
-    def _ended(self, entry: _Held) -> bool:
-        """As :meth:`_answer`; a defect ends this request only, not the thread of all others."""
-        try:
-            return self._answer(entry)
-        except Exception as error:
-            _log.exception("a flush request met a defect")
-            entry.request.refuse("internal", f"{type(error).__name__}: {error}")
-            return True
-
-    def _answer(self, entry: _Held) -> bool:
-        """Answer a request if it is time; False where it goes on waiting."""
-        asks = entry.asks
-        scan = (asks.source, asks.session, asks.sequence)
+    def _decided(self) -> list[tuple[_Pending, Outcome]]:
+        """The requests that can be answered now, and how; they are no longer pending."""
         now = time.monotonic()
-        if not self._ledger.arrived(*scan) and now >= entry.give_up_at:
-            reply = self._ledger.give_up(*scan)
-        else:
-            reply = self._ledger.outcome(*scan)
-        if reply is not None:
-            entry.request.answer(reply)
-            return True
-        if now >= entry.deadline:
-            entry.request.refuse(
-                "timeout",
-                f"scan {asks.sequence} of {asks.source} is not in the map after {asks.timeout_s} s",
-            )
-            return True
-        if self._ledger.settled(*scan):
+        outcomes = [(entry, self._outcome(entry, now)) for entry in self._pending]
+        self._pending = [entry for entry, outcome in outcomes if outcome is None]
+        if any(self._ledger.settled(*entry.scan) for entry in self._pending):
             self._publish_soon()
-        return False
+        return [(entry, outcome) for entry, outcome in outcomes if outcome is not None]
+
+    def _outcome(self, entry: _Pending, now: float) -> Outcome | None:
+        """What a request is answered with; ``None`` where it stays pending."""
+        if now >= entry.give_up_at and not self._ledger.arrived(*entry.scan):
+            reply = self._ledger.give_up(*entry.scan)
+        else:
+            reply = self._ledger.outcome(*entry.scan)
+        if reply is not None or now < entry.deadline:
+            return reply
+        asks = entry.asks
+        return RefusedError(
+            "timeout",
+            f"scan {asks.sequence} of {asks.source} is not in the map after {asks.timeout_s} s",
+        )
+
+    def _time_left_s(self) -> float | None:
+        """How long until time alone decides on a request; ``None``: it never does."""
+        times = [entry.deadline for entry in self._pending]
+        times += [
+            entry.give_up_at for entry in self._pending if not self._ledger.arrived(*entry.scan)
+        ]
+        return max(0.0, min(times) - time.monotonic()) if times else None

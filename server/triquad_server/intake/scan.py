@@ -2,17 +2,18 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
-from triquad_map.compiled.voxel_index import Keys, empty_keys, enter
+from triquad_format.records.arrays import Longs
+from triquad_format.records.pose import is_rigid, rotation_error
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.thinning import enter
+from triquad_map.compiled.sparse.voxel_index import empty_keys
 
 from triquad_server.settings import ScanSettings
 
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
-
-_RIGID_TOLERANCE = 1e-3
 
 
 class ScanRefusedError(Exception):
@@ -24,20 +25,12 @@ class ScanRefusedError(Exception):
 
 
 @dataclass(frozen=True)
-class IngestReport:
-    """What became of a scan's points."""
-
-    points_used: int
-    points_dropped: dict[str, int]  # by reason
-
-
-@dataclass(frozen=True)
-class Rays:
+class ScanRays:
     """The usable rays of a scan, in the map frame, metres."""
 
     origin: NDArray[np.float64]  # [3] the sensor
     ends: NDArray[np.float64]  # [N, 3]
-    report: IngestReport
+    points_dropped: dict[str, int]  # points of the scan that are not used, by reason
 
 
 def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
@@ -49,13 +42,11 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
         raise ScanRefusedError(
             "pose_not_finite", f"the pose has values that are not finite: {pose}"
         )
-    rotation = np.clip(pose[:3, :3], -2, 2)  # no larger number can be part of a rotation
-    skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if skew > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or (pose[3] != (0, 0, 0, 1)).any():
+    if not is_rigid(pose):
         raise ScanRefusedError(
             "pose_not_rigid",
-            f"the pose is not a rotation and a translation (rotation off by {skew:.2g}, "
-            f"last row {pose[3]}); scale and shear are not allowed",
+            f"the pose is not a rotation and a translation (rotation off by "
+            f"{rotation_error(pose):.2g}, last row {pose[3]}); scale and shear are not allowed",
         )
     far = float(np.abs(pose[:3, 3]).max())
     if far > WORLD_LIMIT_M:
@@ -66,13 +57,24 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
         )
 
 
-@numba.njit(cache=True, nogil=True)
+def _check_points(points: NDArray[np.float32], max_points: int) -> None:
+    """Refuse points that are not [N, 3], or more than ``max_points``."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ScanRefusedError("points_shape", f"points are {list(points.shape)}, not [N, 3]")
+    if len(points) > max_points:
+        raise ScanRefusedError(
+            "too_many_points",
+            f"{len(points)} points exceed scan.max_points = {max_points}",
+        )
+
+
+@kernel()
 def _select(
     points: NDArray[np.float32],
     range_min_m: float,
     range_max_m: float,
     thin_m: float,
-    keys: Keys,
+    keys: Longs,
 ) -> tuple[NDArray[np.float64], int, int, int]:
     """The points that are used; how many are not finite, too near and too far."""
     kept = np.empty((len(points), 3))
@@ -96,7 +98,7 @@ def usable_rays(
     points: NDArray[np.float32],
     world_from_sensor: NDArray[np.float64],
     settings: ScanSettings,
-) -> Rays:
+) -> ScanRays:
     """The rays of a scan that are finite, in range and thinned.
 
     Args:
@@ -108,13 +110,7 @@ def usable_rays(
         ScanRefusedError: the pose is bad, or no point can be used.
     """
     check_pose(world_from_sensor)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ScanRefusedError("points_shape", f"points are {list(points.shape)}, not [N, 3]")
-    if len(points) > settings.max_points:
-        raise ScanRefusedError(
-            "too_many_points",
-            f"{len(points)} points exceed scan.max_points = {settings.max_points}",
-        )
+    _check_points(points, settings.max_points)
     kept, not_finite, too_near, too_far = _select(
         np.ascontiguousarray(points),
         settings.range_min_m,
@@ -130,5 +126,5 @@ def usable_rays(
             f"{settings.range_max_m} m from the sensor",
         )
     rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
-    report = IngestReport(len(kept), {reason: n for reason, n in dropped.items() if n})
-    return Rays(origin.copy(), kept @ rotation.T + origin, report)
+    counts = {reason: count for reason, count in dropped.items() if count}
+    return ScanRays(origin.copy(), kept @ rotation.T + origin, counts)

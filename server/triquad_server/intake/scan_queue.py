@@ -10,9 +10,9 @@ from triquad_format.errors import FormatError, ProtocolVersionError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import Scan
 
-from triquad_server.counter import Tally
+from triquad_server.counter import Counter
 from triquad_server.intake.sources import SourceLedger
-from triquad_server.net.payload import payload_limit
+from triquad_server.net.request import payload_limit
 
 _log = logging.getLogger(__name__)
 
@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 class ScanQueue:
     """The newest scans that wait; where it is full, the oldest is pushed out and counted."""
 
-    def __init__(self, limit: int, ledger: SourceLedger, dropped: Tally) -> None:
+    def __init__(self, limit: int, ledger: SourceLedger, dropped: Counter) -> None:
         self._lock = threading.Lock()
         self._scans: deque[Scan] = deque()
         self._in_hand = False
@@ -68,7 +68,7 @@ class ScanIntake:
         limit: int,
         max_points: int,
         queue: ScanQueue,
-        dropped: Tally,
+        dropped: Counter,
         arrived: Callable[[], None],
     ) -> None:
         """Begin to receive; ``arrived`` is called after each scan that was queued.
@@ -97,7 +97,7 @@ class ScanIntake:
         for sample in self._subscriber:
             try:
                 self._receive(str(sample.key_expr), sample.payload)
-            except Exception:  # a defect must not stop the intake of all other scans
+            except Exception:  # an internal error must not stop the intake of other scans
                 self._dropped.add("internal")
                 _log.exception("a scan on %s could not be received", sample.key_expr)
             self._arrived()

@@ -58,7 +58,7 @@ class SourceLedger:
         self._forgotten_lost = 0
 
     def arrive(self, scan: Scan) -> str | None:
-        """Note a scan's arrival; the reason where its sequence or stamp refuses it."""
+        """Record a scan's arrival; the reason where its sequence or stamp refuses it."""
         with self.changed:
             if not 0 <= scan.sequence < MAX_SEQUENCE:
                 return "bad_sequence"
@@ -79,7 +79,7 @@ class SourceLedger:
             return None
 
     def take(self, scan: Scan) -> None:
-        """Note that a scan went into the map."""
+        """Record that a scan went into the map."""
         with self.changed:
             track = self._leave_queue(scan)
             track.taken += 1
@@ -87,12 +87,12 @@ class SourceLedger:
                 track.unpublished = scan.sequence
 
     def refuse(self, scan: Scan, text: str) -> None:
-        """Note that the map refused a scan."""
+        """Record that the map refused a scan."""
         with self.changed:
             self._leave_queue(scan).refuse(f"scan {scan.sequence}: {text}")
 
     def turn_away(self, scan: Scan, text: str) -> None:
-        """Note that a scan that just arrived is not let into the queue.
+        """Record that a scan that just arrived is not let into the queue.
 
         Earlier ones may still wait there, so it says nothing of them.
         """
@@ -103,12 +103,12 @@ class SourceLedger:
             self.changed.notify_all()
 
     def push_out(self, scan: Scan) -> None:
-        """Note that a scan was pushed out of the full queue."""
+        """Record that a scan was pushed out of the full queue."""
         with self.changed:
             self._leave_queue(scan).lost += 1
 
     def publish(self) -> None:
-        """Note that an epoch shows all scans that were taken so far."""
+        """Record that an epoch shows all scans that were taken so far."""
         with self.changed:
             for track in self._tracks.values():
                 track.unpublished = None

@@ -9,18 +9,17 @@ import torch
 from numpy.typing import NDArray
 from triquad_format.records.region import MapRecord, RegionIndex
 
-from triquad_server.engine.engine import GradientSums, Loss
-from triquad_server.epochs.epoch import Epoch, FrozenRegion, Publication, frozen_region
-from triquad_server.intake.scan import IngestReport, Rays, ScanRefusedError, usable_rays
+from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.trainer import Loss
+from triquad_server.epochs.epoch import Epoch, FrozenRegion
+from triquad_server.intake.scan import ScanRays, ScanRefusedError, usable_rays
+from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.normals import SurfaceNormals
-from triquad_server.mapping.region_map import RegionMap, RegionSetup
 from triquad_server.settings import Settings
-from triquad_server.threads import MAPPING
+from triquad_server.threads import Teams
 
 _LOSS_MEMORY = 0.95
 _POOL_STEP = 1.1
-_SURFELS_REFITTED = 8_000
-"""With each epoch while the field is being trained: some 10 ms."""
 
 
 @dataclass(frozen=True)
@@ -41,36 +40,40 @@ class Mapper:
         settings: Settings,
         device: str,
         record: MapRecord | None = None,
+        teams: Teams | None = None,
     ) -> None:
+        """A map that goes on from its ``record``; without ``teams`` it has threads of its own."""
         self._name = name
+        self._teams = teams or Teams()
         self._settings = settings
         self._field_settings = record.settings if record else settings.field
         self._device = torch.device(device)
         if self._device.type == "cpu":
             # Its threads spin between operations, and would take the cores from the kernels.
             torch.set_num_threads(1)
-        self._normals = SurfaceNormals()
+        self._normals = SurfaceNormals(self._teams.mapping)
         self._setup = RegionSetup(
-            self._field_settings,
-            settings.scan,
-            settings.training,
-            self._device,
-            GradientSums(),
+            field=self._field_settings,
+            scan=settings.scan,
+            training=settings.training,
+            device=self._device,
+            sums=GradientSums(),
+            team=self._teams.mapping,
         )
-        self._regions: dict[RegionIndex, RegionMap] = {}
+        self._regions: dict[RegionIndex, LiveRegion] = {}
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
         self._structure_changed = True
         self.samples_trained = 0
         self._loss: Loss | None = None
         for region in record.regions if record else ():
-            self._regions[region.index] = RegionMap.restore(region, self._setup)
+            self._regions[region.index] = LiveRegion.restore(region, self._setup)
         self._share_pool()
 
     @property
     def settled(self) -> bool:
         """Whether nothing is left to learn from the scans so far."""
-        return not any(region.owed for region in self._regions.values())
+        return not any(region.budget_samples for region in self._regions.values())
 
     @property
     def loss(self) -> float:
@@ -78,13 +81,13 @@ class Mapper:
         return 0.0 if self._loss is None else float(self._loss)
 
     @property
-    def regions(self) -> list[RegionMap]:
-        """The regions, for looking at."""
+    def regions(self) -> list[LiveRegion]:
+        """The regions; only the thread that owns the map may use them."""
         return list(self._regions.values())
 
     @property
-    def segments_kept(self) -> int:
-        """Segments in the replay pools."""
+    def rays_kept(self) -> int:
+        """Rays that the replay pools hold an interval of, counted once for each region."""
         return sum(len(region.pool) for region in self._regions.values())
 
     def ingest(
@@ -92,10 +95,13 @@ class Mapper:
         points: NDArray[np.float32],
         world_from_sensor: NDArray[np.float64],
         stamp_s: int = 0,
-    ) -> IngestReport:
+    ) -> dict[str, int]:
         """Take in a scan: ``points`` [N, 3] in metres of the sensor frame, pose [4, 4].
 
         ``stamp_s`` is when it was taken, seconds since 1970.
+
+        Returns:
+            How many points were not used, by reason.
 
         Raises:
             ScanRefusedError: the scan cannot be used; the map is unchanged.
@@ -104,19 +110,19 @@ class Mapper:
         around = self._regions_around(rays)
         self._check_regions(around)
         regions = [self._region(index) for index in around]
-        with MAPPING.beside() as beside:
+        with self._teams.mapping.beside() as beside:
             for region in regions:
                 beside(region.see(rays, stamp_s))
             normals = self._normals.add(rays.ends, rays.origin)
             for region in regions:
                 region.learn(rays, normals)
             self._share_pool()
-        return rays.report
+        return rays.points_dropped
 
     def train(self) -> None:
-        """One optimiser step in the region that owes the most; nothing where all is settled."""
-        region = max(self._regions.values(), key=lambda region: region.owed, default=None)
-        if region is None or region.owed == 0:
+        """One optimiser step where the training budget is largest; nothing once all is settled."""
+        region = max(self._regions.values(), key=lambda r: r.budget_samples, default=None)
+        if region is None or region.budget_samples == 0:
             return
         loss = region.train()
         before = loss if self._loss is None else self._loss
@@ -135,11 +141,11 @@ class Mapper:
         )
         regions = tuple(self._freeze(region, before) for region in self._regions.values())
         self._epoch = Epoch(
-            self._name,
-            self._number,
-            self._field_settings,
-            self._settings.mesh,
-            regions,
+            name=self._name,
+            number=self._number,
+            settings=self._field_settings,
+            regions=regions,
+            split=self._teams.answers.split,
         )
         self._structure_changed = False
         return self._epoch
@@ -169,7 +175,7 @@ class Mapper:
             if epoch is None or frozen.changed > epoch
         }
         regions = tuple(
-            region.record(True) for index, region in self._regions.items() if index in changed
+            region.record() for index, region in self._regions.items() if index in changed
         )
         return MapChanges(
             MapRecord(self._name, newest.number, self._field_settings, regions),
@@ -179,25 +185,15 @@ class Mapper:
 
     def _freeze(
         self,
-        region: RegionMap,
+        region: LiveRegion,
         before: dict[RegionIndex, FrozenRegion],
     ) -> FrozenRegion:
         """The region as it is now; the last frozen one where it did not change since."""
         if not region.changed and region.index in before:
             return before[region.index]
-        region.changed = False
-        new = Publication(
-            region.index,
-            self._field_settings,
-            region.field,
-            region.evidence,
-            self._number,
-            None if region.owed == 0 else _SURFELS_REFITTED,
-        )
-        known = before.get(region.index)
-        return frozen_region(new, known.surfels if known else None)
+        return region.freeze(self._number, before.get(region.index))
 
-    def _regions_around(self, rays: Rays) -> list[RegionIndex]:
+    def _regions_around(self, rays: ScanRays) -> list[RegionIndex]:
         """Regions whose cubes hold an end point or the sensor, and those of the map in between."""
         pitch = self._field_settings.region_pitch_m
         half = self._field_settings.region_side_m / 2
@@ -227,22 +223,22 @@ class Mapper:
                 f"training.max_regions = {limit}",
             )
 
-    def _region(self, index: RegionIndex) -> RegionMap:
+    def _region(self, index: RegionIndex) -> LiveRegion:
         if index not in self._regions:
-            self._regions[index] = RegionMap(index, self._setup)
+            self._regions[index] = LiveRegion.unseen(index, self._setup)
             self._share_pool()
             self._structure_changed = True
         return self._regions[index]
 
     def _share_pool(self) -> None:
-        """Let the regions keep as many segments as they were offered, all up to one limit."""
-        left = self._settings.training.pool_segments
+        """Let the regions keep as many rays as they were offered, all up to one limit."""
+        left = self._settings.training.pool_rays
         offered = sorted(region.pool.offered for region in self._regions.values())
         limit = left
         for position, count in enumerate(offered):
             limit = max(1, left // (len(offered) - position))
             left -= min(count, limit)
-        # In coarse steps: to lower it is dear.
+        # In coarse steps: to lower the limit is expensive.
         limit = int(_POOL_STEP ** math.floor(math.log(limit, _POOL_STEP)))
         for region in self._regions.values():
             region.pool.limit(max(1, limit))

@@ -1,25 +1,25 @@
 """The thread that owns the live map: takes scans, trains in slices, publishes epochs."""
 
 import logging
-import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
-from triquad_server.counter import Tally
-from triquad_server.epochs.epochs import EpochShelf, ShelfLimits
+from triquad_server.counter import Counter
 from triquad_server.epochs.gate import QueryGate
+from triquad_server.epochs.history import EpochHistory, EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan import ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.threads import PATIENCE
+from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
@@ -37,8 +37,16 @@ class Progress:
     settled: bool = True  # nothing is left to learn, and the newest epoch shows all
     scans_taken: int = 0
     samples_trained: int = 0
-    segments_kept: int = 0
+    rays_kept: int = 0
     loss: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Command:
+    """What is to be run on the mapper thread, and who waits for it."""
+
+    run: Callable[[Mapper], Any]
+    result: Future[Any]
 
 
 @dataclass(frozen=True)
@@ -48,8 +56,8 @@ class MapperInputs:
     scans: ScanQueue
     ledger: SourceLedger
     gate: QueryGate
-    scans_dropped: Tally
-    points_dropped: Tally
+    scans_dropped: Counter
+    points_dropped: Counter
 
 
 class MapperThread:
@@ -60,28 +68,29 @@ class MapperThread:
         mapper: Mapper,
         inputs: MapperInputs,
         publish_period_s: float,
-        shelf: ShelfLimits,
+        kept: EpochLimits,
         failed: Callable[[], None],
     ) -> None:
-        """Publish the first epoch; ``failed`` is called where the thread ends by a defect."""
+        """Publish the first epoch; ``failed`` is called where an internal error ends the thread."""
         self._mapper = mapper
         self._inputs = inputs
         self._period_s = publish_period_s
         self._failed = failed
-        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._commands: deque[_Command] = deque()
+        self._ended: str | None = None  # why there are no more commands
         self._wake = threading.Event()
         self._publish_soon = threading.Event()
         self._resting = threading.Event()
         self._stopping = threading.Event()
-        self._ended = threading.Event()
         self._next_publish = 0.0
         self._unpublished = False
         self._scans_taken = 0
         self._loss = 0.0  # as of the newest epoch
         self._step_s = _GIVE_WAY_S  # what the last step of training took
-        self.epochs = EpochShelf(mapper.publish(), shelf)
+        self.epochs = EpochHistory(mapper.publish(), kept)
         self.progress = Progress()
-        self._note_progress()
+        self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
 
     def start(self) -> None:
@@ -94,14 +103,16 @@ class MapperThread:
         self._wake.set()
 
     def close(self) -> None:
-        """End after the current slice; commands that wait are still carried out."""
+        """End after the current slice; pending commands are still carried out."""
         self._stopping.set()
         self._wake.set()
-        if self._thread.ident is not None:
+        if self._thread.ident is None:
+            self._refuse_commands("the mapper was never started")
+        else:
             self._thread.join()
 
     def wake(self) -> None:
-        """Look for scans."""
+        """Have the thread see whether scans are waiting."""
         self._wake.set()
 
     def publish_soon(self) -> None:
@@ -113,36 +124,30 @@ class MapperThread:
         """What ``command`` returns when run on the mapper thread, between slices.
 
         Raises:
-            MapperStoppedError: the thread has ended.
+            MapperStoppedError: the thread has ended, or ends before it comes to the command.
         """
-        future: Future[ResultT] = Future()
-
-        def run() -> None:
-            try:
-                future.set_result(command(self._mapper))
-            except BaseException as error:
-                future.set_exception(error)
-
-        self._commands.put(run)
+        result: Future[ResultT] = Future()
+        with self._lock:
+            if self._ended is not None:
+                raise MapperStoppedError(self._ended)
+            self._commands.append(_Command(command, result))
         self._wake.set()
-        while not future.done() and not self._ended.is_set():
-            _wait(future)
-        if not future.done():
-            raise MapperStoppedError("the mapper has stopped")
-        return future.result()
+        return result.result()
 
     def _run(self) -> None:
-        be_patient(PATIENCE)
+        lower_priority(NICENESS)
+        ended = "the mapper has stopped"
         try:
             while not self._stopping.is_set():
                 self._turn()
             self._run_commands()
             self._publish()
         except Exception:
-            _log.exception("the mapper stopped by a defect")
+            ended = "the mapper has stopped: internal error, see the server's log"
+            _log.exception("the mapper was stopped by an internal error")
             self._failed()
         finally:
-            self._ended.set()
+            self._refuse_commands(ended)
 
     def _turn(self) -> None:
         """One round: commands, a scan, a slice of training, an epoch where one is due."""
@@ -162,18 +167,32 @@ class MapperThread:
         if self._publish_soon.is_set() or self._publish_due():
             self._publish_soon.clear()
             self._publish()
-        self._note_progress()
+        self._record_progress()
         if self._mapper.settled and not took_scan:
             self._wake.wait(self._rest_s())
 
     def _run_commands(self) -> None:
-        while True:
+        while (command := self._next_command()) is not None:
             try:
-                command = self._commands.get_nowait()
-            except queue.Empty:
-                return
-            command()
-            self._publish()
+                result = command.run(self._mapper)
+                self._publish()  # first: whoever gets the result may ask for its epoch
+            except BaseException as error:
+                self._unpublished = True
+                command.result.set_exception(error)
+            else:
+                command.result.set_result(result)
+
+    def _next_command(self) -> _Command | None:
+        with self._lock:
+            return self._commands.popleft() if self._commands else None
+
+    def _refuse_commands(self, why: str) -> None:
+        """Take no more commands; those that are pending fail."""
+        with self._lock:
+            self._ended = why
+            pending, self._commands = self._commands, deque()
+        for command in pending:
+            command.result.set_exception(MapperStoppedError(why))
 
     def _ingest_next(self) -> bool:
         """Take in the oldest waiting scan; False where none waits."""
@@ -181,7 +200,7 @@ class MapperThread:
         if scan is None:
             return False
         try:
-            report = self._mapper.ingest(
+            points_dropped = self._mapper.ingest(
                 scan.points, scan.world_from_sensor, scan.stamp_ns // 1_000_000_000
             )
         except ScanRefusedError as error:
@@ -190,10 +209,10 @@ class MapperThread:
             _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
         except Exception as error:  # bad input, whatever it is, must not stop the server
             self._inputs.scans_dropped.add("internal")
-            self._inputs.ledger.refuse(scan, f"a defect of the server: {error!r}")
+            self._inputs.ledger.refuse(scan, f"internal error of the server: {error!r}")
             _log.exception("scan %d of %s could not be taken in", scan.sequence, scan.source)
         else:
-            for reason, count in report.points_dropped.items():
+            for reason, count in points_dropped.items():
                 self._inputs.points_dropped.add(reason, count)
             self._scans_taken += 1
             self._unpublished = True
@@ -218,19 +237,11 @@ class MapperThread:
         """How long there is nothing to do; None: until woken."""
         return max(0.0, self._next_publish - time.monotonic()) if self._unpublished else None
 
-    def _note_progress(self) -> None:
+    def _record_progress(self) -> None:
         self.progress = Progress(
-            self._mapper.settled and not self._unpublished,
-            self._scans_taken,
-            self._mapper.samples_trained,
-            self._mapper.segments_kept,
-            self._loss,
+            settled=self._mapper.settled and not self._unpublished,
+            scans_taken=self._scans_taken,
+            samples_trained=self._mapper.samples_trained,
+            rays_kept=self._mapper.rays_kept,
+            loss=self._loss,
         )
-
-
-def _wait(future: Future[Any]) -> None:
-    """Wait a while for a result, not for ever: the thread that makes it may end."""
-    try:
-        future.exception(timeout=0.2)
-    except TimeoutError:
-        return

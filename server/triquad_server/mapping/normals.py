@@ -5,13 +5,19 @@ tell the normal of far ground, where it is a few lines of points; the moments of
 fine grid serves where it has a plane, the coarse one where it has not.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
-from triquad_map.compiled.rows import with_room
-from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, make_row, pack, unpack
-
-from triquad_server.threads import MAPPING
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.rows import with_room
+from triquad_map.compiled.sparse.voxel_index import (
+    Index,
+    VoxelIndex,
+    find_row,
+    make_row,
+    pack,
+    unpack,
+)
+from triquad_map.compiled.team import Team
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
@@ -19,19 +25,19 @@ _MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a p
 _FULL = 65_536  # points of a cell, above which older ones count for less
 _RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
 
-Moments = NDArray[np.float32]
+PointMoments = NDArray[np.float32]
 Normals = NDArray[np.float32]
 Rows = NDArray[np.int32]
 Counts = NDArray[np.float32]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _add(
     points: NDArray[np.float64],
     start: int,
     cell_m: float,
     index: Index,
-    moments: Moments,
+    moments: PointMoments,
     rows: Rows,
     count: int,
 ) -> tuple[int, int]:
@@ -64,12 +70,12 @@ def _add(
     return len(points), count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _gather(
     row: int,
     cell_m: float,
     index: Index,
-    moments: Moments,
+    moments: PointMoments,
     total: NDArray[np.float64],
 ) -> None:
     """Sum the moments of the 27 cells around that of a row, relative to its centre."""
@@ -96,7 +102,7 @@ def _gather(
                 total[9] += m[9] + 2 * c * m[3] + n * c * c
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
     """Normal of the plane through points with the moments ``m``; False where there is none."""
     n = m[0]
@@ -135,8 +141,10 @@ def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
-def _outdated(rows: Rows, normals: NDArray[np.float64], moments: Moments, basis: Counts) -> Rows:
+@kernel()
+def _outdated(
+    rows: Rows, normals: NDArray[np.float64], moments: PointMoments, basis: Counts
+) -> Rows:
     """Cells of points without a normal whose own is of far fewer points than there are.
 
     Their ``basis`` is brought up to date.
@@ -152,8 +160,10 @@ def _outdated(rows: Rows, normals: NDArray[np.float64], moments: Moments, basis:
     return outdated[:count]
 
 
-@numba.njit(cache=True, nogil=True)
-def _estimate(rows: Rows, cell_m: float, index: Index, moments: Moments, normals: Normals) -> None:
+@kernel()
+def _estimate(
+    rows: Rows, cell_m: float, index: Index, moments: PointMoments, normals: Normals
+) -> None:
     """Set the normals [cells, 3] of cells; NaN where there is no plane."""
     total, normal = np.empty(10), np.empty(3)
     for row in rows:
@@ -163,7 +173,7 @@ def _estimate(rows: Rows, cell_m: float, index: Index, moments: Moments, normals
         normals[row] = normal
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _adopt(rows: Rows, of_cells: Normals, normals: NDArray[np.float64]) -> None:
     """Replace those of ``normals`` that are NaN by those of their cells."""
     for i in range(len(rows)):
@@ -175,7 +185,8 @@ def _adopt(rows: Rows, of_cells: Normals, normals: NDArray[np.float64]) -> None:
 class MomentGrid:
     """Moments of points in the cells of a sparse lattice."""
 
-    def __init__(self, cell_m: float) -> None:
+    def __init__(self, cell_m: float, team: Team) -> None:
+        self._team = team
         self._cell_m = cell_m
         self._cells = VoxelIndex(1024)
         self._moments = np.zeros((1024, 10), np.float32)
@@ -211,7 +222,7 @@ class MomentGrid:
             part = outdated[first:last]
             _estimate(part, self._cell_m, self._cells.arrays, self._moments, self._normals)
 
-        MAPPING.split(len(outdated), work)
+        self._team.split(len(outdated), work)
         _adopt(rows, self._normals, normals)
 
     def keep_nearest(self, place: NDArray[np.float64], cells: int) -> None:
@@ -249,11 +260,12 @@ class SurfaceNormals:
 
     def __init__(
         self,
+        team: Team,
         fine_m: float = 0.15,
         coarse_m: float = 0.5,
         max_cells: int = 150_000,  # of each grid, at some 100 bytes
     ) -> None:
-        self._grids = (MomentGrid(fine_m), MomentGrid(coarse_m))
+        self._grids = (MomentGrid(fine_m, team), MomentGrid(coarse_m, team))
         self._max_cells = max_cells
 
     def add(self, points: NDArray[np.float64], sensor: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,32 +1,32 @@
-"""Training samples drawn along segments (3QFP, section III-C).
+"""Training samples drawn along ray intervals (3QFP, section III-C).
 
-Every draw makes new ones: a segment that is trained on again teaches other points of its ray.
+Every draw makes new ones: an interval that is trained on again teaches other points of its ray.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.morton import encode
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.team import Team
 
-from triquad_server.mapping.ray_labels import DIRECTION, END, FREE_FROM, FREE_TO, LABEL, SLOPE
-from triquad_server.threads import MAPPING
+from triquad_server.engine.batch import Batch
+from triquad_server.mapping.ray_intervals import DIRECTION, END, FREE_FROM, FREE_TO, LABEL, SLOPE
 
 Floats = NDArray[np.float32]
 
 _CELLS = 128
 """Cells from the centre of the cube to its face, by which samples are put in order."""
 
-_AHEAD = 16  # segments that are brought into the cache before their turn
+_AHEAD = 16  # intervals that are brought into the cache before their turn
 
 
 class Placement(NamedTuple):
-    """Where on their segments samples lie."""
+    """Where on their intervals samples lie."""
 
     surface_share: float  # of the samples that lie around the end points
     spread_m: float  # standard deviation of those
@@ -34,33 +34,25 @@ class Placement(NamedTuple):
     half_side_m: float  # of the region's cube: samples lie inside
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Samples to train on."""
-
-    points: Tensor  # [B, 3] metres from the region's centre
-    labels: Tensor  # [B] signed distances, metres
-
-
-def draw_samples(segments: Tensor, placement: Placement, generator: torch.Generator) -> Batch:
-    """One sample on each of the ``segments`` [B, COLUMNS], on their device."""
-    kinds, places = torch.rand((2, len(segments)), generator=generator, device=segments.device)
-    near = torch.randn(len(segments), generator=generator, device=segments.device)
+def draw_samples(intervals: Tensor, placement: Placement, generator: torch.Generator) -> Batch:
+    """One sample on each of the ``intervals`` [B, COLUMNS], on their device."""
+    kinds, places = torch.rand((2, len(intervals)), generator=generator, device=intervals.device)
+    near = torch.randn(len(intervals), generator=generator, device=intervals.device)
     near = (near * placement.spread_m).clamp(-placement.truncation_m, placement.truncation_m)
-    ends, directions = segments[:, END : END + 3], segments[:, DIRECTION : DIRECTION + 3]
-    first, last = segments[:, FREE_FROM], segments[:, FREE_TO]
+    ends, directions = intervals[:, END : END + 3], intervals[:, DIRECTION : DIRECTION + 3]
+    first, last = intervals[:, FREE_FROM], intervals[:, FREE_TO]
     outside = ((ends + near[:, None] * directions).abs() >= placement.half_side_m).any(dim=1)
     free = first + places * (last - first)
     offsets = torch.where((kinds < placement.surface_share) & ~outside, near, free)
     return Batch(
         ends + offsets[:, None] * directions,
-        segments[:, LABEL] - offsets * segments[:, SLOPE],
+        intervals[:, LABEL] - offsets * intervals[:, SLOPE],
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _draw(
-    segments: Floats,
+    intervals: Floats,
     chosen: NDArray[np.int64],
     placement: Placement,
     kinds: Floats,
@@ -72,8 +64,8 @@ def _draw(
     """Fill in the samples [B, 4], points and labels, and the cells [B] that hold them."""
     per_m = _CELLS / placement.half_side_m
     for i in range(len(chosen)):
-        prefetch_row(segments, chosen[min(i + _AHEAD, len(chosen) - 1)])
-        row = segments[chosen[i]]
+        prefetch_row(intervals, chosen[min(i + _AHEAD, len(chosen) - 1)])
+        row = intervals[chosen[i]]
         offset = near[i] * placement.spread_m
         offset = min(max(offset, -placement.truncation_m), placement.truncation_m)
         outside = False
@@ -90,7 +82,7 @@ def _draw(
         cells[i] = encode(u, v)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _in_order(samples: Floats, cells: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Points [B, 3] and labels [B] in the order of their cells (a counting sort)."""
     starts = np.zeros((2 * _CELLS) ** 2 + 1, np.int32)
@@ -109,12 +101,13 @@ def _in_order(samples: Floats, cells: NDArray[np.int64]) -> tuple[Floats, Floats
 
 
 def draw_ordered_samples(
-    segments: Floats,
+    intervals: Floats,
     chosen: NDArray[np.int64],
     placement: Placement,
     rng: np.random.Generator,
+    team: Team,
 ) -> Batch:
-    """As :func:`draw_samples` for the segments ``chosen`` [B], in compiled code.
+    """As :func:`draw_samples` for the intervals ``chosen`` [B], in compiled code.
 
     Neighbours in space follow each other, and find in the cache what the last one fetched.
     """
@@ -127,7 +120,7 @@ def draw_ordered_samples(
     def work(first: int, last: int) -> None:
         part = slice(first, last)
         _draw(
-            segments,
+            intervals,
             chosen[part],
             placement,
             kinds[part],
@@ -137,6 +130,6 @@ def draw_ordered_samples(
             cells[part],
         )
 
-    MAPPING.split(count, work)
+    team.split(count, work)
     points, labels = _in_order(samples, cells)
     return Batch(torch.from_numpy(points), torch.from_numpy(labels))

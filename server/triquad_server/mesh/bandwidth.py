@@ -1,5 +1,6 @@
 """How many bytes a second each client is sent: a token bucket for each."""
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass
 
@@ -7,7 +8,7 @@ MAX_CLIENTS = 1024
 """Of more, those heard of longest ago are forgotten."""
 
 BURST_S = 1.0
-"""Somebody who asked for nothing so long may have this many seconds' worth at once."""
+"""A client that asked for nothing for so long may be sent as many seconds' worth at once."""
 
 
 @dataclass
@@ -19,18 +20,22 @@ class _Bucket:
 
 
 class Bandwidth:
-    """Buckets of clients, by their names. Times are monotonic seconds."""
+    """Buckets of clients, by their names. Times are monotonic seconds.
+
+    A rate of infinity sets no limit.
+    """
 
     def __init__(self) -> None:
         self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
 
     def may_send(self, client: str, bytes_per_s: float, now_s: float) -> bool:
         """Whether it is time to send to a client again."""
-        return self._filled(client, bytes_per_s, now_s).tokens > 0
+        return math.isinf(bytes_per_s) or self._filled(client, bytes_per_s, now_s).tokens > 0
 
     def spend(self, client: str, count: int, bytes_per_s: float, now_s: float) -> None:
-        """Note that bytes are sent to a client."""
-        self._filled(client, bytes_per_s, now_s).tokens -= count
+        """Count bytes that are sent to a client."""
+        if not math.isinf(bytes_per_s):
+            self._filled(client, bytes_per_s, now_s).tokens -= count
 
     def _filled(self, client: str, bytes_per_s: float, now_s: float) -> _Bucket:
         most = bytes_per_s * BURST_S

@@ -10,7 +10,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Region, region_corner
 
 NET_LEAVES = 2
-"""Side of the cells in which the surface is looked for, in leaves: 0.4 m."""
+"""Side of the cells in which the surface is searched for, in leaves: 0.4 m."""
 
 CLUSTER_CELLS = 3
 """Side of the cubes of cells whose vertices become one: 1.2 m."""

@@ -3,18 +3,18 @@
 Lattice points are multiples of the cell, whatever the tile, so neighbouring tiles share the
 points of their common face and meet without seams, also where they were meshed at different
 times: the later one takes over the values of the earlier one there. Only faces where the evidence
-saw a surface are kept: elsewhere the field has zeros that nobody taught it.
+saw a surface are kept: elsewhere the field has zeros that no ray taught it.
 """
 
 import functools
 from dataclasses import dataclass
 from typing import Protocol
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.status import Status
 from triquad_format.wire.tile_codec import STEPS, TileSurface
+from triquad_map.compiled.kernel import kernel
 
 from triquad_server.mesh.marching_cubes import Crossings
 from triquad_server.mesh.tile_border import TileBorder
@@ -49,8 +49,8 @@ class TileMesh:
         return TileSurface(self.points, self.axes, steps, self.faces)
 
 
-class Distances(Protocol):
-    """What the mesher asks of an epoch."""
+class SurfaceSource(Protocol):
+    """What the mesher asks of a map: its distances, and where a surface was seen."""
 
     def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
         """Signed distances [N] at points [N, 3], metres."""
@@ -60,7 +60,7 @@ class Distances(Protocol):
 
 
 def mesh_tile(
-    source: Distances,
+    source: SurfaceSource,
     tile: TileIndex,
     lattice: TileLattice,
     around: TileBorder | None = None,
@@ -94,13 +94,13 @@ def mesh_tile(
 
 
 def _seen_cells(
-    source: Distances, first: NDArray[np.int64], lattice: TileLattice
+    source: SurfaceSource, first: NDArray[np.int64], lattice: TileLattice
 ) -> NDArray[np.int64]:
     """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
     reach_m = lattice.cell_m / 2 + lattice.reach_m
     groups = _grid(-(-lattice.cells // lattice.group)) * lattice.group
     centres = _positions(groups, lattice.group / 2, first, lattice.cell_m)
-    # A group is looked into where any of its cells may be such.
+    # A group is searched where any of its cells may be such.
     wide = lattice.cell_m * (lattice.group - 1) / 2 + reach_m
     groups = groups[source.status(centres, wide) == Status.SURFACE]
     cells = _cells_of(groups, lattice.group, lattice.cells)
@@ -108,7 +108,7 @@ def _seen_cells(
     return np.asarray(cells[seen == Status.SURFACE])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _cells_of(groups: NDArray[np.int64], group_side: int, side: int) -> NDArray[np.int64]:
     """Cells [C, 3] of groups, named by their least corners, of a tile of ``side`` cells."""
     cells = np.empty((len(groups) * group_side**3, 3), np.int64)
@@ -122,7 +122,7 @@ def _cells_of(groups: NDArray[np.int64], group_side: int, side: int) -> NDArray[
     return cells[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _positions(
     cells: NDArray[np.int64], offset: float, first: NDArray[np.int64], cell_m: float
 ) -> NDArray[np.float64]:
@@ -134,7 +134,7 @@ def _positions(
     return positions
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _centroids(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     centroids = np.empty((len(faces), 3))
     for i in range(len(faces)):
@@ -144,7 +144,7 @@ def _centroids(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArr
     return centroids
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _renumbered(
     faces: NDArray[np.int32], vertices: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
@@ -172,7 +172,7 @@ def _grid(side: int) -> NDArray[np.int64]:
     return cells.reshape(-1, 3)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _corners(seen: NDArray[np.int64], volume: NDArray[np.float32]) -> NDArray[np.int64]:
     """The lattice points [P, 3] at the corners of cells [C, 3]; they become NaN in ``volume``."""
     points = np.empty((8 * len(seen), 3), np.int64)
@@ -188,7 +188,7 @@ def _corners(seen: NDArray[np.int64], volume: NDArray[np.float32]) -> NDArray[np
 
 
 def _lattice_values(
-    source: Distances,
+    source: SurfaceSource,
     seen: NDArray[np.int64],
     first: NDArray[np.int64],
     lattice: TileLattice,

@@ -8,7 +8,7 @@ import numpy as np
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from triquad_format.mapfile.map_facts import FRAME_ID
+from triquad_format.mapfile.metadata import FRAME_ID
 from triquad_format.mapfile.parts.part import PREVIEW, Part, PartKey
 from triquad_format.mapfile.writer import Previews
 from triquad_format.records.field_settings import FieldSettings

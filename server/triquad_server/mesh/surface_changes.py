@@ -39,8 +39,8 @@ class _Voxels:
 
 
 @dataclass(frozen=True)
-class _Noted:
-    """The surface of a region when its changes were last told."""
+class _Recorded:
+    """The surface of a region when its changes were last reported."""
 
     region: FrozenRegion
     voxels: _Voxels
@@ -48,15 +48,15 @@ class _Noted:
 
 
 class SurfaceChanges:
-    """Compares each epoch with what was told before, in groups of voxels: cubes of ``group_m``.
+    """Compares each epoch with what was reported before, in groups of voxels: cubes of ``group_m``.
 
-    Where the surface crosses a voxel is told by the field at the voxel's centre, along its
+    Where the surface crosses a voxel follows from the field at the voxel's centre, along its
     gradient. While a field is trained, single voxels are never at rest; so a group changes where
 
     * a voxel with seen surface is new, or forgotten;
     * the surface left some voxels (moved by more than half their side);
     * it moved by more than the tolerance in more than half of the group's voxels, since the group
-      was told of last: small movements add up.
+      was last reported: small movements add up.
     """
 
     def __init__(
@@ -66,32 +66,32 @@ class SurfaceChanges:
         self._tolerance_m = tolerance_m
         self._group_m = group_m
         self._team = team
-        self._noted: dict[RegionIndex, _Noted] = {}
+        self._recorded: dict[RegionIndex, _Recorded] = {}
 
     def since_last(self, regions: tuple[FrozenRegion, ...]) -> Changes:
         """What changed since the last call."""
-        before, self._noted = self._noted, {}
+        before, self._recorded = self._recorded, {}
         nothing = np.zeros((0, 3))
         found = [Changes(nothing, nothing)]
         for region in regions:
             old = before.pop(region.index, None)
             if old is None:
-                new = self._look(region, None)
+                new = self._measure(region, None)
                 found.append(Changes(new.voxels.centres, nothing))
             elif old.region is region:
                 new = old
             else:
-                new, changes = self._compare(old, self._look(region, old))
+                new, changes = self._compare(old, self._measure(region, old))
                 found.append(changes)
-            self._noted[region.index] = new
+            self._recorded[region.index] = new
         found += [Changes(gone.voxels.centres, nothing) for gone in before.values()]
         return Changes(
             np.concatenate([changes.places for changes in found]),
             np.concatenate([changes.drifted for changes in found]),
         )
 
-    def _compare(self, old: _Noted, new: _Noted) -> tuple[_Noted, Changes]:
-        """What is to be noted, and what changed."""
+    def _compare(self, old: _Recorded, new: _Recorded) -> tuple[_Recorded, Changes]:
+        """What is to be recorded, and what changed."""
         voxels = new.voxels
         before = old.offsets
         gone = np.zeros((0, 3))
@@ -111,19 +111,19 @@ class SurfaceChanges:
         left = moved > self._settings.leaf_m / 2
         many_left = count(left) >= np.maximum(_LEFT_VOXELS, _LEFT_SHARE * size)
         drifted = 2 * count(moved > self._tolerance_m) > size
-        told = drifted | many_left | (count(is_new) > 0)
-        noted = np.where(told[voxels.group], new.offsets, before)
+        reported = drifted | many_left | (count(is_new) > 0)
+        recorded = np.where(reported[voxels.group], new.offsets, before)
         places = is_new | (left & many_left[voxels.group])
-        return _Noted(new.region, voxels, noted), Changes(
+        return _Recorded(new.region, voxels, recorded), Changes(
             np.concatenate([gone, voxels.centres[places]]), voxels.groups[drifted]
         )
 
-    def _look(self, region: FrozenRegion, old: _Noted | None) -> _Noted:
+    def _measure(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
         if old is not None and old.region.evidence is region.evidence:
             voxels = old.voxels
         else:
             voxels = self._voxels(region)
-        return _Noted(region, voxels, self._offsets(region, voxels.centres))
+        return _Recorded(region, voxels, self._offsets(region, voxels.centres))
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
         evidence = region.evidence

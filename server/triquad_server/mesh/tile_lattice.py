@@ -7,9 +7,6 @@ from numpy.typing import NDArray
 
 from triquad_server.settings import MeshSettings
 
-LEVELS = 3
-"""Levels of detail: cells of level ``l`` are ``2**l`` times as large as those of level 0."""
-
 _GROUP_CELLS = 8
 
 
@@ -21,7 +18,7 @@ class TileLattice:
     cell_m: float
     cells: int  # along the side of a tile, the same on all levels
     reach_m: float  # centres of faces lie at most this far from voxels with seen surface
-    group: int  # cells along the side of the groups that are looked at first
+    group: int  # cells along the side of the groups that are searched first
 
     @property
     def tile_side_m(self) -> float:
@@ -38,7 +35,7 @@ def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
     """The lattice of a level, ``0 <= level < LEVELS``.
 
     A tile of level ``l`` covers ``2**l`` tiles of level 0 along each axis. Groups of cells are of
-    the same size on all levels, so that no level looks farther around than level 0.
+    the same size on all levels, so that no level searches farther around than level 0.
     """
     scale = 1 << level
     return TileLattice(

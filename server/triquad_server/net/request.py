@@ -5,23 +5,30 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import zenoh
-from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.errors import ProtocolVersionError, RefusedError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 
-from triquad_server.counter import Tally
-from triquad_server.errors import RequestError
+from triquad_server.counter import Counter
 
 _log = logging.getLogger(__name__)
 
 RequestT = TypeVar("RequestT", bound=Message)
 
+_POINT_BYTES = 12
+_OTHER_BYTES = 4096  # the largest message takes less without its points
+
+
+def payload_limit(points: int) -> int:
+    """Most bytes that a message of so many points may have: what is larger is not decoded."""
+    return points * _POINT_BYTES + _OTHER_BYTES
+
 
 class Request:
     """A query that waits for its answer."""
 
-    def __init__(self, query: zenoh.Query, key: str, refused: Tally) -> None:
+    def __init__(self, query: zenoh.Query, key: str, refused: Counter) -> None:
         """``key`` is the key of the operation; refusals are counted in ``refused``."""
         self._query = query
         self._key = key
@@ -37,17 +44,17 @@ class Request:
         """The request's message.
 
         Raises:
-            RequestError: there is none, or it cannot be decoded.
+            RefusedError: there is none, or it cannot be decoded.
         """
         payload = self._query.payload
         if payload is None:
-            raise RequestError("bad_request", f"no payload: expected a {kind.__name__}")
+            raise RefusedError("bad_request", f"no payload: expected a {kind.__name__}")
         try:
             return codec.decode(kind, payload.to_bytes())
         except ProtocolVersionError as error:
-            raise RequestError("bad_version", str(error)) from error
+            raise RefusedError("bad_version", str(error)) from error
         except WireError as error:
-            raise RequestError("bad_request", str(error)) from error
+            raise RefusedError("bad_request", str(error)) from error
 
     def answer(self, message: Message) -> None:
         """Reply with ``message``."""
@@ -57,7 +64,7 @@ class Request:
         )
 
     def refuse(self, code: str, text: str) -> None:
-        """Reply with an error; ``code`` is one of ``messages.ERROR_CODES``."""
+        """Reply with an error; ``code`` is one of ``ERROR_CODES``."""
         self._refused.add(code)
         _log.debug("request on %s refused (%s): %s", self._key, code, text)
         payload = codec.encode(ErrorReply(code, text[:4096]))

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Iterator
 from triquad_format.errors import MapFileError
 from triquad_format.mapfile.index import OtherFiles
 from triquad_format.mapfile.manifest import Entry
+from triquad_format.mapfile.parts.body import repack_part
+from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.mapfile.parts.part import MAP, Part
-from triquad_format.mapfile.parts.part_body import repack_part
-from triquad_format.mapfile.writer import region_parts
 
 from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mesh.preview import preview_part
@@ -29,7 +29,7 @@ def checkpoint_parts(
     for index in changes.regions:
         region = changed.get(index)
         if region is not None:
-            yield from region_parts(region, settings, _FEATURE_DTYPE)
+            yield from pack_region(region, settings, _FEATURE_DTYPE)
             yield preview_part(region, settings, changes.epoch.distances, stamp_ns)
         elif known is not None:
             entries = known.of_region(index)

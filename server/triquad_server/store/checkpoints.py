@@ -6,13 +6,15 @@ import threading
 import time
 from concurrent.futures import Future
 
+from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
-from triquad_map.compiled.team import be_patient
+from triquad_map.compiled.team import lower_priority
 
-from triquad_server.errors import RequestError, StoreBaseError, StoreError
+from triquad_server.errors import StoreBaseError, StoreError
+from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.store import Store
-from triquad_server.threads import PATIENCE
+from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
@@ -60,17 +62,17 @@ class Checkpoints:
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
         """A checkpoint of the map as it is now; the last one where nothing changed."""
         if self._store is None:
-            raise RequestError("store", _NO_STORE)
+            raise RefusedError("store", _NO_STORE)
         asked: Future[CheckpointInfo] = Future()
         self._asked.put(asked)
         self._wake.set()
         try:
             return asked.result()
         except StoreError as error:
-            raise RequestError("store", str(error)) from error
+            raise RefusedError("store", str(error)) from error
 
     def _run(self) -> None:
-        be_patient(2 * PATIENCE)  # mapping comes first, too
+        lower_priority(2 * NICENESS)  # mapping comes first, too
         due = time.monotonic() + self._period_s
         while not self._stopping.is_set():
             self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)
@@ -93,20 +95,21 @@ class Checkpoints:
         try:
             self._write()
         except StoreError:
-            return  # noted in the status and in the log
+            return  # the status and the log have it
         except Exception:
-            self.error = "a defect of the server; its log has the details"
-            _log.exception("a checkpoint met a defect")
+            self.error = "an internal error of the server; its log has the details"
+            _log.exception("a checkpoint met an internal error")
 
     def _write(self) -> CheckpointInfo:
         assert self._store is not None
-        epoch = self._mapper.call(lambda mapper: mapper.publish().number)
+        base = self._store.base_epoch
+        changes = self._mapper.call(lambda mapper: mapper.changes_since(base))
         last = self.last
         # The base is the last checkpoint, as long as its files are as they were written.
-        if last is not None and last.epoch == epoch == self._store.base_epoch:
+        if last is not None and last.epoch == changes.record.epoch == base:
             return last
         try:
-            info = self._write_changes(self._store)
+            info = self._write_changes(self._store, changes)
         except StoreError as error:
             self.error = str(error)
             _log.error("%s", error)
@@ -115,11 +118,10 @@ class Checkpoints:
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
 
-    def _write_changes(self, store: Store) -> CheckpointInfo:
-        """What changed since the last checkpoint; all of the map where that was damaged since."""
-        base = store.base_epoch
+    def _write_changes(self, store: Store, changes: MapChanges) -> CheckpointInfo:
+        """Write the changes; all of the map where the checkpoints before were damaged since."""
         try:
-            return store.write(self._mapper.call(lambda mapper: mapper.changes_since(base)))
+            return store.write(changes)
         except StoreBaseError as error:
             _log.warning("%s; all of the map is written instead", error)
             return store.write(self._mapper.call(lambda mapper: mapper.changes_since(None)))
@@ -139,7 +141,7 @@ class Checkpoints:
             _log.error("%s", error)
             return
         except Exception:
-            _log.exception("folding checkpoints met a defect")
+            _log.exception("folding checkpoints met an internal error")
             return
         if info is None:
             return

@@ -5,10 +5,10 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from triquad_format.mapfile.mapfile import write_map
+from triquad_format.errors import RefusedError
+from triquad_format.mapfile.writer import write_map
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
 
-from triquad_server.errors import RequestError
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.preview import previews_of
 from triquad_server.store.stamp import stamp_now_ns
@@ -50,7 +50,12 @@ class MapDownloads:
         buffer, stamp_ns = io.BytesIO(), stamp_now_ns()
         previews = previews_of(record, distances=newest.distances, stamp_ns=stamp_ns)
         written = write_map(record, buffer, stamp_ns=stamp_ns, previews=previews)
-        info = MapInfo(written.epoch, written.bytes, written.sha256, CHUNK_BYTES)
+        info = MapInfo(
+            epoch=written.epoch,
+            bytes=written.bytes,
+            sha256=written.sha256,
+            chunk_bytes=CHUNK_BYTES,
+        )
         with self._lock:
             self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())
             while len(self._files) > FILES_KEPT:
@@ -62,9 +67,9 @@ class MapDownloads:
         with self._lock:
             file = self._files.get(request.sha256)
         if file is None:
-            raise RequestError("chunk_gone", "this map file is not kept; ask for its info again")
+            raise RefusedError("chunk_gone", "this map file is not kept; ask for its info again")
         if not 0 <= request.offset < len(file.data) or request.length < 1:
-            raise RequestError(
+            raise RefusedError(
                 "bad_request",
                 f"{request.length} bytes from {request.offset} on are not in the file of "
                 f"{len(file.data)} bytes",

@@ -32,8 +32,8 @@ class FolderLock:
             StoreError: another process has come first.
             OSError: the file cannot be made.
         """
-        held = os.fstat(self._file.fileno())
-        if self._path.exists() and os.path.samestat(held, self._path.stat()):
+        locked = os.fstat(self._file.fileno())
+        if self._path.exists() and os.path.samestat(locked, self._path.stat()):
             return
         lost, self._file = self._file, _locked(self._path)
         lost.close()

@@ -5,35 +5,35 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
-from triquad_format.mapfile.map_facts import MapFacts
+from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.part import MAP, PartKey
 from triquad_format.records.region import RegionIndex
 
 _MAX_FILES = 8
-_MAX_HELD = 1.5
+_MAX_STORED_RATIO = 1.5  # of the bytes that are needed
 _LARGE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class KnownParts:
-    """The newest checkpoint, seen from outside: every entry names the file that holds the part."""
+    """The newest checkpoint, as any later file sees it: each entry names the file with the part."""
 
     facts: MapFacts
     stamp_ns: int
     entries: Mapping[PartKey, Entry]
-    held: Mapping[FileRef, int]  # bytes of the parts in each of its files, needed or not
+    stored: Mapping[FileRef, int]  # bytes of the parts in each of its files, needed or not
 
     @property
     def files(self) -> frozenset[str]:
         """Names of all its files."""
-        return frozenset(file.name for file in self.held)
+        return frozenset(file.name for file in self.stored)
 
     @property
     def worth_folding(self) -> bool:
         """Whether the files are many, or a third of their bytes is no longer needed."""
-        live = sum(entry.size for entry in self.entries.values())
-        held = sum(self.held.values())
-        return len(self.held) > _MAX_FILES or held > _MAX_HELD * live
+        needed = sum(entry.size for entry in self.entries.values())
+        stored = sum(self.stored.values())
+        return len(self.stored) > _MAX_FILES or stored > _MAX_STORED_RATIO * needed
 
     def of_region(self, index: RegionIndex) -> list[Entry]:
         """The parts of a region, in their order."""
@@ -53,15 +53,15 @@ class KnownParts:
 
 
 def known_parts(
-    manifest: Manifest, file: FileRef, held_before: Mapping[FileRef, int]
+    manifest: Manifest, file: FileRef, stored_before: Mapping[FileRef, int]
 ) -> KnownParts:
     """What is known once ``file`` with this manifest is on the disk.
 
-    ``held_before`` gives the bytes of the parts in each of the other files.
+    ``stored_before`` gives the bytes of the parts in each of the other files.
     """
-    held = {other: held_before.get(other, 0) for other in manifest.files}
-    held[file] = own_bytes(manifest)
-    return KnownParts(manifest.facts, manifest.stamp_ns, manifest.elsewhere(file), held)
+    stored = {other: stored_before.get(other, 0) for other in manifest.files}
+    stored[file] = own_bytes(manifest)
+    return KnownParts(manifest.facts, manifest.stamp_ns, manifest.elsewhere(file), stored)
 
 
 def own_bytes(manifest: Manifest) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import MapRecord
 
-from triquad_tools.evaluation.driven_street import DrivenStreet
+from triquad_tools.evaluation.map_scores import DrivenStreet
 from triquad_tools.mapfiles.seen_space import surface_voxels
 
 _ALONG_RAYS = 200_000

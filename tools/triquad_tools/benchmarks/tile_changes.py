@@ -5,11 +5,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from triquad_client import Mesh
 from triquad_server.mesh.mesher import TileIndex
 
-from triquad_tools.evaluation.meshfile import Mesh
-
-_CANDIDATES = 8  # triangles that are looked at for each point: those of the nearest centroids
+_CANDIDATES = 8  # triangles that are tried for each point: those of the nearest centroids
 
 
 def changed_tiles(
@@ -61,6 +60,6 @@ class _Triangles:
         for rows in candidates.T:
             left = np.flatnonzero(far)
             corners = self._corners[rows[left]]
-            nearest = closest_point(corners, points[left])  # type: ignore[no-untyped-call]
+            nearest = closest_point(corners, points[left])
             far[left] = np.linalg.norm(nearest - points[left], axis=1) > limit_m
         return far

@@ -3,20 +3,37 @@
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_client import Client, Mesh
 
 from triquad_tools.console.arguments import count, not_negative, positive, seed
-from triquad_tools.console.errors import ToolError
-from triquad_tools.console.report import Row, centimetres, json_text, percent, print_table
+from triquad_tools.console.command import OK, ToolError, run
+from triquad_tools.console.report import Row, centimetres, json_text, percent, print_rows
+from triquad_tools.evaluation.map_scores import (
+    StreetScores,
+    WithheldScores,
+    score_street,
+    score_withheld,
+    street_probes,
+)
+from triquad_tools.evaluation.metrics import (
+    MeshScores,
+    ScoreSettings,
+    score_against_cloud,
+    score_against_scene,
+)
+from triquad_tools.evaluation.open_map import open_map
+from triquad_tools.mapfiles.meshfile import read_mesh
+from triquad_tools.recordings.cloud import is_withheld, merged, world_points
+from triquad_tools.recordings.kitti import read_folder
+from triquad_tools.simulation.street import street_drive
 
-if TYPE_CHECKING:
-    from triquad_tools.evaluation.map_scores import StreetScores, WithheldScores
-    from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings
-    from triquad_tools.simulation.lidar import SimulatedDrive
-
-OK, FAILED, BAD_INPUT = 0, 1, 2
-
+_COMMAND = "triquad-eval"
 _SEED = 0  # of the points that are drawn; scores can be repeated
 _SERVER_SAMPLES_MAX = 3_000_000  # of a street's mesh: more change the scores by little
 _STREET_VOXEL_M = 0.05  # between the street's points that completion asks for
@@ -26,49 +43,37 @@ Results = dict[str, Any]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 1 a server failed, 2 wrong usage or input that cannot be used."""
-    options = _parser().parse_args(argv)
-    from triquad_tools.evaluation.open_map import MapUnreachableError
+    return run(_COMMAND, partial(_evaluate, _parser().parse_args(argv)))
 
+
+def _evaluate(options: argparse.Namespace) -> int:
     evaluate: Callable[[argparse.Namespace], Results] = options.evaluate
-    try:
-        results = evaluate(options)
-    except MapUnreachableError as error:
-        return _complain(str(error), FAILED)
-    except (ToolError, OSError) as error:
-        return _complain(str(error), BAD_INPUT)
-    except KeyboardInterrupt:
-        return _complain("interrupted", FAILED)
+    results = evaluate(options)
     if options.json:
         print(json_text(results))
         return OK
     for name, scores in results.items():
-        print_table(_TITLES[name], _ROWS[name](scores))
+        print_rows(_TITLES[name], _ROWS[name](scores))
     return OK
-
-
-def _complain(message: str, code: int) -> int:
-    print(f"triquad-eval: {message}", file=sys.stderr)
-    return code
 
 
 def evaluate_mesh(options: argparse.Namespace) -> Results:
     """Scores of a mesh file against a cloud, a folder of scans or a simulated street."""
-    import numpy as np
-
-    from triquad_tools.evaluation.meshfile import read_mesh
-    from triquad_tools.evaluation.metrics import score_against_cloud, score_against_scene
-
     mesh = read_mesh(options.mesh)
     if not len(mesh.faces):
         raise ToolError(f"{options.mesh}: has no faces; a cloud can only be a --reference")
-    settings = _score_settings(options)
-    rng = np.random.default_rng(_SEED)
+    settings = ScoreSettings(
+        threshold_m=options.threshold,
+        accuracy_cut_m=options.accuracy_cut,
+        completion_cut_m=options.completion_cut,
+        voxel_m=options.voxel,
+    )
     if options.street is None:
         reference = _reference(options.reference, settings.voxel_m, options.range_min)
-        return {"mesh": score_against_cloud(mesh, reference, settings, rng)}
-    drive = _drive(options)
+        return {"mesh": score_against_cloud(mesh, reference, settings)}
+    drive = street_drive(options.street, options.scans, options.step)
     visible = drive.true_hits(settings.voxel_m)
-    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings, rng)}
+    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings)}
 
 
 def evaluate_map(options: argparse.Namespace) -> Results:
@@ -77,31 +82,21 @@ def evaluate_map(options: argparse.Namespace) -> Results:
 
 
 def _on_street(options: argparse.Namespace) -> Results:
-    import numpy as np
-
-    from triquad_tools.evaluation.map_scores import score_street, street_probes
-    from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
-    from triquad_tools.evaluation.open_map import open_map
-
-    drive = _drive(options)
-    rng = np.random.default_rng(_SEED)
-    probes = street_probes(drive, rng)
+    drive = street_drive(options.street, options.scans, options.step)
+    probes = street_probes(drive, np.random.default_rng(_SEED))
     with open_map(options.target, options.map) as opened:
-        results: Results = {"street": score_street(opened.query, probes)}
-        mesh = opened.mesh(drive.scene.bounds) if opened.mesh else None
-    if mesh is not None:
-        settings = ScoreSettings(samples_max=_SERVER_SAMPLES_MAX)
-        visible = drive.true_hits(_STREET_VOXEL_M)
-        results["mesh"] = score_against_scene(mesh, drive.scene, visible, settings, rng)
+        results: Results = {"street": score_street(opened.query_sdf, probes)}
+        if isinstance(opened, Client):  # a file has no mesh
+            low, high = drive.scene.bounds.tolist()
+            found = opened.mesh((low, high))
+            visible = drive.true_hits(_STREET_VOXEL_M)
+            settings = ScoreSettings(samples_max=_SERVER_SAMPLES_MAX)
+            mesh = Mesh(found.vertices, found.faces)
+            results["mesh"] = score_against_scene(mesh, drive.scene, visible, settings)
     return results
 
 
 def _at_withheld(options: argparse.Namespace) -> Results:
-    from triquad_tools.evaluation.cloud import is_withheld, world_points
-    from triquad_tools.evaluation.kitti import read_folder
-    from triquad_tools.evaluation.map_scores import score_withheld
-    from triquad_tools.evaluation.open_map import open_map
-
     folder = read_folder(options.withheld)
     every = options.skip_every
     indices = [i for i in range(len(folder)) if every == 0 or is_withheld(i, every)]
@@ -113,45 +108,23 @@ def _at_withheld(options: argparse.Namespace) -> Results:
     limits = (options.range_min, options.range_max)
     with open_map(options.target, options.map) as opened:
         clouds = (world_points(folder, index, *limits) for index in indices)
-        return {"withheld": score_withheld(opened.query, clouds)}
+        return {"withheld": score_withheld(opened.query_sdf, clouds)}
 
 
-def _reference(path: Path, voxel_m: float, range_min_m: float) -> Any:
+def _reference(path: Path, voxel_m: float, range_min_m: float) -> NDArray[np.float64]:
     """The points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
-    from triquad_tools.evaluation.cloud import world_points
-    from triquad_tools.evaluation.kitti import read_folder
-    from triquad_tools.evaluation.meshfile import read_mesh
-    from triquad_tools.simulation.voxel import merged
-
     if path.is_dir():
         folder = read_folder(path)
         clouds = (world_points(folder, index, range_min_m) for index in range(len(folder)))
         points = merged(clouds, voxel_m)
     else:
-        points = read_mesh(path).vertices.astype(float)
+        points = np.asarray(read_mesh(path).vertices, np.float64)
     if not len(points):
         raise ToolError(f"{path}: holds no points")
     return points
 
 
-def _drive(options: argparse.Namespace) -> "SimulatedDrive":
-    from triquad_tools.simulation.street_drive import street_drive
-
-    return street_drive(options.street, options.scans, options.step)
-
-
-def _score_settings(options: argparse.Namespace) -> "ScoreSettings":
-    from triquad_tools.evaluation.metrics import ScoreSettings
-
-    return ScoreSettings(
-        threshold_m=options.threshold,
-        accuracy_cut_m=options.accuracy_cut,
-        completion_cut_m=options.completion_cut,
-        voxel_m=options.voxel,
-    )
-
-
-def mesh_rows(scores: "MeshScores") -> list[Row]:
+def mesh_rows(scores: MeshScores) -> list[Row]:
     """The scores of a mesh as lines of a table."""
     return [
         Row("accuracy", centimetres(scores.accuracy_m), "mean, mesh to truth, outliers left out"),
@@ -166,7 +139,7 @@ def mesh_rows(scores: "MeshScores") -> list[Row]:
     ]
 
 
-def street_rows(scores: "StreetScores") -> list[Row]:
+def street_rows(scores: StreetScores) -> list[Row]:
     """The scores of a map of a street as lines of a table."""
     return [
         Row("SDF error", centimetres(scores.sdf_error_m), "mean, within 10 cm of the surface"),
@@ -180,7 +153,7 @@ def street_rows(scores: "StreetScores") -> list[Row]:
     ]
 
 
-def withheld_rows(scores: "WithheldScores") -> list[Row]:
+def withheld_rows(scores: WithheldScores) -> list[Row]:
     """The scores of a map at withheld scans as lines of a table."""
     return [
         Row("SURFACE", percent(scores.surface_ratio), "of all points"),
@@ -207,7 +180,7 @@ _ROWS: dict[str, Callable[[Any], list[Row]]] = {
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="triquad-eval",
+        prog=_COMMAND,
         description="Score a mesh or a map. docs/tools.md defines the figures.",
         epilog="Exit status: 0 done, 1 the server failed, 2 wrong usage or input.",
     )

@@ -1,75 +1,89 @@
-"""``triquad-inspect``: what map files hold, whether they are sound, and how they differ."""
+"""``triquad-inspect``: what maps hold, whether their files are valid, how they differ, slices."""
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from triquad_format.errors import DamagedMapFileError
+from triquad_format.mapfile.reader import MapFile
 
 from triquad_tools.console.arguments import count, positive
-from triquad_tools.console.errors import ToolError
+from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
+from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
+from triquad_tools.mapfiles.checks import FailedCheckError, verify
+from triquad_tools.mapfiles.diff import compare, difference, print_diff
+from triquad_tools.mapfiles.source import MissingFilesError, read_whole
+from triquad_tools.mapfiles.store_log import print_log, read_log
+from triquad_tools.mapfiles.summary import print_summary, summarise
 
-if TYPE_CHECKING:
-    from triquad_format.mapfile.mapfile import MapFile
-
-OK, DAMAGED, BAD_INPUT = 0, 1, 2
-
+_COMMAND = "triquad-inspect"
+_DAMAGE = (DamagedMapFileError, FailedCheckError, MissingFilesError)
 _TILE_M = 6.4
 _LEAST_TILE_M = 0.1
 _ROWS = 20
+_CELL_M = 0.1
 _PICTURE_SUFFIX = ".png"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 sound, 1 damaged, 2 not readable, or wrong usage."""
+    """Run the tool: 0 valid, 1 damaged, 2 not readable, or wrong usage."""
     options = _parser().parse_intermixed_args(argv)
-    from triquad_format.errors import DamagedMapFileError, FormatError
-
-    from triquad_tools.mapfiles.map_checks import FailedCheckError
-    from triquad_tools.mapfiles.whole_map import MissingFilesError
-
-    try:
-        _check_usage(options)
-        return _run(options)
-    except (DamagedMapFileError, FailedCheckError, MissingFilesError) as error:
-        return _complain(str(error), DAMAGED)
-    except (FormatError, ToolError, OSError) as error:
-        return _complain(str(error), BAD_INPUT)
-    except KeyboardInterrupt:
-        return _complain("interrupted", BAD_INPUT)
+    return run(_COMMAND, partial(_inspect, options), failures=_DAMAGE)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="triquad-inspect",
-        description="Show what a map file holds, a folder's history, or how two maps differ. "
-        "Map files are read in full and checked.",
-        epilog="Exit status: 0 sound, also where maps differ; 1 damaged; 2 not readable (missing, "
-        "or of a newer version), or wrong usage.",
+        prog=_COMMAND,
+        description="Show what a map file holds, a folder's history, how two maps differ, or a "
+        "slice of a map. Map files are read in full and checked.",
+        epilog="Exit status: 0 valid, also where maps differ; 1 damaged, or the server failed; "
+        "2 not readable (missing, or of a newer version), or wrong usage.",
     )
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="map file")
-    parser.add_argument(
+    add = parser.add_argument
+    add("files", type=Path, nargs="+", metavar="FILE", help="map file; with --slice also a server")
+    add(
         "--verify",
         action="store_true",
         help="check also with the mcap library and by evaluating the field; list the checks",
     )
-    parser.add_argument(
-        "--log", action="store_true", help="list the checkpoints in the folder FILE"
-    )
-    parser.add_argument("--diff", action="store_true", help="compare two map files, A and B")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw a plan of the map(s)")
-    parser.add_argument(
-        "--tile", type=positive, metavar="M", help=f"side of a tile of --diff ({_TILE_M} m)"
-    )
-    parser.add_argument("--limit", type=count, metavar="N", help=f"rows of --diff ({_ROWS})")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add("--log", action="store_true", help="list the checkpoints in the folder FILE")
+    add("--diff", action="store_true", help="compare two map files, A and B")
+    add("--plot", type=Path, metavar="OUT.png", help="draw a plan of the map(s), or the slice")
+    add("--tile", type=positive, metavar="M", help=f"side of a tile of --diff ({_TILE_M} m)")
+    add("--limit", type=count, metavar="N", help=f"rows of --diff ({_ROWS})")
+    add("--json", action="store_true", help="print JSON")
+    _add_slice(parser.add_argument_group("slices"))
     return parser
+
+
+def _add_slice(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add(
+        "--slice",
+        type=float,
+        metavar="Z",
+        help="draw distance and status at this height, metres, into --plot; FILE may be the "
+        "endpoint of a server, such as tcp/127.0.0.1:7447",
+    )
+    add(
+        "--box",
+        type=float,
+        nargs=4,
+        metavar=("WEST", "SOUTH", "EAST", "NORTH"),
+        help="what it shows, metres, map frame (default: all that a file has seen)",
+    )
+    add("--cell", type=positive, metavar="M", help=f"side of its cells (default: {_CELL_M:g})")
+    add("--map", metavar="NAME", help="of the server (default: default)")
 
 
 def _check_usage(options: argparse.Namespace) -> None:
     """Refuse what does not go together."""
-    given, plot = len(options.files), options.plot
+    given, plot, sliced = len(options.files), options.plot, options.slice is not None
+    other = options.log or options.diff or options.verify or options.json
     problems = {
         "--log and --diff exclude each other": options.log and options.diff,
         f"--diff compares two map files: {given} given": options.diff and given != 2,
@@ -78,6 +92,11 @@ def _check_usage(options: argparse.Namespace) -> None:
         "--tile and --limit go with --diff": (options.tile or options.limit) and not options.diff,
         f"--tile {options.tile} m is too small: use {_LEAST_TILE_M} or more": (
             options.tile and options.tile < _LEAST_TILE_M
+        ),
+        "--slice needs --plot OUT.png": sliced and not plot,
+        "--slice excludes --log, --diff, --verify and --json": sliced and other,
+        "--box, --cell and --map go with --slice": (
+            (options.box or options.cell or options.map) and not sliced
         ),
         "--plot is for map files, not for --log": options.log and plot,
         f"--plot {plot}: its name must end in {_PICTURE_SUFFIX}": (
@@ -88,12 +107,13 @@ def _check_usage(options: argparse.Namespace) -> None:
             plot and plot.exists() and any(p.exists() and plot.samefile(p) for p in options.files)
         ),
     }
-    for problem, there in problems.items():
-        if there:
-            raise ToolError(problem)
+    refuse(problems)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _inspect(options: argparse.Namespace) -> int:
+    _check_usage(options)
+    if options.slice is not None:
+        return _slice(options)
     if options.log:
         return _log(options)
     return _diff(options) if options.diff else _show(options)
@@ -101,21 +121,15 @@ def _run(options: argparse.Namespace) -> int:
 
 def _show(options: argparse.Namespace) -> int:
     """One map file."""
-    import dataclasses
-
-    from triquad_tools.mapfiles.map_checks import verify
-    from triquad_tools.mapfiles.map_summary import print_summary, summarise
-    from triquad_tools.mapfiles.whole_map import read_whole
-
     path = options.files[0]
     file = read_whole(path)
     summary = summarise(file)
     if options.verify:
         summary = dataclasses.replace(summary, checks=verify(path, file))
     if options.plot:
-        from triquad_tools.plots.plan_view import plan_picture
+        from triquad_tools.plots.map_plan import draw_map  # slow to import
 
-        plan_picture(_title(path, file), file).save(options.plot)
+        draw_map(_title(path, file), file, options.plot)
     if options.json:
         print(json_text(summary))
     else:
@@ -123,10 +137,17 @@ def _show(options: argparse.Namespace) -> int:
     return OK
 
 
+def _slice(options: argparse.Namespace) -> int:
+    """One layer of a map, of a file or of a server."""
+    from triquad_tools.plots.slice_plan import SliceOptions, draw_slice  # slow to import
+
+    wanted = SliceOptions(options.slice, options.box, options.cell or _CELL_M)
+    draw_slice(str(options.files[0]), options.map or "default", wanted, options.plot)
+    return OK
+
+
 def _log(options: argparse.Namespace) -> int:
     """The checkpoints of a folder."""
-    from triquad_tools.mapfiles.store_log import print_log, read_log
-
     path = options.files[0]
     if path.is_file():
         raise ToolError(f"{path} is a file: --log lists the checkpoints in a folder")
@@ -136,16 +157,13 @@ def _log(options: argparse.Namespace) -> int:
     else:
         print_log(log)
     if log.damaged:
-        return _complain(f"{log.damaged} of {len(log.checkpoints)} do not open", DAMAGED)
+        message = f"{log.damaged} of {len(log.checkpoints)} do not open"
+        return complain(_COMMAND, message, FAILED)
     return OK
 
 
 def _diff(options: argparse.Namespace) -> int:
     """Two map files."""
-    from triquad_tools.console.progress import progress
-    from triquad_tools.mapfiles.map_diff import compare, difference, print_diff
-    from triquad_tools.mapfiles.whole_map import read_whole
-
     a, b = (read_whole(path) for path in options.files)
     with progress("comparing"):
         comparison = compare(a.record, b.record)
@@ -155,9 +173,9 @@ def _diff(options: argparse.Namespace) -> int:
         for letter, path, file in zip("AB", options.files, (a, b), strict=True)
     ]
     if options.plot:
-        from triquad_tools.plots.diff_view import diff_picture
+        from triquad_tools.plots.diff_plan import draw_diff  # slow to import
 
-        diff_picture(titles, comparison).save(options.plot)
+        draw_diff("\n".join(titles), comparison, options.plot)
     if options.json:
         print(json_text(diff))
     else:
@@ -166,13 +184,8 @@ def _diff(options: argparse.Namespace) -> int:
     return OK
 
 
-def _title(path: Path, file: "MapFile") -> str:
+def _title(path: Path, file: MapFile) -> str:
     return f"{path}: map {file.record.name!r}, epoch {file.record.epoch}"
-
-
-def _complain(message: str, code: int) -> int:
-    print(f"triquad-inspect: {message}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

@@ -4,19 +4,35 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+from triquad_format.errors import DamagedMapFileError
+from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
+from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
+from triquad_format.records.field_settings import check_range
+from triquad_format.recovery.loss import Loss
+from triquad_format.recovery.recovered_map import RecoveredMap, recover
 
 from triquad_tools.console.arguments import error_limit, positive
-from triquad_tools.console.errors import ToolError
+from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
+from triquad_tools.mapfiles.packing import chosen_precision, pack_map, print_packed
+from triquad_tools.mapfiles.source import (
+    Box,
+    NothingLeftError,
+    SourceMap,
+    chosen_file,
+    cropped,
+    epoch_of,
+    read_source,
+)
 
-if TYPE_CHECKING:
-    from triquad_tools.mapfiles.map_source import Box, SourceMap
-
-OK, DAMAGED, BAD_INPUT = 0, 1, 2
-
-_MAP, _MESHES, _GRID = ".triquad", (".ply", ".glb"), ".npz"
+_COMMAND = "triquad-pack"
+_DAMAGE = (DamagedMapFileError, NothingLeftError)
+_MAP, _MESHES, _GRID = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".npz"
 _SUFFIXES = (_MAP, *_MESHES, _GRID)
+_PLANES = ("XY", "XZ", "YZ")
 _MESH_CELL_M, _GRID_CELL_M = 0.1, 0.2
 _CELL_RANGE_M = (0.01, 10.0)
 
@@ -25,33 +41,12 @@ _Add = Callable[..., argparse.Action]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 1 damage, or nothing lies in the box, 2 otherwise."""
-    arguments = _parser().parse_args(argv)
-    from triquad_format.errors import DamagedMapFileError, FormatError
-
-    from triquad_tools.mapfiles.map_source import NothingLeftError
-
-    try:
-        return _pack(arguments)
-    except (DamagedMapFileError, NothingLeftError) as error:
-        return _complain(error, DAMAGED)
-    except (FormatError, ToolError, OSError) as error:
-        return _complain(error, BAD_INPUT)
-    except OverflowError:
-        return _complain("its regions lie too far from the origin: use --crop", BAD_INPUT)
-    except MemoryError:
-        return _complain("it does not fit into memory: use --crop", BAD_INPUT)
-    except KeyboardInterrupt:
-        return _complain("interrupted", BAD_INPUT)
-
-
-def _complain(message: object, code: int) -> int:
-    print(f"triquad-pack: {message}", file=sys.stderr)
-    return code
+    return run(_COMMAND, partial(_pack, _parser().parse_args(argv)), failures=_DAMAGE)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="triquad-pack",
+        prog=_COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
         "of it, in the newest version, or as a mesh or an array of distances.",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
@@ -106,55 +101,49 @@ def _add_target(add: _Add) -> None:
     add("--force", action="store_true", help="replace OUT where it exists")
 
 
-def _pack(arguments: argparse.Namespace) -> int:
-    from triquad_tools.mapfiles.map_source import chosen_file, epoch_of
-
-    _check_usage(arguments)
-    path = chosen_file(arguments.input, arguments.at)
-    _check_target(path, arguments.output, arguments.force)
-    if path != arguments.input:
+def _pack(options: argparse.Namespace) -> int:
+    _check_usage(options)
+    path = chosen_file(options.input, options.at)
+    _check_target(path, options.output, options.force)
+    if path != options.input:
         print(f"epoch {epoch_of(path)}, from {path}")
-        if arguments.at is None:
+        if options.at is None:
             _tell_set_aside(path)
-    if arguments.output.suffix == _MAP:
-        return _pack_map(arguments, path)
-    return _export(arguments, path)
+    write = _pack_map if options.output.suffix == _MAP else _export
+    try:
+        return write(options, path)
+    except MemoryError as error:
+        raise ToolError("it does not fit into memory: use --crop") from error
 
 
 def _tell_set_aside(path: Path) -> None:
-    """Name the newer checkpoints beside the newest sound one, which were damaged."""
-    from triquad_format.mapfile.history import set_aside
-
+    """Name the newer checkpoints beside the newest valid one, which were damaged."""
     for newer in (aside for aside in set_aside(path.parent) if aside.name > path.name):
-        print(f"triquad-pack: {newer} is newer, but damaged: --recover saves what is intact of it")
+        print(f"{_COMMAND}: {newer} is newer, but damaged: --recover saves what is intact of it")
 
 
-def _check_usage(arguments: argparse.Namespace) -> None:
+def _check_usage(options: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
-    suffix = arguments.output.suffix
-    rounds = arguments.precision or arguments.max_error
+    suffix = options.output.suffix
+    rounds = options.precision or options.max_error
     problems = {
-        f"{arguments.output}: use a name that ends in {', '.join(_SUFFIXES)}": (
+        f"{options.output}: use a name that ends in {', '.join(_SUFFIXES)}": (
             suffix not in _SUFFIXES
         ),
         f"--precision and --max-error are of map files: {suffix} has none": (
             rounds and suffix != _MAP
         ),
-        f"--max-error makes integers: leave out --precision {arguments.precision}": (
-            arguments.max_error and arguments.precision in ("fp16", "fp32")
+        f"--max-error makes integers: leave out --precision {options.precision}": (
+            options.max_error and options.precision in ("fp16", "fp32")
         ),
-        "--cell is of meshes and grids: a map file has none": arguments.cell and suffix == _MAP,
-        f"--sparse is of {_GRID}": arguments.sparse and suffix != _GRID,
+        "--cell is of meshes and grids: a map file has none": options.cell and suffix == _MAP,
+        f"--sparse is of {_GRID}": options.sparse and suffix != _GRID,
     }
-    for problem, there in problems.items():
-        if there:
-            raise ToolError(problem)
+    refuse(problems)
 
 
 def _check_target(source: Path, target: Path, force: bool) -> None:
     """Refuse a target that must not be written."""
-    from triquad_format.mapfile.history import checkpoint_file, checkpoint_files
-
     folder = target.parent
     named_so = checkpoint_file(target) is not None
     if named_so and folder.is_dir() and checkpoint_files(folder):
@@ -170,58 +159,78 @@ def _check_target(source: Path, target: Path, force: bool) -> None:
         raise ToolError(f"{target.parent} is not a folder: make it first")
 
 
-def _pack_map(arguments: argparse.Namespace, path: Path) -> int:
-    from triquad_tools.mapfiles.map_packing import chosen_precision, pack_map, print_packed
-
-    precision = chosen_precision(arguments.precision, arguments.max_error)
-    training = not arguments.no_training and precision.max_error_m is None
-    source, complete = _source(arguments, path, _box(arguments.crop), training)
-    packed = pack_map(source, precision, arguments.output)
-    print_packed(arguments.output, packed, path.stat().st_size)
-    return OK if complete else DAMAGED
+def _pack_map(options: argparse.Namespace, path: Path) -> int:
+    precision = chosen_precision(options.precision, options.max_error)
+    training = not options.no_training and precision.max_error_m is None
+    source, complete = _source(options, path, _box(options.crop), training)
+    packed = pack_map(source, precision, options.output)
+    print_packed(options.output, packed, path.stat().st_size)
+    return OK if complete else FAILED
 
 
-def _export(arguments: argparse.Namespace, path: Path) -> int:
-    from triquad_format.records.field_settings import check_range
+def _export(options: argparse.Namespace, path: Path) -> int:
+    from triquad_tools.mapfiles.export import MARGIN_CELLS, export_grid, export_mesh  # slow
 
-    from triquad_tools.mapfiles.map_export import MARGIN_CELLS, export_grid, export_mesh
-
-    box, output = _box(arguments.crop), arguments.output
+    box, output = _box(options.crop), options.output
     grid = output.suffix == _GRID
-    cell_m = arguments.cell or (_GRID_CELL_M if grid else _MESH_CELL_M)
+    cell_m = options.cell or (_GRID_CELL_M if grid else _MESH_CELL_M)
     check_range("--cell", cell_m, *_CELL_RANGE_M)
     needed = None if box is None else box + [[-MARGIN_CELLS * cell_m], [MARGIN_CELLS * cell_m]]
-    source, complete = _source(arguments, path, needed, training=False)
+    source, complete = _source(options, path, needed, training=False)
     if grid:
-        written = export_grid(source.record, box, cell_m, arguments.sparse, output)
+        written = export_grid(source.record, box, cell_m, options.sparse, output)
     else:
         written = export_mesh(source.record, box, cell_m, output)
     print(f"{output}: {written}")
-    return OK if complete else DAMAGED
+    return OK if complete else FAILED
 
 
-def _box(corners: list[float] | None) -> "Box | None":
-    import numpy as np
-
+def _box(corners: list[float] | None) -> Box | None:
     return None if corners is None else np.reshape(np.array(corners), (2, 3))
 
 
 def _source(
-    arguments: argparse.Namespace, path: Path, box: "Box | None", training: bool
-) -> "tuple[SourceMap, bool]":
+    options: argparse.Namespace, path: Path, box: Box | None, training: bool
+) -> tuple[SourceMap, bool]:
     """The map, and whether nothing of it is lost."""
-    from triquad_tools.mapfiles.map_source import SourceMap, cropped, read_source
-
-    if not arguments.recover:
+    if not options.recover:
         return read_source(path, box, training), True
-    from triquad_format.recovery.recover import recover
-
-    from triquad_tools.mapfiles.recovery_report import print_recovery
-
     recovery = recover(path)
-    print_recovery(recovery)
+    _print_recovery(recovery)
     source = SourceMap(recovery.record, recovery.stamp_ns or None)
     return cropped(source, box, training), recovery.complete
+
+
+def _print_recovery(recovery: RecoveredMap) -> None:
+    """Print a line for each loss, and how much was saved."""
+    for loss in recovery.losses:
+        print(f"lost: {_what(loss)}{_where(loss)}")
+    if recovery.parts_listed is None:
+        saved = f"saved {recovery.parts_intact} parts"
+        print(f"{saved}; the list of parts is lost: there may have been more")
+    elif recovery.complete:
+        print(f"saved all {recovery.parts_listed} parts: nothing is lost")
+    else:
+        print(f"saved {recovery.parts_intact} of {recovery.parts_listed} parts")
+    if not recovery.record.has_evidence:
+        print("no evidence is left: the map gives distances, but says UNKNOWN everywhere")
+
+
+def _what(loss: Loss) -> str:
+    region = "region {} {} {}".format(*loss.key.region)
+    return {
+        REGION: f"{region}, all of it",
+        VERTICES: f"vertices of plane {_PLANES[loss.key.plane]} of {region}: now UNKNOWN",
+        EVIDENCE: f"evidence of {region}: now UNKNOWN",
+        TRAINING: f"training state of {region}: it answers, but learns anew",
+    }[loss.key.topic]
+
+
+def _where(loss: Loss) -> str:
+    if loss.key.topic == TRAINING:
+        return ""
+    bounds = zip("xyz", loss.minimum.tolist(), loss.maximum.tolist(), strict=True)
+    return ", " + ", ".join(f"{axis} {low:.1f} to {high:.1f} m" for axis, low, high in bounds)
 
 
 if __name__ == "__main__":

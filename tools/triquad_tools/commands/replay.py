@@ -5,20 +5,19 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from triquad_client import Client, FlushReport, connect
 
 from triquad_tools.console.arguments import count, not_negative, positive
-from triquad_tools.console.errors import ToolError
+from triquad_tools.console.command import FAILED, OK, ToolError, run
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
+from triquad_tools.recordings.cloud import is_withheld, points_in_range
+from triquad_tools.recordings.kitti import KittiFolder, read_folder
 
-if TYPE_CHECKING:
-    from triquad_client import Client, FlushReport
-
-    from triquad_tools.evaluation.kitti import KittiFolder
-
-OK, FAILED, BAD_INPUT = 0, 1, 2
+_COMMAND = "triquad-replay"
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class ReplayReport:
 
     published: int
     skipped: int  # not sent: no point was left of them
-    flush: "FlushReport | None"  # None: nothing was published
+    flush: FlushReport | None  # None: nothing was published
     refusals: dict[str, int]  # on the server meanwhile, by reason
     seconds: float  # until the server had taken in all
 
@@ -52,28 +51,11 @@ class ReplayReport:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 1 scans were lost or refused or the server failed, 2 bad input."""
-    options = _parser().parse_args(argv)
-    from triquad_client import ConnectError, InvalidInputError, TriquadError, UnknownMapError
-    from triquad_format.errors import FormatError
-
-    try:
-        return _run(options)
-    except (ConnectError, UnknownMapError) as error:
-        return _complain(str(error), FAILED)
-    except (ToolError, InvalidInputError, FormatError, OSError) as error:
-        return _complain(str(error), BAD_INPUT)
-    except TriquadError as error:
-        return _complain(str(error), FAILED)
-    except KeyboardInterrupt:
-        return _complain("interrupted; scans that were sent are in the map", FAILED)
+    work = partial(_replay, _parser().parse_args(argv))
+    return run(_COMMAND, work, interrupted="interrupted; scans that were sent are in the map")
 
 
-def _run(options: argparse.Namespace) -> int:
-    from triquad_client import connect
-
-    from triquad_tools.evaluation.cloud import is_withheld
-    from triquad_tools.evaluation.kitti import read_folder
-
+def _replay(options: argparse.Namespace) -> int:
     folder = read_folder(options.folder)
     indices = [i for i in range(len(folder)) if not is_withheld(i, options.skip_every)]
     if not indices:
@@ -84,30 +66,22 @@ def _run(options: argparse.Namespace) -> int:
         report = publisher.replay(folder, indices, options.range_min)
         print(_summary(report))
         if options.settle:
-            _settle(client)
+            status = wait_until_settled(client)
+            trained = f"{status.samples_trained / 1e6:.1f} M samples trained"
+            print(f"settled: epoch {status.epoch}, {trained}")
     return OK if report.complete else FAILED
-
-
-def _complain(message: str, code: int) -> int:
-    print(f"triquad-replay: {message}", file=sys.stderr)
-    return code
-
-
-def _settle(client: "Client") -> None:
-    status = wait_until_settled(client)
-    print(f"settled: epoch {status.epoch}, {status.samples_trained / 1e6:.1f} M samples trained")
 
 
 class _Publisher:
     """Publishes scans of a folder through a client."""
 
-    def __init__(self, client: "Client", source: str, pace: Pace) -> None:
+    def __init__(self, client: Client, source: str, pace: Pace) -> None:
         self._client = client
         self._source = source
         self._pace = pace
 
     def replay(
-        self, folder: "KittiFolder", indices: Sequence[int], range_min_m: float
+        self, folder: KittiFolder, indices: Sequence[int], range_min_m: float
     ) -> ReplayReport:
         """Publish the scans ``indices`` and wait until the server has dealt with them."""
         before = self._client.status().scans_dropped
@@ -130,10 +104,8 @@ class _Publisher:
         refusals = {reason: count for reason, count in refusals.items() if count > 0}
         return ReplayReport(published, skipped, flush, refusals, seconds)
 
-    def _publish(self, folder: "KittiFolder", index: int, range_min_m: float) -> bool:
+    def _publish(self, folder: KittiFolder, index: int, range_min_m: float) -> bool:
         """Publish one scan; False where no point of it is left."""
-        from triquad_tools.evaluation.cloud import points_in_range
-
         points = points_in_range(folder.read_points(index), range_min_m)
         if not len(points):
             return False
@@ -178,7 +150,7 @@ def _summary(report: ReplayReport) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="triquad-replay",
+        prog=_COMMAND,
         description="Publish a KITTI-style folder of scans to a map server. By default the server "
         "sets the pace, and no scan is lost.",
         epilog="Exit status: 0 all scans are in the map, 1 some were lost or refused or the "

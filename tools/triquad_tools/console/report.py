@@ -3,37 +3,78 @@
 import dataclasses
 import json
 import math
+import sys
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from typing import Any
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.table import Table
+
+_GAP = 2  # spaces before each column
+_PIPE_WIDTH = 10_000  # characters: nothing is broken where a program reads
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table."""
+    """One line of a table: a figure by its name."""
 
     name: str
     value: str
     note: str = ""
 
 
-def print_table(title: str, rows: Sequence[Row]) -> None:
-    """Print rows under a title to standard output."""
-    names = max((len(row.name) for row in rows), default=0)
-    values = max((len(row.value) for row in rows), default=0)
-    print(title)
+def print_rows(title: str, rows: Sequence[Row], align: Literal["left", "right"] = "right") -> None:
+    """Print figures under a title to standard output."""
+    table = _table()
+    table.add_column()
+    table.add_column(justify=align)
+    table.add_column()
     for row in rows:
-        line = f"  {row.name:<{names}}  {row.value:>{values}}"
-        print(f"{line}  {row.note}".rstrip())
+        table.add_row(row.name, row.value, row.note)
+    print(title)
+    _print(table)
 
 
 def print_columns(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table under titles: the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
-    for row in (titles, *rows):
-        cells = [f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True)]
-        print("  ".join(["", f"{row[0]:<{widths[0]}}", *cells]).rstrip())
+    """Print a table under titles: the first column to the left, the others to the right.
+
+    Where the terminal is too narrow, titles are broken, but no cell is.
+    """
+    table = _table(show_header=True)
+    columns = list(zip(titles, *rows, strict=True))
+    narrow = sum(_GAP + max(map(len, column)) for column in columns) > _console().width
+    for number, (title, *cells) in enumerate(columns):
+        widest = max(map(len, cells), default=1)
+        shown = textwrap.fill(title, widest, break_long_words=False) if narrow else title
+        table.add_column(shown, justify="right" if number else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    _print(table)
+
+
+def _table(show_header: bool = False) -> Table:
+    """A table without rules or colours: each line can be searched for and cut up."""
+    return Table(box=None, show_header=show_header, header_style="", padding=(0, 0, 0, _GAP))
+
+
+def _console() -> Console:
+    """As wide as the terminal; elsewhere so wide that lines are whole."""
+    width = None if sys.stdout.isatty() else _PIPE_WIDTH
+    return Console(markup=False, highlight=False, width=width)
+
+
+def _print(table: Table) -> None:
+    """Print within the terminal's width, if nothing is cut by that."""
+    console = _console()
+    unbounded = console.options.update(width=_PIPE_WIDTH)
+    console.width = max(console.width, console.measure(table, options=unbounded).minimum)
+    with console.capture() as captured:
+        console.print(table)
+    for line in captured.get().splitlines():
+        print(line.rstrip())
 
 
 def json_text(value: object) -> str:

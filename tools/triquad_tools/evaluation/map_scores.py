@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.status import Status
 
-from triquad_tools.evaluation.metrics import field_scores
-from triquad_tools.simulation.lidar import SimulatedDrive
+from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.metrics import median_angle_deg
+from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 from triquad_tools.simulation.scene import Scene
 
 NEAR_M = 0.1  # distances are scored up to this far from the surface
 HOUSE_MARGIN_M = 0.5  # deeper than this in a house nothing can be seen
 PROBE_SPACING_M = 0.1  # between surface points at which distances are scored
 _HOUSE_PROBES = 20_000
+_SEED = 0  # of the points at which a driven street is asked
 _HOUSE_REACH_M = 20.0  # houses are probed up to this far from where the sensor was
 
 
@@ -53,6 +55,15 @@ class StreetProbes:
     exact_sdf: NDArray[np.float64]  # [N] metres
     exact_gradient: NDArray[np.float64]  # [N, 3]
     in_houses: NDArray[np.float64]  # [M, 3] where no ray can have been
+
+
+@dataclass(frozen=True)
+class DrivenStreet:
+    """A simulated drive, its scans and where its map will be asked."""
+
+    drive: SimulatedDrive
+    scans: list[SimulatedScan]
+    probes: StreetProbes
 
 
 @dataclass(frozen=True)
@@ -96,6 +107,16 @@ def street_probes(drive: SimulatedDrive, rng: np.random.Generator) -> StreetProb
     )
 
 
+def driven_street(drive: SimulatedDrive) -> DrivenStreet:
+    """Make all scans of a drive."""
+    scans: list[SimulatedScan] = []
+    with progress("simulating the drive", len(drive)) as report:
+        for scan in drive:
+            scans.append(scan)
+            report(len(scans), f"{len(scans)} of {len(drive)} scans")
+    return DrivenStreet(drive, scans, street_probes(drive, np.random.default_rng(_SEED)))
+
+
 def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     """Scores of a map at ``probes``."""
     answer = query(probes.near, gradient=True)
@@ -104,14 +125,7 @@ def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     known = np.isfinite(answer.sdf)
     nan = float("nan")
     errors = np.abs(answer.sdf.astype(np.float64) - probes.exact_sdf)[known]
-    angle = nan
-    if known.any():
-        angle = field_scores(
-            answer.sdf[known],
-            answer.gradient[known],
-            probes.exact_sdf[known],
-            probes.exact_gradient[known],
-        ).median_angle_deg
+    angle = median_angle_deg(answer.gradient[known], probes.exact_gradient[known])
     houses = query(probes.in_houses)
     return StreetScores(
         sdf_error_m=float(errors.mean()) if len(errors) else nan,

@@ -1,4 +1,4 @@
-"""Scores of a mesh and of a field, as the literature on neural mapping defines them.
+"""Scores of a mesh, as the literature on neural mapping defines them.
 
 Accuracy goes from the mesh to the truth, completion from the truth to the mesh. The mesh is
 sampled densely; samples and truth are thinned to one point per voxel. Samples beside the truth's
@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from triquad_client import Mesh
 
-from triquad_tools.evaluation.meshfile import Mesh
+from triquad_tools.recordings.cloud import thin
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.voxel import thin
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class ScoreSettings:
     completion_cut_m: float = 2.0  # greater distances count as this
     voxel_m: float = 0.02  # samples and truth are thinned to this
     samples_max: int = 10_000_000  # drawn from the mesh before thinning
+    seed: int = 0  # of these samples: scores can be repeated
 
 
 @dataclass(frozen=True)
@@ -43,18 +44,8 @@ class MeshScores:
     references: int  # points of the truth
 
 
-@dataclass(frozen=True)
-class FieldScores:
-    """How well a field agrees with the exact one at some points."""
-
-    mean_error_m: float  # of the absolute difference of distances
-    median_error_m: float
-    median_angle_deg: float  # between gradients
-    points: int
-
-
 def score_against_cloud(
-    mesh: Mesh, reference: NDArray[np.float64], settings: ScoreSettings, rng: np.random.Generator
+    mesh: Mesh, reference: NDArray[np.float64], settings: ScoreSettings
 ) -> MeshScores:
     """Scores of a mesh against a cloud ``[M, 3]`` of true surface points, metres, same frame.
 
@@ -62,7 +53,7 @@ def score_against_cloud(
     mesh as better than about 1.5 cm.
     """
     reference = _thinned_reference(reference, settings)
-    samples = _samples(mesh, reference, settings, rng)
+    samples = _samples(mesh, reference, settings)
     cut = settings.accuracy_cut_m
     distances = _tree(reference).query(samples, distance_upper_bound=cut, workers=-1)[0]
     return _scores(distances, samples, reference, settings)
@@ -73,7 +64,6 @@ def score_against_scene(
     scene: Scene,
     visible: NDArray[np.float64],
     settings: ScoreSettings,
-    rng: np.random.Generator,
 ) -> MeshScores:
     """Scores of a mesh against an exact scene.
 
@@ -83,30 +73,18 @@ def score_against_scene(
         visible: ``[M, 3]`` exact surface points that the sensor has seen, which completion
             asks for (see :meth:`triquad_tools.simulation.lidar.SimulatedDrive.true_hits`).
         settings: thresholds.
-        rng: draws the samples.
     """
     visible = _thinned_reference(visible, settings)
-    samples = _samples(mesh, visible, settings, rng)
+    samples = _samples(mesh, visible, settings)
     return _scores(np.abs(scene.sdf(samples)), samples, visible, settings)
 
 
-def field_scores(
-    sdf: NDArray[np.floating],
-    gradient: NDArray[np.floating],
-    exact_sdf: NDArray[np.floating],
-    exact_gradient: NDArray[np.floating],
-) -> FieldScores:
-    """Scores of distances ``[N]`` (metres) and gradients ``[N, 3]`` at the same points."""
-    errors = np.abs(np.asarray(sdf, np.float64) - exact_sdf)
-    lengths = np.linalg.norm(gradient, axis=1) * np.linalg.norm(exact_gradient, axis=1)
-    cosines = np.einsum("ni,ni->n", gradient, exact_gradient) / np.maximum(lengths, 1e-12)
+def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    """Median of the angles between vectors ``[N, 3]``; NaN where there are none."""
+    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    cosines = np.einsum("ni,ni->n", one, other) / np.maximum(lengths, 1e-12)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return FieldScores(
-        mean_error_m=float(np.mean(errors)),
-        median_error_m=float(np.median(errors)),
-        median_angle_deg=float(np.median(angles)),
-        points=len(errors),
-    )
+    return float(np.median(angles)) if len(angles) else float("nan")
 
 
 def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -143,7 +121,6 @@ def _samples(
     mesh: Mesh,
     reference: NDArray[np.float64],
     settings: ScoreSettings,
-    rng: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Thinned samples of the mesh in the truth's bounding box.
 
@@ -155,7 +132,7 @@ def _samples(
     count = min(wanted, settings.samples_max)
     if count == 0:
         return np.empty((0, 3))
-    samples = sample_mesh(mesh, count, rng)
+    samples = sample_mesh(mesh, count, np.random.default_rng(settings.seed))
     low = reference.min(axis=0) - settings.accuracy_cut_m
     high = reference.max(axis=0) + settings.accuracy_cut_m
     samples = samples[np.all((samples >= low) & (samples <= high), axis=1)]

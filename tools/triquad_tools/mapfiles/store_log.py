@@ -5,11 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError, MapFileError, NoIndexError
-from triquad_format.mapfile.history import CheckpointFile, checkpoint_files, map_folder, set_aside
+from triquad_format.mapfile.checkpoint_folder import (
+    CheckpointFile,
+    checkpoint_files,
+    map_folder,
+    set_aside,
+)
 from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
+from triquad_format.mapfile.mcap.random_access import FileBytes
 from triquad_format.mapfile.parts.part import REGION_TOPICS, PartKey
-from triquad_format.mapfile.random_access import FileBytes
 from triquad_format.records.region import RegionIndex
 
 from triquad_tools.console.report import print_columns, utc_time

@@ -3,22 +3,20 @@
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from triquad_format.mapfile.manifest import Manifest
-from triquad_format.mapfile.parts.cell import CELL_LEAVES, extent
-from triquad_format.mapfile.parts.part import EVIDENCE, VERTICES, PartKey
+from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import region_centre, region_corner
 
 from triquad_tools.console.report import utc_time
 from triquad_tools.mapfiles.seen_space import Columns
-from triquad_tools.plots.colour_scale import AGE, WHITE, ColourScale, rgb
-from triquad_tools.plots.plan_grid import PlanGrid, Window
-from triquad_tools.plots.plan_sheet import Panel, Swatch
+from triquad_tools.plots.plan import Layer, Plan, PlanGrid, Window, draw_layers
 
 _NEVER = -1
 _MOST_COLOURS = 6
-_SHADE = 0.75  # of cells with surface, for orientation
 _PLAN_PLANE = 0  # XY
 
 
@@ -37,25 +35,18 @@ class _Age:
         return ", ".join(filter(None, (epochs, utc_time(self.stamp_ns))))
 
 
-def ages_panel(grid: PlanGrid, manifest: Manifest, seen: Columns, surface: Columns) -> Panel:
+def ages_plan(grid: PlanGrid, manifest: Manifest, seen: Columns) -> Plan:
     """A plan of the epochs in which places last changed, square by square."""
-    heading = "Last changed"
     epochs = np.where(grid.marked(seen.middles), latest_epochs(grid, manifest), _NEVER)
     ages = _ages(epochs, manifest)
-    shares = np.arange(1, len(ages) + 1) / max(len(ages), 1)
-    colours = ColourScale(heading, AGE, 0.0, 1.0).colours(shares)
-    picture = np.full((grid.rows, grid.columns, 3), rgb(WHITE), np.uint8)
-    for age, colour in zip(ages, colours, strict=True):
-        picture[(epochs >= age.first) & (epochs <= age.last)] = colour
-    shaded = grid.marked(surface.middles)
-    picture[shaded] = (_SHADE * picture[shaded]).astype(np.uint8)
-    swatches = [
-        Swatch(f"#{colour.tobytes().hex()}", str(age))
+    colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(ages)))[::-1]  # the latest is dark
+    layers = [
+        Layer(str(age), to_hex(colour), (epochs >= age.first) & (epochs <= age.last))
         for age, colour in zip(ages, colours, strict=True)
     ]
     side_m = manifest.facts.settings.leaf_m * CELL_LEAVES
-    note = f"told apart in squares of {side_m:g} m; darker where there is surface"
-    return Panel(heading, picture, swatches=tuple(reversed(swatches)), note=note)
+    note = f"told apart in squares of {side_m:g} m"
+    return Plan("Last changed", lambda axes: draw_layers(axes, layers[::-1]), note)
 
 
 def latest_epochs(grid: PlanGrid, manifest: Manifest) -> NDArray[np.int64]:

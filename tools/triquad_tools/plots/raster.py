@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from triquad_tools.simulation.compiled import compiled
+from triquad_map.compiled.kernel import kernel
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ def rasterise(
     return raster
 
 
-@compiled
+@kernel()
 def _draw(
     corners: NDArray[np.float64],
     faces: NDArray[np.int32],
@@ -78,7 +77,7 @@ def _draw(
                     weights[row, column, 2] = wc
 
 
-@compiled
+@kernel()
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     """Unit normals ``[V, 3]``: those of the faces around a vertex, weighted by their area."""
     normals = np.zeros((len(vertices), 3))

@@ -1,6 +1,7 @@
-"""Pictures of meshes: shaded in software, with a sun, its shadows and a soft sky."""
+"""Pictures of meshes: shaded in software, with a sun, its shadows and a soft sky.
 
-from pathlib import Path
+Own code, as the libraries that do this want a display, a GPU driver or hundreds of megabytes.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,17 +69,12 @@ def render_mesh(
 
 def height_colours(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
     """Colours ``[V, 3]`` of vertices by their height, blue below to red above."""
+    if not len(vertices):
+        return np.zeros((0, 3))
     low, high = np.quantile(vertices[:, 2], [0.01, 0.99])
     place = (vertices[:, 2] - low) / max(float(high - low), 1e-6)
     stops = np.linspace(0.0, 1.0, len(_HEIGHT_STOPS))
     return np.stack([np.interp(place, stops, channel) for channel in _HEIGHT_STOPS.T], axis=1)
-
-
-def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture ``[H, W, 3]`` as a PNG file."""
-    from PIL import Image
-
-    Image.fromarray(picture).save(path, optimize=True)
 
 
 def _shade(

@@ -8,9 +8,7 @@ from triquad_format.records.region import MapRecord, region_centre
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import centimetres
-from triquad_tools.plots.colour_scale import HEAT, ColourScale
-from triquad_tools.plots.plan_grid import PlanGrid
-from triquad_tools.plots.plan_sheet import Panel
+from triquad_tools.plots.plan import Plan, PlanGrid, Scale, draw_nothing, draw_values
 
 _MOST_SAMPLES = 500_000
 _LEAST_RANGE_CM = 2.0
@@ -39,20 +37,18 @@ def sample_errors(record: MapRecord) -> SampleErrors:
     return SampleErrors(asked, np.abs(answer.sdf - np.concatenate(labels)[::every]))
 
 
-def errors_panel(grid: PlanGrid, record: MapRecord) -> Panel:
+def errors_plan(grid: PlanGrid, record: MapRecord) -> Plan:
     """A plan of the mean error in each column."""
     heading = "Error at the training samples"
     found = sample_errors(record)
     if not len(found.points):
-        return Panel(heading, None, note="no samples in this file")
-    cells = grid.mean(found.points, 100 * found.errors_m)
-    high = np.ceil(np.nanquantile(cells, 0.99))
-    scale = ColourScale(
-        "|signed distance - label| in cm, mean", HEAT, 0.0, max(float(high), _LEAST_RANGE_CM)
-    )
+        return Plan(heading, lambda axes: draw_nothing(axes, "no samples in this file"))
+    cells = grid.statistic(found.points, 100 * found.errors_m, "mean")
+    high = max(float(np.ceil(np.nanquantile(cells, 0.99))), _LEAST_RANGE_CM)
+    scale = Scale("mean |signed distance - label| in cm", "plasma_r", 0.0, high)
     mean, p95 = found.errors_m.mean(), np.quantile(found.errors_m, 0.95)
     note = (
         f"mean {centimetres(mean)}, 95 % {centimetres(p95)} at {len(found.points):,} samples "
         f"within {100 * record.settings.leaf_m / 2:g} cm of the surface"
     )
-    return Panel(heading, scale.colours(cells), scale, note=note)
+    return Plan(heading, lambda axes: draw_values(axes, cells, scale), note)

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_tools.recordings.cloud import merged
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.voxel import merged
 
 _SENSOR_HEIGHT_M = 1.8
 _LANE_M = 1.6  # lateral offset of the lane from the middle of the road

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_map.compiled.kernel import kernel
 
-from triquad_tools.simulation.compiled import compiled
 from triquad_tools.simulation.solids import distance_to
 
 CELL_M = 2.5
@@ -58,7 +58,7 @@ def nearest(
     return Nearest(*_nearest(solids, *lists, points))
 
 
-@compiled
+@kernel()
 def _all_distances(solids: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     distances = np.empty((points.shape[0], solids.shape[0]))
     for i in range(points.shape[0]):
@@ -68,7 +68,7 @@ def _all_distances(solids: NDArray[np.float64], points: NDArray[np.float64]) -> 
     return distances
 
 
-@compiled
+@kernel()
 def _cell(origin: NDArray[np.float64], shape: NDArray[np.int64], point: NDArray[np.float64]) -> int:
     """The flat index of a point's cell; one past the last for a point beside the grid."""
     flat = np.int64(0)
@@ -80,7 +80,7 @@ def _cell(origin: NDArray[np.float64], shape: NDArray[np.int64], point: NDArray[
     return int(flat)
 
 
-@compiled
+@kernel()
 def _nearest(
     solids: NDArray[np.float64],
     origin: NDArray[np.float64],

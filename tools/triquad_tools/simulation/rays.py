@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_map.compiled.kernel import kernel
 
-from triquad_tools.simulation.compiled import compiled
 from triquad_tools.simulation.solids import BOUND, X, Y, Z, distance_to
 
 _NEWTON_STEPS = 64
@@ -41,7 +41,7 @@ def cast_rays(
     return _cast(ordered, offsets[order], gaps[order], origin, directions, range_max_m)
 
 
-@compiled
+@kernel()
 def _cast(
     solids: NDArray[np.float64],
     offsets: NDArray[np.float64],
@@ -74,7 +74,7 @@ def _cast(
     return ranges
 
 
-@compiled
+@kernel()
 def _hit(
     row: NDArray[np.float64],
     origin: NDArray[np.float64],

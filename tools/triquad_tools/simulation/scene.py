@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from triquad_tools.simulation.nearest import CandidateGrid, Nearest, candidate_grid, nearest
 from triquad_tools.simulation.rays import cast_rays
 from triquad_tools.simulation.solids import Label, Solid, solid_table
-from triquad_tools.simulation.surface import sample_surface
 
 _ON_SURFACE_M = 1e-7
 
@@ -36,20 +35,15 @@ class Scene:
         """Unit gradients ``[N, 3]`` of the signed distance at points ``[N, 3]`` of the world."""
         return self._nearest(points).gradients
 
-    def labels(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The :class:`Label` ``[N]`` of the solid nearest to each point ``[N, 3]``."""
-        owners = self._nearest(points).owners
-        return np.array([solid.label for solid in self.solids], np.int64)[owners]
-
     def is_exact(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether the signed distance is exact, ``[N]``, at points ``[N, 3]`` of the world.
 
-        No part of the surface is nearer than the distance says; it is exact where its foot point
-        really lies on the surface.
+        No part of the surface is nearer than the distance says; it is exact where the closest
+        point that it tells of really lies on the surface.
         """
         found = self._nearest(points)
-        feet = points - found.distances[:, None] * found.gradients
-        return (found.distances >= 0.0) | (np.abs(self.sdf(feet)) < _ON_SURFACE_M)
+        closest = points - found.distances[:, None] * found.gradients
+        return (found.distances >= 0.0) | (np.abs(self.sdf(closest)) < _ON_SURFACE_M)
 
     def is_inside_house(
         self, points: NDArray[np.float64], margin_m: float = 0.5
@@ -72,19 +66,6 @@ class Scene:
         """
         start = np.ascontiguousarray(origin, np.float64)
         return cast_rays(self._table, start, _rows(directions), range_max_m)
-
-    def surface_samples(self, spacing_m: float, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Random points ``[M, 3]`` exactly on the surface, within the bounds.
-
-        Their density is uniform: one per ``spacing_m ** 2`` of area on average. What lies hidden
-        inside another solid is no surface and gets none.
-        """
-        density = 1.0 / spacing_m**2
-        parts = [sample_surface(solid, density, self.bounds, rng) for solid in self.solids]
-        points = np.concatenate(parts)
-        inside = np.all((points >= self.bounds[0]) & (points <= self.bounds[1]), axis=1)
-        points = points[inside]
-        return points[self.sdf(points) > -_ON_SURFACE_M]
 
     @cached_property
     def _table(self) -> NDArray[np.float64]:

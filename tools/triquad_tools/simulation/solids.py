@@ -9,8 +9,7 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-
-from triquad_tools.simulation.compiled import compiled
+from triquad_map.compiled.kernel import kernel
 
 Vector = tuple[float, float, float]
 
@@ -92,7 +91,7 @@ def solid_table(solids: tuple[Solid, ...]) -> NDArray[np.float64]:
 Distance = tuple[float, float, float, float]  # and its gradient
 
 
-@compiled
+@kernel()
 def _box_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
     qx, qy, qz = abs(x) - row[_A], abs(y) - row[_B], abs(z) - row[_C]
     sx, sy, sz = math.copysign(1.0, x), math.copysign(1.0, y), math.copysign(1.0, z)
@@ -107,7 +106,7 @@ def _box_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Dis
     return length - row[_D], sx * mx / length, sy * my / length, sz * mz / length
 
 
-@compiled
+@kernel()
 def _extrude(profile: float, along: float) -> tuple[float, float, float]:
     """Distance to a profile extruded along an axis, and its derivatives by both arguments."""
     if profile <= 0.0 and along <= 0.0:
@@ -117,7 +116,7 @@ def _extrude(profile: float, along: float) -> tuple[float, float, float]:
     return length, mp / length, ma / length
 
 
-@compiled
+@kernel()
 def _cylinder_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
     rho = math.sqrt(x * x + y * y)
     distance, wr, wz = _extrude(rho - row[_A], abs(z) - row[_B])
@@ -125,7 +124,7 @@ def _cylinder_distance(row: NDArray[np.float64], x: float, y: float, z: float) -
     return distance, wr * ux, wr * uy, math.copysign(wz, z)
 
 
-@compiled
+@kernel()
 def _gable_profile(row: NDArray[np.float64], y: float, z: float) -> tuple[float, float, float]:
     """Distance to the right half of a gable's outline (``y >= 0``, ``z`` from the bottom)."""
     width, ridge, eave = row[_B], 2.0 * row[_C], row[_D]
@@ -150,14 +149,14 @@ def _gable_profile(row: NDArray[np.float64], y: float, z: float) -> tuple[float,
     return (best, by / best, bz / best) if best > 0.0 else (0.0, ny, nz)
 
 
-@compiled
+@kernel()
 def _gable_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
     profile, gy, gz = _gable_profile(row, abs(y), z + row[_C])
     distance, wp, wx = _extrude(profile, abs(x) - row[_A])
     return distance, math.copysign(wx, x), math.copysign(wp * gy, y), wp * gz
 
 
-@compiled
+@kernel()
 def distance_to(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
     """Signed distance of a world point to the solid of a row, and its gradient, world frame."""
     kind = row[_KIND]

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import (
     Label,
@@ -38,6 +39,12 @@ def street(seed: int, length_m: float = 100.0) -> Scene:
         parts += _poles_and_trees(rng, side, length_m)
     bounds = np.array([[-_MARGIN_M, -24.0, -0.5], [length_m + _MARGIN_M, 24.0, _TOP_M]])
     return Scene(tuple(parts), bounds, length_m)
+
+
+def street_drive(seed: int, scans: int, step_m: float = 1.0) -> SimulatedDrive:
+    """A drive along street ``seed``, scans ``step_m`` apart; always the same scans."""
+    scene = street(seed)
+    return SimulatedDrive(scene, Lidar(), drive(scene, scans, step_m), seed)
 
 
 def _standing(

@@ -4,6 +4,8 @@ import itertools
 from dataclasses import dataclass
 
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
+from triquad_format.mapfile.mcap.chunks import chunk_crc, chunk_messages
+from triquad_format.mapfile.mcap.random_access import RandomAccess
 from triquad_format.mapfile.mcap.records import (
     CHANNEL,
     CHUNK,
@@ -13,16 +15,15 @@ from triquad_format.mapfile.mcap.records import (
     MAGIC,
     METADATA,
     METADATA_INDEX,
+    Channel,
     Fields,
     Message,
     Record,
+    channel_entry,
     check_crc,
-    chunk_crc,
-    chunk_messages,
     metadata_entries,
     walk,
 )
-from triquad_format.mapfile.random_access import RandomAccess
 
 MAX_SUMMARY_BYTES = 64 * 2**20
 MAX_METADATA_BYTES = 2**20
@@ -53,11 +54,11 @@ class McapIndex:
         head = source.read(0, min(len(MAGIC), source.size))
         if head != MAGIC[: len(head)]:
             raise MapFileError("this is not a map file: it does not begin as MCAP files do")
-        self._channels: dict[int, tuple[str, str]] = {}
+        self._channels: dict[int, Channel] = {}
         self._chunks: list[_Place] = []
         self._metadata: list[tuple[str, _Place]] = []
         for record in walk(self._summary(), 0):
-            self._note(record)
+            self._add(record)
         if not self._metadata:
             raise NoIndexError("its metadata has no index: triquad-pack rewrites such files")
 
@@ -90,7 +91,11 @@ class McapIndex:
         return messages[0]
 
     def metadata(self, name: str) -> list[dict[str, str]]:
-        """The metadata records of a name."""
+        """The entries of the metadata record of a name, or nothing.
+
+        Raises:
+            DamagedMapFileError: there are several, or it is malformed or too long.
+        """
         places = [place for indexed, place in self._metadata if indexed == name]
         if len(places) > 1:
             raise DamagedMapFileError(f"the metadata {name!r} is there more than once")
@@ -121,12 +126,12 @@ class McapIndex:
         check_crc("the summary", summary + end[: FOOTER_BYTES - 4], crc)
         return memoryview(summary)
 
-    def _note(self, record: Record) -> None:
+    def _add(self, record: Record) -> None:
+        """Keep what a record of the summary tells."""
         fields = Fields(record)
         if record.opcode == CHANNEL:
-            number = fields.number(2)
-            fields.take(2)  # schema
-            self._channels[number] = (fields.text(), fields.text())
+            number, channel = channel_entry(record)
+            self._channels[number] = channel
         elif record.opcode == CHUNK_INDEX:
             fields.take(16)  # times of the first and last message
             self._chunks.append(_Place(fields.number(8), fields.number(8)))

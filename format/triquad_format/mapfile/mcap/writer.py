@@ -6,7 +6,7 @@ The specification is at https://mcap.dev/spec.
 
 import hashlib
 import zlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
@@ -30,7 +30,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from triquad_format.mapfile.mcap.records import MAGIC, chunk_limit
+from triquad_format.mapfile.mcap.chunks import chunk_limit
+from triquad_format.mapfile.mcap.records import MAGIC
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,11 @@ class McapWriter:
         self,
         stream: BinaryIO,
         library: str,
+        *,
         schemas: Sequence[SchemaSpec],
         channels: Sequence[ChannelSpec],
     ) -> None:
+        """Write what begins the file; ``library`` names the program that writes it."""
         self._stream = stream
         self._digest = hashlib.sha256()
         self._crc = 0
@@ -86,6 +89,11 @@ class McapWriter:
             self._record(record)
 
     @property
+    def topics(self) -> Collection[str]:
+        """The topics of its channels."""
+        return self._specs.keys()
+
+    @property
     def sha256(self) -> str:
         """Digest of all that was written, hexadecimal."""
         return self._digest.hexdigest()
@@ -96,14 +104,23 @@ class McapWriter:
         self._record(Metadata(metadata=entries, name=name))
         self._summary.metadata.append(MetadataIndex(start, self.size - start, name))
 
-    def add_message(self, topic: str, payload: bytes, time_ns: int, seams: Sequence[int]) -> None:
+    def add_message(
+        self, topic: str, payload: bytes, *, time_ns: int, seams: Sequence[int]
+    ) -> None:
         """Write a message in a chunk of its own.
 
-        ``seams`` are offsets in the payload where bytes of another kind begin.
+        Args:
+            topic: of one of the channels.
+            payload: what the message holds.
+            time_ns: of the message, nanoseconds since 1970.
+            seams: offsets in the payload where bytes of another kind begin.
+
+        Raises:
+            OSError: the stream cannot be written.
         """
         spec = self._specs[topic]
         number = spec.number
-        chunk = _chunk(number, payload, time_ns, seams, spec.level)
+        chunk = _chunk(spec, payload, time_ns=time_ns, seams=seams)
         start = self.size
         self._record(chunk)
         index_start = self.size
@@ -186,11 +203,11 @@ def _channel_records(specs: Sequence[ChannelSpec], schemas: Sequence[Schema]) ->
     ]
 
 
-def _chunk(channel: int, payload: bytes, time_ns: int, seams: Sequence[int], level: int) -> Chunk:
+def _chunk(spec: ChannelSpec, payload: bytes, *, time_ns: int, seams: Sequence[int]) -> Chunk:
     """A chunk of one message."""
     message = _packed(
         Message(
-            channel_id=channel,
+            channel_id=spec.number,
             log_time=time_ns,
             data=payload,
             publish_time=time_ns,
@@ -198,7 +215,7 @@ def _chunk(channel: int, payload: bytes, time_ns: int, seams: Sequence[int], lev
         )
     )
     shift = len(message) - len(payload)
-    stored = _compress(message, [shift + seam for seam in seams], level)
+    stored = _compress(message, [shift + seam for seam in seams], spec.level)
     # What shrinks by more than readers believe is not compressed.
     shrinks = len(stored) < len(message) <= chunk_limit(len(stored))
     return Chunk(
@@ -237,7 +254,7 @@ def _packed(record: McapRecord) -> bytes:
 def _compress(data: bytes, seams: Sequence[int], level: int) -> bytes:
     """One zstd frame in which a block ends at each seam.
 
-    A block has one Huffman table: noise and numbers in one block spoil each other.
+    A block has one Huffman table: noise and numbers in one block compress badly.
     """
     compressor = zstandard.ZstdCompressor(level=level).compressobj(size=len(data))
     cuts = [0, *seams, len(data)]

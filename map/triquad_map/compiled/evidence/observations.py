@@ -2,43 +2,41 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.rows import with_room
-from triquad_map.compiled.voxel_index import Index, find_row, pack
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.rows import with_room
+from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT, block_key, byte_of, is_inside
+from triquad_map.compiled.sparse.voxel_index import Index, find_row
 from triquad_map.surface.confidence import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
 
-_SHIFT = BLOCK_VOXELS.bit_length() - 1
-_LOW = BLOCK_VOXELS - 1
 _VOXELS = BLOCK_VOXELS**3
 _NOWHERE = -1
 _MIN_CAPACITY = 64
-
-Masks = NDArray[np.uint8]
 
 
 class Observed(NamedTuple):
     """The arrays of the observations, as kernels take them."""
 
-    places: NDArray[np.int32]  # [blocks] where in the others a block of evidence stands; -1: none
-    weights: NDArray[np.float32]  # [places, voxels] rays, the near ones counting more
-    sectors: Masks  # [places, voxels] a bit for each eighth of the horizon looked from
-    seen_s: NDArray[np.int64]  # [places] when the last ray ended in the block
+    places: Ints  # [blocks] where in the others a block of evidence stands; -1: none
+    weights: Floats  # [places, voxels] rays, the near ones counting more
+    sectors: Bytes  # [places, voxels] a bit for each eighth of the horizon looked from
+    seen_s: Longs  # [places] when the last ray ended in the block
 
 
 class Sighting(NamedTuple):
     """From where and when a scan looked."""
 
-    origin: NDArray[np.float64]  # [3] the sensor, voxels
+    origin: Doubles  # [3] the sensor, voxels
     leaf_m: float
     stamp_s: int  # seconds since 1970
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _sector(x: float, y: float) -> int:
     """Which eighth of the horizon a direction lies in."""
     eighth = 0 if y >= 0 else 4
@@ -47,9 +45,9 @@ def _sector(x: float, y: float) -> int:
     return eighth + (1 if abs(y) > abs(x) else 0)
 
 
-@numba.njit(cache=True, nogil=True)
-def _note(
-    voxels: NDArray[np.float64],
+@kernel()
+def _record(
+    voxels: Doubles,
     start: int,
     side: int,
     blocks: Index,
@@ -60,14 +58,12 @@ def _note(
     """Count rays that ended at ``voxels`` [N, 3]; returns (points done, places in use)."""
     origin, leaf_m = sighting.origin, sighting.leaf_m
     for i in range(start, len(voxels)):
-        x, y, z = (
-            int(np.floor(voxels[i, 0])),
-            int(np.floor(voxels[i, 1])),
-            int(np.floor(voxels[i, 2])),
-        )
-        if min(x, y, z) < 0 or max(x, y, z) >= side:
+        x = int(np.floor(voxels[i, 0]))
+        y = int(np.floor(voxels[i, 1]))
+        z = int(np.floor(voxels[i, 2]))
+        if not is_inside(x, y, z, side):
             continue
-        row = find_row(blocks, pack(x >> _SHIFT, y >> _SHIFT, z >> _SHIFT))
+        row = find_row(blocks, block_key(x, y, z))
         place = observed.places[row]
         if place == _NOWHERE:
             if count == len(observed.seen_s):
@@ -75,7 +71,7 @@ def _note(
             place = count
             observed.places[row] = place
             count += 1
-        voxel = (((x & _LOW) << _SHIFT) | (y & _LOW)) << _SHIFT | (z & _LOW)
+        voxel = byte_of(x, y) << SHIFT | (z & LOW)
         dx, dy, dz = origin[0] - voxels[i, 0], origin[1] - voxels[i, 1], origin[2] - voxels[i, 2]
         square = (dx * dx + dy * dy + dz * dz) * (leaf_m / NEAR_M) ** 2
         observed.weights[place, voxel] += np.float32(1 / (1 + square))
@@ -84,37 +80,45 @@ def _note(
     return len(voxels), count
 
 
-@numba.njit(cache=True, nogil=True)
-def _levels(surface: Masks, observed: Observed, levels: Masks) -> None:
+@kernel(inline="always")
+def _level(weight: float, sectors: int) -> int:
+    """The level of a voxel that was looked at from some ``sectors``, a bit for each."""
+    count = 0
+    for sector in range(8):
+        count += sectors >> sector & 1
+    strength = weight * (0.5 + 0.5 * min(SECTORS_COUNTED, max(1, count)))
+    level = 0
+    while level < LEVELS - 1 and strength >= LEAST_STRENGTH * (1 << level):
+        level += 1
+    return level
+
+
+@kernel()
+def _levels(surface: Bytes, observed: Observed, levels: Bytes) -> None:
+    """Fill in the ``levels`` of the voxels of ``surface``; those of rows without a place stay."""
     at = 0
     for row in range(len(surface)):
         place = observed.places[row]
         for byte in range(BLOCK_BYTES):
             bits = int(surface[row, byte])
-            for bit in range(BLOCK_VOXELS):
-                if not bits >> bit & 1:
-                    continue
-                if place != _NOWHERE:
-                    sectors = 0
-                    for sector in range(8):
-                        sectors += observed.sectors[place, byte << _SHIFT | bit] >> sector & 1
-                    strength = observed.weights[place, byte << _SHIFT | bit] * (
-                        0.5 + 0.5 * min(SECTORS_COUNTED, max(1, sectors))
-                    )
-                    while levels[at] < LEVELS - 1 and strength >= LEAST_STRENGTH * (
-                        1 << levels[at]
-                    ):
-                        levels[at] += 1
-                at += 1
+            if bits == 0:
+                continue
+            for z in range(BLOCK_VOXELS):
+                if bits >> z & 1:
+                    if place != _NOWHERE:
+                        voxel = byte << SHIFT | z
+                        weight = observed.weights[place, voxel]
+                        levels[at] = _level(weight, observed.sectors[place, voxel])
+                    at += 1
 
 
-@numba.njit(cache=True, nogil=True)
-def _restore(surface: Masks, levels: Masks, observed: Observed) -> None:
+@kernel()
+def _restore(surface: Bytes, levels: Bytes, observed: Observed) -> None:
     """Give the voxels of ``surface`` the least strength of their levels, seen from one sector."""
     at = 0
     for row in range(len(surface)):
         for voxel in range(_VOXELS):
-            if surface[row, voxel >> _SHIFT] >> (voxel & _LOW) & 1:
+            if surface[row, voxel >> SHIFT] >> (voxel & LOW) & 1:
                 if levels[at] > 0:
                     strength = LEAST_STRENGTH * (1 << (levels[at] - 1))
                     observed.weights[observed.places[row], voxel] = np.float32(strength)
@@ -130,33 +134,31 @@ class Observations:
         self._count = 0
         self._observed = _arrays(blocks, _MIN_CAPACITY)
 
-    def note(
-        self, voxels: NDArray[np.float64], side: int, blocks: Index, sighting: Sighting
-    ) -> None:
+    def record(self, voxels: Doubles, side: int, blocks: Index, sighting: Sighting) -> None:
         """Count rays that ended at ``voxels`` [N, 3], whose ``blocks`` are all there."""
         self._make_room(len(blocks.row_keys))
         done = 0
         while done < len(voxels):
-            done, self._count = _note(
+            done, self._count = _record(
                 voxels, done, side, blocks, sighting, self._observed, self._count
             )
             if done < len(voxels):
                 self._grow(2 * len(self._observed.seen_s))
 
-    def levels(self, surface: Masks) -> NDArray[np.uint8]:
+    def levels(self, surface: Bytes) -> Bytes:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
         levels = np.zeros(int(surface_counts(surface).sum()), np.uint8)
         self._make_room(len(surface))
         _levels(surface, self._observed, levels)
         return levels
 
-    def seen_s(self, blocks: int) -> NDArray[np.int64]:
+    def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
         self._make_room(blocks)
         places = self._observed.places[:blocks]
         return np.where(places == _NOWHERE, 0, self._observed.seen_s[places])
 
-    def forget(self, blocks: NDArray[np.intp], surface: Masks) -> None:
+    def forget(self, blocks: NDArray[np.intp], surface: Bytes) -> None:
         """Forget, in the rows ``blocks`` [N], voxels that are not set in ``surface`` any more."""
         self._make_room(len(surface))
         rows = blocks[self._observed.places[blocks] != _NOWHERE]
@@ -166,9 +168,7 @@ class Observations:
         self._observed.sectors[places] *= kept
 
     @classmethod
-    def restore(
-        cls, surface: Masks, levels: NDArray[np.uint8], seen_s: NDArray[np.int64]
-    ) -> "Observations":
+    def restore(cls, surface: Bytes, levels: Bytes, seen_s: Longs) -> "Observations":
         """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels."""
         observations = cls(len(surface))
         used = np.flatnonzero(surface.any(axis=1))

@@ -1,71 +1,54 @@
 """The nearest unknown voxel: no ray ended in it, and none passed through it."""
 
-from typing import NamedTuple
-
-import numba
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.voxel_index import CELL_LIMIT, Index, find_row, pack
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT
+from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, find_row, pack
 
-_SHIFT = BLOCK_VOXELS.bit_length() - 1
 _SIDE = float(BLOCK_VOXELS)
 _ALL = 0xFF
 
-Masks = NDArray[np.uint8]
-Doubles = NDArray[np.float64]
 Place = tuple[float, float, float]
 
 # What is known of the nearest unknown voxel while it is searched for.
 _SQUARE, _X, _Y, _Z = range(4)
 
 
-class SeenSpace(NamedTuple):
-    """The evidence of a region, as kernels take it."""
-
-    blocks: Index
-    surface: Masks  # [blocks, BLOCK_BYTES]
-    free: Masks  # [blocks, BLOCK_BYTES]
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _nearest(x: float, low: float, side: float) -> float:
     """The place in ``[low, low + side]`` that is nearest to ``x``."""
     return min(max(x, low), low + side)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _square_gap(x: float, low: float, side: float) -> float:
     """Square of how far ``x`` lies outside of ``[low, low + side]``."""
     gap = x - _nearest(x, low, side)
     return gap * gap
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _take(at: Place, low: Place, side: float, square: float, state: Doubles) -> None:
-    """Note an unknown cube as the nearest so far."""
+    """Take an unknown cube as the nearest so far."""
     state[_SQUARE] = square
     state[_X] = _nearest(at[0], low[0], side)
     state[_Y] = _nearest(at[1], low[1], side)
     state[_Z] = _nearest(at[2], low[2], side)
 
 
-@numba.njit(cache=True, nogil=True)
-def _search_block(
-    row: int,
-    corner: Place,
-    at: Place,
-    seen: SeenSpace,
-    state: Doubles,
-) -> None:
-    """Look at the unknown voxels of a block."""
+@kernel()
+def _search_block(row: int, corner: Place, at: Place, seen: SeenVoxels, state: Doubles) -> None:
+    """Search the unknown voxels of a block."""
     for byte in range(BLOCK_BYTES):
         bits = int(seen.surface[row, byte] | seen.free[row, byte])
         if bits == _ALL:
             continue
-        x = corner[0] + (byte >> _SHIFT)
-        y = corner[1] + (byte & (BLOCK_VOXELS - 1))
+        x = corner[0] + (byte >> SHIFT)
+        y = corner[1] + (byte & LOW)
         column = _square_gap(at[0], x, 1.0) + _square_gap(at[1], y, 1.0)
         if column >= state[_SQUARE]:
             continue
@@ -77,12 +60,12 @@ def _search_block(
                     _take(at, (x, y, z), 1.0, square, state)
 
 
-@numba.njit(cache=True, nogil=True)
-def _search(at: Place, seen: SeenSpace, cells: tuple[int, int], state: Doubles) -> None:
-    """Look at the blocks around a point, shell by shell."""
-    home_x = int(np.floor(at[0])) >> _SHIFT
-    home_y = int(np.floor(at[1])) >> _SHIFT
-    home_z = int(np.floor(at[2])) >> _SHIFT
+@kernel()
+def _search(at: Place, seen: SeenVoxels, cells: tuple[int, int], state: Doubles) -> None:
+    """Search the blocks around a point, shell by shell."""
+    home_x = int(np.floor(at[0])) >> SHIFT
+    home_y = int(np.floor(at[1])) >> SHIFT
+    home_z = int(np.floor(at[2])) >> SHIFT
     shell = 0
     while shell == 0 or ((shell - 1) * _SIDE) ** 2 < state[_SQUARE]:
         for x in range(max(home_x - shell, cells[0]), min(home_x + shell + 1, cells[1])):
@@ -108,19 +91,15 @@ def _search(at: Place, seen: SeenSpace, cells: tuple[int, int], state: Doubles) 
         shell += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def find_unknown(
-    points: Doubles,
-    seen: SeenSpace,
-    cells: tuple[int, int],
-    distances: Doubles,
-    nearest: Doubles,
+    points: Doubles, seen: SeenVoxels, cells: tuple[int, int], distances: Doubles, nearest: Doubles
 ) -> None:
     """Lower ``distances`` [N] to those from ``points`` [N, 3] to the nearest unknown voxel.
 
     Points are leaf coordinates of the region, as are the ``nearest`` [N, 3] of unknown space;
     distances are in voxels. Only blocks whose indices are in ``range(*cells)`` on each axis are
-    looked at; where there is none, all is unknown.
+    searched; where there is none, all is unknown.
     """
     state = np.empty(4)
     for i in range(len(points)):

@@ -1,27 +1,26 @@
 """Points that kernels work on at a time, and what they work out of them.
 
-The last axis of nearly all arrays runs over the tile's points, so that every loop over them is made
-of vector instructions; and a tile is small enough to stay in the cache nearest to the core.
+The last axis of nearly all arrays runs over the points of the batch, so that every loop over them
+is made of vector instructions; and a batch is small enough to stay in the cache nearest to the
+core.
 """
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Floats, Ints, Longs
 
-TILE = 64
-"""Points of a tile."""
+from triquad_map.compiled.kernel import kernel
 
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
+BATCH = 64
+"""Points of a batch."""
 
 
-class Tile(NamedTuple):
-    """Room for one tile, with ``T = TILE``, ``H`` levels and features of length ``d``."""
+class PointBatch(NamedTuple):
+    """Room for one batch, with ``T = BATCH``, ``H`` levels and features of length ``d``."""
 
     points: Floats  # [3, T] metres from the region's centre
-    keys: NDArray[np.int64]  # [T] of the blocks on one plane
+    keys: Longs  # [T] of the blocks on one plane
     blocks: Ints  # [3, T] number of the block on each plane, 0 where there is none
     local: Floats  # [2, T] place within the block on one plane, in blocks
     corners: Ints  # [3 H, T] within the block: the cell's vertex of least coordinates
@@ -40,37 +39,37 @@ class Tile(NamedTuple):
     gradient: Floats  # [3, T] of the logits with respect to the points, per metre
 
 
-@numba.njit(cache=True, nogil=True)
-def new_tile(levels: int, size: int, inputs: int, hidden: int) -> Tile:
-    """Room for a tile: ``levels`` of features of length ``size``, an MLP's inputs and width."""
-    return Tile(
-        np.zeros((3, TILE), np.float32),
-        np.zeros(TILE, np.int64),
-        np.zeros((3, TILE), np.int32),
-        np.zeros((2, TILE), np.float32),
-        np.zeros((3 * levels, TILE), np.int32),
-        np.zeros((3 * levels, TILE), np.float32),
-        np.zeros((3 * levels, TILE), np.float32),
-        np.zeros((TILE, 12 * levels), np.int32),
-        np.zeros((TILE, levels * size), np.float32),
-        np.zeros((inputs, TILE), np.float32),
-        np.zeros((inputs, TILE), np.float32),
-        np.zeros((hidden, TILE), np.float32),
-        np.zeros((hidden, TILE), np.float32),
-        np.zeros((hidden, TILE), np.float32),
-        np.zeros((hidden, TILE), np.float32),
-        np.zeros(TILE, np.float32),
-        np.zeros(TILE, np.float32),
-        np.zeros((3, TILE), np.float32),
+@kernel()
+def new_batch(levels: int, size: int, inputs: int, hidden: int) -> PointBatch:
+    """Room for a batch: ``levels`` of features of length ``size``, an MLP's inputs and width."""
+    return PointBatch(
+        np.zeros((3, BATCH), np.float32),
+        np.zeros(BATCH, np.int64),
+        np.zeros((3, BATCH), np.int32),
+        np.zeros((2, BATCH), np.float32),
+        np.zeros((3 * levels, BATCH), np.int32),
+        np.zeros((3 * levels, BATCH), np.float32),
+        np.zeros((3 * levels, BATCH), np.float32),
+        np.zeros((BATCH, 12 * levels), np.int32),
+        np.zeros((BATCH, levels * size), np.float32),
+        np.zeros((inputs, BATCH), np.float32),
+        np.zeros((inputs, BATCH), np.float32),
+        np.zeros((hidden, BATCH), np.float32),
+        np.zeros((hidden, BATCH), np.float32),
+        np.zeros((hidden, BATCH), np.float32),
+        np.zeros((hidden, BATCH), np.float32),
+        np.zeros(BATCH, np.float32),
+        np.zeros(BATCH, np.float32),
+        np.zeros((3, BATCH), np.float32),
     )
 
 
-@numba.njit(cache=True, nogil=True)
-def load(tile: Tile, points: Floats, first: int) -> int:
+@kernel()
+def load(batch: PointBatch, points: Floats, first: int) -> int:
     """Take up points [N, 3] from ``first`` on; returns how many, the last fills up the rest."""
-    count: int = min(TILE, len(points) - first)
-    for t in range(TILE):
+    count: int = min(BATCH, len(points) - first)
+    for t in range(BATCH):
         i = first + min(t, count - 1)
         for axis in range(3):
-            tile.points[axis, t] = points[i, axis]
+            batch.points[axis, t] = points[i, axis]
     return count

@@ -1,17 +1,16 @@
 """The field's arithmetic in compiled code, for the CPU.
 
-The same field as the tensors of :mod:`triquad_server.engine.field` compute, which are its
+The same field as the tensors of :mod:`triquad_server.engine.tensor_field` compute, which are its
 reference: values, gradients with respect to the points and to the parameters. A kernel
 runs on one thread and holds no Python lock; callers split the work. Arrays are float32.
 """
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Floats, Ints
 
-from triquad_map.compiled.field.batch import TILE, Tile, load, new_tile
+from triquad_map.compiled.field.batch import BATCH, PointBatch, load, new_batch
 from triquad_map.compiled.field.encoding import (
     Geometry,
     add_feature_gradient,
@@ -21,11 +20,9 @@ from triquad_map.compiled.field.encoding import (
     locate,
     wave,
 )
-from triquad_map.compiled.field.mlp import Mlp, add_weight_gradient, backward, forward, turned
-from triquad_map.compiled.field.quadtree import Vertices
-
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
+from triquad_map.compiled.field.mlp import Mlp, add_weight_gradient, backward, forward, transposed
+from triquad_map.compiled.field.vertices import Vertices
+from triquad_map.compiled.kernel import kernel
 
 
 class CompiledField(NamedTuple):
@@ -45,52 +42,52 @@ class Touched(NamedTuple):
     rows: Ints  # [rows] those touched in this step, in the order in which they were
 
 
-@numba.njit(cache=True, nogil=True)
-def _tile_for(field: CompiledField) -> Tile:
+@kernel()
+def _batch_for(field: CompiledField) -> PointBatch:
     inputs, hidden = field.mlp.w1.shape
-    return new_tile(field.geometry.levels, field.features.shape[1], inputs, hidden)
+    return new_batch(field.geometry.levels, field.features.shape[1], inputs, hidden)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def _forward(tile: Tile, field: CompiledField) -> None:
+@kernel(fastmath=True)
+def _forward(batch: PointBatch, field: CompiledField) -> None:
     levels = field.geometry.levels
     if levels > 0:
-        locate(tile, field.geometry, field.vertices, field.features)
-        interpolate(tile, levels, field.features)
-    wave(tile, levels * field.features.shape[1], field.turns_per_m)
-    forward(tile, field.mlp)
+        locate(batch, field.geometry, field.vertices, field.features)
+        interpolate(batch, levels, field.features)
+    wave(batch, levels * field.features.shape[1], field.turns_per_m)
+    forward(batch, field.mlp)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def evaluate(points: Floats, field: CompiledField, logits: Floats, gradients: Floats) -> None:
     """Fill ``logits`` [N] and, where not empty, ``gradients`` [N, 3] (per metre)."""
     learnt = field.geometry.levels * field.features.shape[1]
-    tile = _tile_for(field)
-    tile.slopes[:] = 1
-    w1_turned, w2_turned = turned(field.mlp, len(tile.x))
-    for first in range(0, len(points), TILE):
-        count = load(tile, points, first)
-        _forward(tile, field)
+    batch = _batch_for(field)
+    batch.slopes[:] = 1
+    w1_transposed, w2_transposed = transposed(field.mlp, len(batch.x))
+    for first in range(0, len(points), BATCH):
+        count = load(batch, points, first)
+        _forward(batch, field)
         for t in range(count):
-            logits[first + t] = tile.logits[t]
+            logits[first + t] = batch.logits[t]
         if len(gradients) == 0:
             continue
-        backward(tile, field.mlp, w1_turned, w2_turned)
-        tile.gradient[:] = 0
-        add_wave_slopes(tile, learnt, field.turns_per_m)
+        backward(batch, field.mlp, w1_transposed, w2_transposed)
+        batch.gradient[:] = 0
+        add_wave_slopes(batch, learnt, field.turns_per_m)
         if field.geometry.levels > 0:
-            add_feature_slopes(tile, field.geometry, field.features)
+            add_feature_slopes(batch, field.geometry, field.features)
         for t in range(count):
             for axis in range(3):
-                gradients[first + t, axis] = tile.gradient[axis, t]
+                gradients[first + t, axis] = batch.gradient[axis, t]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def _note_touched(tile: Tile, count: int, touched: Touched, step: int, known: int) -> int:
+@kernel(fastmath=True)
+def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, known: int) -> int:
     """Add the rows of the first ``count`` points to the ``known`` ones; returns how many now."""
     for t in range(count):
-        for i in range(tile.rows.shape[1]):
-            row = tile.rows[t, i]
+        for i in range(batch.rows.shape[1]):
+            row = batch.rows[t, i]
             if touched.stamps[row] != step and row != 0:  # absent vertices learn nothing
                 touched.stamps[row] = step
                 touched.rows[known] = row
@@ -98,21 +95,21 @@ def _note_touched(tile: Tile, count: int, touched: Touched, step: int, known: in
     return known
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def _cross_entropy(tile: Tile, targets: Floats, share: float) -> float:
-    """Sets the slopes of the tile's logits; returns the sum of the losses."""
+@kernel(fastmath=True)
+def _cross_entropy(batch: PointBatch, targets: Floats, share: float) -> float:
+    """Sets the slopes of the batch's logits; returns the sum of the losses."""
     loss = 0.0
-    tile.slopes[:] = 0
+    batch.slopes[:] = 0
     for t in range(len(targets)):
-        logit = tile.logits[t]
+        logit = batch.logits[t]
         tail = np.exp(-abs(logit))  # never overflows
         squashed = (np.float32(1) if logit >= 0 else tail) / (np.float32(1) + tail)
         loss += max(logit, np.float32(0)) - logit * targets[t] + np.log1p(tail)
-        tile.slopes[t] = (squashed - targets[t]) * np.float32(share)
+        batch.slopes[t] = (squashed - targets[t]) * np.float32(share)
     return loss
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def accumulate(
     points: Floats,
     targets: Floats,
@@ -140,17 +137,17 @@ def accumulate(
         How many rows were touched, and the sum of the samples' losses times ``share``.
     """
     levels = field.geometry.levels
-    tile = _tile_for(field)
-    w1_turned, w2_turned = turned(field.mlp, levels * field.features.shape[1])
+    batch = _batch_for(field)
+    w1_transposed, w2_transposed = transposed(field.mlp, levels * field.features.shape[1])
     known = 0
     loss = 0.0
-    for first in range(0, len(points), TILE):
-        count = load(tile, points, first)
-        _forward(tile, field)
-        loss += _cross_entropy(tile, targets[first : first + count], share)
-        backward(tile, field.mlp, w1_turned, w2_turned)
-        add_weight_gradient(tile, mlp_sums)
+    for first in range(0, len(points), BATCH):
+        count = load(batch, points, first)
+        _forward(batch, field)
+        loss += _cross_entropy(batch, targets[first : first + count], share)
+        backward(batch, field.mlp, w1_transposed, w2_transposed)
+        add_weight_gradient(batch, mlp_sums)
         if levels > 0:
-            add_feature_gradient(tile, count, levels, feature_sums)
-            known = _note_touched(tile, count, touched, step, known)
+            add_feature_gradient(batch, count, levels, feature_sums)
+            known = _record_touched(batch, count, touched, step, known)
     return known, float(loss * share)

@@ -1,14 +1,12 @@
-"""The field's MLP on a tile in compiled code: forward, and backward by hand."""
+"""The field's MLP on a batch in compiled code: forward, and backward by hand."""
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Floats
 
-from triquad_map.compiled.field.batch import TILE, Tile
-
-Floats = NDArray[np.float32]
+from triquad_map.compiled.field.batch import BATCH, PointBatch
+from triquad_map.compiled.kernel import kernel
 
 _ZERO = np.float32(0)
 
@@ -24,7 +22,7 @@ class Mlp(NamedTuple):
     b3: Floats  # [1]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
     """``out += weights.T @ x`` for weights [K, J], x [K, T], out [J, T]."""
     inputs, outputs = weights.shape
@@ -34,7 +32,7 @@ def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
             w0, w1, w2, w3 = weights[k, j], weights[k + 1, j], weights[k + 2, j], weights[k + 3, j]
             w4, w5 = weights[k + 4, j], weights[k + 5, j]
             w6, w7 = weights[k + 6, j], weights[k + 7, j]
-            for t in range(TILE):
+            for t in range(BATCH):
                 out[j, t] += (
                     w0 * x[k, t]
                     + w1 * x[k + 1, t]
@@ -48,12 +46,12 @@ def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
         k += 8
     while k < inputs:
         for j in range(outputs):
-            for t in range(TILE):
+            for t in range(BATCH):
                 out[j, t] += weights[k, j] * x[k, t]
         k += 1
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
     """``sums += x @ g.T`` for x [K, T], g [J, T], sums [K, J]."""
     inputs, outputs = sums.shape
@@ -62,7 +60,7 @@ def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
         for j in range(0, fourth, 4):
             s0, s1, s2, s3 = _ZERO, _ZERO, _ZERO, _ZERO
             t0, t1, t2, t3 = _ZERO, _ZERO, _ZERO, _ZERO
-            for t in range(TILE):
+            for t in range(BATCH):
                 s0 += x[k, t] * g[j, t]
                 s1 += x[k, t] * g[j + 1, t]
                 s2 += x[k, t] * g[j + 2, t]
@@ -84,49 +82,49 @@ def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
             sums[k, j] += _dot(x[k], g[j])
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _dot(a: Floats, b: Floats) -> float:
     total: float = _ZERO
-    for t in range(TILE):
+    for t in range(BATCH):
         total += a[t] * b[t]
     return total
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _add_row_sums(g: Floats, sums: Floats) -> None:
     """``sums += g.sum(1)`` for g [J, T]."""
     for j in range(len(g)):
         total = _ZERO
-        for t in range(TILE):
+        for t in range(BATCH):
             total += g[j, t]
         sums[j] += total
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
     for j in range(len(biases)):
-        for t in range(TILE):
+        for t in range(BATCH):
             out[j, t] = biases[j]
     _add_product(weights, x, out)
     for j in range(len(biases)):
-        for t in range(TILE):
+        for t in range(BATCH):
             out[j, t] = max(out[j, t], _ZERO)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def forward(tile: Tile, mlp: Mlp) -> None:
-    """Both hidden layers and the logits of the tile's inputs."""
-    _layer(mlp.w1, mlp.b1, tile.x, tile.h1)
-    _layer(mlp.w2, mlp.b2, tile.h1, tile.h2)
-    for t in range(TILE):
-        tile.logits[t] = mlp.b3[0]
+@kernel(fastmath=True)
+def forward(batch: PointBatch, mlp: Mlp) -> None:
+    """Both hidden layers and the logits of the batch's inputs."""
+    _layer(mlp.w1, mlp.b1, batch.x, batch.h1)
+    _layer(mlp.w2, mlp.b2, batch.h1, batch.h2)
+    for t in range(BATCH):
+        batch.logits[t] = mlp.b3[0]
     for j in range(len(mlp.w3)):
-        for t in range(TILE):
-            tile.logits[t] += mlp.w3[j] * tile.h2[j, t]
+        for t in range(BATCH):
+            batch.logits[t] += mlp.w3[j] * batch.h2[j, t]
 
 
-@numba.njit(cache=True, nogil=True)
-def turned(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
+@kernel()
+def transposed(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
     """The first two layers' weights as :func:`backward` needs them.
 
     Those of the first layer reach the first ``inputs`` inputs only.
@@ -134,30 +132,30 @@ def turned(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
     return np.ascontiguousarray(mlp.w1[:inputs].T), np.ascontiguousarray(mlp.w2.T)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def backward(tile: Tile, mlp: Mlp, w1_turned: Floats, w2_turned: Floats) -> None:
-    """Gradients of the hidden layers and of the inputs, from ``tile.slopes``."""
+@kernel(fastmath=True)
+def backward(batch: PointBatch, mlp: Mlp, w1_transposed: Floats, w2_transposed: Floats) -> None:
+    """Gradients of the hidden layers and of the inputs, from ``batch.slopes``."""
     for j in range(len(mlp.w3)):
-        for t in range(TILE):
-            tile.g2[j, t] = tile.slopes[t] * mlp.w3[j] if tile.h2[j, t] > 0 else _ZERO
-    tile.g1[:] = 0
-    _add_product(w2_turned, tile.g2, tile.g1)
+        for t in range(BATCH):
+            batch.g2[j, t] = batch.slopes[t] * mlp.w3[j] if batch.h2[j, t] > 0 else _ZERO
+    batch.g1[:] = 0
+    _add_product(w2_transposed, batch.g2, batch.g1)
     for j in range(len(mlp.b1)):
-        for t in range(TILE):
-            tile.g1[j, t] = tile.g1[j, t] if tile.h1[j, t] > 0 else _ZERO
-    gx = tile.gx[: w1_turned.shape[1]]
+        for t in range(BATCH):
+            batch.g1[j, t] = batch.g1[j, t] if batch.h1[j, t] > 0 else _ZERO
+    gx = batch.gx[: w1_transposed.shape[1]]
     gx[:] = 0
-    _add_product(w1_turned, tile.g1, gx)
+    _add_product(w1_transposed, batch.g1, gx)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def add_weight_gradient(tile: Tile, sums: Mlp) -> None:
+@kernel(fastmath=True)
+def add_weight_gradient(batch: PointBatch, sums: Mlp) -> None:
     """Add the gradient of the weights, after :func:`backward`; points of no slope add nothing."""
-    _add_outer_product(tile.x, tile.g1, sums.w1)
-    _add_row_sums(tile.g1, sums.b1)
-    _add_outer_product(tile.h1, tile.g2, sums.w2)
-    _add_row_sums(tile.g2, sums.b2)
+    _add_outer_product(batch.x, batch.g1, sums.w1)
+    _add_row_sums(batch.g1, sums.b1)
+    _add_outer_product(batch.h1, batch.g2, sums.w2)
+    _add_row_sums(batch.g2, sums.b2)
     for j in range(len(sums.w3)):
-        sums.w3[j] += _dot(tile.slopes, tile.h2[j])
-    for t in range(TILE):
-        sums.b3[0] += tile.slopes[t]
+        sums.w3[j] += _dot(batch.slopes, batch.h2[j])
+    for t in range(BATCH):
+        sums.b3[0] += batch.slopes[t]

@@ -8,26 +8,20 @@ nothing.
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.records import morton
+from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
 from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.voxel_index import Index, VoxelIndex
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT
+from triquad_map.compiled.sparse.voxel_index import Index, VoxelIndex
 from triquad_map.surface.surfels import SurfelKind, Surfels
 
-_SHIFT = BLOCK_VOXELS.bit_length() - 1
-_LOW = BLOCK_VOXELS - 1
 _FAR = 1e6  # voxels
 GROUP_SHIFT = 2
 GROUP_VOXELS = float(BLOCK_VOXELS << GROUP_SHIFT)
-
-Masks = NDArray[np.uint8]
-Ints = NDArray[np.int32]
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 
 
 class BlockGroups(NamedTuple):
@@ -50,20 +44,20 @@ class SurfelIndex(NamedTuple):
     starts: Ints  # [blocks + 1] first surfel of each block
     positions: Floats  # [3, surfels] from the block's corner, voxels; far away where there is none
     normals: Floats  # [surfels, 3]
-    kinds: Masks  # [surfels] SurfelKind
+    kinds: Bytes  # [surfels] SurfelKind
 
 
 @dataclass(frozen=True)
 class SurfelPlaces:
     """Where the surfels of the voxels in which rays ended stand."""
 
-    surface: Masks  # [blocks, BLOCK_BYTES] these voxels
+    surface: Bytes  # [blocks, BLOCK_BYTES] these voxels
     starts: Ints  # [blocks + 1] first surfel of each block
-    voxels: NDArray[np.int64]  # [S, 3] voxel of each surfel
+    voxels: Longs  # [S, 3] voxel of each surfel
     groups: BlockGroups
 
 
-def surfel_places(cells: NDArray[np.int64], surface: Masks) -> SurfelPlaces:
+def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
     """Places for the voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks at ``cells`` [, 3]."""
     starts = surfel_starts(surface)
     voxels = surfel_voxels(cells, surface, int(starts[-1]))
@@ -84,13 +78,13 @@ def surfel_index(places: SurfelPlaces, surfels: Surfels) -> SurfelIndex:
     )
 
 
-def surfel_starts(surface: Masks) -> Ints:
+def surfel_starts(surface: Bytes) -> Ints:
     """The first surfel [blocks + 1] of the voxels in ``surface`` [blocks, BLOCK_BYTES]."""
     return np.concatenate([[0], np.cumsum(surface_counts(surface))]).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
-def surfel_voxels(cells: NDArray[np.int64], surface: Masks, count: int) -> NDArray[np.int64]:
+@kernel()
+def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
     """The voxels [count, 3] of surfels, given the blocks' ``cells`` [blocks, 3]."""
     voxels = np.empty((count, 3), np.int64)
     at = 0
@@ -99,17 +93,15 @@ def surfel_voxels(cells: NDArray[np.int64], surface: Masks, count: int) -> NDArr
             bits = int(surface[row, byte])
             for z in range(BLOCK_VOXELS):
                 if bits >> z & 1:
-                    voxels[at, 0] = (cells[row, 0] << _SHIFT) + (byte >> _SHIFT)
-                    voxels[at, 1] = (cells[row, 1] << _SHIFT) + (byte & _LOW)
-                    voxels[at, 2] = (cells[row, 2] << _SHIFT) + z
+                    voxels[at, 0] = (cells[row, 0] << SHIFT) + (byte >> SHIFT)
+                    voxels[at, 1] = (cells[row, 1] << SHIFT) + (byte & LOW)
+                    voxels[at, 2] = (cells[row, 2] << SHIFT) + z
                     at += 1
     return voxels
 
 
-@numba.njit(cache=True, nogil=True)
-def moved_rows(
-    before: Masks, before_starts: NDArray[np.int32], now: Masks, count: int
-) -> NDArray[np.int32]:
+@kernel()
+def moved_rows(before: Bytes, before_starts: Ints, now: Bytes, count: int) -> Ints:
     """For each surfel [count] of ``now``, its number in ``before``; -1 where it is new.
 
     Blocks are those of ``before`` and more.
@@ -131,8 +123,8 @@ def moved_rows(
     return rows
 
 
-@numba.njit(cache=True, nogil=True)
-def _block_boxes(cells: NDArray[np.int64], surface: Masks, rows: NDArray[np.int64]) -> Ints:
+@kernel()
+def _block_boxes(cells: Longs, surface: Bytes, rows: Longs) -> Ints:
     """The boxes [M, 6] around the seen surface of some blocks."""
     boxes = np.empty((len(rows), 6), np.int32)
     for i, row in enumerate(rows):
@@ -141,15 +133,15 @@ def _block_boxes(cells: NDArray[np.int64], surface: Masks, rows: NDArray[np.int6
         for byte in range(BLOCK_BYTES):
             for z in range(BLOCK_VOXELS):
                 if surface[row, byte] >> z & 1:
-                    for axis, place in enumerate((byte >> _SHIFT, byte & _LOW, z)):
+                    for axis, place in enumerate((byte >> SHIFT, byte & LOW, z)):
                         boxes[i, axis] = min(boxes[i, axis], place)
                         boxes[i, axis + 3] = max(boxes[i, axis + 3], place + 1)
         for side in range(6):
-            boxes[i, side] += cells[row, side % 3] << _SHIFT
+            boxes[i, side] += cells[row, side % 3] << SHIFT
     return boxes
 
 
-def block_groups(cells: NDArray[np.int64], surface: Masks) -> BlockGroups:
+def block_groups(cells: Longs, surface: Bytes) -> BlockGroups:
     """The blocks at ``cells`` [blocks, 3] that hold any of ``surface``, in groups."""
     used = np.flatnonzero(surface.any(axis=1))
     codes, owners = np.unique(morton.encode(cells[used] >> GROUP_SHIFT), return_inverse=True)

@@ -8,13 +8,14 @@ uses them: to pass them on, or to reach into tuples for them, takes longer than 
 import itertools
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats, Ints
 from triquad_format.records.region import BLOCK_VOXELS
 
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.sparse.voxel_bits import LOW
+from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, find_row, pack, unpack
 from triquad_map.compiled.surfels.surfel_index import GROUP_SHIFT, GROUP_VOXELS, SurfelIndex
-from triquad_map.compiled.voxel_index import CELL_LIMIT, find_row, pack, unpack
 from triquad_map.nearest import NearestSurfels
 from triquad_map.surface.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
 
@@ -25,21 +26,17 @@ _STEPS = np.array(
 
 _NEIGHBOURS = len(_STEPS)
 _FARTHEST = CELL_LIMIT / 2
-_LOW = BLOCK_VOXELS - 1
 _DISC = int(SurfelKind.DISC)
 _RADIUS = np.float32(DISC_RADIUS)
 
 _CANDIDATES = 128
-"""How many surfels are kept in mind for the direction."""
+"""How many surfels are remembered for the direction."""
 
 _NONE = -1
 
 # The numbers of ``Search.found``.
 _SURFEL, _MEMBER, _COUNT = range(3)
 
-Ints = NDArray[np.int32]
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 Place = tuple[float, float, float]
 
 
@@ -54,7 +51,7 @@ class Search(NamedTuple):
     away: Floats  # [blocks of a group] and for those of blocks
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _wider(square: float, by: float) -> float:
     """Square of a distance that is larger ``by`` so much."""
     reach = np.sqrt(square) + np.float32(by)
@@ -62,7 +59,7 @@ def _wider(square: float, by: float) -> float:
     return wider
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _sifted(search: Search, limit: float) -> int:
     """Keep the candidates that are nearer than the root of ``limit``; how many they are."""
     candidates, nearness = search.candidates, search.nearness
@@ -75,13 +72,25 @@ def _sifted(search: Search, limit: float) -> int:
     return count
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
+def _disc_square(a: float, b: float, c: float, normal: Floats, square: float) -> float:
+    """Square of the distance to a disc, of whose middle a place is ``(a, b, c)`` off."""
+    height = a * normal[0] + b * normal[1] + c * normal[2]
+    beside = square - height * height
+    square = height * height
+    if beside > _RADIUS * _RADIUS:
+        beyond = np.sqrt(beside) - _RADIUS
+        square += beyond * beyond
+    return square
+
+
+@kernel(fastmath=True, inline="always")
 def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) -> None:
-    """Look at the surfels of a block. All is relative to its corner, in single precision."""
+    """Search the surfels of a block. All is relative to its corner, in single precision."""
     row, boxes = index.groups.members[member], index.groups.member_boxes
-    x = np.float32(at[0] - (int(boxes[0, member]) & ~_LOW))
-    y = np.float32(at[1] - (int(boxes[1, member]) & ~_LOW))
-    z = np.float32(at[2] - (int(boxes[2, member]) & ~_LOW))
+    x = np.float32(at[0] - (int(boxes[0, member]) & ~LOW))
+    y = np.float32(at[1] - (int(boxes[1, member]) & ~LOW))
+    z = np.float32(at[2] - (int(boxes[2, member]) & ~LOW))
     start, count = index.starts[row], index.starts[row + 1] - index.starts[row]
     # Slices of their own, which the compiler makes vector instructions of.
     xs = index.positions[0, start : start + count]
@@ -91,7 +100,7 @@ def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) ->
     for i in range(count):
         a, b, c = x - xs[i], y - ys[i], z - zs[i]
         squares[i] = a * a + b * b + c * c
-    best, noted = search.best[0], search.found[_COUNT]
+    best, known = search.best[0], search.found[_COUNT]
     near, far = _wider(best, SMOOTHING), _wider(best, SMOOTHING + DISC_RADIUS)
     sifted = best
     for i in range(count):
@@ -99,34 +108,25 @@ def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) ->
             continue
         surfel, square = start + i, squares[i]
         if kinds[surfel] == _DISC:
-            height = (
-                (x - xs[i]) * normals[surfel, 0]
-                + (y - ys[i]) * normals[surfel, 1]
-                + (z - zs[i]) * normals[surfel, 2]
-            )
-            beside = square - height * height
-            square = height * height
-            if beside > _RADIUS * _RADIUS:
-                beyond = np.sqrt(beside) - _RADIUS
-                square += beyond * beyond
+            square = _disc_square(x - xs[i], y - ys[i], z - zs[i], normals[surfel], square)
         if square > near:
             continue
-        if noted == _CANDIDATES and best < sifted:
-            noted, sifted = _sifted(search, near), best
-        if noted < _CANDIDATES:
-            search.candidates[noted, 0], search.candidates[noted, 1] = surfel, member
-            search.nearness[noted] = square
-            noted += 1
+        if known == _CANDIDATES and best < sifted:
+            known, sifted = _sifted(search, near), best
+        if known < _CANDIDATES:
+            search.candidates[known, 0], search.candidates[known, 1] = surfel, member
+            search.nearness[known] = square
+            known += 1
         if square < best:
             best = square
             search.found[_SURFEL], search.found[_MEMBER] = surfel, member
             near, far = _wider(best, SMOOTHING), _wider(best, SMOOTHING + DISC_RADIUS)
-    search.best[0], search.found[_COUNT] = best, noted
+    search.best[0], search.found[_COUNT] = best, known
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _search_group(index: SurfelIndex, group: int, at: Place, search: Search) -> None:
-    """Look at the blocks of a group, the nearest first."""
+    """Search the blocks of a group, the nearest first."""
     first, last = index.groups.starts[group], index.groups.starts[group + 1]
     boxes, away = index.groups.member_boxes, search.away
     x0, y0, z0 = boxes[0, first:last], boxes[1, first:last], boxes[2, first:last]
@@ -150,7 +150,7 @@ def _search_group(index: SurfelIndex, group: int, at: Place, search: Search) -> 
             limit = _wider(search.best[0], SMOOTHING + OUTSIDE)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _reaches(index: SurfelIndex, group: int, at: Place, search: Search) -> bool:
     """Whether a group may hold a surfel that counts."""
     boxes = index.groups.boxes
@@ -160,9 +160,9 @@ def _reaches(index: SurfelIndex, group: int, at: Place, search: Search) -> bool:
     return bool(a * a + b * b + c * c <= _wider(search.best[0], SMOOTHING + OUTSIDE))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 def _search(index: SurfelIndex, at: Place, search: Search) -> None:
-    """Look at the groups around a point, then at all others."""
+    """Search the groups around a point, then at all others."""
     places = index.groups.places
     x = int(np.floor(at[0] / GROUP_VOXELS))
     y = int(np.floor(at[1] / GROUP_VOXELS))
@@ -176,19 +176,19 @@ def _search(index: SurfelIndex, at: Place, search: Search) -> None:
         else:
             group = turn - _NEIGHBOURS
             a, b, c = unpack(places.row_keys[group])
-            if max(abs(a - x), abs(b - y), abs(c - z)) <= 1:  # looked at already
+            if max(abs(a - x), abs(b - y), abs(c - z)) <= 1:  # searched already
                 continue
         if group >= 0 and _reaches(index, group, at, search):
             _search_group(index, group, at, search)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _foot(index: SurfelIndex, surfel: int, member: int, at: Place) -> Place:
+@kernel(inline="always")
+def _closest_point(index: SurfelIndex, surfel: int, member: int, at: Place) -> Place:
     """The point of a surfel that is nearest to a place."""
     boxes = index.groups.member_boxes
-    qx = (int(boxes[0, member]) & ~_LOW) + float(index.positions[0, surfel])
-    qy = (int(boxes[1, member]) & ~_LOW) + float(index.positions[1, surfel])
-    qz = (int(boxes[2, member]) & ~_LOW) + float(index.positions[2, surfel])
+    qx = (int(boxes[0, member]) & ~LOW) + float(index.positions[0, surfel])
+    qy = (int(boxes[1, member]) & ~LOW) + float(index.positions[1, surfel])
+    qz = (int(boxes[2, member]) & ~LOW) + float(index.positions[2, surfel])
     if index.kinds[surfel] != _DISC:
         return qx, qy, qz
     nx, ny, nz = index.normals[surfel, 0], index.normals[surfel, 1], index.normals[surfel, 2]
@@ -199,31 +199,31 @@ def _foot(index: SurfelIndex, surfel: int, member: int, at: Place) -> Place:
     return qx + share * a, qy + share * b, qz + share * c
 
 
-@numba.njit(cache=True, nogil=True)
-def _note_found(
+@kernel()
+def _write_found(
     index: SurfelIndex, at: Place, search: Search, i: int, nearest: NearestSurfels
 ) -> None:
-    """Write down what was found for point ``i``."""
+    """Write what was found for point ``i``."""
     best = np.sqrt(search.best[0])
     surfel = search.found[_SURFEL]
-    foot = _foot(index, surfel, search.found[_MEMBER], at)
-    total, x, y, z = 1.0, foot[0], foot[1], foot[2]
+    closest = _closest_point(index, surfel, search.found[_MEMBER], at)
+    total, x, y, z = 1.0, closest[0], closest[1], closest[2]
     for k in range(search.found[_COUNT]):
         share = 1.0 - (np.sqrt(search.nearness[k]) - best) / SMOOTHING
         if share > 0.0 and search.candidates[k, 0] != surfel:
-            a, b, c = _foot(index, search.candidates[k, 0], search.candidates[k, 1], at)
+            a, b, c = _closest_point(index, search.candidates[k, 0], search.candidates[k, 1], at)
             weight = share * share
             total += weight
             x, y, z = x + weight * a, y + weight * b, z + weight * c
     nearest.distances[i] = best
     nearest.rows[i] = surfel
-    nearest.feet[i, 0], nearest.feet[i, 1], nearest.feet[i, 2] = foot
+    nearest.closest[i, 0], nearest.closest[i, 1], nearest.closest[i, 2] = closest
     nearest.means[i, 0] = x / total
     nearest.means[i, 1] = y / total
     nearest.means[i, 2] = z / total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def find_nearest(points: Doubles, index: SurfelIndex, nearest: NearestSurfels) -> None:
     """Improve ``nearest`` where a surfel of the region lies nearer to ``points`` [N, 3].
 
@@ -245,4 +245,4 @@ def find_nearest(points: Doubles, index: SurfelIndex, nearest: NearestSurfels) -
         search.found[_SURFEL], search.found[_COUNT] = _NONE, 0
         _search(index, at, search)
         if search.found[_SURFEL] != _NONE:
-            _note_found(index, at, search, i, nearest)
+            _write_found(index, at, search, i, nearest)

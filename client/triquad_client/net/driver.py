@@ -1,0 +1,93 @@
+"""Running calls to their end: one loop, whoever waits."""
+
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine
+from contextlib import closing
+from functools import partial
+from typing import Any, TypeVar
+
+from triquad_client.net.call import Ask, Batch, Call, Pause, ResultT, Run, Step
+
+PendingT = TypeVar("PendingT")
+
+
+class Driver(ABC):
+    """Takes the steps of calls, one after the other; subclasses say how."""
+
+    async def run_call(self, call: Call[ResultT]) -> ResultT:
+        """What the call returns; raises what it raises."""
+        with closing(call):
+            resume = partial(call.send, None)
+            while True:
+                try:
+                    step = resume()
+                except StopIteration as end:
+                    result: ResultT = end.value
+                    return result
+                try:
+                    resume = partial(call.send, await self._take(step))
+                except Exception as error:
+                    resume = partial(call.throw, error)
+
+    async def _take(self, step: Step) -> Any:
+        if isinstance(step, Batch):
+            return await self._replies(step)
+        if isinstance(step, Pause):
+            return await self._pause(step.seconds)
+        return await self._work(step.job)
+
+    @abstractmethod
+    async def _replies(self, batch: Batch) -> list[Any]:
+        """The replies to the requests, in the order of the items."""
+
+    @abstractmethod
+    async def _pause(self, seconds: float) -> None:
+        """Let time pass."""
+
+    @abstractmethod
+    async def _work(self, job: Callable[[Run], Any]) -> Any:
+        """What ``job`` returns."""
+
+
+class BlockingDriver(Driver):
+    """Takes the steps in the thread that makes the call. None of its coroutines ever waits."""
+
+    def run(self, call: Call[ResultT]) -> ResultT:
+        """What the call returns; raises what it raises."""
+        return _result(self.run_call(call))
+
+    async def _pause(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    async def _work(self, job: Callable[[Run], Any]) -> Any:
+        return job(self.run)
+
+
+async def exchange(
+    batch: Batch,
+    send: Callable[[Ask[Any]], Awaitable[PendingT]],
+    receive: Callable[[PendingT], Awaitable[Any]],
+) -> list[Any]:
+    """The replies to a batch, of which ``batch.at_once`` requests are under way at a time."""
+    waiting: deque[PendingT] = deque()
+    replies = []
+    for item in batch.items:
+        waiting.append(await send(batch.request(item)))
+        if len(waiting) >= batch.at_once:
+            replies.append(await receive(waiting.popleft()))
+    while waiting:
+        replies.append(await receive(waiting.popleft()))
+    return replies
+
+
+def _result(coroutine: Coroutine[Any, Any, ResultT]) -> ResultT:
+    """What a coroutine returns that waits for nothing: it needs no event loop."""
+    try:
+        coroutine.send(None)
+    except StopIteration as end:
+        result: ResultT = end.value
+        return result
+    coroutine.close()
+    raise AssertionError("a blocking driver waited for an event loop")

@@ -1,0 +1,38 @@
+"""Writes the tables of ``settings.md`` from the server's settings: ``make docs``."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from triquad_server.settings import setting_schemas
+
+PAGE = Path(__file__).with_name("settings.md")
+
+_HEAD = "| key | default | range | |\n|---|---|---|---|\n"
+
+
+def with_tables(page: str) -> str:
+    """The page, with a table of the settings below the heading of each section."""
+    for section, schemas in setting_schemas().items():
+        rows = [_row(key, schema) for key, schema in schemas.items()]
+        table = _HEAD + "".join(rows)
+        # The prose between heading and table, and that below the table, are written by hand.
+        found = re.search(rf"## `\[{section}\]`[^|]*\n\n((?:\|.*\n)+)", page)
+        if found is None:
+            raise ValueError(f"{PAGE} has no section [{section}] with a table")
+        page = page[: found.start(1)] + table + page[found.end(1) :]
+    return page
+
+
+def _row(key: str, schema: dict[str, Any]) -> str:
+    if "enum" in schema:
+        allowed = ", ".join(f"`{json.dumps(value)}`" for value in schema["enum"])
+    else:
+        allowed = f"{schema['minimum']} to {schema['maximum']}"
+    default, meaning = json.dumps(schema["default"]), " ".join(schema["description"].split())
+    return f"| `{key}` | `{default}` | {allowed} | {meaning} |\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,145 @@
+"""A folder of checkpoints: the epochs of a map that can be read back.
+
+A checkpoint is complete, or holds what changed and names the files that hold the rest.
+"""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from triquad_format.errors import MapFileError
+from triquad_format.mapfile.file_errors import named
+from triquad_format.mapfile.index import DAMAGED_SUFFIX, MapIndex, files_in
+from triquad_format.mapfile.manifest import Manifest
+from triquad_format.mapfile.mcap.random_access import FileBytes
+
+_NAME = re.compile(r"epoch-([0-9]{9,19})(\.delta)?\.triquad")
+
+
+@dataclass(frozen=True, order=True)
+class CheckpointFile:
+    """A checkpoint, by its name."""
+
+    epoch: int
+    complete: bool  # whether it needs no other file
+    path: Path
+
+
+def checkpoint_name(epoch: int, complete: bool) -> str:
+    """Name of a checkpoint's file."""
+    return f"epoch-{epoch:09d}{'' if complete else '.delta'}.triquad"
+
+
+def checkpoint_file(path: Path) -> CheckpointFile | None:
+    """The checkpoint of that name; ``None`` where it is not the name of one."""
+    match = _NAME.fullmatch(path.name)
+    if match is None or int(match[1]) >= 2**63:
+        return None
+    return CheckpointFile(int(match[1]), not match[2], path)
+
+
+def checkpoint_files(folder: Path) -> list[CheckpointFile]:
+    """The checkpoints in a folder, newest first; a complete one before a delta.
+
+    What is no file, or a link to none, is left out.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    found = [checkpoint_file(path) for path in folder.iterdir() if path.is_file()]
+    return sorted((file for file in found if file is not None), reverse=True)
+
+
+def set_aside(folder: Path) -> list[Path]:
+    """Checkpoints in a folder that a server found damaged and renamed, in the order of names.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    ended = [path for path in folder.iterdir() if path.name.endswith(DAMAGED_SUFFIX)]
+    return sorted(path for path in ended if checkpoint_file(path.with_suffix("")) is not None)
+
+
+def newest_of_each(files: Iterable[CheckpointFile]) -> list[CheckpointFile]:
+    """One file for each epoch: the complete one where there are two."""
+    by_epoch: dict[int, CheckpointFile] = {}
+    for file in files:
+        by_epoch.setdefault(file.epoch, file)
+    return list(by_epoch.values())
+
+
+def map_folder(store: Path) -> Path:
+    """The folder of checkpoints that ``store`` is, or the only one that it holds.
+
+    Raises:
+        MapFileError: there is none, or there are several; the text names them.
+    """
+    if checkpoint_files(store):
+        return store
+    maps = sorted(path for path in store.iterdir() if path.is_dir() and checkpoint_files(path))
+    if len(maps) != 1:
+        names = ", ".join(path.name for path in maps) or "none"
+        raise MapFileError(f"{store} is not a folder of checkpoints; maps in it: {names}")
+    return maps[0]
+
+
+def open_manifest(file: CheckpointFile) -> Manifest:
+    """The manifest of a checkpoint, found by the file's index.
+
+    Raises:
+        NoIndexError: another tool rewrote the file without one.
+        MapFileError: the file is damaged, or needs a newer reader.
+        OSError: it cannot be read.
+    """
+    source = FileBytes(file.path)
+    try:
+        with named(str(file.path)):
+            return MapIndex(source, files_in(file.path.parent)).manifest
+    finally:
+        source.close()
+
+
+def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
+    """The newest checkpoint that is not after ``when``.
+
+    Args:
+        folder: of checkpoints.
+        when: number of an epoch, or a time as in RFC 3339 (local time where it has no offset).
+
+    Raises:
+        MapFileError: ``when`` is neither, or there is no such checkpoint; the text tells which
+            there are.
+    """
+    files = newest_of_each(checkpoint_files(folder))
+    found = [file for file in files if _is_by(file, when)]
+    epochs = f"epochs {files[-1].epoch} to {files[0].epoch}" if files else "nothing"
+    if not found:
+        raise MapFileError(f"{folder} holds no checkpoint of {when} or before, but {epochs}")
+    if _is_epoch(when) and int(when) > files[0].epoch:
+        raise MapFileError(
+            f"{folder} holds {epochs}, not {when}; a time is written as 2026-01-31T12:00:00Z"
+        )
+    return max(found)
+
+
+def _is_epoch(when: str) -> bool:
+    return when.isascii() and when.isdigit() and len(when) < 20
+
+
+def _is_by(file: CheckpointFile, when: str) -> bool:
+    if _is_epoch(when):
+        return file.epoch <= int(when)
+    try:
+        limit_s = datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp()
+    except ValueError as error:
+        raise MapFileError(
+            f"{when!r} is neither the number of an epoch nor a time such as 2026-01-31T12:00:00Z"
+        ) from error
+    try:
+        manifest = open_manifest(file)
+    except MapFileError:
+        return False
+    # Times are shown in whole seconds: what is shown must find its checkpoint.
+    return 0 < manifest.stamp_ns // 10**9 <= limit_s

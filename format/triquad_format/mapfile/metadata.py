@@ -1,0 +1,193 @@
+"""What a map file says of itself: the version that its readers need, and facts of the whole map.
+
+The MCAP metadata record ``triquad`` holds both; the facts stand in the first part and in the
+manifest, too.
+"""
+
+import dataclasses
+import reprlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Any
+
+from triquad_format import __version__
+from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
+from triquad_format.mapfile.parts.body import PartBody, pack_part, unpack_body
+from triquad_format.mapfile.parts.part import MANIFEST, MAP, Part, PartKey
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.wire.keys import check_name
+
+METADATA_NAME = "triquad"
+FORMAT_VERSION = 1
+MIN_READER_VERSION = 1
+
+BASE_FILES = "base-files"
+"""The required feature of a file whose parts lie in other files, too."""
+
+KNOWN_FEATURES: frozenset[str] = frozenset({BASE_FILES})
+"""The ``required_features`` that this reader understands."""
+
+FRAME_ID = "map"
+UNITS = "m"
+
+MAX_MAP_BYTES = 4 * 2**30
+"""Limit on the size of a map file, and on its chunks' decompressed size together."""
+
+
+@dataclass(frozen=True)
+class MapFacts:
+    """Name, epoch and settings of a map."""
+
+    name: str
+    epoch: int
+    settings: FieldSettings
+
+
+def pack_facts(facts: MapFacts) -> dict[str, object]:
+    """The facts as a msgpack map."""
+    defaults = dataclasses.asdict(FieldSettings())
+    settings = dataclasses.asdict(facts.settings)
+    return {
+        "name": facts.name,
+        "epoch": facts.epoch,
+        "frame_id": FRAME_ID,
+        "units": UNITS,
+        "settings": {name: type(defaults[name])(value) for name, value in settings.items()},
+    }
+
+
+def pack_map_part(facts: MapFacts) -> Part:
+    """The facts as the first part of a file."""
+    return pack_part(PartKey(MAP), pack_facts(facts))
+
+
+def unpack_facts(body: PartBody) -> MapFacts:
+    """The facts in a part.
+
+    Raises:
+        FormatError: one is missing or out of range.
+    """
+    for key, wanted in (("frame_id", FRAME_ID), ("units", UNITS)):
+        if body.value(key, str) != wanted:
+            raise UnsupportedMapFileError(f"{key} = {body.value(key, str)!r:.80}, not {wanted!r}")
+    name = body.value("name", str)
+    check_name("map", name)
+    return MapFacts(name, body.count("epoch"), _unpack_settings(body.mapping("settings")))
+
+
+def check_map_part(payload: bytes, facts: MapFacts) -> None:
+    """Raise :class:`FormatError` unless the part ``/triquad/map`` tells the same facts."""
+    if unpack_facts(unpack_body(MAP, payload)) != facts:
+        raise DamagedMapFileError(f"{MAP} and {MANIFEST} contradict each other")
+
+
+def _unpack_settings(body: Mapping[str, object]) -> FieldSettings:
+    """The settings of a field; all must be there."""
+    values: dict[str, Any] = {}
+    for name, default in dataclasses.asdict(FieldSettings()).items():
+        value = body.get(name)
+        if type(default) is float and type(value) is int and abs(value) < 2**53:
+            value = float(value)
+        if type(value) is not type(default):
+            raise DamagedMapFileError(f"{MAP}: setting {name} = {reprlib.repr(value)}")
+        values[name] = value
+    return FieldSettings(**values)
+
+
+def pack_metadata(
+    facts: MapFacts, *, stamp_ns: int | None, needs_other_files: bool
+) -> dict[str, str]:
+    """The metadata of a file.
+
+    Args:
+        facts: of its map.
+        stamp_ns: time of its epoch, nanoseconds since 1970; ``None``: not known.
+        needs_other_files: whether parts may lie in other files.
+    """
+    entries = {
+        "format_version": str(FORMAT_VERSION),
+        "min_reader_version": str(MIN_READER_VERSION),
+        "required_features": BASE_FILES if needs_other_files else "",
+        "producer": f"triquad {__version__}",
+        "map": facts.name,
+        "epoch": str(facts.epoch),
+        "frame_id": FRAME_ID,
+        "units": UNITS,
+    }
+    if stamp_ns is not None:
+        created = datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc)
+        entries["created"] = created.strftime("%Y-%m-%dT%H:%M:%SZ")
+    return entries
+
+
+def readable_metadata(found: list[dict[str, str]]) -> dict[str, str]:
+    """The metadata of a file that this reader can read.
+
+    Args:
+        found: the entries of all metadata records ``triquad``; there must be one.
+
+    Raises:
+        MapFileError: there is none: it is no map file.
+        UnsupportedMapFileError: it needs a newer reader; the text names what is missing.
+        DamagedMapFileError: there are several, or it does not tell which reader it needs.
+    """
+    if not found:
+        raise MapFileError("this is an MCAP file, but not a map: it has no metadata 'triquad'")
+    if len(found) > 1:
+        raise DamagedMapFileError("the metadata 'triquad' is there more than once")
+    check_readable(found[0])
+    return found[0]
+
+
+def check_readable(metadata: dict[str, str]) -> None:
+    """Refuse a file that this reader does not understand.
+
+    Raises:
+        UnsupportedMapFileError: it needs a newer reader; the text names what is missing.
+        DamagedMapFileError: the metadata does not tell.
+    """
+    needed = metadata.get("min_reader_version", "")
+    # int() alone would also take '+1', ' 1' and digits of other scripts, of any length.
+    if not (needed.isascii() and needed.isdigit() and len(needed) < 10):
+        raise DamagedMapFileError(f"min_reader_version = {needed!r:.40} is not a number")
+    if int(needed) > FORMAT_VERSION:
+        raise UnsupportedMapFileError(
+            f"it needs a reader of map file version {needed}; this one reads {FORMAT_VERSION}: "
+            f"install a newer triquad (written by {metadata.get('producer', 'unknown')!r:.80})",
+        )
+    if "required_features" not in metadata:
+        raise DamagedMapFileError("the metadata 'triquad' does not name its required_features")
+    missing = _required(metadata) - KNOWN_FEATURES
+    if missing:
+        unknown = ", ".join(sorted(missing))
+        raise UnsupportedMapFileError(
+            f"it requires {unknown:.200}, which this reader does not know: install a newer triquad"
+        )
+
+
+def _required(metadata: dict[str, str]) -> set[str]:
+    return {name.strip() for name in metadata["required_features"].split(",")} - {""}
+
+
+def check_agreement(metadata: dict[str, str], facts: MapFacts, *, needs_other_files: bool) -> None:
+    """Raise :class:`DamagedMapFileError` unless metadata and manifest tell the same.
+
+    Args:
+        metadata: of the file.
+        facts: what its parts tell of the map.
+        needs_other_files: whether its manifest lists parts that lie in other files.
+    """
+    wanted = {
+        "map": facts.name,
+        "epoch": str(facts.epoch),
+        "frame_id": FRAME_ID,
+        "units": UNITS,
+    }
+    for key, value in wanted.items():
+        if metadata.get(key) != value:
+            raise DamagedMapFileError(
+                f"its metadata says {key} = {metadata.get(key)!r:.80}, its parts say {value!r}",
+            )
+    if needs_other_files and BASE_FILES not in _required(metadata):
+        raise DamagedMapFileError(f"parts lie in other files, but {BASE_FILES} is not required")

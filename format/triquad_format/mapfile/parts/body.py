@@ -1,0 +1,213 @@
+"""The msgpack map of a part: packed with its seams, and read back with every field checked."""
+
+import reprlib
+import typing
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format.errors import DamagedMapFileError, WireError
+from triquad_format.mapfile.parts.columns import (
+    MAX_CODE_BYTES,
+    join_integers,
+    unshuffle,
+    unshuffle_codes,
+)
+from triquad_format.mapfile.parts.part import PREFIX, Part, PartKey
+from triquad_format.records.region import RegionIndex
+from triquad_format.wire.array import ArraySpec, unpack_array
+from triquad_format.wire.structure import MAX_OBJECTS, binary_offsets, check_structure
+
+MAX_REGION_INDEX = 2**31 - 1
+MAX_ITEMS = 64
+_OBJECTS_PER_ITEM = 8  # of a manifest's longest list
+_MAX_STRING_BYTES = 4096
+_MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
+
+
+def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
+    """A part of this body: numbers, strings, lists, maps and packed arrays.
+
+    Its seams lie between the byte planes of its arrays.
+    """
+    payload = typing.cast(bytes, msgpack.packb(body))
+    return Part(key, payload, _seams(payload, body))
+
+
+def repack_part(key: PartKey, payload: bytes) -> Part:
+    """A part that was read and checked, to be written again."""
+    if not key.topic.startswith(PREFIX):
+        return Part(key, payload)
+    body = msgpack.unpackb(payload, max_map_len=MAX_ITEMS, max_ext_len=0)
+    return Part(key, payload, _seams(payload, body))
+
+
+def _seams(payload: bytes, body: Mapping[str, object]) -> tuple[int, ...]:
+    """Where byte planes begin and end in a payload."""
+    seams: list[int] = []
+    for place, planes in zip(binary_offsets(payload), _plane_counts(body), strict=True):
+        size = len(place)
+        if size >= _MIN_SEAM_BYTES:
+            step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
+            seams.extend(range(place.start, place.stop + 1, step))
+    return tuple(seams)
+
+
+def _plane_counts(value: object) -> Iterator[int]:
+    """Byte planes of each binary in a body, in the order of the payload."""
+    if isinstance(value, bytes):
+        yield 1
+    elif isinstance(value, Mapping) and isinstance(value.get("data"), bytes):
+        yield value["shape"][0] if value["dtype"] in ("|u1", "|i1") and value["shape"] else 1
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _plane_counts(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _plane_counts(item)
+
+
+def unpack_body(topic: str, payload: bytes, max_items: int = MAX_ITEMS) -> "PartBody":
+    """The body of a part.
+
+    Args:
+        topic: of the part.
+        payload: of the part.
+        max_items: limit on the length of its lists.
+
+    Raises:
+        DamagedMapFileError: it is not a msgpack map, or exceeds a limit.
+    """
+    try:
+        check_structure(payload, max(MAX_OBJECTS, _OBJECTS_PER_ITEM * max_items))
+        body = msgpack.unpackb(
+            payload,
+            max_str_len=_MAX_STRING_BYTES,
+            max_array_len=max_items,
+            max_map_len=MAX_ITEMS,
+            max_ext_len=0,
+        )
+    except (WireError, ValueError, msgpack.exceptions.UnpackException) as error:
+        raise DamagedMapFileError(f"{topic}: not a msgpack map: {error}") from error
+    return PartBody(topic, body)
+
+
+class PartBody:
+    """A msgpack map in a part, with typed access to its fields.
+
+    Every method raises :class:`~triquad_format.errors.FormatError` where a field is missing or
+    malformed; the text names topic, field and value.
+    """
+
+    def __init__(self, topic: str, body: object) -> None:
+        """Take a decoded body; ``topic`` is for messages."""
+        if not isinstance(body, dict):
+            raise DamagedMapFileError(f"{topic}: not a map but a {type(body).__name__}")
+        self.topic = topic
+        self._body: Mapping[str, object] = body
+
+    def value(self, key: str, kind: type) -> Any:
+        """The field ``key``, which must be exactly of the type ``kind``."""
+        value = self._body.get(key)
+        if type(value) is not kind:
+            raise DamagedMapFileError(
+                f"{self.topic}: {key} = {reprlib.repr(value)} is not {kind.__name__}",
+            )
+        return value
+
+    def expect(self, key: str, wanted: object) -> None:
+        """Refuse a part whose field ``key`` is not ``wanted``."""
+        value = self.value(key, type(wanted))
+        if value != wanted:
+            raise DamagedMapFileError(f"{self.topic}: {key} = {value!r}, expected {wanted!r}")
+
+    def count(self, key: str) -> int:
+        """A number in ``[0, 2**63)``."""
+        value: int = self.value(key, int)
+        if not 0 <= value < 2**63:
+            raise DamagedMapFileError(f"{self.topic}: {key} = {value} is not a count")
+        return value
+
+    def texts(self, key: str) -> list[str]:
+        """A list of strings."""
+        values: list[Any] = self.value(key, list)
+        if not all(type(value) is str for value in values):
+            raise DamagedMapFileError(f"{self.topic}: {key} is not a list of strings")
+        return values
+
+    def index(self) -> RegionIndex:
+        """The index of the region to which the part belongs."""
+        value = self.value("region", list)
+        if len(value) != 3 or not all(
+            type(number) is int and abs(number) <= MAX_REGION_INDEX for number in value
+        ):
+            raise DamagedMapFileError(
+                f"{self.topic}: region = {reprlib.repr(value)} is not an index"
+            )
+        return (value[0], value[1], value[2])
+
+    def array(self, key: str, dtype: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+        """An array of this dtype and shape; a size that is ``None`` may be any."""
+        name = f"{self.topic}: {key}"
+        array = unpack_array(name, self._body.get(key))
+        ArraySpec(dtype, shape).check(name, array)
+        return array
+
+    def arrays(self, key: str, count: int) -> tuple[NDArray[Any], ...]:
+        """``count`` arrays of ``<f4``, each of any shape."""
+        arrays = []
+        for i, item in enumerate(self._items(key, count)):
+            name = f"{self.topic}: {key}[{i}]"
+            array = unpack_array(name, item)
+            ArraySpec("<f4", (None,) * array.ndim).check(name, array)
+            arrays.append(array)
+        return tuple(arrays)
+
+    def maps(self, key: str, count: int) -> tuple["PartBody", ...]:
+        """``count`` nested maps."""
+        return tuple(PartBody(self.topic, item) for item in self._items(key, count))
+
+    def codes(self, key: str, most: int) -> NDArray[np.int64]:
+        """Morton codes [V], of which no more than ``most`` are decoded: each takes eight bytes."""
+        planes = self.array(key, "|u1", (None, None))
+        self.limit(key, planes.shape[1], most)
+        if not 1 <= len(planes) <= MAX_CODE_BYTES:
+            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per code")
+        return unshuffle_codes(planes)
+
+    def floats(self, key: str, *shape: int | None) -> NDArray[Any]:
+        """A shuffled array of ``<f2`` or ``<f4``."""
+        planes = self.array(key, "|u1", (None, *shape))
+        if len(planes) not in (2, 4):
+            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
+        return unshuffle(planes, f"<f{len(planes)}")
+
+    def integers(self, key: str, count: int, size: int) -> NDArray[np.int16]:
+        """Integers [count, size] of one or two bytes."""
+        planes = self.array(key, "|i1", (None, size, count))
+        if len(planes) not in (1, 2):
+            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
+        return join_integers(planes)
+
+    def limit(self, key: str, count: int, most: int) -> None:
+        """Refuse a field of more than ``most`` rows."""
+        if count > most:
+            raise DamagedMapFileError(f"{self.topic}: {key} has {count} rows, above {most}")
+
+    def has(self, key: str) -> bool:
+        """Whether there is a field ``key``."""
+        return key in self._body
+
+    def mapping(self, key: str) -> Mapping[str, object]:
+        """A nested map."""
+        value: Mapping[str, object] = self.value(key, dict)
+        return value
+
+    def _items(self, key: str, count: int) -> list[Any]:
+        items: list[Any] = self.value(key, list)
+        if len(items) != count:
+            raise DamagedMapFileError(f"{self.topic}: {key} holds {len(items)} items, not {count}")
+        return items

@@ -1,0 +1,169 @@
+"""What is intact in a damaged map file, as a valid map.
+
+Every chunk is searched for on its own (:mod:`triquad_format.recovery.intact_chunks`). Where the
+manifest is intact, it tells what each part is and what is missing; else the parts tell of
+themselves.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from triquad_format.errors import FormatError, MapFileError
+from triquad_format.mapfile.file_errors import named
+from triquad_format.mapfile.metadata import MAX_MAP_BYTES
+from triquad_format.mapfile.parts.part import (
+    FIELD_TOPICS,
+    REGION,
+    REGION_TOPICS,
+    TRAINING,
+    TRAINING_TOPICS,
+    VERTICES,
+    PartKey,
+    cells_at,
+)
+from triquad_format.mapfile.parts.region_parts import RegionParts
+from triquad_format.records.evidence_voxels import masked, seen_voxels, status_voxels
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.leaf_box import LeafBox
+from triquad_format.records.record_check import check_record
+from triquad_format.records.region import (
+    AXES,
+    MapRecord,
+    Region,
+    RegionIndex,
+    leaf_coordinates,
+    region_centre,
+)
+from triquad_format.recovery.intact_parts import IntactParts, intact_parts
+from triquad_format.recovery.loss import Loss, effect_box, loss_of
+
+
+@dataclass(frozen=True)
+class RecoveredMap:
+    """What was saved of a map, and what was not."""
+
+    record: MapRecord
+    losses: tuple[Loss, ...]  # those that are known
+    parts_intact: int  # parts of regions that could be read
+    parts_listed: int | None  # how many there were; None: not known, for the manifest is lost
+    stamp_ns: int  # when the epoch was written, nanoseconds since 1970; 0 if not known
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing was lost."""
+        return not self.losses and self.parts_intact == self.parts_listed
+
+
+def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> RecoveredMap:
+    """All that is intact in a map file, and in the files of its folder that it needs.
+
+    The result is valid. It answers as the whole map did wherever no loss reaches. Where vertices
+    are lost, evidence goes with them: so nothing there passes for known. Training state stays
+    where all of a region's is intact.
+
+    Args:
+        path: the file, truncated or damaged in any way.
+        max_bytes: limit on each file's size and, decompressed, on its parts together.
+
+    Raises:
+        MapFileError: nothing could be saved, or the file needs a newer reader.
+        OSError: it cannot be read.
+    """
+    with named(str(path)):
+        recovered = _recovered(intact_parts(path, max_bytes))
+        if not recovered.record.regions and not recovered.complete:
+            raise MapFileError("nothing can be saved: no region is intact")
+        return recovered
+
+
+def _recovered(found: IntactParts) -> RecoveredMap:
+    settings = found.facts.settings
+    regions: list[Region] = []
+    lost: set[PartKey] = set()
+    for index in found.regions:
+        payloads, missing = found.found_of(index), found.missing_of(index)
+        region = _region(index, settings, payloads, missing=missing)
+        if region is None:
+            lost.add(PartKey(REGION, index))
+            continue
+        if found.parts_listed is None:
+            missing |= _missing_squares(settings, region, payloads)
+        lost |= {key for key in missing if key.topic in FIELD_TOPICS}
+        had_training = any(key.topic in TRAINING_TOPICS for key in (*payloads, *missing))
+        if had_training and region.training is None:
+            lost.add(PartKey(TRAINING, index))
+        regions.append(region)
+    losses = tuple(loss_of(key, settings) for key in sorted(lost, key=_place))
+    regions = [_masked_where_lost(settings, region, losses) for region in regions]
+    record = MapRecord(found.facts.name, found.facts.epoch, settings, tuple(regions))
+    return RecoveredMap(
+        record,
+        losses,
+        parts_intact=len(found.payloads),
+        parts_listed=found.parts_listed,
+        stamp_ns=found.stamp_ns,
+    )
+
+
+def _place(key: PartKey) -> tuple[RegionIndex, PartKey]:
+    return key.region, key
+
+
+def _region(
+    index: RegionIndex,
+    settings: FieldSettings,
+    payloads: Mapping[PartKey, bytes],
+    *,
+    missing: set[PartKey],
+) -> Region | None:
+    """The region of these parts, with its training state where that is complete."""
+    choices = [REGION_TOPICS, FIELD_TOPICS]
+    if any(key.topic in (VERTICES, *TRAINING_TOPICS) for key in missing):
+        choices = [FIELD_TOPICS]
+    for topics in choices:
+        parts = RegionParts(index, settings)
+        try:
+            for key, payload in payloads.items():
+                if key.topic in topics:
+                    parts.add(key, payload)
+            region = parts.region()
+            check_record(MapRecord("recovered", 0, settings, (region,)))
+        except FormatError:
+            continue
+        return region
+    return None
+
+
+def _missing_squares(
+    settings: FieldSettings, region: Region, payloads: Mapping[PartKey, bytes]
+) -> set[PartKey]:
+    """Squares that held vertices: every node in which a surface was seen has its four corners."""
+    if settings.encoding == "fourier":
+        return set()
+    voxels = seen_voxels(region.evidence, region.evidence.surface)
+    needed = set()
+    for table in region.tables:
+        shift = settings.depth - table.level
+        nodes = np.unique(voxels[:, list(AXES[table.plane])] >> shift, axis=0)
+        for corner in np.ndindex(2, 2):
+            squares = cells_at((nodes + corner) << shift)
+            needed |= {
+                PartKey(VERTICES, region.index, plane=table.plane, cell=cell) for cell in squares
+            }
+    return needed - payloads.keys()
+
+
+def _masked_where_lost(settings: FieldSettings, region: Region, losses: Iterable[Loss]) -> Region:
+    """The region without evidence where vertices are lost, be they its own or a neighbour's."""
+    evidence = region.evidence
+    centre = region_centre(settings, region.index)
+    for loss in losses:
+        if loss.key.topic == VERTICES and loss.meets(centre, settings.region_side_m):
+            corners = effect_box(loss.key, settings)
+            box = LeafBox(*leaf_coordinates(settings, corners - centre))
+            evidence = masked(evidence, ~status_voxels(evidence, box))
+    return dataclasses.replace(region, evidence=evidence)

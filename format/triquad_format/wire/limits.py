@@ -1,0 +1,19 @@
+"""Limits of requests that clients check before they send, and servers before they answer."""
+
+MIN_LENGTH_M = 1e-6
+"""Of distances, ranges and grid cells: what is smaller is a mistake."""
+
+MAX_DISTANCE_M = 100.0
+"""How far around a point surfaces may be looked for; also the largest radius and grid cell."""
+
+MAX_RANGE_M = 1_000.0
+"""Of rays; also the longest segment."""
+
+MAX_ITERATIONS = 200
+"""Steps of an alignment."""
+
+LEVELS = 3
+"""Levels of detail of meshes: cells of level ``l`` are ``2**l`` times as large as those of 0."""
+
+MAX_KNOWN_TILES = 100_000
+"""Mesh tiles that a client may name as known when it asks what changed."""

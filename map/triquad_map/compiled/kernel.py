@@ -1,0 +1,142 @@
+"""How kernels are compiled, and where their compiled code is kept.
+
+numba finds compiled code again as long as the file of a kernel is the same, whatever became of the
+functions and constants that the kernel takes from other files. Here the code of a module's kernels
+is kept in a folder that is named by a digest of the module and of all that it imports of these
+packages, directly or not; folders of earlier digests are removed.
+"""
+
+import ast
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import llvmlite.binding
+import numba
+import numpy as np
+
+_OURS = "triquad_"
+"""What the names of the packages begin with whose modules count."""
+
+_BUILD = (
+    platform.python_version(),
+    numba.__version__,
+    np.__version__,
+    llvmlite.binding.get_host_cpu_name(),
+)
+"""All else that compiled code depends on."""
+
+_numba_config: Any = numba.config
+_choosing_folder = threading.Lock()
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+
+def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
+    """Compile a function when it is first called; it runs without Python's lock.
+
+    Args:
+        options: of ``numba.njit``.
+    """
+
+    def compiled(function: FunctionT) -> FunctionT:
+        with _choosing_folder, _code_in(_code_folder(function.__module__)) as cached:
+            done: FunctionT = numba.njit(cache=cached, nogil=True, **options)(function)
+        return done
+
+    return compiled
+
+
+@contextmanager
+def _code_in(folder: Path | None) -> Iterator[bool]:
+    """Have numba keep code in a folder; yields whether there is one."""
+    before = _numba_config.CACHE_DIR
+    _numba_config.CACHE_DIR = str(folder or before)
+    try:
+        yield folder is not None
+    finally:
+        _numba_config.CACHE_DIR = before
+
+
+@functools.cache
+def _code_folder(module: str) -> Path | None:
+    """Where the compiled code of a module is kept; ``None`` where nothing can be written."""
+    base = _base_folder(_numba_config.CACHE_DIR)
+    if base is None:
+        return None
+    place = f"{sys.implementation.cache_tag} {_file_of(module)}"  # installations do not mix
+    versions = base / f"{module}-{hashlib.sha256(place.encode()).hexdigest()[:12]}"
+    folder = versions / source_digest(module)
+    for other in versions.glob("*"):
+        if other != folder:
+            shutil.rmtree(other, ignore_errors=True)
+    return folder
+
+
+@functools.cache
+def _base_folder(chosen: str) -> Path | None:
+    """The folder that the user chose for numba, that of the user's caches, or a temporary one."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    folder = Path(chosen) if chosen else caches / "triquad" / "kernels"
+    if _can_write(folder):
+        return folder
+    shared = Path(tempfile.gettempdir()) / f"triquad-kernels-{_user_id()}"
+    return shared if _can_write(shared) and _is_private(shared) else None
+
+
+def _can_write(folder: Path) -> bool:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether nobody else can write to a folder: compiled code that lies in it is run."""
+    state = folder.stat()
+    return sys.platform == "win32" or (state.st_uid == _user_id() and not state.st_mode & 0o022)
+
+
+def _user_id() -> int:
+    return 0 if sys.platform == "win32" else os.getuid()
+
+
+def source_digest(module: str) -> str:
+    """A digest of a module and of all modules of these packages that it imports."""
+    reached, waiting = {module}, [module]
+    while waiting:
+        new = _imports(waiting.pop()) - reached
+        reached |= new
+        waiting.extend(new)
+    digest = hashlib.sha256(repr(_BUILD).encode())
+    for name in sorted(reached):
+        digest.update(name.encode() + hashlib.sha256(_file_of(name).read_bytes()).digest())
+    return digest.hexdigest()[:24]
+
+
+@functools.cache
+def _imports(module: str) -> set[str]:
+    """The modules of these packages that a module imports itself."""
+    names: set[str] = set()
+    for node in ast.parse(_file_of(module).read_bytes()).body:
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return {name for name in names if name.startswith(_OURS) and name in sys.modules}
+
+
+def _file_of(module: str) -> Path:
+    return Path(str(sys.modules[module].__file__))

@@ -1,0 +1,1 @@
+"""Many regions as one map: who answers where, and how what they answer becomes one."""

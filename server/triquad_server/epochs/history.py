@@ -1,0 +1,82 @@
+"""The epochs that requests can ask for."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from triquad_format.errors import RefusedError
+
+from triquad_server.epochs.epoch import Epoch
+
+
+@dataclass(frozen=True)
+class EpochLimits:
+    """Which epochs stay."""
+
+    kept: int  # so many of the newest stay, at least 1
+    pinned: int  # so many older ones stay at most: those that were asked for by number last
+    pin_s: float  # an older epoch stays for so long after it was last asked for
+
+
+class EpochHistory:
+    """The newest epochs, and older ones while they are asked for by number."""
+
+    def __init__(
+        self,
+        first: Epoch,
+        limits: EpochLimits,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``clock`` tells seconds that never run backwards."""
+        self._lock = threading.Lock()
+        self._limits = limits
+        self._clock = clock
+        self._newest = first
+        self._epochs = {first.number: first}  # oldest first
+        self._asked: dict[int, float] = {}  # when, by number; longest ago first
+
+    @property
+    def newest(self) -> Epoch:
+        """The epoch published last."""
+        return self._newest
+
+    def add(self, epoch: Epoch) -> None:
+        """Make ``epoch`` the newest; older ones may go."""
+        with self._lock:
+            self._newest = epoch
+            self._epochs[epoch.number] = epoch
+            self._tidy()
+
+    def get(self, number: int) -> Epoch:
+        """The epoch of that number, or the newest for 0.
+
+        Asking for an epoch by number pins it: a long request in many parts, or many requests that
+        belong together, do not lose their epoch while they go on.
+
+        Raises:
+            RefusedError: ``epoch_gone``.
+        """
+        with self._lock:
+            epoch = self._epochs.get(number) if number else self._newest
+            if epoch is None:
+                raise RefusedError(
+                    "epoch_gone",
+                    f"epoch {number} is not kept; kept are {sorted(self._epochs)}",
+                )
+            if number:
+                self._asked.pop(number, None)
+                self._asked[number] = self._clock()
+            self._tidy()
+            return epoch
+
+    def _tidy(self) -> None:
+        """Let go of older epochs whose time is over, or that exceed the limit."""
+        older = list(self._epochs)[: -self._limits.kept]
+        since = self._clock() - self._limits.pin_s
+        pinned = [n for n, asked in self._asked.items() if n in older and asked >= since]
+        stay = pinned[max(0, len(pinned) - self._limits.pinned) :]
+        for number in older:
+            if number not in stay:
+                del self._epochs[number]
+                self._asked.pop(number, None)

@@ -1,0 +1,206 @@
+"""One region of the live map: its field, its evidence and what it still has to learn."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import (
+    Region,
+    RegionIndex,
+    leaf_coordinates,
+    region_centre,
+)
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.observations import Sighting
+from triquad_map.compiled.sparse.thinning import thin
+from triquad_map.compiled.surfels.surfel_map import SurfelTask, first_surfels
+from triquad_map.compiled.team import Team
+from triquad_map.composition.field_samples import field_samples
+
+from triquad_server.engine.adam import Rates
+from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.field_record import field_from_record, region_record, training_state
+from triquad_server.engine.live_field import LiveField, initial_field
+from triquad_server.engine.trainer import Loss, make_trainer
+from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.intake.scan import ScanRays
+from triquad_server.mapping.ray_intervals import ray_intervals, sample_intervals
+from triquad_server.mapping.replay_pool import ReplayPool
+from triquad_server.mapping.sampling import Placement
+from triquad_server.settings import ScanSettings, TrainingSettings
+
+_CARVE_SHORT_M = 0.1
+_CHECKPOINT_SAMPLES = 1_000_000
+_LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
+_SURFELS_REFITTED = 8_000
+"""With each epoch while the field is being trained: some 10 ms."""
+
+
+@dataclass(frozen=True)
+class RegionSetup:
+    """What the regions of a map have in common."""
+
+    field: FieldSettings
+    scan: ScanSettings
+    training: TrainingSettings
+    device: torch.device
+    sums: GradientSums
+    team: Team
+
+    @property
+    def placement(self) -> Placement:
+        """Where samples lie."""
+        return Placement(
+            surface_share=self.scan.surface_share,
+            spread_m=self.scan.spread_m,
+            truncation_m=self.scan.truncation_m,
+            half_side_m=self.field.region_side_m / 2,
+        )
+
+    def seeds(self, index: RegionIndex) -> tuple[int, int]:
+        """Seeds of a region's field and of its replay pool; no two regions share one."""
+        natural = tuple(2 * i if i >= 0 else -2 * i - 1 for i in index)
+        sequence = np.random.SeedSequence(self.training.seed, spawn_key=natural)
+        field, pool = sequence.generate_state(2, np.uint64).tolist()
+        return field, pool
+
+
+class LiveRegion:
+    """A region that is being mapped, by one thread. Everything public is in the map frame."""
+
+    def __init__(
+        self, index: RegionIndex, setup: RegionSetup, field: LiveField, evidence: LiveEvidence
+    ) -> None:
+        self.index = index
+        self.centre = region_centre(setup.field, index)
+        self.field = field
+        self.evidence = evidence
+        _, seed = setup.seeds(index)
+        self.pool = ReplayPool(
+            capacity=setup.training.pool_rays,
+            placement=setup.placement,
+            device=setup.device,
+            seed=seed,
+            team=setup.team,
+        )
+        self.budget_samples = 0  # the training budget: samples that are still to be trained on
+        self._fresh_budget_samples = 0  # those of them that are to be from the newest scan
+        self.changed = True  # since it was last published
+        self._setup = setup
+        self._settings = setup.field
+        self._training = setup.training
+        self._trainer = make_trainer(field, setup.sums, setup.team)
+
+    @classmethod
+    def unseen(cls, index: RegionIndex, setup: RegionSetup) -> "LiveRegion":
+        """A region of which nothing is known yet."""
+        seed, _ = setup.seeds(index)
+        field = initial_field(setup.field, setup.device, seed)
+        return cls(index, setup, field, LiveEvidence(1 << setup.field.depth))
+
+    @classmethod
+    def restore(cls, record: Region, setup: RegionSetup) -> "LiveRegion":
+        """A region from its record; without training state its replay pool starts empty."""
+        seed, _ = setup.seeds(record.index)
+        field = field_from_record(record, setup.field, setup.device, seed)
+        evidence = LiveEvidence.from_record(1 << setup.field.depth, record.evidence)
+        region = cls(record.index, setup, field, evidence)
+        state = record.training
+        if state is not None and len(state.sample_points):
+            region.pool.add(sample_intervals(state.sample_points, state.sample_labels))
+            region.budget_samples = min(state.budget_samples, setup.training.max_budget_samples)
+        return region
+
+    def see(self, rays: ScanRays, stamp_s: int) -> Callable[[], None]:
+        """Record where the rays ended, and grow the field there; outside the cube nothing is.
+
+        Returns:
+            What records the free space that the rays crossed, wherever they come from and end. It
+            may run beside :meth:`learn`.
+        """
+        ends = self.voxels(rays.ends)
+        origin = self.voxels(rays.origin[None])[0]
+        sighting = Sighting(origin, self._settings.leaf_m, stamp_s)
+        new = self.evidence.mark_surface(ends, sighting)
+        # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
+        self.field.grow(new)
+        self.changed = True
+        short = _CARVE_SHORT_M / self._settings.leaf_m
+        return lambda: self.evidence.carve(origin, ends[thin(ends, 1.0)], short)
+
+    def learn(self, rays: ScanRays, normals: NDArray[np.float64]) -> None:
+        """Keep what the rays teach, to be trained on.
+
+        ``normals`` [N, 3] are those at the rays' ends, NaN where unknown.
+        """
+        half = self._settings.region_side_m / 2
+        intervals = ray_intervals(rays, normals, self.centre, half, self._setup.scan)
+        if len(intervals) == 0:
+            return
+        self.pool.add(intervals)
+        samples = int(len(intervals) * self._training.samples_per_ray)
+        self.budget_samples = min(self.budget_samples + samples, self._training.max_budget_samples)
+        self._fresh_budget_samples = int(samples * self._training.fresh_share)
+
+    def train(self) -> Loss:
+        """One optimiser step; returns the loss."""
+        settings = self._training
+        fresh = min(self._fresh_budget_samples, int(settings.batch * settings.fresh_share))
+        batch = self.pool.draw(settings.batch, fresh)
+        rate = settings.learning_rate * self._cooling()
+        loss = self._trainer.train(batch, Rates(rate, settings.beta1, settings.beta2))
+        self._fresh_budget_samples -= fresh
+        self.budget_samples = max(0, self.budget_samples - settings.batch)
+        self.changed = True
+        return loss
+
+    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Forget evidence and samples between two corners [3]."""
+        self.evidence.clear(self.voxels(low[None])[0], self.voxels(high[None])[0])
+        self.pool.forget(low - self.centre, high - self.centre)
+        if len(self.pool) == 0:
+            self.budget_samples = 0
+        self.changed = True
+
+    def voxels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Voxel coordinates [N, 3] of points."""
+        return leaf_coordinates(self._settings, points - self.centre)
+
+    def freeze(self, epoch: int, before: FrozenRegion | None) -> FrozenRegion:
+        """The region as it is now, to be published with ``epoch``.
+
+        ``before`` is how it was published last: what did not change is shared with it.
+        """
+        self.changed = False
+        field, evidence = self.field.freeze(), self.evidence.freeze()
+        samples = field_samples(field, self._settings, self._setup.team.split)
+        task = SurfelTask(epoch, _SURFELS_REFITTED if self.budget_samples else None)
+        surfels = (
+            first_surfels(evidence, samples, task)
+            if before is None
+            else before.surfels.updated(evidence, samples, task)
+        )
+        return FrozenRegion(
+            index=self.index,
+            centre=self.centre,
+            engine=field,
+            evidence=evidence,
+            surfels=surfels,
+            vertices=self.field.vertices,
+            parameters=self.field.parameters,
+            changed=epoch,
+        )
+
+    def record(self) -> Region:
+        """The region with its training state as plain arrays, sharing nothing with this one."""
+        samples = self.pool.sample(_CHECKPOINT_SAMPLES)
+        state = training_state(self.field, samples, self.budget_samples)
+        return region_record(self.index, self.field, self.evidence.freeze(), state)
+
+    def _cooling(self) -> float:
+        """Share of the learning rate: falls as the budget is used up, so that the field settles."""
+        enough = self._training.cooldown * max(1, len(self.pool))
+        return min(1.0, max(_LEAST_RATE, self.budget_samples / enough))

@@ -1,0 +1,127 @@
+"""Reading the newest valid checkpoint of a folder."""
+
+import hashlib
+import itertools
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_format.errors import MapFileError, TooLargeMapFileError, UnsupportedMapFileError
+from triquad_format.mapfile.checkpoint_folder import (
+    CheckpointFile,
+    checkpoint_files,
+    checkpoint_name,
+)
+from triquad_format.mapfile.index import DAMAGED_SUFFIX
+from triquad_format.mapfile.reader import MapFile, read_map_file
+from triquad_format.records.region import MapRecord
+from triquad_format.wire.messages import CheckpointInfo
+
+from triquad_server.errors import StoreError
+
+_log = logging.getLogger(__name__)
+
+_READ_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class ValidCheckpoint:
+    """A checkpoint that was read."""
+
+    path: Path
+    file: MapFile
+    info: CheckpointInfo
+
+    @property
+    def record(self) -> MapRecord:
+        """The map in it."""
+        return self.file.record
+
+
+def newest_valid(folder: Path) -> ValidCheckpoint | None:
+    """The newest valid checkpoint, or ``None`` where there are no checkpoints at all.
+
+    Damaged ones are renamed, so that they are kept but never count as checkpoints again.
+
+    Raises:
+        StoreError: there are checkpoints but all are damaged; or the newest one cannot be read for
+            a reason that says nothing against the file: it needs a newer release, it is too large,
+            or the system refuses.
+    """
+    damaged: list[Path] = []
+    try:
+        checkpoints = checkpoint_files(folder)
+    except OSError as error:
+        raise StoreError(f"store {folder} cannot be read: {error}") from error
+    for checkpoint in checkpoints:
+        file = _read(checkpoint)
+        if file is None:
+            damaged.append(checkpoint.path)
+            continue
+        _set_aside(damaged)
+        if damaged:
+            _log.warning("the older checkpoint %s is used instead", checkpoint.path)
+        return ValidCheckpoint(checkpoint.path, file, _info(checkpoint))
+    if damaged:
+        raise StoreError(
+            f"all {len(damaged)} checkpoints in {folder} are damaged; move them away to "
+            "start with an empty map",
+        )
+    return None
+
+
+def _read(checkpoint: CheckpointFile) -> MapFile | None:
+    """A checkpoint, or ``None`` where it is damaged or not what its name says.
+
+    Raises:
+        StoreError: it cannot be read now, though it may well be valid.
+    """
+    path = checkpoint.path
+    try:
+        file = read_map_file(path)
+    except UnsupportedMapFileError as error:
+        raise StoreError(f"checkpoint {path} needs a newer release: {error}") from error
+    except (TooLargeMapFileError, OSError) as error:
+        raise StoreError(f"checkpoint {path} cannot be read: {error}") from error
+    except MapFileError as error:
+        _log.warning("checkpoint %s is damaged and left out: %s", path, error)
+        return None
+    epoch = file.record.epoch
+    if epoch != checkpoint.epoch:
+        _log.warning(
+            "checkpoint %s holds epoch %d and is left out; name it %s to use it",
+            path,
+            epoch,
+            checkpoint_name(epoch, checkpoint.complete),
+        )
+        return None
+    return file
+
+
+def _set_aside(damaged: list[Path]) -> None:
+    try:
+        for path in damaged:
+            aside = path.with_name(path.name + DAMAGED_SUFFIX)
+            for number in itertools.count(2):
+                if not os.path.lexists(aside):
+                    break
+                aside = path.with_name(f"{path.name}.{number}{DAMAGED_SUFFIX}")
+            path.rename(aside)
+            _log.warning("%s is now called %s", path, aside.name)
+    except OSError as error:
+        raise StoreError(f"the damaged {path} cannot be renamed: {error}") from error
+
+
+def _info(checkpoint: CheckpointFile) -> CheckpointInfo:
+    digest = hashlib.sha256()
+    with checkpoint.path.open("rb") as file:
+        while block := file.read(_READ_BYTES):
+            digest.update(block)
+        return CheckpointInfo(
+            path=str(checkpoint.path),
+            bytes=file.tell(),
+            epoch=checkpoint.epoch,
+            sha256=digest.hexdigest(),
+            stamp_ns=os.fstat(file.fileno()).st_mtime_ns,
+        )

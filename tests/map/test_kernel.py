@@ -1,0 +1,113 @@
+"""Compiled code is kept between processes, and made anew when anything changes that it uses."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CALLER = """
+from triquad_map.compiled.kernel import kernel
+from triquad_toy.callee import callee
+from triquad_toy.constants import ADDED
+
+@kernel()
+def caller(x):
+    return 10 * callee(x) + ADDED
+
+print(caller(2), sum(caller.stats.cache_hits.values()))
+"""
+
+CALLEE = """
+from triquad_map.compiled.kernel import kernel
+
+@kernel()
+def callee(x):
+    return x + 1
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    folder = tmp_path / "source" / "triquad_toy"
+    folder.mkdir(parents=True)
+    sources = {"__init__": "", "caller": CALLER, "callee": CALLEE, "constants": "ADDED = 3"}
+    for name, source in sources.items():
+        (folder / f"{name}.py").write_text(source)
+    return folder
+
+
+def run(package: Path, **variables: str) -> tuple[int, int]:
+    """The result of the caller in a process of its own, and what it found compiled."""
+    unset = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in unset}
+    environment["HOME"] = str(package.parents[1] / "home")
+    code = f"import sys; sys.path.append({str(package.parent)!r}); import triquad_toy.caller"
+    output = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment | variables,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    ).stdout
+    result, found = output.split()
+    return int(result), int(found)
+
+
+def edit(package: Path, module: str, old: str, new: str) -> None:
+    file = package / f"{module}.py"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+
+
+def test_compiled_code_is_found_by_the_next_process(package):
+    assert run(package) == (33, 0)
+    assert run(package) == (33, 1)
+
+
+def test_a_change_of_what_a_kernel_calls_counts(package):
+    run(package)
+    edit(package, "callee", "x + 1", "x + 2")
+    assert run(package) == (43, 0)
+
+
+def test_a_change_of_a_constant_of_another_module_counts(package):
+    run(package)
+    edit(package, "constants", "3", "4")
+    assert run(package) == (34, 0)
+
+
+def test_code_of_earlier_sources_is_removed(package):
+    run(package)
+    edit(package, "callee", "x + 1", "x + 2")
+    run(package)
+    kernels = package.parents[1] / "home" / ".cache" / "triquad" / "kernels"
+    digests = {folder.name: len(list(folder.iterdir())) for folder in kernels.iterdir()}
+    assert len(digests) == 2
+    assert set(digests.values()) == {1}
+
+
+def test_the_folder_that_the_user_chose_is_used(package, tmp_path):
+    chosen = tmp_path / "chosen"
+    run(package, NUMBA_CACHE_DIR=str(chosen))
+    assert any(chosen.rglob("*.nbc"))
+    assert not (tmp_path / "home").exists()
+
+
+def test_without_a_home_code_is_kept_in_a_temporary_folder(package, tmp_path):
+    (tmp_path / "home").write_text("no folder")
+    (tmp_path / "temporary").mkdir()
+    for found in (0, 1):
+        assert run(package, TMPDIR=str(tmp_path / "temporary")) == (33, found)
+
+
+def test_a_temporary_folder_of_others_is_not_trusted(package, tmp_path):
+    (tmp_path / "home").write_text("no folder")
+    planted = tmp_path / "temporary" / f"triquad-kernels-{os.getuid()}"
+    planted.mkdir(parents=True)
+    planted.chmod(0o777)
+    for _ in range(2):
+        assert run(package, TMPDIR=str(tmp_path / "temporary")) == (33, 0)
+    assert list(planted.iterdir()) == []

@@ -1,0 +1,46 @@
+"""Work that is shared among threads is all done, once, whatever happens."""
+
+import numpy as np
+import pytest
+from triquad_map.compiled.team import THREADS, Team
+
+
+@pytest.fixture
+def team():
+    team = Team("test")
+    yield team
+    team.close()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2047, 100_000])
+def test_each_place_is_worked_on_once(team, count):
+    done = np.zeros(count, int)
+
+    def work(first: int, last: int) -> None:
+        done[first:last] += 1
+
+    team.split(count, work)
+    team.close()
+    team.split(count, work)
+    assert (done == 2).all()
+
+
+def test_an_error_of_one_part_is_raised_when_all_have_ended(team):
+    ended = []
+
+    def work(part: int) -> None:
+        ended.append(part)
+        if part == THREADS - 1:
+            raise ValueError("the last part")
+
+    with pytest.raises(ValueError, match="the last part"):
+        team.each(work)
+    assert sorted(ended) == list(range(THREADS))
+
+
+def test_what_runs_beside_has_ended_when_the_context_does(team):
+    ended = []
+    with team.beside() as hand_over:
+        for number in range(5):
+            hand_over(lambda number=number: ended.append(number))
+    assert sorted(ended) == [0, 1, 2, 3, 4]

@@ -1,0 +1,112 @@
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from support import servers
+from support.small_world import settings, world
+from triquad_format.wire.messages import CheckpointRequest, ResetRequest
+from triquad_server.counter import Counter
+from triquad_server.epochs.gate import QueryGate
+from triquad_server.epochs.history import EpochLimits
+from triquad_server.errors import MapperStoppedError
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.sources import SourceLedger
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
+from triquad_server.mapping.resets import Resets
+from triquad_server.settings import StoreSettings
+from triquad_server.store.checkpoints import Checkpoints
+from triquad_server.store.retention import Retention
+from triquad_server.store.store import Store
+
+NEVER_S = 3600.0
+KEPT = EpochLimits(4, 0, 0.0)
+
+
+def inputs() -> MapperInputs:
+    ledger = SourceLedger()
+    scans = ScanQueue(8, ledger, Counter())
+    return MapperInputs(scans, ledger, QueryGate(), Counter(), Counter())
+
+
+@contextmanager
+def running(mapper: Mapper, failed: Callable[[], None] = lambda: None) -> Iterator[MapperThread]:
+    """The thread of a mapper, which publishes when a command asks for it."""
+    with closing(MapperThread(mapper, inputs(), NEVER_S, KEPT, failed)) as thread:
+        thread.start()
+        yield thread
+
+
+def learning_mapper(kind: type[Mapper] = Mapper) -> Mapper:
+    """A mapper that has enough to learn for the whole test."""
+    mapper = kind("test", settings(samples_per_ray=1000.0), "cpu")
+    scan = world(1).scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    return mapper
+
+
+def test_a_command_returns_its_result_or_raises_its_error() -> None:
+    with running(Mapper("test", settings(), "cpu")) as thread:
+        assert thread.call(lambda mapper: len(mapper.regions)) == 0
+        with pytest.raises(ZeroDivisionError):
+            thread.call(lambda _: 1 // 0)
+        assert thread.call(lambda mapper: mapper.settled)
+
+
+def test_commands_of_a_thread_that_ended_are_refused() -> None:
+    with running(Mapper("test", settings(), "cpu")) as thread:
+        pass
+    with pytest.raises(MapperStoppedError, match="has stopped"):
+        thread.call(lambda mapper: mapper.settled)
+
+
+class FailingMapper(Mapper):
+    """Its training meets an internal error."""
+
+    def train(self) -> None:
+        raise RuntimeError("training failed")
+
+
+def test_commands_of_a_thread_that_failed_are_refused_with_the_cause() -> None:
+    failed = Event()
+    with running(learning_mapper(FailingMapper), failed.set) as thread:
+        assert failed.wait(servers.WAIT_S)
+        with pytest.raises(MapperStoppedError, match="internal error"):
+            thread.call(lambda mapper: mapper.settled)
+
+
+def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
+    thread = MapperThread(
+        Mapper("test", settings(), "cpu"), inputs(), NEVER_S, KEPT, failed=lambda: None
+    )
+    with ThreadPoolExecutor(1) as pool:
+        pending = pool.submit(thread.call, lambda mapper: mapper.settled)
+        thread.close()
+        with pytest.raises(MapperStoppedError, match="never started"):
+            pending.result(servers.WAIT_S)
+
+
+def test_whoever_reset_the_map_finds_the_epoch_that_shows_it() -> None:
+    box = np.full(3, -np.inf), np.full(3, np.inf)
+    with running(learning_mapper()) as thread:
+        reply = Resets(thread).answer(ResetRequest(*box))
+        assert thread.epochs.newest.number >= reply.epoch
+        assert thread.epochs.get(reply.epoch).regions == 0
+
+
+def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Path) -> None:
+    store = Store(tmp_path, "test", Retention.chosen(StoreSettings()))
+    with closing(store), running(learning_mapper()) as thread:
+        checkpoints = Checkpoints(thread, store, 0.0, None)
+        checkpoints.start()
+        with closing(checkpoints):
+            for _ in range(5):
+                before = thread.call(lambda mapper: mapper.publish().number)
+                info = checkpoints.answer(CheckpointRequest())
+                assert info.epoch <= before + 1
+                assert thread.epochs.newest.number == info.epoch
+            thread.rest()

@@ -1,0 +1,194 @@
+import numpy as np
+import pytest
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from support.checkpoint_folder import FIRST, SECOND, write_checkpoints
+from support.exact_maps import SEEN_M, exact_map, flat, table
+from support.map_records import random_record
+from triquad_format.mapfile.reader import read_map_file
+from triquad_format.mapfile.writer import write_map
+from triquad_tools.commands.inspect import main
+from triquad_tools.mapfiles.seen_space import seen_columns, surface_columns
+from triquad_tools.plots.change_ages import latest_epochs
+from triquad_tools.plots.diff_plan import ADDED, GONE
+from triquad_tools.plots.plan import FREE, UNKNOWN, Layer, PlanGrid, Scale, draw_layers, draw_values
+from triquad_tools.plots.sample_errors import sample_errors
+from triquad_tools.plots.slice_plan import SURFACE
+
+
+def read_picture(path):
+    """Pixels ``[rows, columns, 3]`` of 0 to 255."""
+    return (255 * imread(path)[:, :, :3]).round().astype(np.uint8)
+
+
+def share(pixels, colour):
+    """Share of a picture's pixels that have a colour, but for how it was rounded."""
+    return (np.abs(pixels - 255 * np.array(to_rgb(colour))) <= 1).all(axis=-1).mean()
+
+
+# Grids
+
+
+def test_a_grid_holds_its_points_in_cells_of_whole_leaves():
+    rng = np.random.default_rng(0)
+    for size_m, cell_m in ((30.0, 0.2), (200.0, 0.2), (300.0, 0.4), (5000.0, 6.4)):
+        points = rng.uniform(-0.5, 0.5, (1000, 2)) * [size_m, size_m / 10] + [7.0, -1000.0]
+        grid = PlanGrid.around(points, 0.2)
+        assert grid.cell_m == pytest.approx(cell_m)
+        np.testing.assert_allclose(grid.low_m / grid.cell_m, np.round(grid.low_m / grid.cell_m))
+        assert (points >= grid.low_m).all()
+        assert (points <= grid.high_m).all()
+        assert grid.columns <= 1200
+        assert grid.rows >= 0.2 * grid.columns
+        assert grid.marked(points).sum() <= 1000
+
+
+def test_cells_are_where_their_points_are():
+    grid = PlanGrid(np.array([-1.0, -2.0]), 0.5, rows=8, columns=4)
+    points = np.array([[-0.9, -1.9], [0.9, 1.9], [0.9, 1.8], [5.0, 0.0]])
+    marked = grid.marked(points)
+    assert marked[0, 0]  # smallest x and y
+    assert marked[7, 3]
+    assert marked.sum() == 2  # one lies outside
+    values = np.array([1.0, 2.0, 4.0, 8.0])
+    assert grid.statistic(points, values, "max")[7, 3] == 4.0
+    assert grid.statistic(points, values, "mean")[7, 3] == 3.0
+    assert np.isnan(grid.statistic(points, values, "max")[1, 1])
+    assert np.isnan(grid.statistic(points[:0], values[:0], "mean")).all()
+    assert not grid.marked(points[:0]).any()
+
+
+def test_a_window_covers_the_cells_between_its_corners():
+    grid = PlanGrid(np.array([-1.0, -2.0]), 0.5, rows=8, columns=4)
+    covered = np.zeros((8, 4), bool)
+    covered[grid.window(np.array([-0.5, 1.0]), np.array([0.5, 99.0]))] = True
+    expected = np.zeros((8, 4), bool)
+    expected[6:, 1:3] = True
+    np.testing.assert_array_equal(covered, expected)
+
+
+# Colours and legends
+
+
+@pytest.mark.parametrize("name", ["viridis", "plasma_r"])
+def test_what_is_not_known_has_a_colour_of_its_own(name):
+    colours = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
+    for other in (UNKNOWN, FREE):
+        assert np.abs(colours - to_rgb(other)).max(axis=1).min() > 0.2
+    lightness = colours @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(lightness) > 0).all() or (np.diff(lightness) < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("values", "extend"),
+    [((0.0, 1.0), "neither"), ((-1.0, 1.0), "min"), ((0.0, 9.0), "max"), ((-1.0, 9.0), "both")],
+)
+def test_a_scale_says_what_lies_beyond_it(values, extend):
+    axes = Figure().subplots()
+    draw_values(axes, np.array([[*values, np.nan]]), Scale("height in m", "viridis", 0.0, 1.0))
+    (image,) = axes.images
+    assert image.colorbar.extend == extend
+    assert image.colorbar.ax.get_ylabel() == "height in m"
+    assert image.get_clim() == (0.0, 1.0)
+
+
+def test_a_legend_names_every_colour():
+    figure = Figure(layout="constrained")
+    layers = [Layer("wall", "#ff0000", np.eye(2, dtype=bool))]
+    draw_layers(figure.subplots(), layers)
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "wall",
+        "nothing was seen (UNKNOWN)",
+    ]
+
+
+# What the plans show
+
+
+def test_columns_have_their_highest_surface():
+    record = exact_map(table(0.1, 1.1))
+    columns = surface_columns(record)
+    assert len(columns.tops) == 100 * 100
+    inside = np.abs(columns.middles).max(axis=1) < 2.0
+    np.testing.assert_allclose(columns.tops[inside], 1.1)
+    np.testing.assert_allclose(columns.tops[~inside], 0.1)
+    assert np.abs(columns.middles).max() == pytest.approx(SEEN_M - 0.1)
+    assert seen_columns(record).tops.max() == pytest.approx(1.1 + 10 * 0.2)
+
+
+def test_each_place_shows_the_epoch_in_which_it_last_changed(tmp_path):
+    file = read_map_file(write_checkpoints(tmp_path, (9, 12, 15))[-1])
+    grid = PlanGrid(np.array([-18.0, -6.0]), 0.25, rows=48, columns=96)
+    epochs = latest_epochs(grid, file.manifest)
+    assert (FIRST, SECOND) == ((0, 0, 0), (-1, 0, 0))  # the second one is to the left
+    assert np.unique(epochs[:, :48]).tolist() == [15]
+    assert np.unique(epochs[:, 48:]).tolist() == [9]
+
+
+def test_errors_are_those_of_the_labels():
+    found = sample_errors(exact_map(flat(0.1), label_error_m=0.03))
+    np.testing.assert_allclose(found.errors_m, 0.03, atol=1e-5)
+    assert len(found.points) == 2000
+    assert not len(sample_errors(exact_map(flat(0.1), label_error_m=0.5)).points)
+    assert not len(sample_errors(exact_map(flat(0.1))).points)
+
+
+# The command
+
+
+def test_picture_of_a_map(tmp_path, capsys):
+    path, picture = tmp_path / "map.triquad", tmp_path / "map.png"
+    # A table on the ground shows in the colours of both heights.
+    record = exact_map(table(0.1, 1.1), label_error_m=0.03)
+    write_map(record, path, feature_dtype="<f4", stamp_ns=10**18)
+    assert main([str(path), "--plot", str(picture)]) == 0
+    assert "map 'ground'" in capsys.readouterr().out
+    pixels = read_picture(picture)
+    coverage = pixels[:, : pixels.shape[1] // 3]
+    ground, top = (share(coverage, colormaps["viridis"](end)[:3]) for end in (0.0, 1.0))
+    assert top / ground == pytest.approx(4.0 / 96.0, rel=0.1)
+
+
+def test_pictures_of_maps_that_lack_something(tmp_path):
+    deltas = write_checkpoints(tmp_path, (9, 12))
+    write_map(random_record(indices=()), tmp_path / "empty.triquad")
+    write_map(random_record(1, training=False), tmp_path / "plain.triquad")
+    for path in (*deltas, tmp_path / "empty.triquad", tmp_path / "plain.triquad"):
+        assert main([str(path), "--plot", str(tmp_path / "a.png"), "--json"]) == 0
+        assert read_picture(tmp_path / "a.png").shape[0] > 300
+
+
+def test_picture_of_a_difference(tmp_path):
+    for name, height in (("a", flat(0.1)), ("b", table(0.1, 1.1))):
+        write_map(exact_map(height), tmp_path / f"{name}.triquad", feature_dtype="<f4")
+    a, b = str(tmp_path / "a.triquad"), str(tmp_path / "b.triquad")
+    shares = {}
+    for first, second in ((a, b), (b, a), (a, a)):
+        picture = tmp_path / "diff.png"
+        assert main([first, second, "--diff", "--plot", str(picture)]) == 0
+        pixels = read_picture(picture)
+        shares[first, second] = [share(pixels, colour) for colour in (ADDED, GONE)]
+    legend = shares[a, a]  # which has all colours
+    assert shares[a, b][0] > 20 * legend[0]
+    assert shares[a, b][1] == pytest.approx(legend[1])
+    assert shares[b, a][1] > 20 * legend[1]
+    assert shares[b, a][0] == pytest.approx(legend[0])
+
+
+def test_picture_of_a_slice(tmp_path, capsys):
+    path, picture = tmp_path / "map.triquad", tmp_path / "slice.png"
+    write_map(exact_map(flat(0.1)), path, feature_dtype="<f4")
+    command = [str(path), "--plot", str(picture), "--slice"]
+    assert main([*command, "0.1"]) == 0
+    at_ground = read_picture(picture)
+    assert main([*command, "1.5", "--box", "-4", "-4", "4", "4", "--cell", "0.05"]) == 0
+    above = read_picture(picture)
+    assert share(at_ground, SURFACE) > 20 * share(above, SURFACE)
+    assert share(above, FREE) > 20 * share(at_ground, FREE)
+    assert main(["tcp/127.0.0.1:7447", "--plot", str(picture), "--slice", "1"]) == 2
+    assert "needs --box" in capsys.readouterr().err
+    assert main([str(path), "--slice", "1"]) == 2
+    assert "--slice needs --plot" in capsys.readouterr().err

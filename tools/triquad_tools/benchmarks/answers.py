@@ -1,0 +1,131 @@
+"""``triquad-bench`` of answers: how true they are, how they are told from what is not known."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
+from triquad_format.records.region import MapRecord
+from triquad_format.records.status import Status
+from triquad_map.questions.distance import DistanceOptions, Distances, distances
+from triquad_map.questions.spheres import spheres
+from triquad_map.surface.confidence import level_confidence
+from triquad_map.view import MapView
+
+from triquad_tools.benchmarks.answer_probes import AnswerProbes, answer_probes
+from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.evaluation.map_scores import DrivenStreet
+from triquad_tools.simulation.scene import Scene
+
+REACH_M = 5.0
+_NEAR_M = 0.3  # gradients are scored beyond
+_BEHIND_M = 0.3  # how far behind surfaces distances are scored
+_BALL_M = 0.2
+_ASKED = 120_000
+_LEAST_IN_BIN = 200
+
+
+def measure_answers(street: DrivenStreet, record: MapRecord, view: MapView) -> list[Figure]:
+    """Figures of a map of ``street``, its ``record`` and what answers from it."""
+    rng = np.random.default_rng(0)
+    probes = answer_probes(street, record, rng)
+    return (
+        _distances(street.drive.scene, probes, view, rng)
+        + _unknown(probes, view)
+        + _corridor(probes, view)
+    )
+
+
+def _distances(
+    scene: Scene, probes: AnswerProbes, view: MapView, rng: np.random.Generator
+) -> list[Figure]:
+    points = probes.seen_free[rng.permutation(len(probes.seen_free))[:_ASKED]]
+    truth = scene.sdf(points)
+    inside = (truth <= REACH_M) & (truth > -_BEHIND_M)
+    points, truth = points[inside], truth[inside]
+    slopes = scene.gradient(points)
+    answer = distances(view, points, DistanceOptions(REACH_M, unknown_distance=True))
+    feet_seen = view.status(points - truth[:, None] * slopes) == Status.SURFACE
+    assert answer.unknown_distance_m is not None
+    # What a planner can tell from the answer itself.
+    known = answer.unknown_distance_m >= answer.distance_m
+    figures = [Figure("points to which a surface is nearer than unknown space",
+                      100 * known.mean(), "%")]  # fmt: skip
+    figures += _errors("known space", answer, truth, slopes, known, (5.0, 12.0, 0.15))
+    figures += _errors("nearest surface seen", answer, truth, slopes, feet_seen, None)
+    wary = np.minimum(answer.distance_m, answer.unknown_distance_m) - truth
+    figures += [
+        Figure("all, unknown as an obstacle: too large, 99.9 %", np.quantile(wary, 0.999), "m"),
+        Figure("all, unknown as an obstacle: share too large by a voxel",
+               100 * (wary > view.voxel_m).mean(), "%"),
+        Figure("all, unknown as an obstacle: too large at most", wary.max(), "m"),
+    ]  # fmt: skip
+    return figures + _calibration(answer, truth, feet_seen)
+
+
+def _errors(
+    name: str,
+    answer: Distances,
+    truth: NDArray[np.float64],
+    slopes: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+    bounds: tuple[float, float, float] | None,
+) -> list[Figure]:
+    error = (answer.distance_m - truth)[chosen]
+    away = chosen & (truth > _NEAR_M)
+    aligned = (answer.gradient[away] * slopes[away]).sum(axis=1) >= np.cos(np.deg2rad(10.0))
+    mean_cm, tail_cm, most_m = bounds or (None, None, None)
+    return [
+        Figure(f"{name}: distance error, mean", 100 * np.abs(error).mean(), "cm", at_most=mean_cm),
+        Figure(f"{name}: distance error, 99 %", 100 * np.quantile(np.abs(error), 0.99), "cm",
+               at_most=tail_cm),
+        Figure(f"{name}: too large at most", error.max(), "m", at_most=most_m),
+        Figure(f"{name}: too large by 0.15 m", 100 * (error > 0.15).mean(), "%"),
+        Figure(f"{name}: gradient within 10 degrees, outside 0.3 m", 100 * aligned.mean(), "%",
+               at_least=90.0 if bounds else None),
+    ]  # fmt: skip
+
+
+def _calibration(
+    answer: Distances, truth: NDArray[np.float64], chosen: NDArray[np.bool_]
+) -> list[Figure]:
+    """Whether errors fall as the stated confidence rises."""
+    chosen = chosen & answer.found
+    error = np.abs(answer.distance_m - truth)[chosen]
+    levels = level_confidence()
+    edges = np.concatenate([[0.0], (levels[1:] + levels[:-1]) / 2, [1.01]])
+    means = []
+    figures = []
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        there = (answer.confidence[chosen] >= low) & (answer.confidence[chosen] < high)
+        if there.sum() >= _LEAST_IN_BIN:
+            means.append(float(error[there].mean()))
+            name = f"confidence {low:.2f} to {min(1.0, high):.2f}: error, mean"
+            figures.append(Figure(name, 100 * means[-1], "cm"))
+    rank = spearmanr(np.arange(len(means)), means).statistic if len(means) > 1 else np.nan
+    return [*figures, Figure("rank correlation of error and confidence", rank, "", at_most=-0.8)]
+
+
+def _unknown(probes: AnswerProbes, view: MapView) -> list[Figure]:
+    def share(points: NDArray[np.float64]) -> float:
+        return float(100 * (view.status(points) == Status.UNKNOWN).mean())
+
+    return [
+        Figure(f"{len(probes.never_seen)} never-seen points: unknown", share(probes.never_seen),
+               "%", at_least=99),
+        Figure(f"{len(probes.seen_free)} points on rays: unknown", share(probes.seen_free), "%",
+               at_most=1),
+        Figure(f"{len(probes.ghosts)} ghosts of three planes: unknown", share(probes.ghosts), "%",
+               at_least=100),
+    ]  # fmt: skip
+
+
+def _corridor(probes: AnswerProbes, view: MapView) -> list[Figure]:
+    """Obstacles around the way of the sensor, where there are none."""
+    balls = spheres(view, probes.corridor, np.full(len(probes.corridor), _BALL_M))
+    answer = distances(view, probes.corridor, DistanceOptions(REACH_M))
+    false = (balls.status == Status.SURFACE) | (answer.distance_m <= 0)
+    return [
+        Figure(f"{len(probes.corridor)} balls in the corridor: false obstacles",
+               float(false.sum()), "", at_most=0),
+        Figure("balls in the corridor: unknown", 100 * (balls.status == Status.UNKNOWN).mean(),
+               "%"),
+    ]  # fmt: skip

@@ -1,0 +1,172 @@
+"""``triquad-bench`` of planners: one, sixteen at once while a lidar streams, and a frozen one."""
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+from triquad_format.mapfile.reader import read_map
+from triquad_format.wire import keys
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
+
+from triquad_tools.benchmarks.answers import REACH_M, measure_answers
+from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.served import MAP, Served, served, stream
+from triquad_tools.benchmarks.street import BenchStreet
+from triquad_tools.console.settling import wait_until_settled
+from triquad_tools.demo.probe import ProbeReport
+
+Points = NDArray[np.float64]
+
+_ASKED = 1_000
+_CLIENTS = 16
+_SETTLE_LIMIT_S = 600.0
+_WARM_S = 3.0  # until sixteen processes have started
+_FREEZE_AFTER_S = 0.5
+_FROZEN = """
+import sys, triquad_client
+with triquad_client.connect(sys.argv[1], sys.argv[2], timeout_s=60.0) as client:
+    print("asking", flush=True)
+    while True:
+        client.mesh()
+"""
+
+
+def measure_planners(made: BenchStreet) -> list[Figure]:
+    """Figures of answers, and of how soon they come."""
+    with served() as server:
+        points = _planner_points(made)
+        figures = _one(server, made, points[0])
+        figures += _sixteen(server, made, points)
+        figures += _beside_frozen(server, points[0])
+        wait_until_settled(server.client, _SETTLE_LIMIT_S)
+        server.client.download_map(server.folder / "map.triquad")
+        record = read_map(server.folder / "map.triquad")
+    view = Mapper(MAP, Settings(), "cpu", record).publish()
+    return measure_answers(made, record, view) + figures
+
+
+def _planner_points(made: BenchStreet) -> list[Points]:
+    """What each planner asks: points around one place of the drive each."""
+    rng = np.random.default_rng(0)
+    poses = made.drive.poses[np.arange(_CLIENTS) * len(made.drive.poses) // _CLIENTS]
+    return [pose[:3, 3] + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (_ASKED, 3)) for pose in poses]
+
+
+def _trained_per_s(server: Served, made: BenchStreet, title: str) -> float:
+    """Stream all scans; returns how many samples were trained each second meanwhile."""
+    before = server.client.status().samples_trained
+    started = time.monotonic()
+    stream(server.client, made.scans, title)
+    trained = server.client.status().samples_trained - before
+    return trained / (time.monotonic() - started)
+
+
+def _one(server: Served, made: BenchStreet, points: Points) -> list[Figure]:
+    stream(server.client, made.scans, "streaming alone at first")
+    with server.planner(points, "distance") as probe:
+        time.sleep(_WARM_S)
+        stream(server.client, made.scans, "streaming beside one planner")
+        met = probe.finish()
+    name = f"{_ASKED} distances to {REACH_M:g} m with gradient while streaming"
+    return [
+        Figure(f"{name}, median", met.latency_p50_ms, "ms", at_most=5),
+        Figure(f"{name}, 99 %", met.latency_p99_ms, "ms", at_most=20),
+        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms"),
+        Figure(f"{name}, errors", met.errors, "", at_most=0),
+    ]
+
+
+def _sixteen(server: Served, made: BenchStreet, points: Sequence[Points]) -> list[Figure]:
+    alone = _trained_per_s(server, made, "streaming alone")
+    figures = [Figure("samples trained while streaming alone", alone / 1e6, "M/s")]
+    for question in ("gradient", "distance"):
+        with ExitStack() as probes:
+            asking = [probes.enter_context(server.planner(each, question)) for each in points]
+            time.sleep(2 * _WARM_S)
+            title = f"streaming beside {_CLIENTS} planners ({question})"
+            trained = _trained_per_s(server, made, title)
+            met = [probe.finish() for probe in asking]
+        name = f"{_CLIENTS} clients, {question}"
+        figures += _met_together(name, met)
+        figures.append(Figure(f"{name}: training keeps", trained / alone, "", at_least=0.5))
+    return figures
+
+
+def _met_together(name: str, met: Sequence[ProbeReport]) -> list[Figure]:
+    return [
+        Figure(f"{name}: queries of {_ASKED} points", sum(report.queries for report in met), ""),
+        Figure(f"{name}: errors", sum(report.errors for report in met), "", at_most=0),
+        Figure(f"{name}: median of the clients' medians",
+               float(np.median([report.latency_p50_ms for report in met])), "ms"),
+        Figure(f"{name}: 99 % of the worst client",
+               max(report.latency_p99_ms for report in met), "ms", at_most=60),
+    ]  # fmt: skip
+
+
+def _beside_frozen(server: Served, points: Points) -> list[Figure]:
+    """What a client that freezes in the middle of a mesh does to the others."""
+    wait_until_settled(server.client, _SETTLE_LIMIT_S)
+
+    def ask() -> tuple[ProbeReport, int]:
+        with server.planner(points, "distance") as probe, _samples(server.endpoint) as count:
+            time.sleep(15.0)
+            return probe.finish(), count()
+
+    with _mesh_reader(server.endpoint) as reader:
+        beside, samples = ask()
+        reader.send_signal(signal.SIGSTOP)
+        frozen, frozen_samples = ask()
+    ratio = frozen.latency_p99_ms / beside.latency_p99_ms
+    return [
+        Figure("beside a client that fetches meshes, 99 %", beside.latency_p99_ms, "ms"),
+        Figure("beside one frozen in the middle of a mesh, 99 %", frozen.latency_p99_ms, "ms"),
+        Figure("the same, times", ratio, "", at_most=1.5),
+        Figure("the same, errors", frozen.errors, "", at_most=0),
+        Figure("status samples lost meanwhile", max(0, samples - frozen_samples - 1), "",
+               at_most=0),
+    ]  # fmt: skip
+
+
+@contextmanager
+def _mesh_reader(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
+    """A process that fetches meshes all the time."""
+    command = [sys.executable, "-c", _FROZEN, endpoint, MAP]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            process.stdout.readline()
+            time.sleep(_FREEZE_AFTER_S)
+            yield process
+        finally:
+            process.kill()
+
+
+@contextmanager
+def _samples(endpoint: str) -> Iterator[Callable[[], int]]:
+    """Counts the status samples that come."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+    lock = threading.Lock()
+    received = 0
+
+    def take(_sample: zenoh.Sample) -> None:
+        nonlocal received
+        with lock:
+            received += 1
+
+    with zenoh.open(config) as session:
+        subscriber = session.declare_subscriber(
+            keys.status_key(MAP), zenoh.handlers.Callback(take, indirect=False)
+        )
+        yield lambda: received
+        subscriber.undeclare()

@@ -1,0 +1,89 @@
+"""A server process for ``triquad-bench``, with a client, and a lidar that streams to it."""
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_client import Client, connect
+from triquad_format.mapfile.checkpoint_folder import checkpoint_name
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.region import MapRecord
+
+from triquad_tools.benchmarks.street import BenchStreet, PosedScan
+from triquad_tools.console.progress import progress
+from triquad_tools.demo.probe import Probe, ProbeReport
+from triquad_tools.demo.server import DemoServer, ServerOptions
+
+MAP = "bench"
+
+_RATE_HZ = 10.0
+_TIMEOUT_S = 60.0
+_ASKED = 1_000
+
+
+@dataclass(frozen=True)
+class Served:
+    """A running server."""
+
+    folder: Path  # for whatever is measured
+    endpoint: str
+    client: Client
+
+    def another_client(self) -> Client:
+        """A client of its own, for a ``with`` statement."""
+        return connect(self.endpoint, MAP, timeout_s=_TIMEOUT_S)
+
+    def planner(self, points: NDArray[np.float64], question: str) -> Probe:
+        """A process that asks a question at points [N, 3], for a ``with`` statement."""
+        with tempfile.NamedTemporaryFile(dir=self.folder, suffix=".npy", delete=False) as file:
+            np.save(file, points)
+        return Probe(self.endpoint, MAP, Path(file.name), question)
+
+
+@contextmanager
+def served(record: MapRecord | None = None) -> Iterator[Served]:
+    """A server with an empty map, or with that of a record, in a folder that goes in the end."""
+    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
+        folder = Path(name)
+        options = ServerOptions.within(folder, MAP)
+        if record is not None:
+            store = options.store / MAP
+            store.mkdir(parents=True)
+            write_map(record, store / checkpoint_name(record.epoch, complete=True))
+        with (
+            DemoServer(options) as server,
+            connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client,
+        ):
+            yield Served(folder, server.endpoint, client)
+
+
+def stream(
+    client: Client,
+    scans: Sequence[PosedScan],
+    title: str = "streaming at 10 Hz",
+    published: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Publish scans as a lidar does; ``published`` is told the number of each."""
+    started, stamp_s = time.monotonic(), time.time()
+    with progress(title, len(scans)) as report:
+        for number, scan in enumerate(scans):
+            due_s = number / _RATE_HZ
+            time.sleep(max(0.0, started + due_s - time.monotonic()))
+            client.publish_scan(scan.points, scan.world_from_sensor, stamp_s + due_s)
+            published(number)
+            report(number + 1, f"{number + 1} of {len(scans)} scans")
+
+
+def stream_beside_planner(
+    server: Served, made: BenchStreet, published: Callable[[int], None] = lambda _: None
+) -> ProbeReport:
+    """Stream the street while a planner asks for 1,000 gradients, and say what it met."""
+    points = np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
+    with server.planner(points, "gradient") as probe:
+        stream(server.client, made.scans, published=published)
+        return probe.finish()

@@ -1,0 +1,68 @@
+"""The drive that everything in ``triquad-bench`` is measured on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
+
+from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
+from triquad_tools.simulation.street import street
+
+SCANS = 100
+_LENGTH_M = 110.0  # so that the map has some 2 million parameters
+_COLUMNS = 1024  # some 60,000 points a scan
+_VISIBLE_VOXEL_M = 0.05
+
+
+class PosedScan(Protocol):
+    """A scan and where it was taken."""
+
+    @property
+    def points(self) -> NDArray[np.floating]:
+        """``[N, 3]`` metres, sensor frame."""
+
+    @property
+    def world_from_sensor(self) -> NDArray[np.float64]:
+        """``[4, 4]``."""
+
+
+@dataclass(frozen=True)
+class BenchStreet(DrivenStreet):
+    """A drive of 10 s, and the truth about it."""
+
+    visible: NDArray[np.float64]  # [M, 3] exact surface points that the lidar hit
+
+
+def bench_street(seed: int) -> BenchStreet:
+    """100 scans along the exact street ``seed``."""
+    scene = street(seed, _LENGTH_M)
+    poses = drive(scene, SCANS, _LENGTH_M / SCANS)
+    driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed))
+    visible = driven.drive.true_hits(_VISIBLE_VOXEL_M)
+    low, high = scene.bounds  # to which meshes are cut
+    visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
+    return BenchStreet(driven.drive, driven.scans, driven.probes, visible)
+
+
+def settled_mapper(
+    name: str, scans: Sequence[PosedScan], settings: Settings | None = None
+) -> Mapper:
+    """A mapper that has learnt all it can of some scans; ``name`` is told while one waits."""
+    settings = settings or Settings()
+    warm_up(settings, "cpu")
+    mapper = Mapper("bench", settings, "cpu")
+    with progress(f"mapping {name}", len(scans) + 1) as report:
+        for number, scan in enumerate(scans):
+            mapper.ingest(scan.points, scan.world_from_sensor)
+            report(number, f"scan {number}")
+        while not mapper.settled:
+            mapper.train()
+        report(len(scans) + 1, "settled")
+    return mapper

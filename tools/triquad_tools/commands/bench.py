@@ -1,0 +1,165 @@
+"""``triquad-bench``: how fast and how good triquad is on this machine."""
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from triquad_tools.console.arguments import count, positive, seed
+from triquad_tools.console.command import (
+    BAD_INPUT,
+    OK,
+    ToolError,
+    complain,
+    run,
+    sigterm_interrupts,
+)
+from triquad_tools.console.report import Row, json_text, print_rows
+
+if TYPE_CHECKING:
+    from triquad_tools.benchmarks.figures import Figure
+    from triquad_tools.benchmarks.street import BenchStreet
+
+_COMMAND = "triquad-bench"
+_ON_STREET = ("core", "server", "file", "store", "mesh", "answers", "align", "offline")
+USUAL_PARTS = (*_ON_STREET, "growth")
+PARTS = (*USUAL_PARTS, "ablation")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool: 0 done, whatever the figures; 1 a part failed; 2 wrong usage."""
+    options = _parser().parse_args(argv)
+    for path in (options.json, options.record):
+        if path is not None and not os.access(path.parent, os.W_OK):
+            message = f"{path}: cannot be written: choose another folder"
+            return complain(_COMMAND, message, BAD_INPUT)
+    with sigterm_interrupts():
+        return run(_COMMAND, partial(_bench, options), failures=(ToolError, OSError))
+
+
+def _bench(options: argparse.Namespace) -> int:
+    parts = options.parts or USUAL_PARTS
+    figures = _on_street([part for part in _ON_STREET if part in parts], options)
+    if "growth" in parts:
+        figures += _growth(options.seed)
+    if "ablation" in parts:
+        from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
+
+        figures += measure_ablation(options.seed, options.scans, options.step)
+    _present(figures, options)
+    return OK
+
+
+def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
+    """The figures of parts that are measured on one drive, each after the other."""
+    if not parts:
+        return []
+    from triquad_tools.benchmarks.align import measure_align  # slow to import
+    from triquad_tools.benchmarks.core import measure_core
+    from triquad_tools.benchmarks.file import measure_file
+    from triquad_tools.benchmarks.mesh import measure_mesh
+    from triquad_tools.benchmarks.offline import measure_offline
+    from triquad_tools.benchmarks.planners import measure_planners
+    from triquad_tools.benchmarks.server import measure_server
+    from triquad_tools.benchmarks.store import measure_store
+    from triquad_tools.benchmarks.street import bench_street
+
+    measures: dict[str, Callable[[BenchStreet], list[Figure]]] = {
+        "core": measure_core,
+        "server": measure_server,
+        "file": measure_file,
+        "store": measure_store,
+        "mesh": measure_mesh,
+        "answers": measure_planners,
+        "align": partial(measure_align, folder=options.recorded),
+        "offline": measure_offline,
+    }
+    made = bench_street(options.seed)
+    return [figure for part in parts for figure in measures[part](made)]
+
+
+def _growth(street_seed: int) -> "list[Figure]":
+    """Measured in a process of its own, whose memory nothing else has used."""
+    from triquad_tools.benchmarks.figures import Figure
+
+    command = [sys.executable, "-m", "triquad_tools.benchmarks.growth", str(street_seed)]
+    result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if result.returncode != 0:
+        raise ToolError(f"the part growth ended with exit code {result.returncode}")
+    return [Figure(**entry) for entry in json.loads(result.stdout)]
+
+
+def machine() -> str:
+    """The machine in words."""
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                name = line.partition(":")[2].strip()
+                break
+    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def _present(figures: "list[Figure]", options: argparse.Namespace) -> None:
+    from triquad_tools.benchmarks.figures import markdown
+
+    title = f"{datetime.date.today().isoformat()}, {machine()}, street {options.seed}"
+    rows = [Row(figure.name, figure.shown, _note(figure)) for figure in figures]
+    print_rows(title, rows)
+    if options.json is not None:
+        result = {"title": title, "figures": [asdict(figure) for figure in figures]}
+        options.json.write_text(json_text(result) + "\n", encoding="utf-8")
+    if options.record is not None:
+        with options.record.open("a", encoding="utf-8") as page:
+            page.write("\n" + markdown(title, figures))
+
+
+def _note(figure: "Figure") -> str:
+    if not figure.wanted:
+        return ""
+    return f"{figure.wanted}: {'yes' if figure.kept else 'NO'}"
+
+
+def _part(name: str) -> str:
+    if name not in PARTS:
+        raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(PARTS)}")
+    return name
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=_COMMAND,
+        description="Measure triquad on this machine, on a simulated street: a server under a "
+        "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
+        "file, checkpoints, mesh tiles, answers to planners, scans put back in place, and maps "
+        "opened offline. Takes a quarter of an hour; nothing else should run meanwhile.",
+        epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
+    )
+    add = parser.add_argument
+    add(
+        "parts",
+        nargs="*",
+        type=_part,
+        metavar="PART",
+        help=f"of {', '.join(PARTS)} (default: all but the ablation)",
+    )
+    add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
+    add("--recorded", type=Path, metavar="FOLDER", help="KITTI-style scans to align, too")
+    add("--scans", type=count, default=60, metavar="N", help="of the ablation (default: 60)")
+    add("--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)")
+    add("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    add("--record", type=Path, metavar="FILE.md", help="add a table to this page")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

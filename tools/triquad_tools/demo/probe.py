@@ -1,0 +1,157 @@
+"""A robot's planner in the demonstration: a process that asks for distances all the time.
+
+It asks for the same points some 20 times a second, until its standard input ends; then it prints
+what it met, as JSON.
+"""
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_tools.console.command import ToolError
+
+if TYPE_CHECKING:
+    from triquad_client import Client
+
+PERIOD_S = 0.05
+_STOP_TIMEOUT_S = 60.0
+
+
+QUESTIONS: "dict[str, Callable[[Client, NDArray[np.float64]], int]]" = {
+    "sdf": lambda client, points: client.query_sdf(points).epoch,
+    "gradient": lambda client, points: client.query_sdf(points, gradient=True).epoch,
+    "distance": lambda client, points: client.query_distance(points).epoch,
+}
+"""What the planner may ask; each returns the epoch that answered."""
+
+
+class ProbeError(ToolError):
+    """A process of queries that failed."""
+
+
+@dataclass(frozen=True)
+class ProbeReport:
+    """What the planner met; latencies are NaN where no query was answered."""
+
+    queries: int
+    errors: int
+    last_error: str | None
+    epochs: int  # different ones that answered
+    epochs_backwards: int  # answers from an older epoch than the one before
+    points: int  # of one query
+    latency_p50_ms: float
+    latency_p95_ms: float
+    latency_p99_ms: float
+    latency_max_ms: float
+
+
+class Probe:
+    """The planner's process; leaving the ``with`` statement ends it in any case."""
+
+    def __init__(self, endpoint: str, map_name: str, points: Path, question: str = "sdf") -> None:
+        """Start to ask a question of ``QUESTIONS`` at ``points``, an ``.npy`` file ``[N, 3]``."""
+        command = [sys.executable, "-m", __name__, endpoint, map_name, str(points), question]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def __enter__(self) -> "Probe":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.__exit__(None, None, None)
+
+    def finish(self) -> ProbeReport:
+        """End the queries and say what they met.
+
+        Raises:
+            ProbeError: the process failed.
+        """
+        try:
+            output, _ = self._process.communicate(timeout=_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            raise ProbeError(f"the queries did not end within {_STOP_TIMEOUT_S:g} s") from None
+        if self._process.returncode != 0:
+            raise ProbeError(f"the queries ended with exit code {self._process.returncode}")
+        return ProbeReport(**json.loads(output))
+
+
+def ask_until(
+    stop: threading.Event,
+    client: "Client",
+    points: NDArray[np.float64],
+    question: str = "sdf",
+) -> ProbeReport:
+    """Ask a question of ``QUESTIONS`` at ``points`` [N, 3] until ``stop`` is set."""
+    from triquad_client import TriquadError
+
+    latencies_s: list[float] = []
+    epochs: list[int] = []
+    errors = 0
+    last_error = None
+    while not stop.is_set():
+        started = time.perf_counter()
+        try:
+            epochs.append(QUESTIONS[question](client, points))
+            latencies_s.append(time.perf_counter() - started)
+        except TriquadError as error:
+            errors += 1
+            last_error = f"{type(error).__name__}: {error}"
+        stop.wait(PERIOD_S - (time.perf_counter() - started))
+    return _report(latencies_s, epochs, errors, last_error, len(points))
+
+
+def _report(
+    latencies_s: Sequence[float],
+    epochs: Sequence[int],
+    errors: int,
+    last_error: str | None,
+    points: int,
+) -> ProbeReport:
+    quantiles = [float("nan")] * 4
+    if latencies_s:
+        quantiles = (1e3 * np.quantile(latencies_s, [0.5, 0.95, 0.99, 1.0])).tolist()
+    return ProbeReport(
+        len(latencies_s) + errors,
+        errors,
+        last_error,
+        len(set(epochs)),
+        sum(later < before for before, later in zip(epochs, epochs[1:], strict=False)),
+        points,
+        *quantiles,
+    )
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the process; ``argv`` is endpoint, map, file of points and question."""
+    from triquad_client import connect
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    endpoint, map_name, points, question = argv
+    stop = threading.Event()
+
+    def wait_for_end() -> None:
+        sys.stdin.read()
+        stop.set()
+
+    threading.Thread(target=wait_for_end, daemon=True).start()
+    with connect(endpoint, map_name) as client:
+        report = ask_until(stop, client, np.load(points), question)
+    print(json.dumps(asdict(report)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,126 @@
+"""The demonstration's server: a ``triquad-server`` process of its own."""
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_tools.console.command import ToolError
+
+_READY_TIMEOUT_S = 300.0  # kernels are compiled on the first start
+_STOP_TIMEOUT_S = 60.0
+
+
+class DemoServerError(ToolError):
+    """A server that does not start, or does not stop."""
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """What the server is started with."""
+
+    endpoint: str
+    map_name: str
+    store: Path
+    log: Path  # its log is added to this file
+
+    @classmethod
+    def within(cls, folder: Path, map_name: str) -> "ServerOptions":
+        """On a free port, with store and log in a folder."""
+        return cls(_free_endpoint(), map_name, folder / "store", folder / "server.log")
+
+
+def _free_endpoint() -> str:
+    """An endpoint on a port of the loopback that nothing uses."""
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class DemoServer:
+    """A running server; leaving the ``with`` statement stops it in any case."""
+
+    def __init__(self, options: ServerOptions) -> None:
+        """Start the process and wait until it is ready.
+
+        Raises:
+            DemoServerError: it ended before, or took too long.
+        """
+        self.endpoint = options.endpoint
+        self._options = options
+        self._started = threading.Event()  # ready, or ended
+        self._ready = False
+        self._last_line = "it said nothing"
+        command = [sys.executable, "-m", "triquad_server.cli", "--listen", options.endpoint]
+        command += ["--map", options.map_name, "--store", str(options.store)]
+        command += ["--no-multicast-scouting"]
+        self._process = subprocess.Popen(
+            command, stderr=subprocess.PIPE, text=True, errors="replace"
+        )
+        self._reader = threading.Thread(target=self._read_log, name="server log")
+        self._reader.start()
+        try:
+            self._wait_until_ready()
+        except BaseException:
+            self._end()
+            raise
+
+    def __enter__(self) -> "DemoServer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def stop(self) -> None:
+        """Ask the server to stop and wait for it.
+
+        Raises:
+            DemoServerError: it did not stop, or not in good order.
+        """
+        self._process.send_signal(signal.SIGTERM)
+        try:
+            code = self._process.wait(_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            raise DemoServerError(
+                f"the server did not stop within {_STOP_TIMEOUT_S:g} s of SIGTERM; its log is "
+                f"{self._options.log}"
+            ) from None
+        if code != 0:
+            raise self._failure(f"the server stopped with exit code {code}")
+
+    def _wait_until_ready(self) -> None:
+        if not self._started.wait(_READY_TIMEOUT_S):
+            raise self._failure(f"the server is not ready after {_READY_TIMEOUT_S:g} s")
+        if not self._ready:
+            raise self._failure("the server did not start")
+
+    def _failure(self, what: str) -> DemoServerError:
+        return DemoServerError(f"{what}: {self._last_line}; its log is {self._options.log}")
+
+    def _read_log(self) -> None:
+        assert self._process.stderr is not None
+        with self._options.log.open("a", encoding="utf-8") as log:
+            for line in self._process.stderr:
+                log.write(line)
+                log.flush()
+                self._last_line = line.strip()
+                if " ready: " in line:
+                    self._ready = True
+                    self._started.set()
+        self._started.set()
+
+    def _end(self) -> None:
+        """Stop the process, the hard way where it does not listen."""
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(_STOP_TIMEOUT_S)
+            except BaseException:  # also a second Ctrl-C: nothing may stay behind
+                self._process.kill()
+                self._process.wait()
+        self._reader.join()
+        self._process.__exit__(None, None, None)

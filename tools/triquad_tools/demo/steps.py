@@ -1,0 +1,161 @@
+"""The steps of the demonstration, each against a running server."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.image import imsave
+from numpy.typing import NDArray
+from triquad_client import CheckpointInfo, Client, Mesh, SdfResult, connect
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.crop import without_training
+from triquad_server.mesh.preview import previews_of
+
+from triquad_tools.console.progress import progress
+from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
+from triquad_tools.demo.probe import Probe, ProbeReport
+from triquad_tools.demo.results import Intake, MapSize, Restart
+from triquad_tools.evaluation.map_scores import (
+    DrivenStreet,
+    StreetScores,
+    driven_street,
+    score_street,
+)
+from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
+from triquad_tools.plots.camera import Camera
+from triquad_tools.plots.render import height_colours, render_mesh
+from triquad_tools.simulation.street import street_drive
+
+MAP = "demo"
+
+_SEED = 0  # of the points that are asked
+_SETTLE_LIMIT_S = 70.0
+_QUERY_POINTS = 1_000
+_RESTART_POINTS = 50_000
+_MESH_SAMPLES = 3_000_000
+_VISIBLE_VOXEL_M = 0.05
+
+# The picture: over the start of the drive, down the street.
+_EYE_M = (-14.0, 0.8, 12.0)
+_TARGET_M = (17.0, -0.3, 0.3)
+_VIEW_DEG = 46.0
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """How the server took in a street while it was asked."""
+
+    intake: Intake
+    queries: ProbeReport
+
+
+@dataclass(frozen=True)
+class Scored:
+    """How good the map is, and what the server said before it was stopped."""
+
+    street: StreetScores
+    mesh: MeshScores
+    surface: Mesh
+    parameters: int
+    checkpoint: CheckpointInfo
+    points: NDArray[np.float64]  # [N, 3] where it was asked
+    answers: SdfResult
+
+
+def simulate(scans: int, seed: int) -> DrivenStreet:
+    """Drive along a street with a simulated lidar."""
+    return driven_street(street_drive(seed, scans))
+
+
+def learn(endpoint: str, street: DrivenStreet, out: Path) -> Learnt:
+    """Stream the scans and wait until they are learnt, while another process asks."""
+    rng = np.random.default_rng(_SEED)
+    asked = out / "query_points.npy"
+    np.save(asked, rng.permutation(street.probes.near)[:_QUERY_POINTS])
+    try:
+        with connect(endpoint, MAP) as client, Probe(endpoint, MAP, asked) as probe:
+            intake = _stream(client, street)
+            return Learnt(intake, probe.finish())
+    finally:
+        asked.unlink()
+
+
+def _stream(client: Client, street: DrivenStreet) -> Intake:
+    started = time.monotonic()
+    start_s = time.time()
+    with progress("streaming scans", len(street.scans)) as report:
+        for index, scan in enumerate(street.scans):
+            stamp_s = start_s + street.drive.stamp_ns(index) / 1e9
+            client.publish_scan(scan.points, scan.world_from_sensor, stamp_s)
+            keep_few_pending(client, index + 1)
+            report(index + 1, f"{index + 1} of {len(street.scans)} scans")
+        flush = client.flush(FLUSH_TIMEOUT_S)
+    taken_in = time.monotonic()
+    status = wait_until_settled(client, _SETTLE_LIMIT_S)
+    return Intake(
+        scans=len(street.scans),
+        taken=flush.taken,
+        refused=flush.refused,
+        lost=flush.lost,
+        points=sum(len(scan.points) for scan in street.scans),
+        seconds=taken_in - started,
+        learning_s=time.monotonic() - started,
+        settled=status.settled,
+        samples_trained=status.samples_trained,
+    )
+
+
+def score(endpoint: str, street: DrivenStreet) -> Scored:
+    """Compare the map with the exact street, and have the server write it to its store."""
+    rng = np.random.default_rng(_SEED)
+    points = rng.permutation(street.probes.near)[:_RESTART_POINTS]
+    scene = street.drive.scene
+    with connect(endpoint, MAP) as client, progress("scoring") as report:
+        report(0.0, "distances")
+        field = score_street(client.query_sdf, street.probes)
+        report(0.0, "mesh")
+        surface = client.mesh((scene.bounds[0].tolist(), scene.bounds[1].tolist()))
+        checkpoint = client.checkpoint()
+        answers = client.query_sdf(points)
+        parameters = client.status().parameters
+        report(0.0, "mesh against the exact surface")
+        settings = ScoreSettings(samples_max=_MESH_SAMPLES)
+        visible = street.drive.true_hits(_VISIBLE_VOXEL_M)
+        scores = score_against_scene(surface, scene, visible, settings)
+        report(0.0, f"{scores.samples:,} samples of the mesh")
+    return Scored(field, scores, surface, parameters, checkpoint, points, answers)
+
+
+def compare(endpoint: str, scored: Scored) -> Restart:
+    """Ask a restarted server what was asked before."""
+    with connect(endpoint, MAP) as client:
+        answers = client.query_sdf(scored.points)
+    change = np.abs(answers.sdf - scored.answers.sdf)
+    return Restart(
+        points=len(change),
+        sdf_difference_max_m=float(change.max()) if len(change) else 0.0,
+        statuses_changed=int((answers.status != scored.answers.status).sum()),
+    )
+
+
+def pack(scored: Scored, path: Path) -> MapSize:
+    """Write the map without the state that only training needs."""
+    record = without_training(read_map(scored.checkpoint.path))
+    packed = write_map(record, path, previews=previews_of(record))
+    return MapSize(packed.bytes, scored.checkpoint.bytes, scored.parameters)
+
+
+def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
+    """Save the mesh, and a picture of it."""
+    with progress("drawing") as report:
+        for path in paths:
+            report(0.0, path.name)
+            surface.save(path)
+        report(0.0, picture.name)
+        camera = Camera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
+        colours = height_colours(surface.vertices)
+        image = render_mesh(surface.vertices, surface.faces, camera=camera, colours=colours)
+        imsave(picture, image)

@@ -1,0 +1,76 @@
+"""Checks of a map file beyond those that every reading makes."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from triquad_format.mapfile.parts.part import PREFIX, PREVIEW
+from triquad_format.mapfile.reader import MapFile
+from triquad_format.records import morton
+from triquad_format.records.region import BLOCK_VOXELS, MapRecord, region_centre
+from triquad_map.reference.evaluator import MapEvaluator
+
+from triquad_tools.console.command import ToolError
+
+_READER_CHECKS = (
+    "records and checksums",
+    "parts against manifest",
+    "versions and metadata",
+    "shapes, codes and values",
+)
+_PROBES = 10_000
+
+
+class FailedCheckError(ToolError):
+    """A check that a map file fails."""
+
+
+def verify(path: Path, file: MapFile) -> tuple[str, ...]:
+    """What was checked of the file at ``path``, which has been read as ``file``.
+
+    Raises:
+        FailedCheckError: a check fails.
+    """
+    checks = [*_READER_CHECKS, _other_files(file), _mcap_library(path, file), _field(file.record)]
+    return tuple(filter(None, checks))
+
+
+def _other_files(file: MapFile) -> str:
+    """Reading has compared each part with its digest, wherever it lies."""
+    elsewhere = sum(entry.file is not None for entry in file.manifest.entries)
+    return f"{elsewhere} parts in other files" if elsewhere else ""
+
+
+def _mcap_library(path: Path, file: MapFile) -> str:
+    try:
+        with path.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            topics = [channel.topic for _, channel, _ in reader.iter_messages()]
+    except (McapError, ValueError, KeyError, struct.error, OSError) as error:
+        raise FailedCheckError(f"{path}: the mcap library refuses it: {error}") from error
+    parts = sum(topic.startswith(PREFIX) or topic == PREVIEW for topic in topics)
+    wanted = len(file.parts) + 1  # with the manifest
+    if parts != wanted:
+        raise FailedCheckError(f"{path}: the mcap library finds {parts} parts of {wanted}")
+    return f"mcap library: {len(topics)} messages"
+
+
+def _field(record: MapRecord) -> str:
+    """The field is finite at block centres of the evidence."""
+    centres = []
+    for region in record.regions:
+        codes = region.evidence.codes[:: len(region.evidence.codes) // _PROBES + 1]
+        leaves = (morton.decode(codes, 3) + 0.5) * BLOCK_VOXELS
+        offset = leaves * record.settings.leaf_m - record.settings.region_side_m / 2
+        centres.append(offset + region_centre(record.settings, region.index))
+    if not centres:
+        return ""
+    points = np.concatenate(centres)
+    with np.errstate(all="ignore"):  # an overflow is what this checks for
+        answer = MapEvaluator(record).query(points)
+    if not np.isfinite(answer.sdf).all():
+        first = points[int(np.argmin(np.isfinite(answer.sdf)))]
+        raise FailedCheckError(f"the field at {first.tolist()} is not finite")
+    return f"field finite at {len(points)} points"

@@ -1,0 +1,233 @@
+"""Where and by how much two maps differ; ``docs/tools.md`` defines every figure."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.region import MapRecord
+from triquad_format.records.status import Status
+from triquad_map.reference.evaluator import MapEvaluator
+
+from triquad_tools.console.report import print_columns
+from triquad_tools.mapfiles.seen_space import surface_voxels
+
+NEAR_ENOUGH_M = 1e-4
+"""A point this near to the zero of the field is on the surface."""
+
+STILL_M = 1e-3
+"""What moved by less has not moved: several times the error of a surface point."""
+
+NOISE_M = 0.02
+"""Two maps that learnt the same differ by up to this; it does not make a change great."""
+
+_STEPS = 8
+_LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Surface points of one map, and what the other map says of them."""
+
+    points: NDArray[np.float64]  # [N, 3] metres, map frame
+    sdf: NDArray[np.float32]  # [N] metres; NaN where the other map has nothing
+    status: NDArray[np.uint8]  # [N] triquad_format.records.status.Status
+    leaf_m: float  # of the map whose surface it is
+
+    def having(self, status: Status) -> NDArray[np.float64]:
+        """The points of which the other map says ``status``."""
+        points: NDArray[np.float64] = self.points[self.status == status]
+        return points
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two maps, seen from each other."""
+
+    old: Sighting  # surface of the first map, asked in the second
+    new: Sighting  # surface of the second map, asked in the first
+
+
+@dataclass(frozen=True)
+class Change:
+    """How the surface in some volume differs between two maps A and B; counts are of points."""
+
+    points_a: int
+    points_b: int
+    added: int  # of B: A has seen free space there
+    gone: int  # of A: B has seen free space there
+    newly_seen: int  # of B: A has seen nothing there
+    not_seen: int  # of A: B has seen nothing there
+    moved_median_m: float  # of the points of A that B has near its surface; NaN if there are none
+    moved_p95_m: float
+    changed_m3: (
+        float  # size of the change: swept by moves beyond NOISE_M, and what is added and gone
+    )
+
+    @property
+    def differs(self) -> bool:
+        """Whether there is anything to tell."""
+        return (
+            bool(self.added or self.gone or self.newly_seen or self.not_seen)
+            or self.moved_p95_m >= STILL_M
+        )
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """What orders changes: the volume, then how far the surface moved."""
+        return self.changed_m3, 0.0 if np.isnan(self.moved_p95_m) else self.moved_p95_m
+
+
+@dataclass(frozen=True)
+class TileChange:
+    """How two maps differ in one tile."""
+
+    low_m: tuple[float, ...]  # [3] corner, map frame
+    high_m: tuple[float, ...]  # [3] opposite corner
+    change: Change
+
+
+@dataclass(frozen=True)
+class MapDiff:
+    """How two maps differ."""
+
+    tile_m: float
+    total: Change
+    tiles: tuple[TileChange, ...]  # those that differ, the greatest change first
+
+
+def compare(a: MapRecord, b: MapRecord) -> Comparison:
+    """The surface of each of two maps, asked in the other."""
+    return Comparison(_sighting(a, b), _sighting(b, a))
+
+
+def difference(comparison: Comparison, tile_m: float) -> MapDiff:
+    """The figures of a comparison, in all and per cube of side ``tile_m``."""
+    tiles = [tile for tile in _tiles(comparison, tile_m) if tile.change.differs]
+    tiles.sort(key=lambda tile: tile.change.size, reverse=True)
+    return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
+
+
+def surface_points(record: MapRecord) -> NDArray[np.float64]:
+    """Points ``[N, 3]`` where the field is zero, at most one for each voxel where rays ended.
+
+    The middles of these voxels are moved along the gradient by Newton's method. Those that have
+    not come to a zero within a voxel's diagonal, at which the map says ``SURFACE``, are left out.
+    """
+    evaluator = MapEvaluator(record)
+    leaf_m = record.settings.leaf_m
+    middles = surface_voxels(record)
+    points = middles.copy()
+    arrived = np.zeros(len(points), np.bool_)
+    under_way = np.arange(len(points))
+    for _ in range(_STEPS):
+        answer = evaluator.query(points[under_way], gradient=True)
+        assert answer.gradient is not None
+        there = np.abs(answer.sdf) <= NEAR_ENOUGH_M
+        arrived[under_way[there & (answer.status == Status.SURFACE)]] = True
+        steps = _newton_steps(answer.sdf[~there], answer.gradient[~there], leaf_m / 2)
+        under_way = under_way[~there]
+        points[under_way] += steps
+        distance = np.linalg.norm(points[under_way] - middles[under_way], axis=1)
+        under_way = under_way[distance <= math.sqrt(3) * leaf_m]
+    found: NDArray[np.float64] = points[arrived]
+    return found
+
+
+def print_diff(diff: MapDiff, limit: int) -> None:
+    """Print the totals, and a table of the ``limit`` tiles that changed most."""
+    if not diff.tiles:
+        print(f"  no difference at {diff.total.points_a:,} surface points")
+        return
+    titles = ("from x m", "y m", "z m", "points A", "in B", "added %", "newly seen %", "gone %",
+              "not seen %", "moved cm", "95 % cm")  # fmt: skip
+    rows = [(*_corner(tile), *_cells(tile.change)) for tile in diff.tiles[:limit]]
+    print_columns(titles, [*rows, ("all", "", "", *_cells(diff.total))])
+    left = len(diff.tiles) - len(rows)
+    if left > 0:
+        print(f"  and {left} more: --limit {len(diff.tiles)} shows all")
+
+
+def _newton_steps(
+    sdf: NDArray[np.float32], gradient: NDArray[np.float32], longest_m: float
+) -> NDArray[np.float64]:
+    """Steps ``[N, 3]`` towards the zero, metres, none longer than ``longest_m``."""
+    slope = np.maximum(np.linalg.norm(gradient, axis=1), _LEAST_SLOPE)
+    length = np.minimum(np.abs(sdf) / slope, longest_m)
+    steps: NDArray[np.float64] = (-np.sign(sdf) * length / slope)[:, None] * gradient
+    return steps
+
+
+def _sighting(of: MapRecord, by: MapRecord) -> Sighting:
+    points = surface_points(of)
+    answer = MapEvaluator(by).query(points)
+    return Sighting(points, answer.sdf, answer.status, of.settings.leaf_m)
+
+
+def _tiles(comparison: Comparison, tile_m: float) -> Iterator[TileChange]:
+    old, new = comparison.old, comparison.new
+    cells = np.floor(np.concatenate([old.points, new.points]) / tile_m).astype(np.int64)
+    tiles, numbers = np.unique(cells, axis=0, return_inverse=True)
+    numbers = numbers.reshape(-1)
+    in_old = _rows_by_number(numbers[: len(old.points)], len(tiles))
+    in_new = _rows_by_number(numbers[len(old.points) :], len(tiles))
+    for cell, rows_old, rows_new in zip(tiles, in_old, in_new, strict=True):
+        low = tuple((cell * tile_m).round(6).tolist())
+        high = tuple(((cell + 1) * tile_m).round(6).tolist())
+        yield TileChange(low, high, _change(_part(old, rows_old), _part(new, rows_new)))
+
+
+def _rows_by_number(numbers: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
+    """For each number below ``count``, the rows that have it."""
+    ends = np.cumsum(np.bincount(numbers, minlength=count))
+    return np.split(np.argsort(numbers, kind="stable"), ends)[:count]
+
+
+def _part(sighting: Sighting, rows: NDArray[np.intp]) -> Sighting:
+    return Sighting(
+        sighting.points[rows], sighting.sdf[rows], sighting.status[rows], sighting.leaf_m
+    )
+
+
+def _change(old: Sighting, new: Sighting) -> Change:
+    moved = np.abs(old.sdf[old.status == Status.SURFACE]).astype(np.float64)
+    gone, added = len(old.having(Status.FREE)), len(new.having(Status.FREE))
+    median, p95 = np.quantile(moved, [0.5, 0.95]) if len(moved) else (np.nan, np.nan)
+    swept = float(moved[moved > NOISE_M].sum()) * old.leaf_m**2
+    return Change(
+        points_a=len(old.points),
+        points_b=len(new.points),
+        added=added,
+        gone=gone,
+        newly_seen=len(new.having(Status.UNKNOWN)),
+        not_seen=len(old.having(Status.UNKNOWN)),
+        moved_median_m=float(median),
+        moved_p95_m=float(p95),
+        changed_m3=swept + gone * old.leaf_m**3 + added * new.leaf_m**3,
+    )
+
+
+def _corner(tile: TileChange) -> tuple[str, ...]:
+    return tuple(f"{low:g}" for low in tile.low_m)
+
+
+def _cells(change: Change) -> tuple[str, ...]:
+    return (
+        f"{change.points_a:,}",
+        f"{change.points_b:,}",
+        _share(change.added, change.points_b),
+        _share(change.newly_seen, change.points_b),
+        _share(change.gone, change.points_a),
+        _share(change.not_seen, change.points_a),
+        _centimetres(change.moved_median_m),
+        _centimetres(change.moved_p95_m),
+    )
+
+
+def _share(count: int, of: int) -> str:
+    return f"{100 * count / of:.1f}" if count else "-"
+
+
+def _centimetres(metres: float) -> str:
+    return "-" if np.isnan(metres) else f"{100 * metres:.2f}"

@@ -1,0 +1,168 @@
+"""The surface of a map as triangles: marching cubes (Lorensen and Cline 1987), block by block.
+
+Lattice points are the multiples of the cell, as those of the server's meshes, so that all blocks
+agree on the points that they share. Only faces where rays have seen a surface are kept: elsewhere
+the field has zeros that nobody taught it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.measure import marching_cubes
+from triquad_client import Mesh
+from triquad_client.mesh.welding import Triangles, joined
+from triquad_format.records.region import MapRecord
+from triquad_map.view import MapView
+
+from triquad_tools.console.command import ToolError
+from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.grid import cells_of_boxes, open_record
+from triquad_tools.mapfiles.seen_space import surface_voxels
+from triquad_tools.mapfiles.source import Box
+
+MAX_FACES = 50_000_000
+
+_BLOCK_CELLS = 32  # along the side of a block: bounds the memory that is needed at once
+_REACH_M = 0.02  # how far beside a voxel with seen surface the middle of a face may lie
+_EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
+
+Cells = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Voxels:
+    """Voxels with seen surface, and the cells around each that may hold faces of it."""
+
+    places: Cells  # [N, 3] on the lattice of voxels
+    first: Cells  # [N, 3] least cell
+    last: Cells  # [N, 3] greatest cell
+
+    def __getitem__(self, rows: NDArray[np.intp]) -> "_Voxels":
+        return _Voxels(self.places[rows], self.first[rows], self.last[rows])
+
+
+def surface_mesh(record: MapRecord, box: Box | None, cell_m: float) -> Mesh:
+    """The surface where rays have seen one, with cells of side ``cell_m``.
+
+    Given a box, it has the faces whose centroids lie in it.
+
+    Raises:
+        ToolError: there are too many faces, or regions too far away.
+    """
+    view = open_record(record)
+    low, high = _EVERYWHERE if box is None else box
+    blocks = list(_blocks(_voxels(record, low, high, cell_m)))
+    tiles: list[Triangles] = []
+    faces = 0
+    with progress("meshing", len(blocks)) as report:
+        for number, (block, voxels) in enumerate(blocks, start=1):
+            tiles.append(_block_mesh(view, block, voxels, cell_m))
+            faces += len(tiles[-1].faces)
+            if faces > MAX_FACES:
+                raise ToolError(f"the mesh has more than {MAX_FACES:,} faces: use --crop or --cell")
+            report(number, f"{faces:,} faces")
+    surface = joined(tiles, _BLOCK_CELLS * cell_m, low, high)
+    return Mesh(surface.vertices, surface.faces, record.epoch)
+
+
+def _voxels(
+    record: MapRecord, low: NDArray[np.float64], high: NDArray[np.float64], cell_m: float
+) -> _Voxels:
+    """The voxels of which faces may lie between two corners [3]."""
+    leaf_m = record.settings.leaf_m
+    middles = surface_voxels(record)
+    reach_m = leaf_m / 2 + _REACH_M + cell_m / 2  # from a voxel's middle to that of a cell
+    near = (middles >= low - 2 * reach_m) & (middles <= high + 2 * reach_m)
+    middles = middles[near.all(axis=1)]
+    return _Voxels(
+        np.floor(middles / leaf_m).astype(np.int64),
+        np.ceil((middles - reach_m) / cell_m - 0.5).astype(np.int64),
+        np.floor((middles + reach_m) / cell_m - 0.5).astype(np.int64),
+    )
+
+
+def _blocks(voxels: _Voxels) -> Iterator[tuple[Cells, _Voxels]]:
+    """The blocks of cells [3] that voxels reach into, each with these voxels."""
+    first, last = voxels.first // _BLOCK_CELLS, voxels.last // _BLOCK_CELLS
+    blocks, rows = cells_of_boxes(first, last)
+    each, numbers = np.unique(blocks, axis=0, return_inverse=True)
+    order = np.argsort(numbers.reshape(-1), kind="stable")
+    ends = np.cumsum(np.bincount(numbers.reshape(-1), minlength=len(each)))
+    groups = np.split(rows[order], ends)
+    return ((block, voxels[group]) for block, group in zip(each, groups, strict=False))
+
+
+def _block_mesh(view: MapView, block: Cells, voxels: _Voxels, cell_m: float) -> Triangles:
+    origin = block * _BLOCK_CELLS
+    cells = _covered(voxels.first - origin, voxels.last - origin)
+    asked = np.argwhere(_corners(cells))
+    # Points that nobody asks for lie in free space.
+    volume = np.ones((_BLOCK_CELLS + 1,) * 3, np.float32)
+    volume[tuple(asked.T)] = view.query(np.asarray((origin + asked) * cell_m, np.float64)).sdf
+    unknown = np.isnan(volume)  # beside the regions
+    cells &= ~_of_cells(unknown)
+    volume[unknown] = 1.0
+    surface = _marched(volume, cells)
+    vertices = (origin + surface.vertices) * cell_m
+    seen = _beside(voxels.places, vertices[surface.faces].mean(axis=1), view.voxel_m)
+    return Triangles(vertices, surface.faces[seen])
+
+
+def _marched(volume: NDArray[np.float32], cells: NDArray[np.bool_]) -> Triangles:
+    """Triangles between lattice points, in units of cells, counter-clockwise from free space."""
+    mask = np.zeros(volume.shape, np.bool_)
+    mask[1:, 1:, 1:] = cells  # a cell is named by its upper corner there
+    try:
+        vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=mask, method="lorensen")
+    except (ValueError, RuntimeError):  # so it tells that no cell is crossed
+        return Triangles(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    return Triangles(vertices.astype(np.float64), faces)
+
+
+def _covered(first: Cells, last: Cells) -> NDArray[np.bool_]:
+    """The cells of a block that lie in any of the boxes ``first`` to ``last`` [N, 3]."""
+    low = np.clip(first, 0, _BLOCK_CELLS)
+    beyond = np.clip(last + 1, 0, _BLOCK_CELLS)
+    # How many boxes begin less how many end, summed up along each axis.
+    changes = np.zeros((_BLOCK_CELLS + 1,) * 3, np.int32)
+    for corner in np.ndindex(2, 2, 2):
+        at = np.where(corner, beyond, low)
+        np.add.at(changes, tuple(at.T), (-1) ** sum(corner))
+    boxes = changes.cumsum(axis=0).cumsum(axis=1).cumsum(axis=2)
+    return np.asarray(boxes[:-1, :-1, :-1] > 0)
+
+
+def _corners(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The lattice points at the corners of any of the cells."""
+    points = np.zeros((_BLOCK_CELLS + 1,) * 3, np.bool_)
+    for x, y, z in np.ndindex(2, 2, 2):
+        points[x : x + _BLOCK_CELLS, y : y + _BLOCK_CELLS, z : z + _BLOCK_CELLS] |= cells
+    return points
+
+
+def _of_cells(points: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells that have any of the lattice points at a corner."""
+    cells = np.zeros((_BLOCK_CELLS,) * 3, np.bool_)
+    for x, y, z in np.ndindex(2, 2, 2):
+        cells |= points[x : x + _BLOCK_CELLS, y : y + _BLOCK_CELLS, z : z + _BLOCK_CELLS]
+    return cells
+
+
+def _beside(voxels: Cells, points: NDArray[np.float64], leaf_m: float) -> NDArray[np.bool_]:
+    """Whether points [P, 3] lie within the reach of any of the voxels [N, 3], on each axis."""
+    sides = [
+        np.floor((points + shift) / leaf_m).astype(np.int64) for shift in (-_REACH_M, _REACH_M)
+    ]
+    least = voxels.min(axis=0) - 1
+    near = np.zeros(len(points), np.bool_)
+    for x, y, z in np.ndindex(2, 2, 2):
+        corner = np.stack([sides[x][:, 0], sides[y][:, 1], sides[z][:, 2]], axis=1)
+        near |= np.isin(_key(corner - least), _key(voxels - least))
+    return near
+
+
+def _key(cells: Cells) -> NDArray[np.int64]:
+    """One number for each of cells [N, 3] that lie near to each other."""
+    return np.asarray((cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2])

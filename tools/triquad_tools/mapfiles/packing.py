@@ -1,0 +1,114 @@
+"""A map as a smaller map file."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_format.mapfile.writer import MapFileInfo, Previews, write_map
+from triquad_format.records.region import MapRecord
+
+from triquad_tools.mapfiles.field_change import FieldChange
+from triquad_tools.mapfiles.quantise import dequantised, quantise
+from triquad_tools.mapfiles.source import SourceMap
+
+DTYPES = {"fp16": "<f2", "fp32": "<f4"}
+INTEGERS = "int8"
+"""Features as integers, most of which take one byte."""
+
+INTEGER_ERROR_M = 0.0015
+"""Limit on the change of distances where none is given."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How features are stored: as floats of ``dtype``, or as integers within an error."""
+
+    dtype: str | None = None  # None: as they are
+    max_error_m: float | None = None  # None: no new integers
+
+
+@dataclass(frozen=True)
+class PackedMap:
+    """What was written."""
+
+    info: MapFileInfo
+    parameters: int
+    change: FieldChange | None  # None: nothing was rounded to integers
+
+
+def chosen_precision(name: str | None, max_error_m: float | None) -> Precision:
+    """What ``--precision`` and ``--max-error`` ask for."""
+    if max_error_m is None and name == INTEGERS:
+        max_error_m = INTEGER_ERROR_M
+    return Precision(DTYPES.get(name or ""), max_error_m)
+
+
+def pack_map(source: SourceMap, precision: Precision, path: Path) -> PackedMap:
+    """Write a map file.
+
+    Raises:
+        FormatError: integers change distances by more than the limit, or features do not fit the
+            dtype.
+        OSError: the file cannot be written.
+    """
+    record, change = source.record, None
+    if precision.max_error_m is not None:
+        _warn_of_integers(record)
+        packed = quantise(record, precision.max_error_m)
+        record, change = packed.record, packed.change
+    elif precision.dtype is not None:
+        record = dequantised(record)
+    dtype = precision.dtype or _dtype(record)
+    stamp_ns = source.stamp_ns
+    previews = _previews(record, stamp_ns)
+    info = write_map(record, path, feature_dtype=dtype, stamp_ns=stamp_ns, previews=previews)
+    return PackedMap(info, sum(region.parameters for region in record.regions), change)
+
+
+def print_packed(path: Path, packed: PackedMap, bytes_before: int) -> None:
+    """Print sizes, and how far distances moved."""
+    size = packed.info.bytes
+    print(f"{path}: {size:,} bytes, {size / bytes_before:.0%} of {bytes_before:,}")
+    if packed.change is None:
+        return
+    each = size / max(packed.parameters, 1)
+    print(f"  {each:.2f} bytes per learnable parameter of {packed.parameters:,}")
+    change = packed.change
+    print(
+        f"  99 % of distances moved by less than {_mm(change.surface_m)} at surface, "
+        f"{_mm(change.near_m)} near it, {_mm(change.free_m)} in free space; "
+        f"the most by {_mm(change.largest_m)}"
+    )
+    print("  without training state: it does not fit rounded features")
+
+
+def _previews(record: MapRecord, stamp_ns: int | None) -> Previews | None:
+    """What MCAP viewers show; nothing where the libraries for it are not installed."""
+    try:
+        from triquad_server.mesh.preview import previews_of
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("triquad"):
+            raise
+        print(
+            f"triquad-pack: without a preview for MCAP viewers, as {error.name} is missing: "
+            "install triquad[preview]",
+            file=sys.stderr,
+        )
+        return None
+    return previews_of(record, stamp_ns=stamp_ns)
+
+
+def _warn_of_integers(record: MapRecord) -> None:
+    if any(table.scale is not None for region in record.regions for table in region.tables):
+        print("triquad-pack: features are integers already: both errors add up", file=sys.stderr)
+
+
+def _dtype(record: MapRecord) -> str:
+    """The dtype that keeps all float features as they are."""
+    tables = [table for region in record.regions for table in region.tables if len(table.codes)]
+    wide = any(table.features.dtype.str == DTYPES["fp32"] for table in tables)
+    return DTYPES["fp32" if wide else "fp16"]
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.2f} mm"

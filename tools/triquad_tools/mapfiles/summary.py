@@ -1,0 +1,202 @@
+"""What a map file holds, in figures."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.mapfile.parts.part import TRAINING_TOPICS
+from triquad_format.mapfile.reader import MapFile
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import MAX_LEVEL, MapRecord, Region, region_centre
+
+from triquad_tools.console.report import Row, print_columns, print_rows
+from triquad_tools.mapfiles.seen_space import evidence_box, owned_evidence
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """The parts of one topic, without the manifest."""
+
+    parts: int  # of the map, wherever they lie
+    bytes: int  # of these, unpacked
+    stored_parts: int  # of these in this file
+    stored_bytes: int  # that these take in this file
+
+
+@dataclass(frozen=True)
+class RegionSummary:
+    """One region. What no other region answers for counts as its volume."""
+
+    index: tuple[int, ...]  # [3]
+    centre_m: tuple[float, ...]  # [3] map frame
+    parameters: int  # numbers that were learnt: features, weights and biases
+    precision: tuple[str, ...]  # dtypes of the features
+    scales: tuple[float, ...]  # steps of integer features, from the smallest
+    vertices: dict[int, int]  # by level
+    evidence_blocks: int
+    evidence_box_m: tuple[tuple[float, ...], ...] | None  # two corners, to whole blocks
+    surface_m3: float  # voxels in which rays ended
+    surface_levels: tuple[int, ...] | None  # number of such voxels by level; None: not known
+    free_m3: float  # voxels through which rays only passed
+    samples: int | None  # for replay; None: no training state
+    budget_samples: int | None
+
+
+@dataclass(frozen=True)
+class MapSummary:
+    """A map file."""
+
+    bytes: int
+    metadata: dict[str, str]
+    map: str
+    epoch: int
+    other_files: tuple[str, ...]  # of the same folder, that hold parts of this map
+    settings: FieldSettings
+    vertices: int
+    parameters: int
+    # of the file without training state; None: not all parameters are in this file, or none is
+    bytes_per_parameter: float | None
+    surface_m3: float
+    free_m3: float
+    training: bool
+    regions: tuple[RegionSummary, ...]
+    parts: dict[str, TopicSummary]
+    checks: tuple[str, ...] = ()  # that were made beyond reading, and passed
+
+
+def summarise(file: MapFile) -> MapSummary:
+    """The figures of a map file."""
+    record = file.record
+    regions = tuple(_summarise_region(record, region) for region in record.regions)
+    parts = _summarise_parts(file)
+    parameters = sum(region.parameters for region in regions)
+    other_files = tuple(ref.name for ref in file.manifest.files)
+    training_bytes = sum(parts[t].stored_bytes for t in TRAINING_TOPICS if t in parts)
+    whole = parameters > 0 and not other_files
+    return MapSummary(
+        bytes=file.size,
+        metadata=file.metadata,
+        map=record.name,
+        epoch=record.epoch,
+        other_files=other_files,
+        settings=record.settings,
+        vertices=sum(sum(region.vertices.values()) for region in regions),
+        parameters=parameters,
+        bytes_per_parameter=(file.size - training_bytes) / parameters if whole else None,
+        surface_m3=sum(region.surface_m3 for region in regions),
+        free_m3=sum(region.free_m3 for region in regions),
+        training=any(region.training is not None for region in record.regions),
+        regions=regions,
+        parts=parts,
+    )
+
+
+def print_summary(name: str, summary: MapSummary) -> None:
+    """Print the figures of the file ``name``."""
+    title = f"{name}: map {summary.map!r}, epoch {summary.epoch}, {summary.bytes:,} bytes"
+    print_rows(title, list(_facts(summary)), align="left")
+    for region in summary.regions:
+        title = f"region {region.index} at {list(region.centre_m)} m"
+        print_rows(title, list(_region_facts(region)), align="left")
+    rows = [
+        (topic, f"{p.parts:,}", f"{p.bytes:,}", f"{p.stored_parts:,}", f"{p.stored_bytes:,}")
+        for topic, p in summary.parts.items()
+    ]
+    print_columns(("part", "count", "bytes", "in this file", "bytes stored"), rows)
+    for check in summary.checks:
+        print(f"  ok: {check}")
+
+
+def _facts(summary: MapSummary) -> Iterator[Row]:
+    for key in ("format_version", "producer", "created"):
+        yield Row(key.replace("_", " "), summary.metadata.get(key, "not given"))
+    files = ", ".join(summary.other_files)
+    yield Row("other files", f"{files}: needed, and there" if files else "none needed")
+    yield Row("regions", str(len(summary.regions)))
+    yield Row("vertices", f"{summary.vertices:,}")
+    share = summary.bytes_per_parameter
+    each = f", {share:.2f} bytes each" if share else ""
+    yield Row("parameters", f"{summary.parameters:,}{each}")
+    yield Row("evidence", _evidence(summary))
+    yield Row("training state", "yes" if summary.training else "no")
+    settings = vars(summary.settings).items()
+    yield Row("settings", ", ".join(f"{name} {value}" for name, value in settings))
+
+
+def _region_facts(region: RegionSummary) -> Iterator[Row]:
+    levels = ", ".join(f"level {level}: {count:,}" for level, count in region.vertices.items())
+    yield Row("vertices", f"{levels} ({_precision(region)})")
+    if region.evidence_box_m is not None:
+        low, high = map(list, region.evidence_box_m)
+        yield Row("evidence", f"{region.evidence_blocks:,} blocks in {low} to {high} m")
+        yield Row("", _evidence(region))
+    if region.surface_levels is not None:
+        voxels = max(sum(region.surface_levels), 1)
+        shares = ", ".join(f"{i}: {n / voxels:.0%}" for i, n in enumerate(region.surface_levels))
+        yield Row("", f"surface by level of support: {shares}")
+    if region.samples is not None:
+        left = f"a training budget of {region.budget_samples:,}"
+        yield Row("training", f"{region.samples:,} samples, {left}")
+
+
+def _evidence(summary: MapSummary | RegionSummary) -> str:
+    return f"{summary.surface_m3:,.1f} m3 surface, {summary.free_m3:,.1f} m3 free"
+
+
+def _precision(region: RegionSummary) -> str:
+    if not region.scales:
+        return ", ".join(region.precision)
+    return f"integers, in steps of {region.scales[0]:.3g} to {region.scales[-1]:.3g}"
+
+
+def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
+    training = region.training
+    evidence = owned_evidence(record.settings, region)
+    box = evidence_box(record.settings, region)
+    voxel_m3 = record.settings.leaf_m**3
+    return RegionSummary(
+        index=region.index,
+        centre_m=_rounded(region_centre(record.settings, region.index)),
+        parameters=region.parameters,
+        precision=tuple(sorted({table.features.dtype.name for table in region.tables})),
+        scales=tuple(sorted(table.scale for table in region.tables if table.scale is not None)),
+        vertices={
+            level: sum(len(table.codes) for table in region.tables if table.level == level)
+            for level in record.settings.levels
+        },
+        evidence_blocks=len(region.evidence.codes),
+        evidence_box_m=None if box is None else tuple(map(_rounded, box)),
+        surface_m3=_bits(evidence.surface) * voxel_m3,
+        surface_levels=None if evidence.levels is None else _by_level(evidence.levels),
+        free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
+        samples=None if training is None else len(training.sample_points),
+        budget_samples=None if training is None else training.budget_samples,
+    )
+
+
+def _by_level(levels: NDArray[np.uint8]) -> tuple[int, ...]:
+    return tuple(np.bincount(levels, minlength=MAX_LEVEL + 1).tolist())
+
+
+def _bits(masks: NDArray[np.uint8]) -> int:
+    return int(np.unpackbits(masks).sum(dtype=np.int64))
+
+
+def _rounded(place: NDArray[np.float64]) -> tuple[float, ...]:
+    """Coordinates without the noise of their last bits."""
+    return tuple(place.round(6).tolist())
+
+
+def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
+    """The parts by topic, those in other files included."""
+    sizes: dict[str, list[int]] = {}
+    stored: dict[str, list[int]] = {}
+    for part in file.parts:
+        stored.setdefault(part.topic, []).append(part.stored_size)
+    for entry in file.manifest.entries:
+        sizes.setdefault(entry.key.topic, []).append(entry.size)
+    return {
+        topic: TopicSummary(len(own), sum(own), len(here := stored.get(topic, [])), sum(here))
+        for topic, own in sizes.items()
+    }

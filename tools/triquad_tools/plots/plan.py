@@ -1,0 +1,193 @@
+"""Plans: maps seen from above, in square cells, with axes in metres and a legend each.
+
+Space of which a map knows nothing is grey, which is in no scale of colours. Scales are those of
+matplotlib whose lightness rises all along, so that nobody needs to see hues; what lies beyond a
+scale has an arrow at its end.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+from scipy.stats import binned_statistic_2d
+
+UNKNOWN = "#bdbdbd"
+FREE = "#f3f3f3"
+
+MOST_CELLS = 1200
+"""Along the longer side of a plan."""
+
+_LEAST_CELLS = 40  # along each side
+_LEAST_SIDE = 0.25  # the shorter side's share of the longer one
+_WIDE = 2.0  # the plans of a map that is wider stand below each other
+_LONGEST_IN, _LONGEST_BESIDE_IN = 11.0, 6.5  # longer side of a plan
+_ROOM_IN = (2.3, 1.7)  # beside a plan for its scale, below it for its legend
+_DPI = 110
+_LETTERS_PT = 13  # can be read in half the size, too
+
+Values = NDArray[np.float64]
+"""One value for each cell ``[rows, columns]``, row 0 that of the smallest y; NaN where none is."""
+
+Draw = Callable[[Axes], None]
+Window = tuple[slice, slice]
+
+
+@dataclass(frozen=True)
+class PlanGrid:
+    """Square cells over a rectangle of the map frame's XY plane."""
+
+    low_m: NDArray[np.float64]  # [2] corner of smallest x and y
+    cell_m: float
+    rows: int
+    columns: int
+
+    @classmethod
+    def around(cls, points: NDArray[np.floating], leaf_m: float) -> "PlanGrid":
+        """The grid that holds points ``[N, 2]``, of cells of one leaf or 2, 4, 8, ..."""
+        points = points if len(points) else np.zeros((1, 2))
+        low, high = points.min(axis=0), points.max(axis=0)
+        longest = math.ceil(float((high - low).max()) / leaf_m) + 1
+        cell_m = leaf_m * 2.0 ** max(math.ceil(math.log2(longest / MOST_CELLS)), 0)
+        first = np.floor(low / cell_m).astype(np.int64)
+        count = np.floor(high / cell_m).astype(np.int64) - first + 1
+        wanted = np.maximum(count, max(math.ceil(_LEAST_SIDE * count.max()), _LEAST_CELLS))
+        first -= (wanted - count) // 2
+        return cls(first * cell_m, cell_m, int(wanted[1]), int(wanted[0]))
+
+    @property
+    def high_m(self) -> NDArray[np.float64]:
+        """``[2]`` corner of largest x and y."""
+        corner: NDArray[np.float64] = self.low_m + self.cell_m * np.array([self.columns, self.rows])
+        return corner
+
+    def window(self, low_m: NDArray[np.floating], high_m: NDArray[np.floating]) -> Window:
+        """The cells with their middle between two corners [2], as an index into a plan."""
+        ends = (np.ceil((end - self.low_m) / self.cell_m - 0.5) for end in (low_m, high_m))
+        first, last = (np.clip(end, 0, [self.columns, self.rows]).astype(int) for end in ends)
+        return slice(first[1], last[1]), slice(first[0], last[0])
+
+    def marked(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """``[rows, columns]``: whether a cell holds any of the points ``[N, 2 or 3]``."""
+        return self.statistic(points, np.zeros(len(points)), "count") > 0
+
+    def statistic(
+        self,
+        points: NDArray[np.floating],
+        values: NDArray[np.floating],
+        kind: Literal["count", "max", "mean"],
+    ) -> Values:
+        """What the values ``[N]`` at points ``[N, 2 or 3]`` amount to in each cell."""
+        if not len(points):
+            return np.full((self.rows, self.columns), 0.0 if kind == "count" else np.nan)
+        x, y = points[:, 0], points[:, 1]
+        limits = tuple(zip(self.low_m.tolist(), self.high_m.tolist(), strict=True))
+        found = binned_statistic_2d(
+            y, x, values, kind, bins=(self.rows, self.columns), range=limits[::-1]
+        )
+        return np.asarray(found.statistic, np.float64)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colours for values from ``low`` to ``high``."""
+
+    label: str
+    colours: str | Colormap  # a name that matplotlib knows, or colours
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One plan of a sheet."""
+
+    heading: str
+    draw: Draw  # onto axes of the grid
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Cells of one colour, and what it stands for."""
+
+    label: str
+    colour: str
+    cells: NDArray[np.bool_]  # [rows, columns]
+
+
+def save_sheet(path: Path, title: str, grid: PlanGrid, plans: Sequence[Plan]) -> None:
+    """Draw plans of one grid beside each other, or below each other where the map is wide.
+
+    Raises:
+        OSError: ``path`` cannot be written.
+    """
+    wide = grid.columns > _WIDE * grid.rows
+    inches = (_LONGEST_IN if wide else _LONGEST_BESIDE_IN) / max(grid.columns, grid.rows)
+    shape = (len(plans), 1) if wide else (1, len(plans))
+    width = shape[1] * (inches * grid.columns + _ROOM_IN[0])
+    height = shape[0] * (inches * grid.rows + _ROOM_IN[1])
+    with rc_context({"font.size": _LETTERS_PT}):
+        figure = Figure((width, height), _DPI, layout="constrained")
+        figure.suptitle(title, x=0.01, ha="left")
+        for plan, part in zip(plans, figure.subfigures(*shape, squeeze=False).flat, strict=True):
+            axes = part.subplots()
+            axes.set_title(plan.heading, loc="left")
+            axes.set_facecolor(UNKNOWN)
+            axes.set(xlabel=f"x in m\n{plan.note}".rstrip(), ylabel="y in m", aspect="equal")
+            axes.set_xlim(grid.low_m[0], grid.high_m[0])
+            axes.set_ylim(grid.low_m[1], grid.high_m[1])
+            plan.draw(axes)
+        figure.savefig(path)
+
+
+def draw_values(axes: Axes, values: Values, scale: Scale) -> None:
+    """Colour the cells that have a value, and show the scale."""
+    known = values[np.isfinite(values)]
+    below, above = bool((known < scale.low).any()), bool((known > scale.high).any())
+    extend = {(False, False): "neither", (True, False): "min", (False, True): "max"}
+    image = axes.imshow(
+        values,
+        cmap=scale.colours,
+        vmin=scale.low,
+        vmax=scale.high,
+        origin="lower",
+        extent=(*axes.get_xlim(), *axes.get_ylim()),
+        interpolation="none",
+    )
+    beside = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
+    axes.figure.colorbar(
+        image, cax=beside, label=scale.label, extend=extend.get((below, above), "both")
+    )
+
+
+def draw_layers(axes: Axes, layers: Sequence[Layer]) -> None:
+    """Colour cells, later layers over earlier ones, with a legend that has the unknown, too."""
+    for layer in layers:
+        axes.imshow(
+            np.where(layer.cells, 0.0, np.nan),
+            cmap=ListedColormap([layer.colour]),
+            origin="lower",
+            extent=(*axes.get_xlim(), *axes.get_ylim()),
+            interpolation="none",
+        )
+    named = [
+        *((layer.colour, layer.label) for layer in layers),
+        (UNKNOWN, "nothing was seen (UNKNOWN)"),
+    ]
+    handles = [Patch(facecolor=colour, edgecolor="black", label=label) for colour, label in named]
+    axes.figure.legend(handles=handles, loc="outside lower left", frameon=False, ncols=2)
+
+
+def draw_nothing(axes: Axes, reason: str) -> None:
+    """Say why a plan shows nothing."""
+    axes.set_facecolor("none")
+    axes.text(0.5, 0.5, reason, ha="center", va="center", transform=axes.transAxes)

@@ -1,0 +1,61 @@
+"""Clouds of points: those of recorded scans in the world frame, and thinner ones."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_tools.recordings.kitti import KittiFolder
+
+_MERGED_POINTS = 2_000_000  # fewer are not worth a merge
+
+
+def is_withheld(index: int, every: int) -> bool:
+    """Whether scan ``index`` is kept back for testing: the last of each ``every`` scans."""
+    return every > 0 and index % every == every - 1
+
+
+def points_in_range(
+    points: NDArray[np.float32], range_min_m: float, range_max_m: float = np.inf
+) -> NDArray[np.float32]:
+    """The points ``[N, 3]``, sensor frame, whose ranges lie within both limits.
+
+    Points that are not finite are left out as soon as a limit is given.
+    """
+    if range_min_m <= 0.0 and not np.isfinite(range_max_m):
+        return points
+    ranges = np.linalg.norm(points, axis=1)
+    kept: NDArray[np.float32] = points[(ranges >= range_min_m) & (ranges <= range_max_m)]
+    return kept
+
+
+def world_points(
+    folder: KittiFolder, index: int, range_min_m: float = 0.0, range_max_m: float = np.inf
+) -> NDArray[np.float64]:
+    """The finite points ``[N, 3]`` of one scan within limits of the range, world frame."""
+    points = points_in_range(folder.read_points(index), range_min_m, range_max_m)
+    points = points[np.isfinite(points).all(axis=1)]
+    pose = folder.poses[index]
+    world: NDArray[np.float64] = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    return world
+
+
+def thin(points: NDArray[np.float64], voxel_m: float) -> NDArray[np.float64]:
+    """The first of the points ``[N, 3]`` in each voxel of side ``voxel_m``, in their order."""
+    if len(points) == 0:
+        return points
+    cells = np.floor(points / voxel_m).astype(np.int64)
+    cells -= cells.min(axis=0)
+    sizes = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    return points[np.sort(np.unique(keys, return_index=True)[1])]
+
+
+def merged(clouds: Iterable[NDArray[np.float64]], voxel_m: float) -> NDArray[np.float64]:
+    """All clouds as one ``[N, 3]``, one point per voxel of side ``voxel_m``."""
+    kept = [np.empty((0, 3))]  # the first is what is merged so far
+    for cloud in clouds:
+        kept.append(thin(cloud, voxel_m))
+        if sum(map(len, kept[1:])) > max(len(kept[0]), _MERGED_POINTS):
+            kept = [thin(np.concatenate(kept), voxel_m)]
+    return thin(np.concatenate(kept), voxel_m)
