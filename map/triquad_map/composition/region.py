@@ -36,7 +36,7 @@ class SeenSpace(Protocol):
         """When a ray last ended anywhere, seconds since 1970; 0: never, or not known."""
 
     def status(self, voxels: Doubles, reach: float) -> Bytes:
-        """Status values [N] at leaf coordinates [N, 3].
+        """Values of :class:`Status` [N] at leaf coordinates [N, 3].
 
         ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
         """

@@ -48,10 +48,7 @@ class FrozenEvidence:
         return int(self.seen_s.max(initial=0))
 
     def status(self, voxels: Doubles, reach: float = 0.5) -> Bytes:
-        """:class:`~triquad_format.records.status.Status` values [N] at ``voxels`` [N, 3].
-
-        ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
-        """
+        """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
         status = np.empty(len(voxels), np.uint8)
         find_status(voxels, reach, self.seen, status)
         return status
@@ -193,11 +190,11 @@ class LiveEvidence:
         evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
         evidence._seen = frozen.seen
-        evidence._make_room()
         if record.levels is not None:
             evidence._observations = Observations.restore(
                 frozen.surface, frozen.levels, frozen.seen_s
             )
+        evidence._make_room()
         return evidence
 
     def _grow(self) -> None:
@@ -205,7 +202,8 @@ class LiveEvidence:
         self._make_room()
 
     def _make_room(self) -> None:
-        """Masks for as many blocks as the index has room for."""
+        """Make room for as many blocks as the index has room for."""
         side, _, *masks = self._seen
         roomy = (with_room(mask, self._blocks.capacity) for mask in masks)
         self._seen = SeenVoxels(side, self._blocks.arrays, *roomy)
+        self._observations.make_room(self._blocks.capacity)

@@ -94,11 +94,10 @@ def _search(at: Place, seen: SeenVoxels, cells: tuple[int, int], state: Doubles)
 def find_unknown(
     points: Doubles, seen: SeenVoxels, cells: tuple[int, int], distances: Doubles, nearest: Doubles
 ) -> None:
-    """Lower ``distances`` [N] to those from ``points`` [N, 3] to the nearest unknown voxel.
+    """Find unknown voxels, see :class:`triquad_map.composition.region.SeenSpace`.
 
-    Points are leaf coordinates of the region, as are the ``nearest`` [N, 3] of unknown space;
-    distances are in voxels. Only blocks whose indices are in ``range(*cells)`` on each axis are
-    searched; where there is none, all is unknown.
+    Only blocks whose indices are in ``range(*cells)`` on each axis are searched; where there is
+    none, all is unknown.
     """
     state = np.empty(4)
     for i in range(len(points)):
