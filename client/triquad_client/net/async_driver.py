@@ -18,10 +18,9 @@ import zenoh
 
 from triquad_client.net.call import Ask, Batch, Run
 from triquad_client.net.connection import Connection, Receiver, closed_error, map_names
-from triquad_client.net.driver import Driver, exchange
-from triquad_client.net.remote_driver import RemoteDriver
+from triquad_client.net.driver import Driver, RemoteDriver, exchange
 
-REQUESTS_IN_FLIGHT = 32
+_REQUESTS_IN_FLIGHT = 32
 """Requests of one operation, over all calls, that wait for their replies at the same time. Servers
 refuse what exceeds their queue (64, where it is not set otherwise) as ``busy``."""
 
@@ -40,7 +39,7 @@ class AsyncDriver(Driver):
         self._sender = sender
         self._workers = ThreadPoolExecutor(_WORKERS, "triquad-worker")
         self._slots: defaultdict[str, asyncio.Semaphore] = defaultdict(
-            lambda: asyncio.Semaphore(REQUESTS_IN_FLIGHT)
+            lambda: asyncio.Semaphore(_REQUESTS_IN_FLIGHT)
         )
 
     async def in_order(self, job: Callable[[], DoneT]) -> DoneT:
@@ -89,8 +88,6 @@ class AsyncDriver(Driver):
     async def _receive(self, pending: "_Pending") -> Any:
         for reply in await pending.arrival.replies:
             return self._connection.read(pending.ask, reply)
-        if self._connection.closed:
-            raise closed_error()
         raise self._connection.no_reply_error(pending.ask, await self.maps())
 
     async def _work(self, job: Callable[[Run], Any]) -> Any:

@@ -91,7 +91,10 @@ class Connection:
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
-        if not self._linked:
+        if self.closed:
+            return closed_error()
+        info = self._session.info
+        if not (info.routers_zid() or info.peers_zid()):
             return ConnectError(
                 "the link to the server is down; it is set up again once the server is back"
             )
@@ -133,12 +136,6 @@ class Connection:
             raise self._broken(error) from error
         return replies
 
-    @property
-    def _linked(self) -> bool:
-        """Whether the session has a link to anybody."""
-        info = self._session.info
-        return bool(info.routers_zid() or info.peers_zid())
-
     def _key(self, ask: Ask[Any]) -> str:
         return keys.operation_key(self.map_name, ask.operation)
 
@@ -165,15 +162,9 @@ def open_connection(
     endpoint: str,
     map_name: str,
     timeout_s: float,
-    config: Path | None,
+    config: str | Path | None,
 ) -> Connection:
-    """A connection to the server at ``endpoint`` that has the map ``map_name``.
-
-    Raises:
-        ConnectError: nothing listens there, or it does not let us in.
-        UnknownMapError: there is no such map.
-        InvalidInputError: there cannot be a map of this name.
-    """
+    """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
     try:
         keys.check_name("map", map_name)
     except FormatError as error:
@@ -197,7 +188,7 @@ def open_connection(
     return connection
 
 
-def _configuration(endpoint: str, timeout_s: float, file: Path | None) -> zenoh.Config:
+def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> zenoh.Config:
     if file is not None:
         config: zenoh.Config = zenoh.Config.from_file(str(file))
     else:

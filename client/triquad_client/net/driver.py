@@ -3,12 +3,16 @@
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
+import zenoh
+
 from triquad_client.net.call import Ask, Batch, Call, Pause, ResultT, Run, Step
+from triquad_client.net.connection import Connection, map_names
 
 PendingT = TypeVar("PendingT")
 
@@ -56,13 +60,54 @@ class BlockingDriver(Driver):
 
     def run(self, call: Call[ResultT]) -> ResultT:
         """What the call returns; raises what it raises."""
-        return _result(self.run_call(call))
+        coroutine = self.run_call(call)
+        try:
+            coroutine.send(None)  # to its end: it waits for nothing, so it needs no event loop
+        except StopIteration as end:
+            result: ResultT = end.value
+            return result
+        coroutine.close()
+        raise AssertionError("a blocking driver waited for an event loop")
 
     async def _pause(self, seconds: float) -> None:
         time.sleep(seconds)
 
     async def _work(self, job: Callable[[Run], Any]) -> Any:
         return job(self.run)
+
+
+class RemoteDriver(BlockingDriver):
+    """Runs calls over a connection, in the threads that make them."""
+
+    def __init__(
+        self, connection: Connection, cancellation: zenoh.CancellationToken | None = None
+    ) -> None:
+        """Once ``cancellation`` is cancelled, every call ends with an error."""
+        self._connection = connection
+        self._cancellation = cancellation
+
+    def maps(self) -> list[str]:
+        """Names of the maps of all servers that can be reached."""
+        return map_names(self._connection.look_for_maps(cancellation=self._cancellation))
+
+    async def _replies(self, batch: Batch) -> list[Any]:
+        return await exchange(batch, self._send, self._receive)
+
+    async def _send(self, ask: Ask[Any]) -> "_Pending":
+        return _Pending(ask, self._connection.send(ask, cancellation=self._cancellation))
+
+    async def _receive(self, pending: "_Pending") -> Any:
+        for reply in pending.replies:
+            return self._connection.read(pending.ask, reply)
+        raise self._connection.no_reply_error(pending.ask, self.maps())
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """A request on its way, and where its replies come from."""
+
+    ask: Ask[Any]
+    replies: Iterable[zenoh.Reply]
 
 
 async def exchange(
@@ -80,14 +125,3 @@ async def exchange(
     while waiting:
         replies.append(await receive(waiting.popleft()))
     return replies
-
-
-def _result(coroutine: Coroutine[Any, Any, ResultT]) -> ResultT:
-    """What a coroutine returns that waits for nothing: it needs no event loop."""
-    try:
-        coroutine.send(None)
-    except StopIteration as end:
-        result: ResultT = end.value
-        return result
-    coroutine.close()
-    raise AssertionError("a blocking driver waited for an event loop")
