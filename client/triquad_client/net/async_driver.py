@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import zenoh
 
@@ -28,6 +28,8 @@ _WORKERS = 32
 """Downloads and long computations that go on at the same time."""
 
 DoneT = TypeVar("DoneT")
+
+_Replies: TypeAlias = "asyncio.Future[list[zenoh.Reply]]"
 
 
 class AsyncDriver(Driver):
@@ -73,7 +75,7 @@ class AsyncDriver(Driver):
     async def _pause(self, seconds: float) -> None:
         await asyncio.sleep(seconds)
 
-    async def _send(self, cancellation: zenoh.CancellationToken, ask: Ask[Any]) -> "_Pending":
+    async def _send(self, cancellation: zenoh.CancellationToken, ask: Ask[Any]) -> _Replies:
         slot = self._slots[ask.operation]
         await slot.acquire()
         arrival = _Arrival.expected()
@@ -83,12 +85,12 @@ class AsyncDriver(Driver):
         except BaseException:
             arrival.replies.cancel()
             raise
-        return _Pending(ask, arrival)
+        return arrival.replies
 
-    async def _receive(self, pending: "_Pending") -> Any:
-        for reply in await pending.arrival.replies:
-            return self._connection.read(pending.ask, reply)
-        raise self._connection.no_reply_error(pending.ask, await self.maps())
+    async def _receive(self, ask: Ask[Any], replies: _Replies) -> Any:
+        for reply in await replies:
+            return self._connection.read(ask, reply)
+        raise self._connection.no_reply_error(ask, await self.maps())
 
     async def _work(self, job: Callable[[Run], Any]) -> Any:
         """What a job returns; where the task is cancelled, so are the requests of the job."""
@@ -107,14 +109,14 @@ class AsyncDriver(Driver):
 class _Arrival:
     """Where the replies to a request will be, and what Zenoh shall do with them."""
 
-    replies: asyncio.Future[list[zenoh.Reply]]
+    replies: _Replies
     receiver: Receiver
 
     @classmethod
     def expected(cls) -> "_Arrival":
         """For the running event loop."""
         loop = asyncio.get_running_loop()
-        future: asyncio.Future[list[zenoh.Reply]] = loop.create_future()
+        future: _Replies = loop.create_future()
         replies: list[zenoh.Reply] = []
 
         def settle() -> None:
@@ -126,14 +128,6 @@ class _Arrival:
                 loop.call_soon_threadsafe(settle)
 
         return cls(future, zenoh.handlers.Callback(replies.append, end, indirect=False))
-
-
-@dataclass(frozen=True)
-class _Pending:
-    """A request on its way."""
-
-    ask: Ask[Any]
-    arrival: _Arrival
 
 
 async def _in_thread(threads: ThreadPoolExecutor, job: Callable[[], DoneT]) -> DoneT:

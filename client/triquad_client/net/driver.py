@@ -5,7 +5,6 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
@@ -93,35 +92,28 @@ class RemoteDriver(BlockingDriver):
     async def _replies(self, batch: Batch) -> list[Any]:
         return await exchange(batch, self._send, self._receive)
 
-    async def _send(self, ask: Ask[Any]) -> "_Pending":
-        return _Pending(ask, self._connection.send(ask, cancellation=self._cancellation))
+    async def _send(self, ask: Ask[Any]) -> Iterable[zenoh.Reply]:
+        return self._connection.send(ask, cancellation=self._cancellation)
 
-    async def _receive(self, pending: "_Pending") -> Any:
-        for reply in pending.replies:
-            return self._connection.read(pending.ask, reply)
-        raise self._connection.no_reply_error(pending.ask, self.maps())
-
-
-@dataclass(frozen=True)
-class _Pending:
-    """A request on its way, and where its replies come from."""
-
-    ask: Ask[Any]
-    replies: Iterable[zenoh.Reply]
+    async def _receive(self, ask: Ask[Any], replies: Iterable[zenoh.Reply]) -> Any:
+        for reply in replies:
+            return self._connection.read(ask, reply)
+        raise self._connection.no_reply_error(ask, self.maps())
 
 
 async def exchange(
     batch: Batch,
     send: Callable[[Ask[Any]], Awaitable[PendingT]],
-    receive: Callable[[PendingT], Awaitable[Any]],
+    receive: Callable[[Ask[Any], PendingT], Awaitable[Any]],
 ) -> list[Any]:
     """The replies to a batch, of which ``batch.at_once`` requests are under way at a time."""
-    waiting: deque[PendingT] = deque()
+    waiting: deque[tuple[Ask[Any], PendingT]] = deque()
     replies = []
     for item in batch.items:
-        waiting.append(await send(batch.request(item)))
+        ask = batch.request(item)
+        waiting.append((ask, await send(ask)))
         if len(waiting) >= batch.at_once:
-            replies.append(await receive(waiting.popleft()))
+            replies.append(await receive(*waiting.popleft()))
     while waiting:
-        replies.append(await receive(waiting.popleft()))
+        replies.append(await receive(*waiting.popleft()))
     return replies

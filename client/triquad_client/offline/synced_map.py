@@ -3,19 +3,18 @@
 import dataclasses
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import FormatError, MapFileError
+from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.body import repack_part
 from triquad_format.mapfile.parts.part import PartKey
 from triquad_format.mapfile.reader import assemble
 from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
@@ -48,7 +47,6 @@ class _State:
 
     sha256: str  # of the file on the server that it was made from
     driver: LocalDriver
-    epoch: int
     checked_s: float  # of the monotonic clock, when the server had nothing newer
     report: SyncReport  # of the last update
 
@@ -70,7 +68,7 @@ class LocalCopy:
     @property
     def epoch(self) -> int:
         """The server's epoch, a published state of its map, that the copy was made from."""
-        return self._current().epoch
+        return self._current().report.epoch
 
     @property
     def age_s(self) -> float:
@@ -105,41 +103,53 @@ class LocalCopy:
             info = run(newest_file(training=False))
             known = self._state
             if known is not None and known.sha256 == info.sha256:
-                report = SyncReport(
-                    epoch=info.epoch,
-                    bytes_received=0,
-                    parts_received=0,
-                    parts_kept=known.report.parts,
-                )
+                report = SyncReport(info.epoch, 0, 0, parts_kept=known.report.parts)
                 self._state = dataclasses.replace(known, checked_s=asked_s, report=report)
                 return report
             remote = RemoteBytes(run, info)
             try:
-                parts = _Parts(StoredMap(remote), self._low, self._high)
-                parts.reuse(self._path)
-                parts.fetch()
-                record = parts.record()
-                parts.write(self._path)
+                stored = StoredMap(remote)
+                wanted = stored.parts_in(self._low, self._high)
+                kept = _kept(self._path, wanted)
+                payloads = kept | {
+                    entry.key: stored.payload(entry) for entry in wanted if entry.key not in kept
+                }
+                manifest = dataclasses.replace(stored.manifest, entries=wanted)
+                record = assemble(manifest, lambda entry: payloads[entry.key])
+                check_record(record)
+                _write(self._path, manifest, payloads)
             except FormatError as error:
                 raise DownloadError(str(error)) from error
-            received = len(parts.wanted) - parts.kept
             report = SyncReport(
                 epoch=info.epoch,
                 bytes_received=remote.bytes_read,
-                parts_received=received,
-                parts_kept=parts.kept,
+                parts_received=len(wanted) - len(kept),
+                parts_kept=len(kept),
             )
-            driver = LocalDriver(record)
-            self._state = _State(
-                sha256=info.sha256,
-                driver=driver,
-                epoch=info.epoch,
-                checked_s=asked_s,
-                report=report,
-            )
+            self._state = _State(info.sha256, LocalDriver(record), asked_s, report)
             if known is not None:
                 known.driver.close()
             return report
+
+
+def _kept(path: Path, wanted: Sequence[Entry]) -> dict[PartKey, bytes]:
+    """The wanted parts that a file has already; it may be no map file."""
+    kept: dict[PartKey, bytes] = {}
+    with suppress(FormatError, FileNotFoundError), StoredMap.open(path) as older:
+        known = {entry.key: entry for entry in older.manifest.entries}
+        for entry in wanted:
+            there = known.get(entry.key)
+            if there is not None and there.sha256 == entry.sha256:
+                with suppress(MapFileError):
+                    kept[entry.key] = older.payload(there)
+    return kept
+
+
+def _write(path: Path, manifest: Manifest, payloads: Mapping[PartKey, bytes]) -> None:
+    """Replace the file at ``path`` by one of these parts, all of it or nothing."""
+    own = {entry.key: dataclasses.replace(entry, file=None) for entry in manifest.entries}
+    parts = (repack_part(key, payloads[key]) for key in own)
+    write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns or None, known=own)
 
 
 class SyncedMap(LocalCopy, MapQueries):
@@ -164,53 +174,3 @@ class SyncedMap(LocalCopy, MapQueries):
             OSError: the file cannot be written.
         """
         return self._ask_server(self._update())
-
-
-class _Parts:
-    """The parts of a map on the server that a box needs."""
-
-    def __init__(
-        self, stored: StoredMap, low: NDArray[np.float64], high: NDArray[np.float64]
-    ) -> None:
-        self._stored = stored
-        self.wanted = stored.parts_in(low, high)
-        self._payloads: dict[PartKey, bytes] = {}
-        self.kept = 0
-
-    def reuse(self, path: Path) -> None:
-        """Take the parts that the file has already; it may be no map file."""
-        try:
-            with StoredMap.open(path) as older:
-                known = {entry.key: entry for entry in older.manifest.entries}
-                for entry in self.wanted:
-                    there = known.get(entry.key)
-                    if there is not None and there.sha256 == entry.sha256:
-                        with suppress(MapFileError):
-                            self._payloads[entry.key] = older.payload(there)
-        except (FormatError, FileNotFoundError):
-            pass
-        self.kept = len(self._payloads)
-
-    def fetch(self) -> None:
-        """Have the server send the others."""
-        for entry in self.wanted:
-            if entry.key not in self._payloads:
-                self._payloads[entry.key] = self._stored.payload(entry)
-
-    def record(self) -> MapRecord:
-        """All of it.
-
-        Raises:
-            FormatError: the parts do not go together.
-        """
-        chosen = dataclasses.replace(self._stored.manifest, entries=self.wanted)
-        record = assemble(chosen, lambda entry: self._payloads[entry.key])
-        check_record(record)
-        return record
-
-    def write(self, path: Path) -> None:
-        """Replace the file at ``path``, all of it or nothing."""
-        manifest = self._stored.manifest
-        own = {entry.key: dataclasses.replace(entry, file=None) for entry in self.wanted}
-        parts = (repack_part(entry.key, self._payloads[entry.key]) for entry in self.wanted)
-        write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns or None, known=own)
