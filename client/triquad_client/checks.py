@@ -33,7 +33,7 @@ def query_points(points: ArrayLike) -> NDArray[np.float64]:
         index = int((np.abs(array) > FARTHEST_M).any(axis=1).argmax())
         raise InvalidInputError(
             f"point {index} is {array[index]}, more than {FARTHEST_M:g} m from the map's origin; "
-            "are these metres of the map frame?",
+            "are these metres of the map frame?"
         )
     return array
 
@@ -59,11 +59,11 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
     if not is_rotation(pose):
         raise InvalidScanError(
             f"world_from_sensor is not rigid: R R^T is off by {rotation_error(pose):.2g}, "
-            f"det R = {np.linalg.det(pose[:3, :3]):.3g}; remove scale, shear and mirroring",
+            f"det R = {np.linalg.det(pose[:3, :3]):.3g}; remove scale, shear and mirroring"
         )
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InvalidScanError(
-            f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?",
+            f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?"
         )
     exact: NDArray[np.float64] = pose.copy()
     exact[3] = (0, 0, 0, 1)

@@ -73,11 +73,7 @@ class RemoteBytes:
 
 
 def fetch(path: Path, training: bool) -> Call[MapInfo]:
-    """Write the newest map to ``path``, all of it or nothing.
-
-    Raises:
-        DownloadError: the bytes are not those the server announced.
-    """
+    """Write the newest map to ``path``, as ``Client.download_map``."""
     # Newer map files may push this one out of the server: then the newest is taken.
     return retried("chunk_gone", lambda: offload(lambda run: _fetch(run, path, training)))
 
@@ -97,11 +93,7 @@ def _fetch(run: Run, path: Path, training: bool) -> MapInfo:
 
 
 def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
-    """Write what answers in the bounds; only its parts travel.
-
-    Raises:
-        DownloadError: nothing of the map lies in the box, or its parts are not valid.
-    """
+    """Write what answers in the bounds, as ``Client.download_box``."""
     minimum, maximum = checks.finite_box(bounds)
     job = partial(_fetch_box, path=path, minimum=minimum, maximum=maximum)
     return (yield from retried("chunk_gone", lambda: offload(job)))

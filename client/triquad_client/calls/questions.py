@@ -104,10 +104,7 @@ def _ask_sdf(points: NDArray[np.float64], gradient: bool, epoch: int) -> Ask[Sdf
 
 
 def distance(
-    points: ArrayLike,
-    options: DistanceOptions,
-    unknown: Unknown | str,
-    at_epoch: int | None,
+    points: ArrayLike, options: DistanceOptions, unknown: Unknown | str, at_epoch: int | None
 ) -> Call[Distances]:
     """True distances to the nearest surface at ``points`` [N, 3] of the map frame, metres."""
     checked = checks.query_points(points)

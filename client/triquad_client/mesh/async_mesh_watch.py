@@ -67,7 +67,7 @@ class AsyncMeshWatch(WatchedMesh):
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
             if asking.done():
                 return asking.result()
-            raise WatchClosedError
+            raise WatchClosedError("the watch is closed")
         finally:
             asking.cancel()
             await asyncio.wait({asking})  # until its requests are cancelled

@@ -144,9 +144,7 @@ def joined(
 
 
 def welded(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int32],
-    tile_side_m: float,
+    vertices: NDArray[np.float64], faces: NDArray[np.int32], tile_side_m: float
 ) -> Triangles:
     """The mesh with one vertex where tiles had several.
 
@@ -168,10 +166,7 @@ def welded(
     return compacted(vertices, joined[(a != b) & (b != c) & (c != a)])
 
 
-def compacted(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.integer],
-) -> Triangles:
+def compacted(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> Triangles:
     """The mesh without vertices that no face uses."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
@@ -215,14 +210,6 @@ def _glb(mesh: Mesh) -> bytes:
     return _exported(scene, "glb")
 
 
-def _obj(mesh: Mesh) -> bytes:
-    return _exported(mesh.to_trimesh(), "obj")
-
-
-def _stl(mesh: Mesh) -> bytes:
-    return _exported(mesh.to_trimesh(), "stl")
-
-
 def _exported(surface: "trimesh.Trimesh | trimesh.Scene", kind: str) -> bytes:
     data = surface.export(file_type=kind)
     return data.encode("ascii") if isinstance(data, str) else cast(bytes, data)
@@ -231,6 +218,6 @@ def _exported(surface: "trimesh.Trimesh | trimesh.Scene", kind: str) -> bytes:
 _FORMATS: dict[str, Callable[[Mesh], bytes]] = {
     ".ply": _ply,
     ".glb": _glb,
-    ".obj": _obj,
-    ".stl": _stl,
+    ".obj": lambda mesh: _exported(mesh.to_trimesh(), "obj"),
+    ".stl": lambda mesh: _exported(mesh.to_trimesh(), "stl"),
 }

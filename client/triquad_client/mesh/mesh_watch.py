@@ -32,9 +32,6 @@ _LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
 class WatchClosedError(ClosedError):
     """The watch was closed, before the call or meanwhile."""
 
-    def __init__(self) -> None:
-        super().__init__("the watch is closed")
-
 
 class WatchedMesh:
     """The tiles of a watch, and the calls that change them; no matter who waits for the replies."""
@@ -170,5 +167,5 @@ class MeshWatch(WatchedMesh):
             return self._driver.run(call)
         except TriquadError as error:
             if self._closed:
-                raise WatchClosedError from error
+                raise WatchClosedError("the watch is closed") from error
             raise

@@ -101,9 +101,7 @@ def ask(request: Ask[ReplyT]) -> Call[ReplyT]:
 
 
 def ask_each(
-    items: Iterable[ItemT],
-    request: Callable[[ItemT], Ask[ReplyT]],
-    at_once: int = _PARTS_IN_FLIGHT,
+    items: Iterable[ItemT], request: Callable[[ItemT], Ask[ReplyT]], at_once: int = _PARTS_IN_FLIGHT
 ) -> Call[list[ReplyT]]:
     """The replies to one request per item; each is made when its turn comes, maybe in a thread."""
     replies: list[ReplyT] = yield Batch(items, request, at_once)
@@ -131,10 +129,7 @@ def retried(code: str, attempt: Callable[[], Call[ResultT]]) -> Call[ResultT]:
 
 
 def in_parts(
-    count: int,
-    most: int,
-    request: Callable[[slice, int], Ask[MapReplyT]],
-    at_epoch: int | None,
+    count: int, most: int, request: Callable[[slice, int], Ask[MapReplyT]], at_epoch: int | None
 ) -> Call[Sequence[MapReplyT]]:
     """The replies about ``count`` items, ``most`` at a time, all from one epoch.
 

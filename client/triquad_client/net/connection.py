@@ -102,7 +102,7 @@ class Connection:
             return UnknownMapError(self.map_name, available)
         return NoReplyError(
             f"no reply on {self._key(ask)} although the map is there: the server is stopping, "
-            "access control forbids the request, or a message exceeds a size limit",
+            "access control forbids the request, or a message exceeds a size limit"
         )
 
     def put(self, key: str, message: Message) -> None:
@@ -120,9 +120,7 @@ class Connection:
             raise self._broken(error) from error
 
     def look_for_maps(
-        self,
-        receiver: Receiver = None,
-        cancellation: zenoh.CancellationToken | None = None,
+        self, receiver: Receiver = None, cancellation: zenoh.CancellationToken | None = None
     ) -> Iterable[zenoh.Reply]:
         """Ask all servers that can be reached for their maps; replies as of :meth:`send`."""
         try:
@@ -159,10 +157,7 @@ def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
 
 
 def open_connection(
-    endpoint: str,
-    map_name: str,
-    timeout_s: float,
-    config: str | Path | None,
+    endpoint: str, map_name: str, timeout_s: float, config: str | Path | None
 ) -> Connection:
     """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
     try:
@@ -175,7 +170,7 @@ def open_connection(
         reason = str(error).split(" at /", 1)[0].strip()
         raise ConnectError(
             f"cannot connect to {endpoint}: {reason} Start triquad-server there, or check the "
-            "endpoint and its credentials.",
+            "endpoint and its credentials."
         ) from error
     connection = Connection(session, map_name, timeout_s)
     try:

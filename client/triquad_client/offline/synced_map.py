@@ -85,12 +85,7 @@ class LocalCopy:
         return self._current().driver.run(call)
 
     def _update(self) -> Call[SyncReport]:
-        """Fetch what changed; where that fails, the copy stays as it was.
-
-        Raises:
-            DownloadError: what arrived is not valid.
-            OSError: the file cannot be written.
-        """
+        """Fetch what changed, as :meth:`SyncedMap.refresh`."""
         return retried("chunk_gone", lambda: offload(self._fetch))
 
     def _current(self) -> _State:

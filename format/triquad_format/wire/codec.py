@@ -26,9 +26,7 @@ MAX_MESSAGE_BYTES = 256 * 2**20
 _MAX_WIRE_STRING_BYTES = 65_536
 _MAX_ITEMS = 65_536
 
-_DTYPES = frozenset(
-    {"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"},
-)
+_DTYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"})
 _MAX_DIMENSIONS = 4
 
 MessageT = TypeVar("MessageT", bound="Message")
@@ -60,7 +58,7 @@ class ArraySpec:
             shape = ", ".join("N" if size is None else str(size) for size in self.shape)
             raise WireError(
                 f"{name}: expected an array [{shape}] of {self.dtype}, "
-                f"got {list(array.shape)} of {array.dtype.str}",
+                f"got {list(array.shape)} of {array.dtype.str}"
             )
 
 
@@ -91,7 +89,7 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
     if version != PROTOCOL_VERSION:
         raise ProtocolVersionError(
             f"protocol version {version!r} is not spoken here, only {PROTOCOL_VERSION}; "
-            "use client and server of the same release",
+            "use client and server of the same release"
         )
     if body.get("kind") != expected.__name__:
         raise WireError(f"expected a {expected.__name__}, got {body.get('kind')!r}")
@@ -110,11 +108,7 @@ def pack_array(array: NDArray[np.generic]) -> dict[str, object]:
     little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
     if little.dtype.str not in _DTYPES:
         raise WireError(f"arrays of {array.dtype} do not travel; use one of {sorted(_DTYPES)}")
-    return {
-        "dtype": little.dtype.str,
-        "shape": list(array.shape),
-        "data": little.tobytes(),
-    }
+    return {"dtype": little.dtype.str, "shape": list(array.shape), "data": little.tobytes()}
 
 
 def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
@@ -202,7 +196,7 @@ def _unpack(name: str, annotation: Any, value: object) -> object:
         if not isinstance(value, dict) or not hints.keys() <= value.keys():
             raise WireError(f"{name}: expected a map with {', '.join(hints)}")
         return annotation(
-            **{key: _unpack(f"{name}.{key}", hint, value[key]) for key, hint in hints.items()},
+            **{key: _unpack(f"{name}.{key}", hint, value[key]) for key, hint in hints.items()}
         )
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)
