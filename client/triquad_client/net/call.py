@@ -16,6 +16,7 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import MapReply
 
 from triquad_client import checks
+from triquad_client.errors import BadReplyError
 
 NEWEST = 0
 """Asks for the newest epoch, a published state of the map; another number pins that epoch."""
@@ -156,13 +157,20 @@ def in_parts(
 
 
 def joined(replies: Sequence[MapReply], flags: Sequence[str] = ()) -> dict[str, Any]:
-    """The fields of replies about parts as one: arrays end to end, ``flags`` as truth values."""
-    fields = {
-        name: np.concatenate([getattr(reply, name) for reply in replies])
-        if isinstance(value, np.ndarray)
-        else value
-        for name, value in vars(replies[0]).items()
-    }
+    """The fields of replies about parts as one: arrays end to end, ``flags`` as truth values.
+
+    Raises:
+        BadReplyError: the replies do not fit together.
+    """
+    try:
+        fields = {
+            name: np.concatenate([getattr(reply, name) for reply in replies])
+            if isinstance(value, np.ndarray)
+            else value
+            for name, value in vars(replies[0]).items()
+        }
+    except ValueError as error:
+        raise BadReplyError(f"the replies about parts do not fit together: {error}") from error
     return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
 
 

@@ -1,6 +1,7 @@
 """The Zenoh session of a client, and requests over it."""
 
 import json
+import weakref
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -33,6 +34,9 @@ class Connection:
 
     def __init__(self, session: zenoh.Session, map_name: str, timeout_s: float) -> None:
         self._session = session
+        # A session that a program forgot is closed before Python ends: Zenoh's threads must not
+        # come back into an interpreter that is no longer there.
+        self._close = weakref.finalize(self, session.close)
         self.map_name = map_name
         self.timeout_s = timeout_s
 
@@ -43,7 +47,7 @@ class Connection:
 
     def close(self) -> None:
         """Close the session; closing twice does no harm. What is under way ends unanswered."""
-        self._session.close()
+        self._close()
 
     def send(
         self,
