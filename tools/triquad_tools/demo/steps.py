@@ -25,8 +25,7 @@ from triquad_tools.evaluation.map_scores import (
     score_street,
 )
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
-from triquad_tools.plots.camera import Camera
-from triquad_tools.plots.render import height_colours, render_mesh
+from triquad_tools.plots.render import Camera, height_colours, render_mesh
 from triquad_tools.simulation.street import street_drive
 
 MAP = "demo"
@@ -157,5 +156,5 @@ def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
         report(0.0, picture.name)
         camera = Camera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
         colours = height_colours(surface.vertices)
-        image = render_mesh(surface.vertices, surface.faces, camera=camera, colours=colours)
+        image = render_mesh(surface.vertices, surface.faces, colours, camera)
         imsave(picture, image)
