@@ -14,10 +14,12 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 
-from triquad_tools.benchmarks.street import BenchStreet, PosedScan
+from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.server import DemoServer, ServerOptions
+from triquad_tools.recordings.cloud import PosedScan
 
 MAP = "bench"
 
@@ -87,3 +89,15 @@ def stream_beside_planner(
     with server.planner(points, "gradient") as probe:
         stream(server.client, made.scans, published=published)
         return probe.finish()
+
+
+def latency_figures(
+    name: str, met: ProbeReport, median_ms: float | None = None, tail_ms: float | None = None
+) -> list[Figure]:
+    """How soon a planner's queries were answered, and what the median and 99 % should be."""
+    return [
+        Figure(f"{name}, median", met.latency_p50_ms, "ms", at_most=median_ms),
+        Figure(f"{name}, 99 %", met.latency_p99_ms, "ms", at_most=tail_ms),
+        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms"),
+        Figure(f"{name}, errors", met.errors, "", at_most=0),
+    ]

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_tools.recordings.cloud import merged
+from triquad_tools.recordings.cloud import PosedScan, merged
 from triquad_tools.simulation.scene import Scene
 
 _SENSOR_HEIGHT_M = 1.8
@@ -18,12 +18,10 @@ _TILT_RAD = math.radians(1.0)  # of the gentle roll and pitch
 
 
 @dataclass(frozen=True)
-class SimulatedScan:
-    """What the sensor measured, and the truth behind it; row ``i`` of both is the same ray."""
+class SimulatedScan(PosedScan):
+    """What the sensor measured: returns with range noise, and the truth behind each."""
 
-    points: NDArray[np.float32]  # [N, 3] metres, sensor frame, with range noise; returns only
     true_hits: NDArray[np.float64]  # [N, 3] metres, world frame, exactly on the surface
-    world_from_sensor: NDArray[np.float64]  # [4, 4]
 
 
 @dataclass(frozen=True)
