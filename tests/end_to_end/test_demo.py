@@ -10,8 +10,9 @@ from support import servers
 from triquad_client import RequestTimeoutError, SdfResult
 from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands import demo
+from triquad_tools.console.command import ToolError
 from triquad_tools.demo import steps
-from triquad_tools.demo.probe import Probe, ProbeError, ProbeReport, ask_until
+from triquad_tools.demo.probe import Probe, ProbeReport, ask_until
 from triquad_tools.demo.results import (
     DemoResults,
     Intake,
@@ -20,7 +21,7 @@ from triquad_tools.demo.results import (
     broken_promises,
     table_rows,
 )
-from triquad_tools.demo.server import DemoServer, DemoServerError, ServerOptions
+from triquad_tools.demo.server import DemoServer, ServerOptions
 from triquad_tools.evaluation.map_scores import StreetScores
 from triquad_tools.evaluation.metrics import MeshScores
 from triquad_tools.mapfiles.meshfile import read_mesh
@@ -118,7 +119,7 @@ def test_a_server_that_cannot_start_is_reported_with_its_last_line(tmp_path) -> 
     (tmp_path / "store").write_text("a file")
     log = tmp_path / "server.log"
     options = ServerOptions(servers.free_endpoint(), "demo", tmp_path / "store", log)
-    with pytest.raises(DemoServerError, match="the server did not start: .*store") as caught:
+    with pytest.raises(ToolError, match="the server did not start: .*store") as caught:
         DemoServer(options)
     assert str(log) in str(caught.value)
     assert str(tmp_path / "store") in log.read_text()
@@ -155,7 +156,7 @@ def test_queries_without_a_server_fail(tmp_path: Path) -> None:
     endpoint = servers.free_endpoint()
     with (
         Probe(endpoint, "demo", tmp_path / "points.npy") as probe,
-        pytest.raises(ProbeError, match="exit code 1"),
+        pytest.raises(ToolError, match="exit code 1"),
     ):
         probe.finish()
 

@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -231,7 +230,3 @@ def _where(loss: Loss) -> str:
         return ""
     bounds = zip("xyz", loss.minimum.tolist(), loss.maximum.tolist(), strict=True)
     return ", " + ", ".join(f"{axis} {low:.1f} to {high:.1f} m" for axis, low, high in bounds)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

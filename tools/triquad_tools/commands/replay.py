@@ -1,7 +1,6 @@
 """``triquad-replay``: publish a recorded folder of scans to a map server."""
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -189,7 +188,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--settle", action="store_true", help="wait until the server has learnt all of it")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

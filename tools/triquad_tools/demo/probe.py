@@ -35,10 +35,6 @@ QUESTIONS: "dict[str, Callable[[Client, NDArray[np.float64]], int]]" = {
 """What the planner may ask; each returns the epoch that answered."""
 
 
-class ProbeError(ToolError):
-    """A process of queries that failed."""
-
-
 @dataclass(frozen=True)
 class ProbeReport:
     """What the planner met; latencies are NaN where no query was answered."""
@@ -77,22 +73,19 @@ class Probe:
         """End the queries and say what they met.
 
         Raises:
-            ProbeError: the process failed.
+            ToolError: the process failed.
         """
         try:
             output, _ = self._process.communicate(timeout=_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            raise ProbeError(f"the queries did not end within {_STOP_TIMEOUT_S:g} s") from None
+            raise ToolError(f"the queries did not end within {_STOP_TIMEOUT_S:g} s") from None
         if self._process.returncode != 0:
-            raise ProbeError(f"the queries ended with exit code {self._process.returncode}")
+            raise ToolError(f"the queries ended with exit code {self._process.returncode}")
         return ProbeReport(**json.loads(output))
 
 
 def ask_until(
-    stop: threading.Event,
-    client: "Client",
-    points: NDArray[np.float64],
-    question: str = "sdf",
+    stop: threading.Event, client: "Client", points: NDArray[np.float64], question: str = "sdf"
 ) -> ProbeReport:
     """Ask a question of ``QUESTIONS`` at ``points`` [N, 3] until ``stop`` is set."""
     from triquad_client import TriquadError
@@ -110,28 +103,13 @@ def ask_until(
             errors += 1
             last_error = f"{type(error).__name__}: {error}"
         stop.wait(PERIOD_S - (time.perf_counter() - started))
-    return _report(latencies_s, epochs, errors, last_error, len(points))
-
-
-def _report(
-    latencies_s: Sequence[float],
-    epochs: Sequence[int],
-    errors: int,
-    last_error: str | None,
-    points: int,
-) -> ProbeReport:
     quantiles = [float("nan")] * 4
     if latencies_s:
         quantiles = (1e3 * np.quantile(latencies_s, [0.5, 0.95, 0.99, 1.0])).tolist()
-    return ProbeReport(
-        len(latencies_s) + errors,
-        errors,
-        last_error,
-        len(set(epochs)),
-        sum(later < before for before, later in zip(epochs, epochs[1:], strict=False)),
-        points,
-        *quantiles,
-    )
+    backwards = sum(later < before for before, later in zip(epochs, epochs[1:], strict=False))
+    queries = len(latencies_s) + errors
+    different = len(set(epochs))
+    return ProbeReport(queries, errors, last_error, different, backwards, len(points), *quantiles)
 
 
 def main(argv: Sequence[str]) -> int:

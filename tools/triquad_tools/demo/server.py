@@ -15,10 +15,6 @@ _READY_TIMEOUT_S = 300.0  # kernels are compiled on the first start
 _STOP_TIMEOUT_S = 60.0
 
 
-class DemoServerError(ToolError):
-    """A server that does not start, or does not stop."""
-
-
 @dataclass(frozen=True)
 class ServerOptions:
     """What the server is started with."""
@@ -48,7 +44,7 @@ class DemoServer:
         """Start the process and wait until it is ready.
 
         Raises:
-            DemoServerError: it ended before, or took too long.
+            ToolError: it ended before, or took too long.
         """
         self.endpoint = options.endpoint
         self._options = options
@@ -64,7 +60,10 @@ class DemoServer:
         self._reader = threading.Thread(target=self._read_log, name="server log")
         self._reader.start()
         try:
-            self._wait_until_ready()
+            if not self._started.wait(_READY_TIMEOUT_S):
+                raise self._failure(f"the server is not ready after {_READY_TIMEOUT_S:g} s")
+            if not self._ready:
+                raise self._failure("the server did not start")
         except BaseException:
             self._end()
             raise
@@ -79,27 +78,21 @@ class DemoServer:
         """Ask the server to stop and wait for it.
 
         Raises:
-            DemoServerError: it did not stop, or not in good order.
+            ToolError: it did not stop, or not in good order.
         """
         self._process.send_signal(signal.SIGTERM)
         try:
             code = self._process.wait(_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            raise DemoServerError(
+            raise ToolError(
                 f"the server did not stop within {_STOP_TIMEOUT_S:g} s of SIGTERM; its log is "
                 f"{self._options.log}"
             ) from None
         if code != 0:
             raise self._failure(f"the server stopped with exit code {code}")
 
-    def _wait_until_ready(self) -> None:
-        if not self._started.wait(_READY_TIMEOUT_S):
-            raise self._failure(f"the server is not ready after {_READY_TIMEOUT_S:g} s")
-        if not self._ready:
-            raise self._failure("the server did not start")
-
-    def _failure(self, what: str) -> DemoServerError:
-        return DemoServerError(f"{what}: {self._last_line}; its log is {self._options.log}")
+    def _failure(self, what: str) -> ToolError:
+        return ToolError(f"{what}: {self._last_line}; its log is {self._options.log}")
 
     def _read_log(self) -> None:
         assert self._process.stderr is not None

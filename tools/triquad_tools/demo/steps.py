@@ -18,15 +18,9 @@ from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.results import Intake, MapSize, Restart
-from triquad_tools.evaluation.map_scores import (
-    DrivenStreet,
-    StreetScores,
-    driven_street,
-    score_street,
-)
+from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
 from triquad_tools.plots.render import Camera, height_colours, render_mesh
-from triquad_tools.simulation.street import street_drive
 
 MAP = "demo"
 
@@ -62,11 +56,6 @@ class Scored:
     checkpoint: CheckpointInfo
     points: NDArray[np.float64]  # [N, 3] where it was asked
     answers: SdfResult
-
-
-def simulate(scans: int, seed: int) -> DrivenStreet:
-    """Drive along a street with a simulated lidar."""
-    return driven_street(street_drive(seed, scans))
 
 
 def learn(endpoint: str, street: DrivenStreet, out: Path) -> Learnt:
