@@ -16,6 +16,7 @@ from triquad_format.recovery.recovered_map import RecoveredMap, recover
 
 from triquad_tools.console.arguments import error_limit, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
+from triquad_tools.mapfiles.grid import export_grid
 from triquad_tools.mapfiles.packing import chosen_precision, pack_map, print_packed
 from triquad_tools.mapfiles.source import (
     Box,
@@ -34,6 +35,7 @@ _SUFFIXES = (_MAP, *_MESHES, _GRID)
 _PLANES = ("XY", "XZ", "YZ")
 _MESH_CELL_M, _GRID_CELL_M = 0.1, 0.2
 _CELL_RANGE_M = (0.01, 10.0)
+_MARGIN_CELLS = 16  # so far around its box a map is needed for a mesh or a grid
 
 _Add = Callable[..., argparse.Action]
 
@@ -168,17 +170,18 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
 
 
 def _export(options: argparse.Namespace, path: Path) -> int:
-    from triquad_tools.mapfiles.export import MARGIN_CELLS, export_grid, export_mesh  # slow
-
     box, output = _box(options.crop), options.output
     grid = output.suffix == _GRID
     cell_m = options.cell or (_GRID_CELL_M if grid else _MESH_CELL_M)
     check_range("--cell", cell_m, *_CELL_RANGE_M)
-    needed = None if box is None else box + [[-MARGIN_CELLS * cell_m], [MARGIN_CELLS * cell_m]]
+    margin_m = _MARGIN_CELLS * cell_m
+    needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
     if grid:
         written = export_grid(source.record, box, cell_m, options.sparse, output)
     else:
+        from triquad_tools.mapfiles.mesh import export_mesh  # slow to import
+
         written = export_mesh(source.record, box, cell_m, output)
     print(f"{output}: {written}")
     return OK if complete else FAILED

@@ -7,12 +7,14 @@ the field has zeros that nobody taught it.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 from triquad_client import Mesh
 from triquad_client.mesh.welding import Triangles, joined
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.records.region import MapRecord
 from triquad_map.view import MapView
 
@@ -41,6 +43,20 @@ class _Voxels:
 
     def __getitem__(self, rows: NDArray[np.intp]) -> "_Voxels":
         return _Voxels(self.places[rows], self.first[rows], self.last[rows])
+
+
+def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
+    """Write the mesh of a map; returns what was written.
+
+    Raises:
+        ToolError: the mesh is too large, or its regions are too far away.
+        OSError: the file cannot be written.
+    """
+    mesh = surface_mesh(record, box, cell_m)
+    packed = mesh.file_bytes(path.suffix)
+    with replacing(path) as stream:
+        stream.write(packed)
+    return f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
 
 
 def surface_mesh(record: MapRecord, box: Box | None, cell_m: float) -> Mesh:

@@ -47,6 +47,15 @@ def evidence_box(settings: FieldSettings, region: Region) -> NDArray[np.float64]
     return region_corner(settings, region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
 
 
+def evidence_bounds(record: MapRecord) -> NDArray[np.float64] | None:
+    """The same box around all that rays have shown of a map."""
+    found = [evidence_box(record.settings, region) for region in record.regions]
+    boxes = [box for box in found if box is not None]
+    if not boxes:
+        return None
+    return np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))])
+
+
 def surface_voxels(record: MapRecord) -> NDArray[np.float64]:
     """Middles ``[N, 3]`` of the voxels in which rays ended, metres, map frame."""
     parts = [np.empty((0, 3))]
