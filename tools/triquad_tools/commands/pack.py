@@ -17,14 +17,13 @@ from triquad_format.recovery.recovered_map import RecoveredMap, recover
 from triquad_tools.console.arguments import error_limit, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.mapfiles.grid import export_grid
-from triquad_tools.mapfiles.packing import chosen_precision, pack_map, print_packed
+from triquad_tools.mapfiles.packing import chosen_precision, pack_map
 from triquad_tools.mapfiles.source import (
     Box,
     NothingLeftError,
     SourceMap,
     chosen_file,
     cropped,
-    epoch_of,
     read_source,
 )
 
@@ -107,7 +106,8 @@ def _pack(options: argparse.Namespace) -> int:
     path = chosen_file(options.input, options.at)
     _check_target(path, options.output, options.force)
     if path != options.input:
-        print(f"epoch {epoch_of(path)}, from {path}")
+        checkpoint = checkpoint_file(path)
+        print(f"epoch {checkpoint and checkpoint.epoch}, from {path}")
         if options.at is None:
             _tell_set_aside(path)
     write = _pack_map if options.output.suffix == _MAP else _export
@@ -164,8 +164,8 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
     precision = chosen_precision(options.precision, options.max_error)
     training = not options.no_training and precision.max_error_m is None
     source, complete = _source(options, path, _box(options.crop), training)
-    packed = pack_map(source, precision, options.output)
-    print_packed(options.output, packed, path.stat().st_size)
+    written = pack_map(source, precision, options.output, path.stat().st_size)
+    print(f"{options.output}: {written}")
     return OK if complete else FAILED
 
 
