@@ -52,7 +52,8 @@ def _evaluate(options: argparse.Namespace) -> int:
         print(json_text(results))
         return OK
     for name, scores in results.items():
-        print_rows(_TITLES[name], _ROWS[name](scores))
+        title, rows = _TABLES[name]
+        print_rows(title, rows(scores))
     return OK
 
 
@@ -164,15 +165,10 @@ def withheld_rows(scores: WithheldScores) -> list[Row]:
     ]
 
 
-_TITLES = {
-    "mesh": "Mesh",
-    "street": "Map, against the exact street",
-    "withheld": "Map, at the points of withheld scans",
-}
-_ROWS: dict[str, Callable[[Any], list[Row]]] = {
-    "mesh": mesh_rows,
-    "street": street_rows,
-    "withheld": withheld_rows,
+_TABLES: dict[str, tuple[str, Callable[[Any], list[Row]]]] = {
+    "mesh": ("Mesh", mesh_rows),
+    "street": ("Map, against the exact street", street_rows),
+    "withheld": ("Map, at the points of withheld scans", withheld_rows),
 }
 
 

@@ -113,12 +113,12 @@ def _blocks(voxels: _Voxels) -> Iterator[tuple[Cells, _Voxels]]:
 def _block_mesh(view: MapView, block: Cells, voxels: _Voxels, cell_m: float) -> Triangles:
     origin = block * _BLOCK_CELLS
     cells = _covered(voxels.first - origin, voxels.last - origin)
-    asked = np.argwhere(_corners(cells))
+    asked = np.argwhere(_any_of_eight(np.pad(cells, 1)))  # lattice points at their corners
     # Points that nobody asks for lie in free space.
     volume = np.ones((_BLOCK_CELLS + 1,) * 3, np.float32)
     volume[tuple(asked.T)] = view.query(np.asarray((origin + asked) * cell_m, np.float64)).sdf
     unknown = np.isnan(volume)  # beside the regions
-    cells &= ~_of_cells(unknown)
+    cells &= ~_any_of_eight(unknown)
     volume[unknown] = 1.0
     surface = _marched(volume, cells)
     vertices = (origin + surface.vertices) * cell_m
@@ -150,20 +150,11 @@ def _covered(first: Cells, last: Cells) -> NDArray[np.bool_]:
     return np.asarray(boxes[:-1, :-1, :-1] > 0)
 
 
-def _corners(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The lattice points at the corners of any of the cells."""
-    points = np.zeros((_BLOCK_CELLS + 1,) * 3, np.bool_)
-    for x, y, z in np.ndindex(2, 2, 2):
-        points[x : x + _BLOCK_CELLS, y : y + _BLOCK_CELLS, z : z + _BLOCK_CELLS] |= cells
-    return points
-
-
-def _of_cells(points: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The cells that have any of the lattice points at a corner."""
-    cells = np.zeros((_BLOCK_CELLS,) * 3, np.bool_)
-    for x, y, z in np.ndindex(2, 2, 2):
-        cells |= points[x : x + _BLOCK_CELLS, y : y + _BLOCK_CELLS, z : z + _BLOCK_CELLS]
-    return cells
+def _any_of_eight(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether any of 2 x 2 x 2 neighbours is set; one less along each side than ``flags``."""
+    flags = flags[:-1] | flags[1:]
+    flags = flags[:, :-1] | flags[:, 1:]
+    return flags[:, :, :-1] | flags[:, :, 1:]
 
 
 def _beside(voxels: Cells, points: NDArray[np.float64], leaf_m: float) -> NDArray[np.bool_]:

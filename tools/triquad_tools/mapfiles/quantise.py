@@ -98,7 +98,7 @@ def _quantise_region(settings: FieldSettings, region: Region, max_error_m: float
     if best is None:
         raise FormatError(
             f"region {region.index}: integers change distances by {error * 1e3:.3f} mm, "
-            f"more than {max_error_m * 1e3:.3f} mm; allow a larger error",
+            f"more than {max_error_m * 1e3:.3f} mm; allow a larger error"
         )
     return dataclasses.replace(region, tables=best, training=None)
 

@@ -7,11 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import NoIndexError
-from triquad_format.mapfile.checkpoint_folder import (
-    checkpoint_at,
-    checkpoint_files,
-    map_folder,
-)
+from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
 from triquad_format.mapfile.file_errors import named
 from triquad_format.mapfile.index import MapIndex, file_in
 from triquad_format.mapfile.mcap.random_access import FileBytes

@@ -17,7 +17,7 @@ from triquad_format.records.region import MapRecord, region_centre, region_corne
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import centimetres, utc_time
-from triquad_tools.mapfiles.seen_space import Columns, seen_columns, surface_columns
+from triquad_tools.mapfiles.seen_space import Columns, seen_columns
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
@@ -46,7 +46,7 @@ def draw_map(title: str, file: MapFile, path: Path) -> None:
         OSError: ``path`` cannot be written.
     """
     record = file.record
-    surface, seen = surface_columns(record), seen_columns(record)
+    surface, seen = seen_columns(record, surface_only=True), seen_columns(record)
     grid = PlanGrid.around(seen.middles, record.settings.leaf_m)
     plans = [
         Plan("Coverage", partial(_draw_coverage, grid, surface, seen)),
