@@ -14,7 +14,7 @@ from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, 
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo import steps
 from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
-from triquad_tools.demo.server import DemoServer, ServerOptions
+from triquad_tools.demo.server import DemoServer
 from triquad_tools.evaluation.map_scores import driven_street
 from triquad_tools.simulation.street import street_drive
 
@@ -51,7 +51,6 @@ def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
         ToolError, TriquadError, FormatError, OSError: a step failed; the server is stopped.
     """
     laps = _Laps()
-    server_options = ServerOptions.within(out, steps.MAP)
     out.mkdir(parents=True, exist_ok=True)
     # What an earlier demonstration left in its store and log is forgotten.
     shutil.rmtree(out / "store" / steps.MAP, ignore_errors=True)
@@ -59,9 +58,9 @@ def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
     street = driven_street(street_drive(street_seed, scans))
     laps.end("simulate")
     _say("starting triquad-server (the first run of all compiles kernels: a minute more) ...")
-    with DemoServer(server_options) as server:
+    with DemoServer(out, steps.MAP) as server:
         laps.end("start")
-        learnt = steps.learn(server.endpoint, street, out)
+        learnt = steps.learn(server.endpoint, street)
         laps.end("learn")
         if not learnt.intake.settled:
             _say("the server is still learning; it is scored as it is now")
@@ -70,7 +69,7 @@ def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
         server.stop()
         laps.end("stop")
     _say("starting triquad-server again, from its checkpoint ...")
-    with DemoServer(server_options) as server:
+    with DemoServer(out, steps.MAP) as server:
         restart = steps.compare(server.endpoint, scored)
         server.stop()
     laps.end("restart")

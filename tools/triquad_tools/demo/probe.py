@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,12 +53,15 @@ class ProbeReport:
 class Probe:
     """The planner's process; leaving the ``with`` statement ends it in any case."""
 
-    def __init__(self, endpoint: str, map_name: str, points: Path, question: str = "sdf") -> None:
-        """Start to ask a question of ``QUESTIONS`` at ``points``, an ``.npy`` file ``[N, 3]``."""
-        command = [sys.executable, "-m", __name__, endpoint, map_name, str(points), question]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+    def __init__(
+        self, endpoint: str, map_name: str, points: NDArray[np.float64], question: str = "sdf"
+    ) -> None:
+        """Start to ask a question of ``QUESTIONS`` at points [N, 3], a few thousand at most."""
+        command = [sys.executable, "-m", __name__, endpoint, map_name, question, str(len(points))]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        assert self._process.stdin is not None
+        self._process.stdin.write(points.astype("<f8").tobytes())
+        self._process.stdin.flush()
 
     def __enter__(self) -> "Probe":
         return self
@@ -113,20 +115,21 @@ def ask_until(
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the process; ``argv`` is endpoint, map, file of points and question."""
+    """Run the process; ``argv`` is endpoint, map, question and how many points are read."""
     from triquad_client import connect
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    endpoint, map_name, points, question = argv
+    endpoint, map_name, question, count = argv
+    points = np.frombuffer(sys.stdin.buffer.read(24 * int(count)), "<f8").reshape(-1, 3)
     stop = threading.Event()
 
     def wait_for_end() -> None:
-        sys.stdin.read()
+        sys.stdin.buffer.read()
         stop.set()
 
     threading.Thread(target=wait_for_end, daemon=True).start()
     with connect(endpoint, map_name) as client:
-        report = ask_until(stop, client, np.load(points), question)
+        report = ask_until(stop, client, points, question)
     print(json.dumps(asdict(report)))
     return 0
 

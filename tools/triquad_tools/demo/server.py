@@ -6,28 +6,12 @@ import subprocess
 import sys
 import threading
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_tools.console.command import ToolError
 
 _READY_TIMEOUT_S = 300.0  # kernels are compiled on the first start
 _STOP_TIMEOUT_S = 60.0
-
-
-@dataclass(frozen=True)
-class ServerOptions:
-    """What the server is started with."""
-
-    endpoint: str
-    map_name: str
-    store: Path
-    log: Path  # its log is added to this file
-
-    @classmethod
-    def within(cls, folder: Path, map_name: str) -> "ServerOptions":
-        """On a free port, with store and log in a folder."""
-        return cls(_free_endpoint(), map_name, folder / "store", folder / "server.log")
 
 
 def _free_endpoint() -> str:
@@ -38,21 +22,21 @@ def _free_endpoint() -> str:
 
 
 class DemoServer:
-    """A running server; leaving the ``with`` statement stops it in any case."""
+    """A running server on a free port; leaving the ``with`` statement stops it in any case."""
 
-    def __init__(self, options: ServerOptions) -> None:
-        """Start the process and wait until it is ready.
+    def __init__(self, folder: Path, map_name: str) -> None:
+        """Start the process, with store and log in a folder, and wait until it is ready.
 
         Raises:
             ToolError: it ended before, or took too long.
         """
-        self.endpoint = options.endpoint
-        self._options = options
+        self.endpoint = _free_endpoint()
+        self._log = folder / "server.log"
         self._started = threading.Event()  # ready, or ended
         self._ready = False
         self._last_line = "it said nothing"
-        command = [sys.executable, "-m", "triquad_server.cli", "--listen", options.endpoint]
-        command += ["--map", options.map_name, "--store", str(options.store)]
+        command = [sys.executable, "-m", "triquad_server.cli", "--listen", self.endpoint]
+        command += ["--map", map_name, "--store", str(folder / "store")]
         command += ["--no-multicast-scouting"]
         self._process = subprocess.Popen(
             command, stderr=subprocess.PIPE, text=True, errors="replace"
@@ -86,17 +70,17 @@ class DemoServer:
         except subprocess.TimeoutExpired:
             raise ToolError(
                 f"the server did not stop within {_STOP_TIMEOUT_S:g} s of SIGTERM; its log is "
-                f"{self._options.log}"
+                f"{self._log}"
             ) from None
         if code != 0:
             raise self._failure(f"the server stopped with exit code {code}")
 
     def _failure(self, what: str) -> ToolError:
-        return ToolError(f"{what}: {self._last_line}; its log is {self._options.log}")
+        return ToolError(f"{what}: {self._last_line}; its log is {self._log}")
 
     def _read_log(self) -> None:
         assert self._process.stderr is not None
-        with self._options.log.open("a", encoding="utf-8") as log:
+        with self._log.open("a", encoding="utf-8") as log:
             for line in self._process.stderr:
                 log.write(line)
                 log.flush()

@@ -58,17 +58,12 @@ class Scored:
     answers: SdfResult
 
 
-def learn(endpoint: str, street: DrivenStreet, out: Path) -> Learnt:
+def learn(endpoint: str, street: DrivenStreet) -> Learnt:
     """Stream the scans and wait until they are learnt, while another process asks."""
-    rng = np.random.default_rng(_SEED)
-    asked = out / "query_points.npy"
-    np.save(asked, rng.permutation(street.probes.near)[:_QUERY_POINTS])
-    try:
-        with connect(endpoint, MAP) as client, Probe(endpoint, MAP, asked) as probe:
-            intake = _stream(client, street)
-            return Learnt(intake, probe.finish())
-    finally:
-        asked.unlink()
+    points = np.random.default_rng(_SEED).permutation(street.probes.near)[:_QUERY_POINTS]
+    with connect(endpoint, MAP) as client, Probe(endpoint, MAP, points) as probe:
+        intake = _stream(client, street)
+        return Learnt(intake, probe.finish())
 
 
 def _stream(client: Client, street: DrivenStreet) -> Intake:

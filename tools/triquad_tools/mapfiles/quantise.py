@@ -89,7 +89,7 @@ def _quantise_region(settings: FieldSettings, region: Region, max_error_m: float
             _rounded(table, factor * weight)
             for table, weight in zip(region.tables, weights, strict=True)
         )
-        error = probes.change(tables).quantile_m
+        error = probes.points.change(probes.moves(tables)).quantile_m
         if error <= limit:
             best = tables
             if error >= _CLOSE * limit or error == 0.0:
@@ -121,15 +121,11 @@ class _RegionProbes:
             region, index=(0, 0, 0), evidence=masked(region.evidence, np.uint8(0)), training=None
         )
         self._record = MapRecord("", 0, settings, (alone,))
-        self._probes = draw_probes(settings, region, np.random.default_rng(_SEARCH_SEED))
+        self.points = draw_probes(settings, region, np.random.default_rng(_SEARCH_SEED))
         self._before = self._distances(region.tables)
 
-    def change(self, tables: tuple[VertexTable, ...]) -> FieldChange:
-        """How far distances move where the region has these tables."""
-        return self._probes.change(self.moves(tables))
-
     def moves(self, tables: tuple[VertexTable, ...]) -> NDArray[np.float32]:
-        """The same [P] at each of the points, metres."""
+        """How far distances move [P], metres, where the region has these tables."""
         return self._distances(tables) - self._before
 
     def _distances(self, tables: tuple[VertexTable, ...]) -> NDArray[np.float32]:
@@ -137,7 +133,7 @@ class _RegionProbes:
         region = dataclasses.replace(self._record.regions[0], tables=tables)
         opened = open_view(dataclasses.replace(self._record, regions=(region,)))
         try:
-            return np.nan_to_num(opened.view.query(self._probes.points).sdf)
+            return np.nan_to_num(opened.view.query(self.points.points).sdf)
         finally:
             opened.close()
 
