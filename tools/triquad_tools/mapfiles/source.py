@@ -40,11 +40,9 @@ class SourceMap:
 
 
 def chosen_file(path: Path, when: str | None) -> Path:
-    """The file itself, or the checkpoint in a folder that ``when`` asks for.
+    """The file itself or, in a folder of checkpoints or a store of one, the checkpoint ``when``.
 
-    Args:
-        path: a map file, a folder of checkpoints, or a store that holds one such folder.
-        when: number of an epoch, or a time; not given, the newest checkpoint is meant.
+    ``when`` is the number of an epoch, or a time; not given, the newest checkpoint is meant.
 
     Raises:
         ToolError: ``when`` is given for a file.
