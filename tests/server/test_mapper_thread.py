@@ -10,17 +10,14 @@ from support import servers
 from support.small_world import settings, world
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
 from triquad_server.counter import Counter
-from triquad_server.epochs.gate import QueryGate
 from triquad_server.epochs.history import EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
-from triquad_server.mapping.resets import Resets
 from triquad_server.settings import StoreSettings
 from triquad_server.store.checkpoints import Checkpoints
-from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
 
 NEVER_S = 3600.0
@@ -30,7 +27,7 @@ KEPT = EpochLimits(4, 0, 0.0)
 def inputs() -> MapperInputs:
     ledger = SourceLedger()
     scans = ScanQueue(8, ledger, Counter())
-    return MapperInputs(scans, ledger, QueryGate(), Counter(), Counter())
+    return MapperInputs(scans, ledger, Counter(), Counter())
 
 
 @contextmanager
@@ -93,13 +90,13 @@ def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
 def test_whoever_reset_the_map_finds_the_epoch_that_shows_it() -> None:
     box = np.full(3, -np.inf), np.full(3, np.inf)
     with running(learning_mapper()) as thread:
-        reply = Resets(thread).answer(ResetRequest(*box))
+        reply = thread.reset(ResetRequest(*box))
         assert thread.epochs.newest.number >= reply.epoch
         assert thread.epochs.get(reply.epoch).regions == 0
 
 
 def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Path) -> None:
-    store = Store(tmp_path, "test", Retention.chosen(StoreSettings()))
+    store = Store(tmp_path, "test", StoreSettings())
     with closing(store), running(learning_mapper()) as thread:
         checkpoints = Checkpoints(thread, store, 0.0, None)
         checkpoints.start()

@@ -7,23 +7,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import (
-    AXES,
-    Mlp,
-    Region,
-    RegionIndex,
-    TrainingState,
-    VertexTable,
-)
+from triquad_format.records.region import AXES, Mlp, Region, RegionIndex, TrainingState, VertexTable
 from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
 
-from triquad_server.engine.batch import Batch
-from triquad_server.engine.live_field import LiveField, StoredField
+from triquad_server.engine.live_field import FrozenField, LiveField
+from triquad_server.engine.trainer import Batch
 
 
 def region_record(
     index: RegionIndex,
-    field: StoredField,
+    field: LiveField | FrozenField,
     evidence: FrozenEvidence,
     training: TrainingState | None,
 ) -> Region:
@@ -74,10 +67,7 @@ def training_state(field: LiveField, samples: Batch, budget_samples: int) -> Tra
 
 
 def field_from_record(
-    record: Region,
-    settings: FieldSettings,
-    device: torch.device,
-    seed: int,
+    record: Region, settings: FieldSettings, device: torch.device, seed: int
 ) -> LiveField:
     """A field that answers as the recorded one and goes on training where it stopped."""
     layers = zip(record.mlp.weights, record.mlp.biases, strict=True)

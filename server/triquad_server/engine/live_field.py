@@ -1,39 +1,19 @@
 """The field of one region while it grows and is trained: what it consists of, and its state."""
 
 import math
-from typing import Protocol
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.frozen_field import FieldArrays, FrozenCompiledField
-from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
-from triquad_map.composition.region import FieldEngine
+from triquad_map.compiled.field.quadtree import LiveQuadtree
 
-from triquad_server.engine.parameter import Parameter
+from triquad_server.engine.adam import Parameter
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
 
-
-class StoredField(Protocol):
-    """What a field consists of, whether it is live or frozen."""
-
-    @property
-    def settings(self) -> FieldSettings:
-        """Its shape."""
-
-    @property
-    def tree(self) -> LiveQuadtree | FrozenQuadtree:
-        """Its vertices."""
-
-    @property
-    def arrays(self) -> FieldArrays:
-        """Its numbers; not to be written to."""
-
-
-class FrozenField(FieldEngine, StoredField, Protocol):
-    """A field that does not change any more. Safe for any thread."""
+FrozenField = FrozenCompiledField | TensorField
+"""A field that does not change any more. Safe for any thread."""
 
 
 class LiveField:
@@ -89,7 +69,7 @@ class LiveField:
         """The numbers as arrays, which share memory with the field where it is on the CPU."""
         return self.tensors.arrays
 
-    def grow(self, leaves: NDArray[np.int64]) -> None:
+    def grow(self, leaves: Longs) -> None:
         """Make room for surfaces in ``leaves`` [N, 3]; new feature vectors start at random.
 
         Leaves are int64 coordinates in ``[0, 2**depth)``, as evidence voxels.
@@ -100,7 +80,7 @@ class LiveField:
         new = torch.randn(size, generator=self._generator, device=self.device)
         self.features.append(new * self.settings.feature_std)
 
-    def restore(self, plane: int, h: int, codes: NDArray[np.int64], features: Tensor) -> None:
+    def restore(self, plane: int, h: int, codes: Longs, features: Tensor) -> None:
         """Add the vertices ``codes`` [V] of one level with their ``features`` [V, d]."""
         self.tree.restore(plane, h, codes)
         self.features.append(features)

@@ -1,13 +1,40 @@
-"""The epochs that requests can ask for."""
+"""The epochs that requests can ask for, and how training gives way while they are asked."""
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from triquad_format.errors import RefusedError
 
 from triquad_server.epochs.epoch import Epoch
+
+
+class QueryGate:
+    """Counts the queries in flight: training waits a moment between slices while there are any."""
+
+    def __init__(self) -> None:
+        self._idle = threading.Condition()
+        self._in_flight = 0
+
+    @contextmanager
+    def query(self) -> Iterator[None]:
+        """A query is being answered."""
+        with self._idle:
+            self._in_flight += 1
+        try:
+            yield
+        finally:
+            with self._idle:
+                self._in_flight -= 1
+                if self._in_flight == 0:
+                    self._idle.notify_all()
+
+    def give_way(self, limit_s: float) -> None:
+        """Return once no query is in flight, or after ``limit_s``: training never starves."""
+        with self._idle:
+            self._idle.wait_for(lambda: self._in_flight == 0, limit_s)
 
 
 @dataclass(frozen=True)
@@ -23,28 +50,21 @@ class EpochHistory:
     """The newest epochs, and older ones while they are asked for by number."""
 
     def __init__(
-        self,
-        first: Epoch,
-        limits: EpochLimits,
-        clock: Callable[[], float] = time.monotonic,
+        self, first: Epoch, limits: EpochLimits, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """``clock`` tells seconds that never run backwards."""
+        self.gate = QueryGate()
+        self.newest = first  # the epoch published last
         self._lock = threading.Lock()
         self._limits = limits
         self._clock = clock
-        self._newest = first
         self._epochs = {first.number: first}  # oldest first
         self._asked: dict[int, float] = {}  # when, by number; longest ago first
-
-    @property
-    def newest(self) -> Epoch:
-        """The epoch published last."""
-        return self._newest
 
     def add(self, epoch: Epoch) -> None:
         """Make ``epoch`` the newest; older ones may go."""
         with self._lock:
-            self._newest = epoch
+            self.newest = epoch
             self._epochs[epoch.number] = epoch
             self._tidy()
 
@@ -58,17 +78,22 @@ class EpochHistory:
             RefusedError: ``epoch_gone``.
         """
         with self._lock:
-            epoch = self._epochs.get(number) if number else self._newest
+            epoch = self._epochs.get(number) if number else self.newest
             if epoch is None:
                 raise RefusedError(
-                    "epoch_gone",
-                    f"epoch {number} is not kept; kept are {sorted(self._epochs)}",
+                    "epoch_gone", f"epoch {number} is not kept; kept are {sorted(self._epochs)}"
                 )
             if number:
                 self._asked.pop(number, None)
                 self._asked[number] = self._clock()
             self._tidy()
             return epoch
+
+    @contextmanager
+    def view(self, number: int) -> Iterator[Epoch]:
+        """The epoch of that number, or the newest for 0; training gives way while it is asked."""
+        with self.gate.query():
+            yield self.get(number)
 
     def _tidy(self) -> None:
         """Let go of older epochs whose time is over, or that exceed the limit."""

@@ -12,7 +12,7 @@ from triquad_format.wire.messages import Scan
 
 from triquad_server.counter import Counter
 from triquad_server.intake.sources import SourceLedger
-from triquad_server.net.request import payload_limit
+from triquad_server.net.requests import payload_limit
 
 _log = logging.getLogger(__name__)
 
@@ -82,8 +82,7 @@ class ScanIntake:
         self._arrived = arrived
         # A ring, since a full channel of another kind would stall the network's threads.
         self._subscriber = session.declare_subscriber(
-            keys.all_scans_key(map_name),
-            zenoh.handlers.RingChannel(limit),
+            keys.all_scans_key(map_name), zenoh.handlers.RingChannel(limit)
         )
         self._thread = threading.Thread(target=self._run, name="scan-intake")
         self._thread.start()

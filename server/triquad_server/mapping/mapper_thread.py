@@ -9,16 +9,17 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from triquad_format.wire.messages import ResetReply, ResetRequest
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
-from triquad_server.epochs.gate import QueryGate
 from triquad_server.epochs.history import EpochHistory, EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan import ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.tile_queries import check_box
 from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
@@ -55,7 +56,6 @@ class MapperInputs:
 
     scans: ScanQueue
     ledger: SourceLedger
-    gate: QueryGate
     scans_dropped: Counter
     points_dropped: Counter
 
@@ -134,6 +134,20 @@ class MapperThread:
         self._wake.set()
         return result.result()
 
+    def reset(self, request: ResetRequest) -> ResetReply:
+        """Forget what lies in the request's box; answered once an epoch shows it.
+
+        Raises:
+            RefusedError: it is not a box.
+        """
+        check_box(request.minimum, request.maximum)
+
+        def reset(mapper: Mapper) -> int:
+            mapper.reset(request.minimum, request.maximum)
+            return mapper.publish().number
+
+        return ResetReply(self.call(reset))
+
     def _run(self) -> None:
         lower_priority(NICENESS)
         ended = "the mapper has stopped"
@@ -159,7 +173,7 @@ class MapperThread:
         took_scan = self._ingest_next()
         if not self._mapper.settled:
             # However many ask, training waits a third of its time at most.
-            self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
+            self.epochs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
             started = time.monotonic()
             self._mapper.train()
             self._step_s = time.monotonic() - started

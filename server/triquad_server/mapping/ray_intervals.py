@@ -10,6 +10,7 @@ A table of ray intervals [N, COLUMNS] is float32, metres, relative to the region
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_map.compiled.kernel import kernel
 
 from triquad_server.intake.scan import ScanRays
@@ -25,11 +26,9 @@ COLUMNS = 10
 
 _MIN_COSINE = 0.05
 
-Vectors = NDArray[np.float64]
-
 
 @kernel()
-def _set_direction(direction: Vectors, origin: Vectors, end: Vectors) -> float:
+def _set_direction(direction: Doubles, origin: Doubles, end: Doubles) -> float:
     """Set the unit vector [3] from ``origin`` to ``end``; returns how far it is."""
     squared = 0.0
     for axis in range(3):
@@ -44,7 +43,7 @@ def _set_direction(direction: Vectors, origin: Vectors, end: Vectors) -> float:
 
 @kernel()
 def _clipped(
-    end: Vectors, direction: Vectors, half_side_m: float, first: float, last: float
+    end: Doubles, direction: Doubles, half_side_m: float, first: float, last: float
 ) -> tuple[float, float]:
     """The part of an interval of a ray that lies in the cube; none where it begins after its end.
 
@@ -62,13 +61,13 @@ def _clipped(
 
 @kernel()
 def _fill(
-    origin: Vectors,
-    ends: Vectors,
-    normals: Vectors,
+    origin: Doubles,
+    ends: Doubles,
+    normals: Doubles,
     half_side_m: float,
     free_from: float,
     behind_m: float,
-    table: NDArray[np.float32],
+    table: Floats,
 ) -> int:
     """Fill the table with the intervals of rays that pass the cube; returns how many."""
     count = 0
@@ -96,12 +95,8 @@ def _fill(
 
 
 def ray_intervals(
-    rays: ScanRays,
-    normals: Vectors,
-    centre: Vectors,
-    half_side_m: float,
-    settings: ScanSettings,
-) -> NDArray[np.float32]:
+    rays: ScanRays, normals: Doubles, centre: Doubles, half_side_m: float, settings: ScanSettings
+) -> Floats:
     """Intervals of the rays that pass a region's cube, cut off at its faces.
 
     Args:
@@ -124,9 +119,7 @@ def ray_intervals(
     return table[:count]
 
 
-def sample_intervals(
-    points: NDArray[np.float32], labels: NDArray[np.floating]
-) -> NDArray[np.float32]:
+def sample_intervals(points: Floats, labels: NDArray[np.floating]) -> Floats:
     """Intervals without length that teach the signed distances ``labels`` [N] at points [N, 3]."""
     table = np.zeros((len(points), COLUMNS), np.float32)
     table[:, END : END + 3] = points

@@ -7,17 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from triquad_format.records.arrays import Floats, Longs
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.morton import encode
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 
-from triquad_server.engine.batch import Batch
+from triquad_server.engine.trainer import Batch
 from triquad_server.mapping.ray_intervals import DIRECTION, END, FREE_FROM, FREE_TO, LABEL, SLOPE
-
-Floats = NDArray[np.float32]
 
 _CELLS = 128
 """Cells from the centre of the cube to its face, by which samples are put in order."""
@@ -45,21 +43,20 @@ def draw_samples(intervals: Tensor, placement: Placement, generator: torch.Gener
     free = first + places * (last - first)
     offsets = torch.where((kinds < placement.surface_share) & ~outside, near, free)
     return Batch(
-        ends + offsets[:, None] * directions,
-        intervals[:, LABEL] - offsets * intervals[:, SLOPE],
+        ends + offsets[:, None] * directions, intervals[:, LABEL] - offsets * intervals[:, SLOPE]
     )
 
 
 @kernel()
 def _draw(
     intervals: Floats,
-    chosen: NDArray[np.int64],
+    chosen: Longs,
     placement: Placement,
     kinds: Floats,
     places: Floats,
     near: Floats,
     samples: Floats,
-    cells: NDArray[np.int64],
+    cells: Longs,
 ) -> None:
     """Fill in the samples [B, 4], points and labels, and the cells [B] that hold them."""
     per_m = _CELLS / placement.half_side_m
@@ -83,7 +80,7 @@ def _draw(
 
 
 @kernel()
-def _in_order(samples: Floats, cells: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def _in_order(samples: Floats, cells: Longs) -> tuple[Floats, Floats]:
     """Points [B, 3] and labels [B] in the order of their cells (a counting sort)."""
     starts = np.zeros((2 * _CELLS) ** 2 + 1, np.int32)
     for cell in cells:
@@ -101,11 +98,7 @@ def _in_order(samples: Floats, cells: NDArray[np.int64]) -> tuple[Floats, Floats
 
 
 def draw_ordered_samples(
-    intervals: Floats,
-    chosen: NDArray[np.int64],
-    placement: Placement,
-    rng: np.random.Generator,
-    team: Team,
+    intervals: Floats, chosen: Longs, placement: Placement, rng: np.random.Generator, team: Team
 ) -> Batch:
     """As :func:`draw_samples` for the intervals ``chosen`` [B], in compiled code.
 

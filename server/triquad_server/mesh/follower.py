@@ -1,13 +1,20 @@
-"""Clients that follow the mesh: their requests, while they are pending."""
+"""Clients that follow the mesh: their requests while they are pending, and the replies to them."""
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from triquad_format.wire.messages import TileUpdatesRequest
+import numpy as np
+from triquad_format.errors import FormatError, RefusedError
+from triquad_format.records.arrays import Ints
+from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_KNOWN_TILES
+from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 
-from triquad_server.mesh.mesher import TileIndex
-from triquad_server.net.request import Request
+from triquad_server.mesh.tile_lattice import TileIndex, TileLattice
+from triquad_server.mesh.tile_level import CachedTile
+from triquad_server.mesh.tile_queries import check_box, check_level
+from triquad_server.net.requests import Request
 from triquad_server.settings import MeshSettings
 
 
@@ -25,25 +32,16 @@ class Follower:
     held: dict[TileIndex, int]  # versions of tiles that it has whatever the revision
     nothing_at: tuple[int, int] | None = None  # state of the cache that had nothing for it
 
-    @property
-    def level(self) -> int:
-        """The level of detail that it follows."""
-        return self.asks.level
-
 
 def new_follower(
-    request: Request,
-    asks: TileUpdatesRequest,
-    *,
-    server: str,
-    epoch: int,
-    settings: MeshSettings,
+    request: Request, asks: TileUpdatesRequest, *, server: str, epoch: int, settings: MeshSettings
 ) -> Follower:
     """A request that begins to wait; it has passed its checks.
 
     ``server`` is the name that replies carry, ``epoch`` the newest.
     """
     restart = asks.server not in ("", server)
+    held = zip(asks.held.tolist(), asks.held_versions.tolist(), strict=True)
     limits = (settings.client_bytes_per_s, asks.max_bytes_per_s)
     return Follower(
         request=request,
@@ -53,12 +51,95 @@ def new_follower(
         bytes_per_s=min((limit for limit in limits if limit), default=math.inf),
         restart=restart,
         known_to=0 if restart else asks.revision,
-        held={} if restart else _versions(asks),
+        held={} if restart else {(x, y, z): version for (x, y, z), version in held},
     )
 
 
-def _versions(asks: TileUpdatesRequest) -> dict[TileIndex, int]:
-    return {
-        (x, y, z): version
-        for (x, y, z), version in zip(asks.held.tolist(), asks.held_versions.tolist(), strict=True)
-    }
+def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
+    """Refuse a request for changes with a field out of range.
+
+    ``server`` is the name that this server's replies carry, ``revision`` the newest of them.
+    """
+    check_box(asks.minimum, asks.maximum)
+    check_level(asks.level)
+    try:
+        keys.check_name("client", asks.client)
+    except FormatError as error:
+        raise RefusedError("bad_request", str(error)) from error
+    # Written so that NaN is refused as well.
+    if not 0 <= asks.timeout_s < math.inf:
+        raise RefusedError(
+            "bad_request", f"timeout_s = {asks.timeout_s} is not a time: use 0 or more"
+        )
+    if asks.max_bytes < 1 or asks.max_bytes_per_s < 0:
+        raise RefusedError(
+            "bad_request",
+            f"max_bytes = {asks.max_bytes}, max_bytes_per_s = {asks.max_bytes_per_s}: "
+            "use at least 1, and at least 0",
+        )
+    _check_held(asks)
+    newest = revision if asks.server == server else 0
+    if asks.server in ("", server) and not 0 <= asks.revision <= newest:
+        raise RefusedError(
+            "bad_request",
+            f"revision = {asks.revision} was never given by server {asks.server!r}: "
+            "use that of the reply before, or 0",
+        )
+
+
+def _check_held(asks: TileUpdatesRequest) -> None:
+    if len(asks.held) != len(asks.held_versions):
+        raise RefusedError(
+            "bad_request", f"{len(asks.held_versions)} versions of {len(asks.held)} held tiles"
+        )
+    if len(asks.held) > MAX_KNOWN_TILES:
+        raise RefusedError(
+            "too_large", f"{len(asks.held)} held tiles exceed the limit of {MAX_KNOWN_TILES}"
+        )
+
+
+@dataclass
+class TileReply:
+    """Tiles on their way to one follower."""
+
+    complete: bool  # nothing more waits
+    revision: int  # up to which the follower knows everything once it has the reply
+    removed: list[TileIndex] = field(default_factory=list)
+    tiles: list[CachedTile] = field(default_factory=list)
+    data: list[bytes] = field(default_factory=list)  # of each tile
+
+    def fits(self, data: bytes, limit: float) -> bool:
+        """Whether a tile may be added: the first always may."""
+        return not data or not self.data or sum(map(len, self.data)) + len(data) <= limit
+
+    def add(self, tile: CachedTile, data: bytes) -> None:
+        """Add a tile with its bytes; one without faces is to be removed."""
+        self.revision = tile.revision
+        if tile.empty:
+            self.removed.append(tile.index)
+        else:
+            self.tiles.append(tile)
+            self.data.append(data)
+
+    def message(
+        self, *, server: str, epoch: int, restart: bool, lattice: TileLattice
+    ) -> TileUpdates:
+        """The reply as it travels."""
+        return TileUpdates(
+            server=server,
+            revision=self.revision,
+            epoch=epoch,
+            complete=self.complete,
+            restart=restart,
+            tile_side_m=lattice.tile_side_m,
+            cell_m=lattice.cell_m,
+            tiles=_indices([tile.index for tile in self.tiles]),
+            versions=np.array([tile.version for tile in self.tiles], np.int64),
+            sizes=np.array([len(data) for data in self.data], np.int64),
+            data=b"".join(self.data),
+            removed=_indices(self.removed),
+        )
+
+
+def _indices(tiles: list[TileIndex]) -> Ints:
+    return np.array(tiles, np.int32).reshape(-1, 3)

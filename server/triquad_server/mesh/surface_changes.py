@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import RegionIndex
 from triquad_map.compiled.surfels.surfel_index import surfel_voxels
@@ -24,17 +25,17 @@ fewer, training is the cause, which never leaves all voxels alone."""
 class Changes:
     """Where the surface changed. Positions are metres in the map frame."""
 
-    places: NDArray[np.float64]  # [N, 3] centres of voxels whose surface is new or gone
-    drifted: NDArray[np.float64]  # [G, 3] centres of groups whose surface moved as a whole
+    places: Doubles  # [N, 3] centres of voxels whose surface is new or gone
+    drifted: Doubles  # [G, 3] centres of groups whose surface moved as a whole
 
 
 @dataclass(frozen=True)
 class _Voxels:
     """The voxels of a region with seen surface."""
 
-    keys: NDArray[np.int64]  # [V] increasing
-    centres: NDArray[np.float64]  # [V, 3] metres, map frame
-    groups: NDArray[np.float64]  # [G, 3] centres of the groups
+    keys: Longs  # [V] increasing
+    centres: Doubles  # [V, 3] metres, map frame
+    groups: Doubles  # [G, 3] centres of the groups
     group: NDArray[np.intp]  # [V] of each voxel
 
 
@@ -44,7 +45,7 @@ class _Recorded:
 
     region: FrozenRegion
     voxels: _Voxels
-    offsets: NDArray[np.float32]  # [V] metres from each voxel's centre to the surface
+    offsets: Floats  # [V] metres from each voxel's centre to the surface
 
 
 class SurfaceChanges:
@@ -104,7 +105,7 @@ class SurfaceChanges:
         moved = np.abs(new.offsets - before)
         is_new = np.isnan(before)
 
-        def count(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+        def count(chosen: Bools) -> NDArray[np.intp]:
             return np.bincount(voxels.group[chosen], minlength=len(voxels.groups))
 
         size = np.bincount(voxels.group, minlength=len(voxels.groups))
@@ -138,7 +139,7 @@ class SurfaceChanges:
         groups = ((cells[first] + 0.5) * self._group_m).astype(np.float64)
         return _Voxels(keys[order], centres, groups, group.ravel())
 
-    def _offsets(self, region: FrozenRegion, centres: NDArray[np.float64]) -> NDArray[np.float32]:
+    def _offsets(self, region: FrozenRegion, centres: Doubles) -> Floats:
         """How far [V] the surface is from the centres; at most a voxel: beyond are others."""
         offsets = np.empty(len(centres), np.float32)
         leaf_m = self._settings.leaf_m
@@ -154,14 +155,12 @@ class SurfaceChanges:
         return offsets
 
 
-def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def _key(cells: Longs) -> Longs:
     """One number for each of cells [N, 3], none of them negative."""
     return (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
 
 
-def _find(
-    keys: NDArray[np.int64], among: NDArray[np.int64]
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _find(keys: Longs, among: Longs) -> tuple[NDArray[np.intp], Bools]:
     """Where increasing keys [N] are among others, and whether they are there at all."""
     rows = np.searchsorted(among, keys)
     if len(among) == 0:

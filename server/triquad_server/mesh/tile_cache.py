@@ -2,23 +2,51 @@
 
 import hashlib
 import threading
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.compiled.compiled_view import CompiledView
 from triquad_map.compiled.team import Team
 
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mesh.mesher import TileIndex, mesh_tile
+from triquad_server.mesh.mesher import mesh_tile
 from triquad_server.mesh.surface_changes import SurfaceChanges
-from triquad_server.mesh.tile_border import TileBorder
-from triquad_server.mesh.tile_bytes import TileBytes
-from triquad_server.mesh.tile_lattice import TileLattice, tile_lattice
+from triquad_server.mesh.tile_lattice import TileBorder, TileIndex, TileLattice, tile_lattice
 from triquad_server.mesh.tile_level import CachedTile, TileDelta, TileLevel
 from triquad_server.settings import MeshSettings
+
+TileKey = tuple[int, TileIndex]
+"""Level of detail and index of a tile."""
+
+
+class TileBytes:
+    """Encoded tiles in memory; those unused for longest are dropped where there are too many."""
+
+    def __init__(self, limit: int) -> None:
+        """Keep at most ``limit`` bytes, or a single tile that is larger."""
+        self._limit = limit
+        self.size = 0  # bytes of the tiles that are kept
+        self._data: OrderedDict[TileKey, bytes] = OrderedDict()  # longest unused first
+
+    def get(self, key: TileKey) -> bytes | None:
+        """The bytes of a tile, None where they are gone."""
+        data = self._data.get(key)
+        if data is not None:
+            self._data.move_to_end(key)
+        return data
+
+    def put(self, key: TileKey, data: bytes) -> None:
+        """Keep the bytes of a tile."""
+        self.size += len(data) - len(self._data.pop(key, b""))
+        self._data[key] = data
+        while self.size > self._limit and len(self._data) > 1:
+            _, dropped = self._data.popitem(last=False)
+            self.size -= len(dropped)
 
 
 class TileCache:
@@ -36,29 +64,14 @@ class TileCache:
         self._changes: SurfaceChanges | None = None
         self._epoch: Epoch | None = None
         self._view: CompiledView | None = None  # of that epoch
-        self._revision = 0
-        self._made = 0
+        self.revision = 0  # how often bytes of any tile came to differ
+        self.tiles_made = 0  # so far
         self._bytes = TileBytes(settings.cache_bytes)
 
     @property
     def epoch(self) -> int:
         """Number of the epoch of the last refresh; -1 before any."""
         return -1 if self._epoch is None else self._epoch.number
-
-    @property
-    def revision(self) -> int:
-        """How often bytes of any tile came to differ."""
-        return self._revision
-
-    @property
-    def tiles_made(self) -> int:
-        """How many tiles were meshed so far."""
-        return self._made
-
-    @property
-    def size(self) -> int:
-        """Bytes of the encoded tiles that are kept."""
-        return self._bytes.size
 
     def lattice(self, level: int) -> TileLattice:
         """Where the tiles of a level lie."""
@@ -85,7 +98,7 @@ class TileCache:
                 epoch.number, epoch.field_settings, epoch.frozen_regions, self._team.split
             )
 
-    def changed(self, level: int, indices: NDArray[np.integer]) -> NDArray[np.int64]:
+    def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
         """Epochs [T] in which the surface of tiles [T, 3] last changed; 0 where none was seen."""
         with self._lock:
             tiles = self._levels[level]
@@ -93,12 +106,7 @@ class TileCache:
         return np.array(epochs, np.int64)
 
     def delta(
-        self,
-        level: int,
-        low: NDArray[np.float64],
-        high: NDArray[np.float64],
-        known_to: int,
-        held: Mapping[TileIndex, int],
+        self, level: int, low: Doubles, high: Doubles, known_to: int, held: Mapping[TileIndex, int]
     ) -> TileDelta:
         """What is new in a box to somebody who knows everything up to the revision ``known_to``.
 
@@ -106,7 +114,7 @@ class TileCache:
         """
         with self._lock:
             return self._levels[level].delta(
-                low, high, known_to=known_to, held=held, revision=self._revision
+                low, high, known_to=known_to, held=held, revision=self.revision
             )
 
     def make(self, level: int, index: TileIndex) -> CachedTile:
@@ -121,13 +129,13 @@ class TileCache:
         data = encode_tile(mesh.surface)
         digest = hashlib.sha256(data).digest()
         with self._lock:
-            self._made += 1
+            self.tiles_made += 1
             old = tiles.tile(index)
             if old is not None and old.digest == digest:
                 version, revision = old.version, old.revision
             else:
-                self._revision += 1
-                version, revision = view.epoch, self._revision
+                self.revision += 1
+                version, revision = view.epoch, self.revision
             tile = CachedTile(
                 index=index,
                 version=version,

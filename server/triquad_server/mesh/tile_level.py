@@ -4,12 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 
-from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.surface_changes import Changes
-from triquad_server.mesh.tile_border import TileBorder
-from triquad_server.mesh.tile_lattice import TileLattice, tiles_meeting
+from triquad_server.mesh.tile_lattice import TileBorder, TileIndex, TileLattice, tiles_meeting
 
 _AROUND = [
     (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
@@ -84,8 +82,8 @@ class TileLevel:
 
     def delta(
         self,
-        low: NDArray[np.float64],
-        high: NDArray[np.float64],
+        low: Doubles,
+        high: Doubles,
         known_to: int,
         held: Mapping[TileIndex, int],
         revision: int,
@@ -97,7 +95,9 @@ class TileLevel:
         """
         ready: list[CachedTile] = []
         to_make: list[TileIndex] = []
-        for index in self._within(low, high):
+        inside = self._indices[self.lattice.meets(self._indices, low, high)]
+        for x, y, z in inside.tolist():
+            index = (x, y, z)
             tile = self.clean(index)
             if tile is None:
                 to_make.append(index)
@@ -126,9 +126,3 @@ class TileLevel:
             if neighbour is not None:
                 found[x, y, z] = neighbour.border.seen_from(offset, self.lattice.cells)
         return found
-
-    def _within(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> list[TileIndex]:
-        """Tiles that meet the box between two corners [3] and ever had a surface near."""
-        corners = self._indices * self.lattice.tile_side_m
-        meets = ((corners <= high) & (corners + self.lattice.tile_side_m >= low)).all(axis=1)
-        return [(x, y, z) for x, y, z in self._indices[meets].tolist()]

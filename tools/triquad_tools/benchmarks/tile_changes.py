@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_client import Mesh
-from triquad_server.mesh.mesher import TileIndex
+from triquad_server.mesh.tile_lattice import TileIndex
 
 _CANDIDATES = 8  # triangles that are tried for each point: those of the nearest centroids
 

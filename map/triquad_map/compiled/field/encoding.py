@@ -1,7 +1,6 @@
 """The field's encoding of a batch in compiled code: interpolated features and Fourier features.
 
-The same as :mod:`triquad_server.engine.corners` and :mod:`triquad_server.engine.tensor_field`
-compute with tensors.
+The same as :mod:`triquad_server.engine.tensor_field` computes with tensors.
 Fourier phases are counted in turns, not radians, which makes their reduction exact.
 """
 
