@@ -12,7 +12,6 @@ from triquad_format.wire.messages import ServerStatus
 
 from triquad_server.counter import Counter
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.memory import resident_bytes
 from triquad_server.store.checkpoints import Checkpoints
@@ -32,30 +31,19 @@ class Identity:
     device: str
 
 
-@dataclass(frozen=True)
-class Counts:
-    """What the server counts."""
-
-    scans_dropped: Counter
-    points_dropped: Counter
-    requests_refused: Counter
-
-
 class Health:
     """Knows how the server is doing."""
 
     def __init__(
         self,
         identity: Identity,
-        counts: Counts,
-        ledger: SourceLedger,
+        requests_refused: Counter,
         scans: ScanQueue,
         mapper: MapperThread,
         checkpoints: Checkpoints,
     ) -> None:
         self._identity = identity
-        self._counts = counts
-        self._ledger = ledger
+        self._requests_refused = requests_refused
         self._scans = scans
         self._mapper = mapper
         self._checkpoints = checkpoints
@@ -73,11 +61,11 @@ class Health:
             epoch=epoch.number,
             settled=progress.settled and len(self._scans) == 0,
             scans_taken=progress.scans_taken,
-            scans_dropped=self._counts.scans_dropped.counts(),
-            scans_lost=self._ledger.lost(),
+            scans_dropped=self._scans.dropped.counts(),
+            scans_lost=self._scans.ledger.lost(),
             scans_waiting=len(self._scans),
-            points_dropped=self._counts.points_dropped.counts(),
-            requests_refused=self._counts.requests_refused.counts(),
+            points_dropped=self._mapper.points_dropped.counts(),
+            requests_refused=self._requests_refused.counts(),
             samples_trained=progress.samples_trained,
             rays_kept=progress.rays_kept,
             loss=float(progress.loss),

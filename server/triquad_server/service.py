@@ -32,12 +32,11 @@ from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.counter import Counter
 from triquad_server.epochs.history import EpochLimits
-from triquad_server.health import Counts, Health, Heartbeat, Identity
+from triquad_server.health import Health, Heartbeat, Identity
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
-from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
+from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
@@ -77,11 +76,8 @@ class Service:
         self._session = session
         self._served = served
         self._settings = settings
-        self._counts = Counts(Counter(), Counter(), Counter())
-        self._ledger = SourceLedger()
-        self._scans = ScanQueue(
-            settings.service.scan_queue, self._ledger, self._counts.scans_dropped
-        )
+        self._requests_refused = Counter()
+        self._scans = ScanQueue(settings.service.scan_queue)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
             self._open(failed)
@@ -105,9 +101,7 @@ class Service:
         checkpoints = Checkpoints(
             self._mapper, self._served.store, self._settings.store.period_s, self._served.restored
         )
-        health = Health(
-            identity, self._counts, self._ledger, self._scans, self._mapper, checkpoints
-        )
+        health = Health(identity, self._requests_refused, self._scans, self._mapper, checkpoints)
         self._serve_queries()
         self._serve_mesh(identity.server)
         self._serve_status(health)
@@ -131,12 +125,7 @@ class Service:
         limits = self._settings.service
         mapper = MapperThread(
             self._served.mapper,
-            MapperInputs(
-                scans=self._scans,
-                ledger=self._ledger,
-                scans_dropped=self._counts.scans_dropped,
-                points_dropped=self._counts.points_dropped,
-            ),
+            self._scans,
             limits.publish_period_s,
             EpochLimits(limits.epochs_kept, limits.epochs_pinned, limits.pin_s),
             failed,
@@ -149,10 +138,8 @@ class Service:
         intake = ScanIntake(
             self._session,
             self._served.name,
-            limit=self._settings.service.scan_queue,
+            self._scans,
             max_points=self._settings.scan.max_points,
-            queue=self._scans,
-            dropped=self._counts.scans_dropped,
             arrived=self._mapper.wake,
         )
         self._parts.callback(intake.close)
@@ -207,7 +194,7 @@ class Service:
     def _serve_status(self, health: Health) -> None:
         """How the server is doing, and whether scans are in the map."""
         flush = FlushHandler(
-            self._ledger,
+            self._scans.ledger,
             self._mapper.publish_soon,
             self._settings.service.flush_timeout_max_s,
             self._settings.service.request_queue,
@@ -235,7 +222,7 @@ class Service:
         group = RequestHandlers(
             self._session,
             {keys.operation_key(self._served.name, key): h for key, h in handlers.items()},
-            self._counts.requests_refused,
+            self._requests_refused,
             workers=workers,
             waiting=limits.request_queue,
             max_bytes=payload_limit(limits.max_query_points),

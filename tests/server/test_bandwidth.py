@@ -1,5 +1,5 @@
 import pytest
-from triquad_server.mesh.tile_senders import MAX_CLIENTS, Bandwidth
+from triquad_server.mesh.followers import MAX_CLIENTS, Bandwidth
 
 
 def sent(bandwidth: Bandwidth, rate: float, reply: int, seconds: float) -> float:

@@ -9,13 +9,11 @@ import pytest
 from support import servers
 from support.small_world import settings, world
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
-from triquad_server.counter import Counter
 from triquad_server.epochs.history import EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
+from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.settings import StoreSettings
 from triquad_server.store.checkpoints import Checkpoints
 from triquad_server.store.store import Store
@@ -24,16 +22,10 @@ NEVER_S = 3600.0
 KEPT = EpochLimits(4, 0, 0.0)
 
 
-def inputs() -> MapperInputs:
-    ledger = SourceLedger()
-    scans = ScanQueue(8, ledger, Counter())
-    return MapperInputs(scans, ledger, Counter(), Counter())
-
-
 @contextmanager
 def running(mapper: Mapper, failed: Callable[[], None] = lambda: None) -> Iterator[MapperThread]:
     """The thread of a mapper, which publishes when a command asks for it."""
-    with closing(MapperThread(mapper, inputs(), NEVER_S, KEPT, failed)) as thread:
+    with closing(MapperThread(mapper, ScanQueue(8), NEVER_S, KEPT, failed)) as thread:
         thread.start()
         yield thread
 
@@ -78,7 +70,7 @@ def test_commands_of_a_thread_that_failed_are_refused_with_the_cause() -> None:
 
 def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
     thread = MapperThread(
-        Mapper("test", settings(), "cpu"), inputs(), NEVER_S, KEPT, failed=lambda: None
+        Mapper("test", settings(), "cpu"), ScanQueue(8), NEVER_S, KEPT, failed=lambda: None
     )
     with ThreadPoolExecutor(1) as pool:
         pending = pool.submit(thread.call, lambda mapper: mapper.settled)

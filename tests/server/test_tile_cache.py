@@ -100,7 +100,7 @@ def patchwork(cache: TileCache, epochs: dict[int, Epoch], level: int) -> Patchwo
     lattice = cache.lattice(level)
     made: dict[TileIndex, Epoch] = {}
     borders: dict[tuple[int, int, int], float] = {}
-    for index, tile in cache._levels[level]._tiles.items():
+    for index, tile in cache._levels[level].tiles.items():
         made[index] = epochs[tile.made]
         points = tile.border.points + np.array(index) * lattice.cells
         for point, value in zip(points.tolist(), tile.border.values.tolist(), strict=True):

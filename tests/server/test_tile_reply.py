@@ -1,10 +1,9 @@
 """What goes into a reply to a follower of the mesh, and which tiles stay in memory."""
 
 import numpy as np
-from triquad_server.mesh.follower import TileReply
-from triquad_server.mesh.tile_cache import TileBytes
+from triquad_server.mesh.followers import TileReply
+from triquad_server.mesh.tile_cache import CachedTile, TileBytes
 from triquad_server.mesh.tile_lattice import TileBorder, tile_lattice
-from triquad_server.mesh.tile_level import CachedTile
 from triquad_server.settings import MeshSettings
 
 

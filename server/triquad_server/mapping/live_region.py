@@ -22,9 +22,8 @@ from triquad_server.engine.live_field import LiveField, initial_field
 from triquad_server.engine.trainer import CompiledTrainer, GradientSums, TensorTrainer
 from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.scan import ScanRays
-from triquad_server.mapping.ray_intervals import ray_intervals, sample_intervals
+from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
 from triquad_server.mapping.replay_pool import ReplayPool
-from triquad_server.mapping.sampling import Placement
 from triquad_server.settings import ScanSettings, TrainingSettings
 
 _CARVE_SHORT_M = 0.1
@@ -44,16 +43,6 @@ class RegionSetup:
     device: torch.device
     sums: GradientSums
     team: Team
-
-    @property
-    def placement(self) -> Placement:
-        """Where samples lie."""
-        return Placement(
-            surface_share=self.scan.surface_share,
-            spread_m=self.scan.spread_m,
-            truncation_m=self.scan.truncation_m,
-            half_side_m=self.field.region_side_m / 2,
-        )
 
     def seeds(self, index: RegionIndex) -> tuple[int, int]:
         """Seeds of a region's field and of its replay pool; no two regions share one."""
@@ -76,7 +65,12 @@ class LiveRegion:
         _, seed = setup.seeds(index)
         self.pool = ReplayPool(
             capacity=setup.training.pool_rays,
-            placement=setup.placement,
+            placement=Placement(
+                surface_share=setup.scan.surface_share,
+                spread_m=setup.scan.spread_m,
+                truncation_m=setup.scan.truncation_m,
+                half_side_m=setup.field.region_side_m / 2,
+            ),
             device=setup.device,
             seed=seed,
             team=setup.team,

@@ -17,8 +17,13 @@ from triquad_map.compiled.sparse.rows import with_room
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.trainer import Batch
-from triquad_server.mapping.ray_intervals import COLUMNS, END
-from triquad_server.mapping.sampling import Placement, draw_ordered_samples, draw_samples
+from triquad_server.mapping.ray_intervals import (
+    COLUMNS,
+    END,
+    Placement,
+    draw_ordered_samples,
+    draw_samples,
+)
 
 _BIN_M = 0.8
 _BINS = 1 << 18

@@ -10,11 +10,16 @@ from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.mesh.follower import Follower, TileReply, check_updates, new_follower
-from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.mesh.followers import (
+    BURST_S,
+    Follower,
+    TileReply,
+    TileSenders,
+    check_updates,
+    new_follower,
+)
+from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
 from triquad_server.mesh.tile_lattice import TileIndex
-from triquad_server.mesh.tile_level import CachedTile, TileDelta
-from triquad_server.mesh.tile_senders import BURST_S, TileSenders
 from triquad_server.net.requests import Request
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import NICENESS

@@ -50,13 +50,44 @@ class _Checkpoint:
 
 
 class CheckpointFolder:
-    """The folder in which the checkpoints of one map lie."""
+    """The folder in which the checkpoints of one map lie; one process at a time may write to it.
+
+    A locked file in it sees to that; the system lets go of it however the process ends.
+    """
 
     def __init__(self, path: Path, retention: StoreSettings) -> None:
+        """Take the folder, which is made if need be; delete what is unfinished in it.
+
+        Raises:
+            StoreError: another process holds it.
+            OSError: it cannot be written to.
+        """
+        path.mkdir(parents=True, exist_ok=True)
         self.path = path
+        self._lock = _locked(path / _LOCK)
         self._retention = retention
         self._needed: dict[Path, frozenset[str]] = {}  # names of files, by checkpoint
         self._identities: dict[str, _FileIdentity | None] = {}  # of files that were valid
+        _delete(path.glob(_UNFINISHED))
+
+    def close(self) -> None:
+        """Let go."""
+        self._lock.close()
+
+    def renew_lock(self) -> None:
+        """Take the folder again where the locked file is no longer the one that others see.
+
+        Whoever deletes it, alone or with the folder, would let another process in.
+
+        Raises:
+            StoreError: another process has come first.
+            OSError: the file cannot be made.
+        """
+        path = self.path / _LOCK
+        if path.exists() and os.path.samestat(os.fstat(self._lock.fileno()), path.stat()):
+            return
+        lost, self._lock = self._lock, _locked(path)
+        lost.close()
 
     def record(self, names: Iterable[str]) -> None:
         """Record files as they are now: they are valid."""
@@ -70,10 +101,6 @@ class CheckpointFolder:
             if identity is None or identity != self._identities.get(name):
                 return False
         return True
-
-    def delete_unfinished(self) -> None:
-        """Delete what a server left that was killed while it wrote."""
-        _delete(self.path.glob(_UNFINISHED))
 
     def delete_old(self, newest: int) -> None:
         """Delete the files that no checkpoint needs which is to stay.
@@ -133,11 +160,7 @@ def _file_identity(path: Path) -> _FileIdentity | None:
     except OSError:
         return None
     return _FileIdentity(
-        device=status.st_dev,
-        inode=status.st_ino,
-        size=status.st_size,
-        modified_ns=status.st_mtime_ns,
-        changed_ns=status.st_ctime_ns,
+        status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
     )
 
 
@@ -147,39 +170,6 @@ def _delete(paths: Iterable[Path]) -> None:
             path.unlink(missing_ok=True)
         except OSError as error:
             _log.warning("%s is not needed, but cannot be deleted: %s", path, error)
-
-
-class FolderLock:
-    """Holds a folder by a locked file in it; the system lets go of it however the process ends."""
-
-    def __init__(self, folder: Path) -> None:
-        """Take the folder.
-
-        Raises:
-            StoreError: another process holds it.
-            OSError: the file cannot be made.
-        """
-        self._path = folder / _LOCK
-        self._file: IO[bytes] = _locked(self._path)
-
-    def renew(self) -> None:
-        """Take the folder again where the locked file is no longer the one that others see.
-
-        Whoever deletes it, alone or with the folder, would let another process in.
-
-        Raises:
-            StoreError: another process has come first.
-            OSError: the file cannot be made.
-        """
-        locked = os.fstat(self._file.fileno())
-        if self._path.exists() and os.path.samestat(locked, self._path.stat()):
-            return
-        lost, self._file = self._file, _locked(self._path)
-        lost.close()
-
-    def close(self) -> None:
-        """Let go."""
-        self._file.close()
 
 
 def _locked(path: Path) -> IO[bytes]:

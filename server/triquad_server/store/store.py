@@ -22,7 +22,7 @@ from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mesh.preview import preview_schema
 from triquad_server.settings import StoreSettings
-from triquad_server.store.checkpoint_folder import CheckpointFolder, FolderLock
+from triquad_server.store.checkpoint_folder import CheckpointFolder
 from triquad_server.store.checkpoint_parts import (
     KnownParts,
     StoppedError,
@@ -46,17 +46,14 @@ class Store:
         """
         self.folder = root / map_name
         self._known: KnownParts | None = None
-        self._files = CheckpointFolder(self.folder, settings)
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = FolderLock(self.folder)
+            self._files = CheckpointFolder(self.folder, settings)
         except OSError as error:
             raise StoreError(f"store {self.folder} cannot be written to: {error}") from error
-        self._files.delete_unfinished()
 
     def close(self) -> None:
         """Let go of the folder."""
-        self._lock.close()
+        self._files.close()
 
     @property
     def base_epoch(self) -> int | None:
@@ -142,7 +139,7 @@ class Store:
     def _writing(self, failure: str) -> Iterator[OtherFiles]:
         """The older files, while a new one is written; errors begin with ``failure``."""
         try:
-            self._lock.renew()
+            self._files.renew_lock()
             with closing(OtherFiles(files_in(self.folder))) as others:
                 yield others
         except MapFileError as error:
