@@ -1,4 +1,5 @@
-# make test    set up a virtual environment and run every check
+# make test    set up a virtual environment and run every check and test
+# make check   the checks alone: style, types, which package may import which
 # make docs    write the tables of docs/settings.md from the settings
 # make demo    set up a virtual environment and map a street, end to end
 VENV ?= .venv
@@ -9,18 +10,18 @@ PIP_FLAGS ?=
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 
-.PHONY: demo docs test lint clean
+.PHONY: check clean demo docs test
 
 demo: $(INSTALLED)
 	$(BIN)/triquad-demo --out demo-out
 
-test: lint
-	$(BIN)/python -m pytest -q --durations=10
+test: check
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --durations=10
 
 docs: $(INSTALLED)
 	$(BIN)/python docs/settings_tables.py
 
-lint: $(INSTALLED)
+check: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
