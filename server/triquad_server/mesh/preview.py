@@ -79,6 +79,11 @@ def previews_of(
     return Previews(preview_schema(), parts)
 
 
+def _distances_of(record: MapRecord) -> Distances:
+    evaluator = MapEvaluator(record)
+    return lambda points: evaluator.query(points).sdf
+
+
 def preview_part(
     region: Region, settings: FieldSettings, distances: Distances, stamp_ns: int
 ) -> Part:
@@ -97,11 +102,6 @@ def preview_part(
     triangles.indices.extend(faces.ravel().tolist())
     payload: bytes = update.SerializeToString(deterministic=True)
     return Part(PartKey(PREVIEW, region.index), payload)
-
-
-def _distances_of(record: MapRecord) -> Distances:
-    evaluator = MapEvaluator(record)
-    return lambda points: evaluator.query(points).sdf
 
 
 def coarse_mesh(
@@ -162,8 +162,8 @@ def _quads(cells: Longs, values: NDArray[np.floating]) -> NDArray[np.intp]:
         around = np.stack([cells[rows], cells[rows] - u, cells[rows] - u - v, cells[rows] - v], 1)
         wanted = morton.encode(around)
         found = np.minimum(np.searchsorted(codes[order], wanted), max(len(codes) - 1, 0))
-        there = (codes[order][found] == wanted).all(axis=1) if len(rows) else np.zeros(0, bool)
-        quad = order[found][there] if len(rows) else np.zeros((0, 4), np.intp)
+        there = (codes[order][found] == wanted).all(axis=1)
+        quad = order[found][there]
         backwards = inside[0][rows][there]
         quads.append(np.where(backwards[:, None], quad[:, ::-1], quad))
     return np.concatenate(quads)

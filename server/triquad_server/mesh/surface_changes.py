@@ -98,10 +98,11 @@ class SurfaceChanges:
         gone = np.zeros((0, 3))
         if voxels is not old.voxels:
             before = np.full(len(voxels.keys), np.nan, np.float32)
-            rows, found = _find(voxels.keys, old.voxels.keys)
-            before[found] = old.offsets[rows[found]]
-            _, kept = _find(old.voxels.keys, voxels.keys)
-            gone = old.voxels.centres[~kept]
+            _, rows, old_rows = np.intersect1d(
+                voxels.keys, old.voxels.keys, assume_unique=True, return_indices=True
+            )
+            before[rows] = old.offsets[old_rows]
+            gone = np.delete(old.voxels.centres, old_rows, axis=0)
         moved = np.abs(new.offsets - before)
         is_new = np.isnan(before)
 
@@ -120,10 +121,8 @@ class SurfaceChanges:
         )
 
     def _measure(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
-        if old is not None and old.region.evidence is region.evidence:
-            voxels = old.voxels
-        else:
-            voxels = self._voxels(region)
+        unchanged = old if old and old.region.evidence is region.evidence else None
+        voxels = unchanged.voxels if unchanged else self._voxels(region)
         return _Recorded(region, voxels, self._offsets(region, voxels.centres))
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
@@ -158,12 +157,3 @@ class SurfaceChanges:
 def _key(cells: Longs) -> Longs:
     """One number for each of cells [N, 3], none of them negative."""
     return (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
-
-
-def _find(keys: Longs, among: Longs) -> tuple[NDArray[np.intp], Bools]:
-    """Where increasing keys [N] are among others, and whether they are there at all."""
-    rows = np.searchsorted(among, keys)
-    if len(among) == 0:
-        return rows, np.zeros(len(keys), np.bool_)
-    rows = np.minimum(rows, len(among) - 1)
-    return rows, among[rows] == keys

@@ -134,7 +134,8 @@ class TileFeed:
             return self._serve(follower)
         except Exception as error:
             _log.exception("a follower of the mesh met an internal error")
-            self._remove(follower)
+            with self._changed:
+                self._pending.remove(follower)
             follower.request.refuse("internal", f"{type(error).__name__}: {error}")
             return True
 
@@ -229,8 +230,4 @@ class TileFeed:
         )
         with self._changed:  # it counts as pending or as being sent, never as neither
             self._senders.send(follower, message)
-            self._pending.remove(follower)
-
-    def _remove(self, follower: Follower) -> None:
-        with self._changed:
             self._pending.remove(follower)
