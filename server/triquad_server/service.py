@@ -31,7 +31,7 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.counter import Counter
-from triquad_server.epochs.history import EpochLimits
+from triquad_server.epochs import EpochLimits
 from triquad_server.health import Health, Heartbeat, Identity
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan_queue import ScanIntake, ScanQueue

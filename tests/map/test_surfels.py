@@ -9,7 +9,7 @@ from triquad_map.composition.field_samples import field_samples
 from triquad_map.composition.split import in_one
 from triquad_map.nearest import NearestSurfels, no_surfels
 from triquad_map.surface.surfels import FieldSample, SurfelKind, fit_surfels
-from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.epochs import FrozenRegion
 from triquad_server.mapping.mapper import Mapper
 
 SIDE = 64

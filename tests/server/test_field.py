@@ -10,8 +10,12 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_server.engine.adam import Rates
-from triquad_server.engine.field_record import field_from_record, region_record
-from triquad_server.engine.live_field import LiveField, initial_field
+from triquad_server.engine.live_field import (
+    LiveField,
+    field_from_record,
+    initial_field,
+    region_record,
+)
 from triquad_server.engine.tensor_field import TensorField
 from triquad_server.engine.trainer import Batch, TensorTrainer
 

@@ -9,7 +9,7 @@ import pytest
 from support import servers
 from support.small_world import settings, world
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
-from triquad_server.epochs.history import EpochLimits
+from triquad_server.epochs import EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper import Mapper

@@ -10,7 +10,7 @@ from support.exact_maps import SETTINGS, exact_map, flat, table
 from support.small_world import settings, settle, world
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import mesh_tile
 from triquad_server.mesh.tile_cache import TileCache

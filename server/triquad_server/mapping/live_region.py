@@ -17,10 +17,15 @@ from triquad_map.compiled.team import Team
 from triquad_map.composition.field_samples import field_samples
 
 from triquad_server.engine.adam import Rates
-from triquad_server.engine.field_record import field_from_record, region_record, training_state
-from triquad_server.engine.live_field import LiveField, initial_field
+from triquad_server.engine.live_field import (
+    LiveField,
+    field_from_record,
+    initial_field,
+    region_record,
+    training_state,
+)
 from triquad_server.engine.trainer import CompiledTrainer, GradientSums, TensorTrainer
-from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.epochs import FrozenRegion
 from triquad_server.intake.scan import ScanRays
 from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
 from triquad_server.mapping.replay_pool import ReplayPool
@@ -190,7 +195,12 @@ class LiveRegion:
     def record(self) -> Region:
         """The region with its training state as plain arrays, sharing nothing with this one."""
         samples = self.pool.sample(_CHECKPOINT_SAMPLES)
-        state = training_state(self.field, samples, self.budget_samples)
+        state = training_state(
+            self.field,
+            points=samples.points,
+            labels=samples.labels,
+            budget_samples=self.budget_samples,
+        )
         return region_record(self.index, self.field, self.evidence.freeze(), state)
 
     def _cooling(self) -> float:

@@ -11,7 +11,7 @@ from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.region import MapRecord, RegionIndex
 
 from triquad_server.engine.trainer import GradientSums
-from triquad_server.epochs.epoch import Epoch, FrozenRegion
+from triquad_server.epochs import Epoch, FrozenRegion
 from triquad_server.intake.scan import ScanRays, ScanRefusedError, usable_rays
 from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.normals import SurfaceNormals

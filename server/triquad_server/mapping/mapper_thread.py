@@ -13,7 +13,7 @@ from triquad_format.wire.messages import ResetReply, ResetRequest
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
-from triquad_server.epochs.history import EpochHistory, EpochLimits
+from triquad_server.epochs import EpochHistory, EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan import ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue

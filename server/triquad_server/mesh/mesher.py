@@ -18,7 +18,7 @@ from triquad_format.wire.tile_codec import STEPS, TileSurface
 from triquad_map.compiled.compiled_view import CompiledView
 from triquad_map.compiled.kernel import kernel
 
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 from triquad_server.mesh.marching_cubes import Crossings
 from triquad_server.mesh.tile_lattice import TileBorder, TileIndex, TileLattice, tiles_meeting
 

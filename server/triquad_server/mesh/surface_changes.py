@@ -10,7 +10,7 @@ from triquad_format.records.region import RegionIndex
 from triquad_map.compiled.surfels.surfel_index import surfel_voxels
 from triquad_map.compiled.team import Team
 
-from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.epochs import FrozenRegion
 
 _KEY_BITS = 20  # of each coordinate of a voxel, or of a group, in its region
 

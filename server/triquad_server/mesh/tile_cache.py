@@ -14,7 +14,7 @@ from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.compiled.compiled_view import CompiledView
 from triquad_map.compiled.team import Team
 
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 from triquad_server.mesh.mesher import mesh_tile
 from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
 from triquad_server.mesh.tile_lattice import (

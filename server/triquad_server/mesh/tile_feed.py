@@ -9,7 +9,7 @@ from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.epochs.history import EpochHistory
+from triquad_server.epochs import EpochHistory
 from triquad_server.mesh.followers import (
     BURST_S,
     Follower,

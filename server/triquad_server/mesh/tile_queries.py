@@ -6,7 +6,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
-from triquad_server.epochs.history import EpochHistory
+from triquad_server.epochs import EpochHistory
 from triquad_server.mesh.mesher import mesh_tile, surface_tiles
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_lattice import TileIndex

@@ -14,7 +14,7 @@ from triquad_format.records.status import Status
 from triquad_server.engine.adam import Rates
 from triquad_server.engine.tensor_field import TensorField
 from triquad_server.engine.trainer import Batch, TensorTrainer
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 from triquad_server.launch import warm_up
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper

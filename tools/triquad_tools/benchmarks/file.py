@@ -10,7 +10,7 @@ from pathlib import Path
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.region import MapRecord
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 from triquad_server.mesh.preview import previews_of
 from triquad_server.settings import Settings
 

@@ -12,7 +12,7 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.reference.evaluator import MapEvaluator
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 
 from triquad_tools.benchmarks.core import seen_points
 from triquad_tools.benchmarks.figures import Figure, compare, seconds

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_client import Client, Mesh
 from triquad_format.mapfile.reader import read_map
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 

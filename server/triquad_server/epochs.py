@@ -1,4 +1,5 @@
-"""The epochs that requests can ask for, and how training gives way while they are asked."""
+"""The published states of the map: what each answers, which can be asked for, and when training
+gives way to that."""
 
 import threading
 import time
@@ -7,8 +8,72 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from triquad_format.errors import RefusedError
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import MapRecord
+from triquad_map.compiled.compiled_view import CompiledView, RegionView
+from triquad_map.composition.split import Split
 
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.engine.live_field import FrozenField, region_record
+
+
+@dataclass(frozen=True)
+class FrozenRegion(RegionView):
+    """A region as it was when it was published."""
+
+    engine: FrozenField
+    vertices: int
+    parameters: int
+    changed: int  # epoch of its last change
+
+
+class Epoch(CompiledView):
+    """An immutable map: every answer comes from the same state. Safe to read from any thread."""
+
+    def __init__(
+        self,
+        name: str,
+        number: int,
+        settings: FieldSettings,
+        regions: tuple[FrozenRegion, ...],
+        split: Split,
+    ) -> None:
+        """The map called ``name``; ``split`` runs the work of its answers."""
+        super().__init__(number, settings, regions, split)
+        self.frozen_regions = regions
+        self._name = name
+
+    @property
+    def number(self) -> int:
+        """Number of this epoch."""
+        return self.epoch
+
+    @property
+    def regions(self) -> int:
+        """Regions of the map."""
+        return len(self.frozen_regions)
+
+    @property
+    def field_settings(self) -> FieldSettings:
+        """Shape of the field."""
+        return self._settings
+
+    @property
+    def vertices(self) -> int:
+        """Quadtree vertices of all regions."""
+        return sum(region.vertices for region in self.frozen_regions)
+
+    @property
+    def parameters(self) -> int:
+        """Learnable numbers of all regions."""
+        return sum(region.parameters for region in self.frozen_regions)
+
+    def record(self) -> MapRecord:
+        """The epoch as a map file holds it, without training state."""
+        regions = tuple(
+            region_record(region.index, region.engine, region.evidence, training=None)
+            for region in self.frozen_regions
+        )
+        return MapRecord(self._name, self.number, self._settings, regions)
 
 
 class QueryGate:
