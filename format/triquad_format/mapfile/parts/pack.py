@@ -40,7 +40,7 @@ from triquad_format.records.region import (
     TrainingState,
     VertexTable,
 )
-from triquad_format.wire.array import pack_array
+from triquad_format.wire.codec import pack_array
 
 SAMPLES_PER_PART = 1 << 17
 
