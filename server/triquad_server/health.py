@@ -1,17 +1,25 @@
-"""The server's status, put together from its parts."""
+"""The server's status: put together from its parts, published once a second, and logged."""
 
+import logging
+import threading
 import time
 from dataclasses import dataclass
 
 import triquad_format
-from triquad_format.wire.messages import ServerStatus, StatusRequest
+import zenoh
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import ServerStatus
 
 from triquad_server.counter import Counter
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.memory import resident_bytes
 from triquad_server.store.checkpoints import Checkpoints
+
+_log = logging.getLogger(__name__)
+
+STATUS_PERIOD_S = 1.0
+_BEATS_PER_LOG_LINE = 5
 
 
 @dataclass(frozen=True)
@@ -23,38 +31,23 @@ class Identity:
     device: str
 
 
-@dataclass(frozen=True)
-class Counts:
-    """What the server counts."""
-
-    scans_dropped: Counter
-    points_dropped: Counter
-    requests_refused: Counter
-
-
 class Health:
     """Knows how the server is doing."""
 
     def __init__(
         self,
         identity: Identity,
-        counts: Counts,
-        ledger: SourceLedger,
+        requests_refused: Counter,
         scans: ScanQueue,
         mapper: MapperThread,
         checkpoints: Checkpoints,
     ) -> None:
         self._identity = identity
-        self._counts = counts
-        self._ledger = ledger
+        self._requests_refused = requests_refused
         self._scans = scans
         self._mapper = mapper
         self._checkpoints = checkpoints
         self._started = time.monotonic()
-
-    def answer(self, _request: StatusRequest) -> ServerStatus:
-        """The status on request."""
-        return self.status()
 
     def status(self) -> ServerStatus:
         """The status now."""
@@ -68,11 +61,11 @@ class Health:
             epoch=epoch.number,
             settled=progress.settled and len(self._scans) == 0,
             scans_taken=progress.scans_taken,
-            scans_dropped=self._counts.scans_dropped.counts(),
-            scans_lost=self._ledger.lost(),
+            scans_dropped=self._scans.dropped.counts(),
+            scans_lost=self._scans.ledger.lost(),
             scans_waiting=len(self._scans),
-            points_dropped=self._counts.points_dropped.counts(),
-            requests_refused=self._counts.requests_refused.counts(),
+            points_dropped=self._mapper.points_dropped.counts(),
+            requests_refused=self._requests_refused.counts(),
             samples_trained=progress.samples_trained,
             rays_kept=progress.rays_kept,
             loss=float(progress.loss),
@@ -84,3 +77,66 @@ class Health:
             last_checkpoint=self._checkpoints.last,
             store_error=self._checkpoints.error,
         )
+
+
+class Heartbeat:
+    """Tells the network and the log how the server is doing."""
+
+    def __init__(self, session: zenoh.Session, map_name: str, health: Health) -> None:
+        self._health = health
+        # Not the priority of the replies: a publisher that drops, at the priority of one that
+        # blocks, waits for the same slow client.
+        self._publisher = session.declare_publisher(
+            keys.status_key(map_name),
+            encoding=keys.encoding(ServerStatus),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_LOW,
+        )
+        self._logged: ServerStatus | None = None
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop publishing."""
+        self._stopping.set()
+        self._thread.join()
+        self._publisher.undeclare()
+
+    def _run(self) -> None:
+        beat = 0
+        while not self._stopping.wait(STATUS_PERIOD_S):
+            beat += 1
+            try:
+                status = self._health.status()
+                self._publisher.put(codec.encode(status))
+            except Exception:
+                _log.exception("the status could not be published")
+                continue
+            if beat % _BEATS_PER_LOG_LINE == 0:
+                self._log_progress(status)
+
+    def _log_progress(self, status: ServerStatus) -> None:
+        """One line, where anything happened since the last one."""
+        before, self._logged = self._logged, status
+        if before is not None and _activity(before) == _activity(status):
+            return
+        _log.info(
+            "epoch %d%s: %d scans taken, %d dropped, %d lost, %d waiting; "
+            "%.1f M samples trained, loss %.4f; %d regions, %d vertices; %.0f MB",
+            status.epoch,
+            " (settled)" if status.settled else "",
+            status.scans_taken,
+            sum(status.scans_dropped.values()),
+            sum(status.scans_lost.values()),
+            status.scans_waiting,
+            status.samples_trained / 1e6,
+            status.loss,
+            status.regions,
+            status.vertices,
+            status.memory_bytes / 1e6,
+        )
+
+
+def _activity(status: ServerStatus) -> tuple[object, ...]:
+    return status.epoch, status.scans_taken, status.scans_dropped, status.scans_lost

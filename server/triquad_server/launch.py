@@ -4,24 +4,26 @@ import logging
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
+from triquad_map.questions.distance import DistanceOptions, distances
 
 from triquad_server.errors import ServerError
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.memory import give_back_early, spare_from_collection
+from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.net.session import NetworkOptions, listen_endpoints, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.stop import Stop, Stops, wait_for_stop
 from triquad_server.store.restore import ValidCheckpoint
-from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
 from triquad_server.threads import Teams
-from triquad_server.warm_up import warm_up
 
 _log = logging.getLogger("triquad_server")
 
@@ -31,6 +33,9 @@ few milliseconds, which is Python's default for a single turn."""
 
 _QUICK_S = 3.0
 """Compiled code that is found on disk is ready by then."""
+
+_WARM_UP_DIRECTIONS = 400
+_WARM_UP_RADIUS_M = 3.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         store = None
         restored = None
         if options.store is not None:
-            store = Store(options.store, options.map_name, Retention.chosen(options.settings.store))
+            store = Store(options.store, options.map_name, options.settings.store)
             stack.enter_context(closing(store))
             restored = _restored(store, options)
         _prepare(options.settings, device)
@@ -131,6 +136,34 @@ def _prepare(settings: Settings, device: str) -> None:
         warm_up(settings, device, report)
     finally:
         first_time.cancel()
+
+
+def warm_up(
+    settings: Settings, device: str, report: Callable[[str], None] = lambda _: None
+) -> None:
+    """Map and ask a made-up sphere, and forget it.
+
+    Compiling takes a minute at the very first start; then the compiled code is found on disk.
+    ``report`` is told what comes next.
+    """
+    count = min(_WARM_UP_DIRECTIONS, settings.scan.max_points)
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radius = min(max(_WARM_UP_RADIUS_M, settings.scan.range_min_m), settings.scan.range_max_m)
+    teams = Teams()
+    mapper = Mapper("warm-up", settings, device, teams=teams)
+    report("taking in scans")
+    mapper.ingest((directions * radius).astype(np.float32), np.eye(4))
+    report("training")
+    mapper.train()
+    epoch = mapper.publish()
+    report("queries")
+    epoch.query(directions, gradient=True)
+    distances(epoch, directions, DistanceOptions(unknown_distance=True))
+    report("meshes")
+    cache = TileCache(settings.mesh, teams.meshing)
+    cache.refresh(epoch)
+    cache.make(0, (0, 0, 0))
 
 
 def _log_ready(options: LaunchOptions, epoch: int, device: str) -> None:

@@ -1,45 +1,53 @@
 """The map server: its parts, wired to a Zenoh session."""
 
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import zenoh
 from triquad_format.wire import keys
-from triquad_format.wire.messages import CheckpointInfo
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    CheckpointRequest,
+    FlushRequest,
+    MapChunkRequest,
+    MapInfoRequest,
+    ResetRequest,
+    SdfRequest,
+    StatusRequest,
+    TileListRequest,
+    TileRequest,
+    TileUpdatesRequest,
+)
+from triquad_format.wire.query_messages import (
+    AlignRequest,
+    DistanceRequest,
+    GridRequest,
+    RaysRequest,
+    SegmentsRequest,
+    SpheresRequest,
+)
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.counter import Counter
-from triquad_server.epochs.gate import QueryGate
-from triquad_server.epochs.history import EpochLimits
-from triquad_server.epochs.views import EpochViews
-from triquad_server.health import Counts, Health, Identity
-from triquad_server.heartbeat import Heartbeat
+from triquad_server.epochs import EpochLimits
+from triquad_server.health import Health, Heartbeat, Identity
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
-from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
-from triquad_server.mapping.resets import Resets
+from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.net.handlers import HandlerLimits, RequestHandlers
-from triquad_server.net.request import payload_limit
-from triquad_server.operations import (
-    Operations,
-    admin_operations,
-    download_operations,
-    mesh_operations,
-    query_operations,
-    status_operations,
-)
+from triquad_server.net.requests import Handler, RequestHandlers, answering, payload_limit
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoints import Checkpoints
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.store import Store
 from triquad_server.threads import Teams
+
+_TILE_WORKERS = 2  # one computes while another packs
 
 
 @dataclass(frozen=True)
@@ -68,14 +76,8 @@ class Service:
         self._session = session
         self._served = served
         self._settings = settings
-        self._counts = Counts(Counter(), Counter(), Counter())
-        self._gate = QueryGate()
-        self._ledger = SourceLedger()
-        self._scans = ScanQueue(
-            settings.service.scan_queue,
-            self._ledger,
-            self._counts.scans_dropped,
-        )
+        self._requests_refused = Counter()
+        self._scans = ScanQueue(settings.service.scan_queue)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
             self._open(failed)
@@ -97,22 +99,22 @@ class Service:
         identity = Identity(self._served.name, secrets.token_hex(8), self._served.device)
         self._mapper = self._open_mapper(failed)
         checkpoints = Checkpoints(
-            self._mapper,
-            self._served.store,
-            self._settings.store.period_s,
-            self._served.restored,
+            self._mapper, self._served.store, self._settings.store.period_s, self._served.restored
         )
-        health = Health(
-            identity, self._counts, self._ledger, self._scans, self._mapper, checkpoints
-        )
-        self._serve(*self._queries())
-        self._serve(*mesh_operations(*self._open_mesh(identity.server)))
-        self._serve(status_operations(health, self._open_flush()))
-        self._serve(download_operations(MapDownloads(self._mapper)))
+        health = Health(identity, self._requests_refused, self._scans, self._mapper, checkpoints)
+        self._serve_queries()
+        self._serve_mesh(identity.server)
+        self._serve_status(health)
+        self._serve_downloads()
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         # Closed before the last checkpoint is written: it shows every reset that was answered.
-        self._serve(admin_operations(checkpoints, Resets(self._mapper)))
+        self._serve(
+            {
+                keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
+                keys.RESET: answering(ResetRequest, self._mapper.reset),
+            }
+        )
         self._parts.callback(self._mapper.rest)
         self._open_intake()
         self._parts.callback(Heartbeat(self._session, identity.map_name, health).close)
@@ -123,13 +125,7 @@ class Service:
         limits = self._settings.service
         mapper = MapperThread(
             self._served.mapper,
-            MapperInputs(
-                scans=self._scans,
-                ledger=self._ledger,
-                gate=self._gate,
-                scans_dropped=self._counts.scans_dropped,
-                points_dropped=self._counts.points_dropped,
-            ),
+            self._scans,
             limits.publish_period_s,
             EpochLimits(limits.epochs_kept, limits.epochs_pinned, limits.pin_s),
             failed,
@@ -138,62 +134,97 @@ class Service:
         self._parts.callback(mapper.close)
         return mapper
 
-    def _queries(self) -> list[Operations]:
-        limits = self._settings.service
-        views = EpochViews(self._mapper.epochs, self._gate)
-        most = QuestionLimits(limits.max_query_points, limits.max_search_points)
-        return query_operations(Answers(views.view, most), limits.query_workers)
-
-    def _open_mesh(self, server: str) -> tuple[TileQueries, TileFeed]:
-        cache = TileCache(self._settings.mesh, self._served.teams.meshing)
-        feed = TileFeed(
-            cache,
-            self._mapper.epochs,
-            self._gate,
-            server=server,
-            settings=self._settings.mesh,
-            limit=self._settings.service.request_queue,
-        )
-        feed.start()
-        self._parts.callback(feed.close)
-        return TileQueries(self._mapper.epochs, cache, self._settings.mesh), feed
-
-    def _open_flush(self) -> FlushHandler:
-        limits = self._settings.service
-        flush = FlushHandler(
-            self._ledger,
-            self._mapper.publish_soon,
-            limits.flush_timeout_max_s,
-            limits.request_queue,
-        )
-        flush.start()
-        self._parts.callback(flush.close)
-        return flush
-
     def _open_intake(self) -> None:
         intake = ScanIntake(
             self._session,
             self._served.name,
-            limit=self._settings.service.scan_queue,
+            self._scans,
             max_points=self._settings.scan.max_points,
-            queue=self._scans,
-            dropped=self._counts.scans_dropped,
             arrived=self._mapper.wake,
         )
         self._parts.callback(intake.close)
 
-    def _serve(self, *groups: Operations) -> None:
-        """Answer operations from now on, until the service is closed."""
+    def _serve_queries(self) -> None:
         limits = self._settings.service
-        for group in groups:
-            handlers = RequestHandlers(
-                self._session,
-                {keys.operation_key(self._served.name, o): h for o, h in group.handlers.items()},
-                HandlerLimits(
-                    workers=group.workers,
-                    waiting=limits.request_queue,
-                    request_bytes=payload_limit(limits.max_query_points),
-                ),
-                self._counts.requests_refused,
-            )
-            self._parts.callback(handlers.close)
+        answers = Answers(
+            self._mapper.epochs.view,
+            QuestionLimits(limits.max_query_points, limits.max_search_points),
+        )
+        self._serve({keys.SDF: answering(SdfRequest, answers.sdf)}, limits.query_workers)
+        self._serve(
+            {
+                keys.DISTANCE: answering(DistanceRequest, answers.distance),
+                keys.SPHERES: answering(SpheresRequest, answers.spheres),
+            },
+            limits.query_workers,
+        )
+        self._serve(
+            {
+                keys.SEGMENTS: answering(SegmentsRequest, answers.segments),
+                keys.RAYS: answering(RaysRequest, answers.rays),
+                keys.GRID: answering(GridRequest, answers.grid),
+            },
+            limits.query_workers,
+        )
+        self._serve({keys.ALIGN: answering(AlignRequest, answers.align)})
+
+    def _serve_mesh(self, server: str) -> None:
+        """Queries of mesh tiles, and following them."""
+        cache = TileCache(self._settings.mesh, self._served.teams.meshing)
+        feed = TileFeed(
+            cache,
+            self._mapper.epochs,
+            server=server,
+            settings=self._settings.mesh,
+            limit=self._settings.service.request_queue,
+        )
+        self._parts.callback(feed.close)
+        tiles = TileQueries(self._mapper.epochs, cache)
+        self._serve(
+            {
+                keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
+                keys.TILE: answering(TileRequest, tiles.tile),
+            },
+            _TILE_WORKERS,
+        )
+        self._serve(
+            {keys.TILE_UPDATES: lambda request: feed.add(request, request.read(TileUpdatesRequest))}
+        )
+
+    def _serve_status(self, health: Health) -> None:
+        """How the server is doing, and whether scans are in the map."""
+        flush = FlushHandler(
+            self._scans.ledger,
+            self._mapper.publish_soon,
+            self._settings.service.flush_timeout_max_s,
+            self._settings.service.request_queue,
+        )
+        self._parts.callback(flush.close)
+        self._serve(
+            {
+                keys.STATUS: answering(StatusRequest, lambda _: health.status()),
+                keys.FLUSH: lambda request: flush.add(request, request.read(FlushRequest)),
+            }
+        )
+
+    def _serve_downloads(self) -> None:
+        downloads = MapDownloads(self._mapper)
+        self._serve(
+            {
+                keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
+                keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
+            }
+        )
+
+    def _serve(self, handlers: Mapping[str, Handler], workers: int = 1) -> None:
+        """Answer a group of operations from now on; no other group waits for it."""
+        limits = self._settings.service
+        group = RequestHandlers(
+            self._session,
+            {keys.operation_key(self._served.name, key): h for key, h in handlers.items()},
+            self._requests_refused,
+            workers=workers,
+            waiting=limits.request_queue,
+            max_bytes=payload_limit(limits.max_query_points),
+        )
+        self._parts.callback(group.close)

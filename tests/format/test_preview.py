@@ -13,7 +13,7 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, Evidence
-from triquad_server.mesh.coarse_mesh import CLUSTER_CELLS, NET_LEAVES
+from triquad_server.mesh.preview import CLUSTER_CELLS, NET_LEAVES
 
 SETTINGS = FieldSettings()
 GROUND_M = 1.3

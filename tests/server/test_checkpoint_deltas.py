@@ -14,8 +14,7 @@ from triquad_format.records.region import MapRecord, RegionIndex
 from triquad_format.recovery.recovered_map import recover
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges, Mapper
-from triquad_server.settings import Settings
-from triquad_server.store.retention import Retention
+from triquad_server.settings import Settings, StoreSettings
 from triquad_server.store.store import Store
 
 ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(10))
@@ -44,7 +43,7 @@ def changes(record: MapRecord, only=ROW) -> MapChanges:
 
 @pytest.fixture
 def store(tmp_path):
-    with closing(Store(tmp_path, "lab", Retention(100))) as store:
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=100))) as store:
         yield store
 
 
@@ -100,7 +99,7 @@ def test_where_most_changed_the_checkpoint_needs_no_other(store):
 def test_a_restarted_store_goes_on_with_deltas(store, tmp_path):
     records = drive(store, 2)
     store.close()
-    with closing(Store(tmp_path, "lab", Retention(100))) as again:
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=100))) as again:
         assert again.base_epoch is None
         restored = again.newest()
         assert restored is not None
@@ -191,10 +190,10 @@ def test_whoever_deletes_the_lock_lets_nobody_else_in(store, tmp_path):
     (store.folder / "lock").unlink()
     store.write(changes(grown(2, 2)))
     with pytest.raises(StoreError, match="in use by another server"):
-        Store(tmp_path, "lab", Retention(2))
+        Store(tmp_path, "lab", StoreSettings(keep=2))
     (store.folder / "lock").unlink()
     with (
-        closing(Store(tmp_path, "lab", Retention(2))),
+        closing(Store(tmp_path, "lab", StoreSettings(keep=2))),
         pytest.raises(StoreError, match="in use by another server"),
     ):
         store.write(changes(grown(3, 3)))
@@ -209,7 +208,7 @@ def test_no_clock_keeps_a_checkpoint_from_being_written(store, monkeypatch, cloc
 
 
 def test_what_is_no_file_does_not_stop_the_retention(tmp_path):
-    with closing(Store(tmp_path, "lab", Retention(2))) as store:
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
         (store.folder / "epoch-000000000.triquad").mkdir()
         os.mkfifo(store.folder / "epoch-000000000.delta.triquad")
         (store.folder / "epoch-000000001.triquad").symlink_to("nowhere")
@@ -227,7 +226,7 @@ def test_without_its_base_a_delta_is_damaged_by_name(store):
 
 def test_another_file_under_the_name_of_the_base_is_found_out(store):
     drive(store, 1)
-    other = Store(store.folder.parent, "other", Retention(2))
+    other = Store(store.folder.parent, "other", StoreSettings(keep=2))
     with closing(other):
         other.write(changes(grown(9, 1)))
         paths(store)[1].write_bytes(paths(other)[1].read_bytes())
@@ -274,7 +273,7 @@ def test_folding_ends_when_the_server_does(store):
 
 
 def test_retention_keeps_the_files_that_kept_checkpoints_need(tmp_path):
-    with closing(Store(tmp_path, "lab", Retention(3))) as store:
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=3))) as store:
         records = drive(store, 5, ROW[:1])
         assert sorted(paths(store)) == [1, 4, 5, 6]
         for epoch in (4, 5, 6):
@@ -286,23 +285,23 @@ def test_retention_keeps_the_files_that_kept_checkpoints_need(tmp_path):
 
 
 def test_retention_by_bytes_counts_shared_files_once(tmp_path):
-    with closing(Store(tmp_path, "lab", Retention())) as store:
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=100, keep_bytes=0))) as store:
         drive(store, 1)
         whole, part = (paths(store)[epoch].stat().st_size for epoch in (1, 2))
     limit = whole + 4 * part
-    with closing(Store(tmp_path, "roomy", Retention(total_bytes=limit))) as store:
+    with closing(Store(tmp_path, "roomy", StoreSettings(keep=100, keep_bytes=limit))) as store:
         drive(store, 9, ROW[:1])
         kept = sorted(paths(store))
         assert kept[0] == 1
         assert 4 <= len(kept) <= 6
         assert sum(path.stat().st_size for path in paths(store).values()) <= limit
-    with closing(Store(tmp_path, "tight", Retention(total_bytes=1))) as store:
+    with closing(Store(tmp_path, "tight", StoreSettings(keep=100, keep_bytes=1))) as store:
         drive(store, 9, ROW[:1])
         assert sorted(paths(store)) == [1, 9, 10]
 
 
 def test_retention_by_age(tmp_path):
-    with closing(Store(tmp_path, "lab", Retention(age_s=1.0))) as store:
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=100, keep_age_s=1.0))) as store:
         records = drive(store, 3, ROW[:1])
         for path in paths(store).values():
             seconds = path.stat().st_mtime - 10
@@ -336,7 +335,7 @@ def test_what_was_set_aside_can_still_be_recovered_with_its_base(store):
 def test_who_lost_the_folder_does_not_fold_in_it(store, tmp_path):
     drive(store, 9)
     (store.folder / "lock").unlink()
-    with closing(Store(tmp_path, "lab", Retention(100))) as other:
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=100))) as other:
         assert other.newest() is not None
         with pytest.raises(StoreError, match="in use by another server"):
             store.fold(lambda: False)

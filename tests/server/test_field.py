@@ -10,11 +10,14 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_server.engine.adam import Rates
-from triquad_server.engine.batch import Batch
-from triquad_server.engine.field_record import field_from_record, region_record
-from triquad_server.engine.live_field import LiveField, initial_field
+from triquad_server.engine.live_field import (
+    LiveField,
+    field_from_record,
+    initial_field,
+    region_record,
+)
 from triquad_server.engine.tensor_field import TensorField
-from triquad_server.engine.tensor_trainer import TensorTrainer
+from triquad_server.engine.trainer import Batch, TensorTrainer
 
 CPU = torch.device("cpu")
 RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99)

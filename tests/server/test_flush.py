@@ -41,7 +41,6 @@ def ledger():
 def handler(ledger, monkeypatch):
     monkeypatch.setattr(flush, "ARRIVAL_GRACE_S", 0.0)
     with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
-        handler.start()
         yield handler
 
 
@@ -92,7 +91,6 @@ def test_a_scan_that_stays_out_of_the_map_ends_in_a_timeout(handler, ledger):
 def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
     asked = threading.Event()
     with closing(FlushHandler(ledger, asked.set, 600.0, 8)) as handler:
-        handler.start()
         request = PendingRequest()
         ledger.arrive(servers.scan(0))
         handler.add(request, asks())
@@ -105,7 +103,6 @@ def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
 def test_pending_requests_are_refused_when_the_server_stops(ledger):
     request = PendingRequest()
     with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
-        handler.start()
         ledger.arrive(servers.scan(0))
         handler.add(request, asks())
     assert request.reply == "timeout"

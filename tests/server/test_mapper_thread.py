@@ -9,34 +9,23 @@ import pytest
 from support import servers
 from support.small_world import settings, world
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
-from triquad_server.counter import Counter
-from triquad_server.epochs.gate import QueryGate
-from triquad_server.epochs.history import EpochLimits
+from triquad_server.epochs import EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.mapper_thread import MapperInputs, MapperThread
-from triquad_server.mapping.resets import Resets
+from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.settings import StoreSettings
 from triquad_server.store.checkpoints import Checkpoints
-from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
 
 NEVER_S = 3600.0
 KEPT = EpochLimits(4, 0, 0.0)
 
 
-def inputs() -> MapperInputs:
-    ledger = SourceLedger()
-    scans = ScanQueue(8, ledger, Counter())
-    return MapperInputs(scans, ledger, QueryGate(), Counter(), Counter())
-
-
 @contextmanager
 def running(mapper: Mapper, failed: Callable[[], None] = lambda: None) -> Iterator[MapperThread]:
     """The thread of a mapper, which publishes when a command asks for it."""
-    with closing(MapperThread(mapper, inputs(), NEVER_S, KEPT, failed)) as thread:
+    with closing(MapperThread(mapper, ScanQueue(8), NEVER_S, KEPT, failed)) as thread:
         thread.start()
         yield thread
 
@@ -81,7 +70,7 @@ def test_commands_of_a_thread_that_failed_are_refused_with_the_cause() -> None:
 
 def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
     thread = MapperThread(
-        Mapper("test", settings(), "cpu"), inputs(), NEVER_S, KEPT, failed=lambda: None
+        Mapper("test", settings(), "cpu"), ScanQueue(8), NEVER_S, KEPT, failed=lambda: None
     )
     with ThreadPoolExecutor(1) as pool:
         pending = pool.submit(thread.call, lambda mapper: mapper.settled)
@@ -93,13 +82,13 @@ def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
 def test_whoever_reset_the_map_finds_the_epoch_that_shows_it() -> None:
     box = np.full(3, -np.inf), np.full(3, np.inf)
     with running(learning_mapper()) as thread:
-        reply = Resets(thread).answer(ResetRequest(*box))
+        reply = thread.reset(ResetRequest(*box))
         assert thread.epochs.newest.number >= reply.epoch
         assert thread.epochs.get(reply.epoch).regions == 0
 
 
 def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Path) -> None:
-    store = Store(tmp_path, "test", Retention.chosen(StoreSettings()))
+    store = Store(tmp_path, "test", StoreSettings())
     with closing(store), running(learning_mapper()) as thread:
         checkpoints = Checkpoints(thread, store, 0.0, None)
         checkpoints.start()

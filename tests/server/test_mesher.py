@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
 from support.small_world import settings, settled_mapper, world
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.epoch_mesh import EpochMesh
-from triquad_server.mesh.mesher import TileMesh
+from triquad_server.mesh.mesher import TileMesh, mesh_tile, surface_tiles
+from triquad_server.mesh.tile_lattice import tile_lattice
 from triquad_server.settings import MeshSettings
+
+LATTICE = tile_lattice(settings().mesh, 0)
 
 
 @pytest.fixture(scope="module")
@@ -16,8 +18,9 @@ def epoch() -> Epoch:
 @pytest.fixture(scope="module")
 def tiles(epoch: Epoch) -> dict[tuple[int, int, int], TileMesh]:
     low, high = np.array([-12.0, -12, -3]), np.array([12.0, 12, 9])
-    mesh = EpochMesh(epoch, settings().mesh)
-    return {(x, y, z): mesh.tile((x, y, z)) for x, y, z in mesh.tiles(low, high).tolist()}
+    indices = surface_tiles(epoch, LATTICE)
+    inside = indices[LATTICE.meets(indices, low, high)]
+    return {(x, y, z): mesh_tile(epoch, (x, y, z), LATTICE) for x, y, z in inside.tolist()}
 
 
 def test_the_mesh_lies_on_the_surface(tiles: dict[tuple[int, int, int], TileMesh]) -> None:
@@ -61,10 +64,8 @@ def test_neighbouring_tiles_meet_without_seams(
 
 
 def test_nothing_is_meshed_where_nothing_was_seen(epoch: Epoch) -> None:
-    mesh = EpochMesh(epoch, settings().mesh)
-    assert len(mesh.tile((1000, 1000, 1000)).faces) == 0
-    ground_below = mesh.tile((0, 0, -3))
-    assert len(ground_below.faces) == 0
+    for outside_or_below_ground in ((1000, 1000, 1000), (0, 0, -3)):
+        assert len(mesh_tile(epoch, outside_or_below_ground, LATTICE).faces) == 0
 
 
 def test_meshes_are_repeatable(
@@ -72,7 +73,7 @@ def test_meshes_are_repeatable(
     tiles: dict[tuple[int, int, int], TileMesh],
 ) -> None:
     tile = max(tiles, key=lambda index: len(tiles[index].faces))
-    again = EpochMesh(epoch, settings().mesh).tile(tile)
+    again = mesh_tile(epoch, tile, LATTICE)
     np.testing.assert_array_equal(again.vertices, tiles[tile].vertices)
     np.testing.assert_array_equal(again.faces, tiles[tile].faces)
 
@@ -85,29 +86,29 @@ def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
     mapper = Mapper("test", small, "cpu")
     scan = world(1).scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
-    mesh = EpochMesh(mapper.publish(), small.mesh)
-    low, high = np.array([3.0, -2.0, -1.0]), np.array([5.0, 2.0, 1.0])
-    listed = {tuple(tile) for tile in mesh.tiles(low, high).tolist()}
+    epoch, lattice = mapper.publish(), tile_lattice(small.mesh, 0)
+    low = np.array([3.0, -2.0, -1.0])
+    listed = {tuple(tile) for tile in surface_tiles(epoch, lattice).tolist()}
     side = small.mesh.tile_side_m
     for offset in np.ndindex(3, 6, 3):
         x, y, z = (np.floor(low / side).astype(int) + offset).tolist()
-        if len(mesh.tile((x, y, z)).faces):
+        if len(mesh_tile(epoch, (x, y, z), lattice).faces):
             assert (x, y, z) in listed
 
 
 def test_tiles_are_those_that_meet_the_bounds(epoch: Epoch) -> None:
-    mesh = EpochMesh(epoch, settings().mesh)
-    everything = mesh.tiles(np.full(3, -np.inf), np.full(3, np.inf))
+    everything = surface_tiles(epoch, LATTICE)
+    assert LATTICE.meets(everything, np.full(3, -np.inf), np.full(3, np.inf)).all()
     side = settings().mesh.tile_side_m
     tiles = {tuple(tile) for tile in everything.tolist()}
     seen = {tuple(tile) for tile in np.floor(world(4).hits / side).astype(int).tolist()}
     assert seen <= tiles
     low, high = np.array([0.1, 0.1, -1.0]), np.array([side + 0.1, side - 0.1, 1.0])
-    some = mesh.tiles(low, high)
+    some = everything[LATTICE.meets(everything, low, high)]
     assert {tuple(tile) for tile in some[:, :2].tolist()} == {(0, 0), (1, 0)}
 
 
 def test_an_empty_map_has_no_tiles() -> None:
-    mesh = EpochMesh(Mapper("test", settings(), "cpu").publish(), settings().mesh)
-    assert len(mesh.tiles(np.full(3, -np.inf), np.full(3, np.inf))) == 0
-    assert len(mesh.tile((0, 0, 0)).vertices) == 0
+    epoch = Mapper("test", settings(), "cpu").publish()
+    assert len(surface_tiles(epoch, LATTICE)) == 0
+    assert len(mesh_tile(epoch, (0, 0, 0), LATTICE).vertices) == 0

@@ -1,8 +1,7 @@
 import numpy as np
 import torch
-from triquad_server.mapping.ray_intervals import sample_intervals
+from triquad_server.mapping.ray_intervals import Placement, sample_intervals
 from triquad_server.mapping.replay_pool import ReplayPool
-from triquad_server.mapping.sampling import Placement
 from triquad_server.threads import Teams
 
 CPU = torch.device("cpu")

@@ -1,10 +1,14 @@
 import numpy as np
 import pytest
 import torch
-from triquad_server.engine.batch import Batch
+from triquad_server.engine.trainer import Batch
 from triquad_server.intake.scan import ScanRays
-from triquad_server.mapping.ray_intervals import ray_intervals
-from triquad_server.mapping.sampling import Placement, draw_ordered_samples, draw_samples
+from triquad_server.mapping.ray_intervals import (
+    Placement,
+    draw_ordered_samples,
+    draw_samples,
+    ray_intervals,
+)
 from triquad_server.settings import ScanSettings
 from triquad_server.threads import Teams
 

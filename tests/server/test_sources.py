@@ -1,7 +1,6 @@
 import threading
 
 from support import servers
-from triquad_server.counter import Counter
 from triquad_server.intake import sources
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.sources import SourceLedger
@@ -107,8 +106,8 @@ def test_losses_of_a_hostile_publisher_still_fit_a_message():
 
 
 def test_a_full_queue_pushes_out_the_oldest_scan_and_counts_it():
-    ledger = SourceLedger()
-    queue = ScanQueue(2, ledger, Counter())
+    queue = ScanQueue(2)
+    ledger = queue.ledger
     for sequence in range(3):
         queue.put(servers.scan(sequence))
     assert ledger.lost() == {"lidar": 1}

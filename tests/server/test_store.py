@@ -9,9 +9,9 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.records.region import MapRecord
 from triquad_server.errors import StoreError
 from triquad_server.mapping.mapper import MapChanges, Mapper
+from triquad_server.settings import StoreSettings
 from triquad_server.store import restore
 from triquad_server.store import store as store_module
-from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
 
 EMPTY = Mapper("lab", servers.SMALL, "cpu").publish()
@@ -23,7 +23,7 @@ def record(epoch: int) -> MapChanges:
 
 @pytest.fixture
 def store(tmp_path):
-    store = Store(tmp_path, "lab", Retention(2))
+    store = Store(tmp_path, "lab", StoreSettings(keep=2))
     yield store
     store.close()
 
@@ -143,21 +143,21 @@ def test_other_files_are_left_alone(store):
 
 def test_two_servers_do_not_share_a_folder(store, tmp_path):
     with pytest.raises(StoreError, match="in use"):
-        Store(tmp_path, "lab", Retention(2))
-    Store(tmp_path, "other", Retention(2)).close()
+        Store(tmp_path, "lab", StoreSettings(keep=2))
+    Store(tmp_path, "other", StoreSettings(keep=2)).close()
 
 
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):
-        Store(tmp_path / "file", "lab", Retention(2))
+        Store(tmp_path / "file", "lab", StoreSettings(keep=2))
 
 
 def test_what_a_killed_server_left_unfinished_goes(store, tmp_path):
     store.write(record(1))
     store.close()
     (store.folder / ".epoch-000000002.triquad.0a1b2c3d.tmp").write_bytes(b"half")
-    with closing(Store(tmp_path, "lab", Retention(2))) as again:
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as again:
         assert names(again) == ["epoch-000000001.triquad"]
         assert again.newest().record.epoch == 1
 

@@ -7,7 +7,7 @@ from support.map_records import assert_same
 from support.store_writer import KEPT, record_at, write_for_ever
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, newest_of_each
 from triquad_format.mapfile.reader import read_map
-from triquad_server.store.retention import Retention
+from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
 
 KILLS = int(os.environ.get("TRIQUAD_KILLS", "15"))
@@ -41,7 +41,7 @@ def test_whenever_the_writer_is_killed_all_that_was_acknowledged_is_there(tmp_pa
         writer.join()
         acknowledged = last_sent(received) or epoch
         received.close()
-        with closing(Store(tmp_path, "lab", Retention(KEPT))) as store:
+        with closing(Store(tmp_path, "lab", StoreSettings(keep=KEPT))) as store:
             restored = store.newest()
             files = checkpoint_files(store.folder)
         assert restored is not None or acknowledged == 0

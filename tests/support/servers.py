@@ -20,14 +20,13 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, Scan
+from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.session import NetworkOptions, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
-from triquad_server.store.retention import Retention
 from triquad_server.store.store import Store
-from triquad_server.warm_up import warm_up
 
 MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
@@ -71,7 +70,7 @@ def running_service(
     compiled()
     endpoint = free_endpoint()
     network = NetworkOptions((endpoint,), connect, multicast_scouting=False)
-    opened = Store(store, map_name, Retention.chosen(settings.store)) if store else None
+    opened = Store(store, map_name, settings.store) if store else None
     restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
     info = restored.info if restored else None

@@ -8,8 +8,7 @@ from pathlib import Path
 from support.map_records import random_record
 from triquad_format.records.region import MapRecord, Region, RegionIndex
 from triquad_server.mapping.mapper import MapChanges, Mapper
-from triquad_server.settings import Settings
-from triquad_server.store.retention import Retention
+from triquad_server.settings import Settings, StoreSettings
 from triquad_server.store.store import Store
 
 ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(10))
@@ -40,7 +39,7 @@ def record_at(epoch: int) -> MapRecord:
 
 def write_for_ever(root: Path, acknowledged: Connection) -> None:
     """Go on where the store ends; sends the number of each epoch that is durable."""
-    with closing(Store(root, "lab", Retention(KEPT))) as store:
+    with closing(Store(root, "lab", StoreSettings(keep=KEPT))) as store:
         restored = store.newest()
         epoch = restored.record.epoch if restored else 0
         asked = Mapper("lab", Settings(field=record_at(0).settings), "cpu").publish()

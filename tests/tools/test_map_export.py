@@ -15,7 +15,8 @@ from triquad_format.records.crop import crop_record
 from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.epoch_mesh import EpochMesh
+from triquad_server.mesh.mesher import mesh_tile, surface_tiles
+from triquad_server.mesh.tile_lattice import tile_lattice
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapfiles.seen_space import surface_voxels
@@ -68,8 +69,9 @@ def test_a_mesh_is_the_one_that_a_server_gives(map_file, tmp_path):
     record = read_map(map_file)
     epoch = Mapper("street", settings(), "cpu", record).publish()
     everywhere = np.full(3, -np.inf), np.full(3, np.inf)
-    mesh = EpochMesh(epoch, settings().mesh)
-    tiles = [mesh.tile(tuple(index)) for index in mesh.tiles(*everywhere).tolist()]
+    lattice = tile_lattice(settings().mesh, 0)
+    indices = surface_tiles(epoch, lattice).tolist()
+    tiles = [mesh_tile(epoch, tuple(index), lattice) for index in indices]
     parts = [(tile.origin + tile.vertices, tile.faces) for tile in tiles]
     served = Mesh(*joined(parts, settings().mesh.tile_side_m, *everywhere))
     written = read_mesh(export(map_file, tmp_path, "mesh.ply"))

@@ -11,7 +11,7 @@ from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest
 
 from triquad_server.intake.sources import MAX_SEQUENCE, SourceLedger
-from triquad_server.net.request import Request
+from triquad_server.net.requests import Request
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,10 @@ class FlushHandler:
         timeout_max_s: float,
         limit: int,
     ) -> None:
-        """At most ``limit`` requests are pending; ``publish_soon`` asks the mapper for an epoch."""
+        """Begin to answer; ``publish_soon`` asks the mapper for an epoch.
+
+        At most ``limit`` requests are pending.
+        """
         self._ledger = ledger
         self._publish_soon = publish_soon
         self._timeout_max_s = timeout_max_s
@@ -70,9 +73,6 @@ class FlushHandler:
         self._pending: list[_Pending] = []
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="flush")
-
-    def start(self) -> None:
-        """Begin to answer."""
         self._thread.start()
 
     def close(self) -> None:
@@ -80,8 +80,7 @@ class FlushHandler:
         with self._ledger.changed:
             self._stopping = True
             self._ledger.changed.notify_all()
-        if self._thread.ident is not None:
-            self._thread.join()
+        self._thread.join()
 
     def add(self, request: Request, asks: FlushRequest) -> None:
         """Take over a request; it is answered once its scan is settled.

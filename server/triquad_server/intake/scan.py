@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from triquad_format.records.arrays import Longs
+from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.pose import is_rigid, rotation_error
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import empty_keys, enter
@@ -27,12 +26,12 @@ class ScanRefusedError(Exception):
 class ScanRays:
     """The usable rays of a scan, in the map frame, metres."""
 
-    origin: NDArray[np.float64]  # [3] the sensor
-    ends: NDArray[np.float64]  # [N, 3]
+    origin: Doubles  # [3] the sensor
+    ends: Doubles  # [N, 3]
     points_dropped: dict[str, int]  # points of the scan that are not used, by reason
 
 
-def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
+def check_pose(world_from_sensor: Doubles) -> None:
     """Refuse a pose [4, 4] that is not finite, not rigid or outside the world."""
     pose = world_from_sensor
     if pose.shape != (4, 4):
@@ -56,25 +55,20 @@ def check_pose(world_from_sensor: NDArray[np.float64]) -> None:
         )
 
 
-def _check_points(points: NDArray[np.float32], max_points: int) -> None:
+def _check_points(points: Floats, max_points: int) -> None:
     """Refuse points that are not [N, 3], or more than ``max_points``."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise ScanRefusedError("points_shape", f"points are {list(points.shape)}, not [N, 3]")
     if len(points) > max_points:
         raise ScanRefusedError(
-            "too_many_points",
-            f"{len(points)} points exceed scan.max_points = {max_points}",
+            "too_many_points", f"{len(points)} points exceed scan.max_points = {max_points}"
         )
 
 
 @kernel()
 def _select(
-    points: NDArray[np.float32],
-    range_min_m: float,
-    range_max_m: float,
-    thin_m: float,
-    keys: Longs,
-) -> tuple[NDArray[np.float64], int, int, int]:
+    points: Floats, range_min_m: float, range_max_m: float, thin_m: float, keys: Longs
+) -> tuple[Doubles, int, int, int]:
     """The points that are used; how many are not finite, too near and too far."""
     kept = np.empty((len(points), 3))
     count = not_finite = too_near = too_far = 0
@@ -93,11 +87,7 @@ def _select(
     return kept[:count], not_finite, too_near, too_far
 
 
-def usable_rays(
-    points: NDArray[np.float32],
-    world_from_sensor: NDArray[np.float64],
-    settings: ScanSettings,
-) -> ScanRays:
+def usable_rays(points: Floats, world_from_sensor: Doubles, settings: ScanSettings) -> ScanRays:
     """The rays of a scan that are finite, in range and thinned.
 
     Args:

@@ -12,7 +12,7 @@ from triquad_format.wire.messages import Scan
 
 from triquad_server.counter import Counter
 from triquad_server.intake.sources import SourceLedger
-from triquad_server.net.request import payload_limit
+from triquad_server.net.requests import payload_limit
 
 _log = logging.getLogger(__name__)
 
@@ -20,13 +20,14 @@ _log = logging.getLogger(__name__)
 class ScanQueue:
     """The newest scans that wait; where it is full, the oldest is pushed out and counted."""
 
-    def __init__(self, limit: int, ledger: SourceLedger, dropped: Counter) -> None:
+    def __init__(self, limit: int) -> None:
+        """At most ``limit`` scans wait."""
+        self.limit = limit
+        self.ledger = SourceLedger()
+        self.dropped = Counter()  # scans that are not in the map, by reason
         self._lock = threading.Lock()
         self._scans: deque[Scan] = deque()
         self._in_hand = False
-        self._limit = limit
-        self._ledger = ledger
-        self._dropped = dropped
 
     def __len__(self) -> int:
         return len(self._scans) + self._in_hand
@@ -34,22 +35,22 @@ class ScanQueue:
     def put(self, scan: Scan) -> None:
         """Add a scan, unless its sequence or stamp refuses it."""
         with self._lock:
-            reason = self._ledger.arrive(scan)
+            reason = self.ledger.arrive(scan)
             if reason is not None:
-                self._dropped.add(reason)
+                self.dropped.add(reason)
                 return
             self._scans.append(scan)
-            pushed_out = self._scans.popleft() if len(self._scans) > self._limit else None
+            pushed_out = self._scans.popleft() if len(self._scans) > self.limit else None
             if pushed_out is not None:
-                self._ledger.push_out(pushed_out)
+                self.ledger.push_out(pushed_out)
 
     def refuse(self, scan: Scan, reason: str, text: str) -> None:
         """Account for a scan that arrived but is not let in."""
         with self._lock:
-            backwards = self._ledger.arrive(scan)
+            backwards = self.ledger.arrive(scan)
             if backwards is None:
-                self._ledger.turn_away(scan, text)
-            self._dropped.add(backwards or reason)
+                self.ledger.turn_away(scan, text)
+            self.dropped.add(backwards or reason)
 
     def take(self) -> Scan | None:
         """The oldest waiting scan; it counts as waiting until the next one is asked for."""
@@ -65,10 +66,9 @@ class ScanIntake:
         self,
         session: zenoh.Session,
         map_name: str,
-        limit: int,
-        max_points: int,
         queue: ScanQueue,
-        dropped: Counter,
+        *,
+        max_points: int,
         arrived: Callable[[], None],
     ) -> None:
         """Begin to receive; ``arrived`` is called after each scan that was queued.
@@ -78,12 +78,10 @@ class ScanIntake:
         """
         self._max_points = max_points
         self._queue = queue
-        self._dropped = dropped
         self._arrived = arrived
         # A ring, since a full channel of another kind would stall the network's threads.
         self._subscriber = session.declare_subscriber(
-            keys.all_scans_key(map_name),
-            zenoh.handlers.RingChannel(limit),
+            keys.all_scans_key(map_name), zenoh.handlers.RingChannel(queue.limit)
         )
         self._thread = threading.Thread(target=self._run, name="scan-intake")
         self._thread.start()
@@ -98,7 +96,7 @@ class ScanIntake:
             try:
                 self._receive(str(sample.key_expr), sample.payload)
             except Exception:  # an internal error must not stop the intake of other scans
-                self._dropped.add("internal")
+                self._queue.dropped.add("internal")
                 _log.exception("a scan on %s could not be received", sample.key_expr)
             self._arrived()
 
@@ -134,5 +132,5 @@ class ScanIntake:
         self._queue.put(scan)
 
     def _drop(self, reason: str, key: str, cause: object) -> None:
-        self._dropped.add(reason)
+        self._queue.dropped.add(reason)
         _log.debug("scan on %s dropped (%s): %s", key, reason, cause)

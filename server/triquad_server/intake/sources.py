@@ -70,7 +70,7 @@ class SourceLedger:
             if scan.stamp_ns < track.stamp_ns:
                 track.refuse(
                     f"scan {scan.sequence}: its stamp {scan.stamp_ns} ns lies before the "
-                    f"{track.stamp_ns} ns of an earlier scan; stamp scans in order",
+                    f"{track.stamp_ns} ns of an earlier scan; stamp scans in order"
                 )
                 self.changed.notify_all()
                 return "time_backwards"

@@ -5,14 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from torch import Tensor
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import (
-    Region,
-    RegionIndex,
-    leaf_coordinates,
-    region_centre,
-)
+from triquad_format.records.region import Region, RegionIndex, leaf_coordinates, region_centre
 from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.compiled.surfels.surfel_map import first_surfels
@@ -21,15 +17,18 @@ from triquad_map.compiled.voxel_index import thin
 from triquad_map.composition.region import field_samples
 
 from triquad_server.engine.adam import Rates
-from triquad_server.engine.compiled_trainer import GradientSums
-from triquad_server.engine.field_record import field_from_record, region_record, training_state
-from triquad_server.engine.live_field import LiveField, initial_field
-from triquad_server.engine.trainer import Loss, make_trainer
-from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.engine.live_field import (
+    LiveField,
+    field_from_record,
+    initial_field,
+    region_record,
+    training_state,
+)
+from triquad_server.engine.trainer import CompiledTrainer, GradientSums, TensorTrainer
+from triquad_server.epochs import FrozenRegion
 from triquad_server.intake.scan import ScanRays
-from triquad_server.mapping.ray_intervals import ray_intervals, sample_intervals
+from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
 from triquad_server.mapping.replay_pool import ReplayPool
-from triquad_server.mapping.sampling import Placement
 from triquad_server.settings import ScanSettings, TrainingSettings
 
 _CARVE_SHORT_M = 0.1
@@ -49,16 +48,6 @@ class RegionSetup:
     device: torch.device
     sums: GradientSums
     team: Team
-
-    @property
-    def placement(self) -> Placement:
-        """Where samples lie."""
-        return Placement(
-            surface_share=self.scan.surface_share,
-            spread_m=self.scan.spread_m,
-            truncation_m=self.scan.truncation_m,
-            half_side_m=self.field.region_side_m / 2,
-        )
 
     def seeds(self, index: RegionIndex) -> tuple[int, int]:
         """Seeds of a region's field and of its replay pool; no two regions share one."""
@@ -81,7 +70,12 @@ class LiveRegion:
         _, seed = setup.seeds(index)
         self.pool = ReplayPool(
             capacity=setup.training.pool_rays,
-            placement=setup.placement,
+            placement=Placement(
+                surface_share=setup.scan.surface_share,
+                spread_m=setup.scan.spread_m,
+                truncation_m=setup.scan.truncation_m,
+                half_side_m=setup.field.region_side_m / 2,
+            ),
             device=setup.device,
             seed=seed,
             team=setup.team,
@@ -92,7 +86,11 @@ class LiveRegion:
         self._setup = setup
         self._settings = setup.field
         self._training = setup.training
-        self._trainer = make_trainer(field, setup.sums, setup.team)
+        self._trainer: CompiledTrainer | TensorTrainer = (
+            CompiledTrainer(field, setup.sums, setup.team)
+            if setup.device.type == "cpu"
+            else TensorTrainer(field)
+        )
 
     @classmethod
     def unseen(cls, index: RegionIndex, setup: RegionSetup) -> "LiveRegion":
@@ -131,7 +129,7 @@ class LiveRegion:
         short = _CARVE_SHORT_M / self._settings.leaf_m
         return lambda: self.evidence.carve(origin, ends[thin(ends, 1.0)], short)
 
-    def learn(self, rays: ScanRays, normals: NDArray[np.float64]) -> None:
+    def learn(self, rays: ScanRays, normals: Doubles) -> None:
         """Keep what the rays teach, to be trained on.
 
         ``normals`` [N, 3] are those at the rays' ends, NaN where unknown.
@@ -145,8 +143,8 @@ class LiveRegion:
         self.budget_samples = min(self.budget_samples + samples, self._training.max_budget_samples)
         self._fresh_budget_samples = int(samples * self._training.fresh_share)
 
-    def train(self) -> Loss:
-        """One optimiser step; returns the loss."""
+    def train(self) -> float | Tensor:
+        """One optimiser step; returns the loss: to read it on a GPU waits for the step."""
         settings = self._training
         fresh = min(self._fresh_budget_samples, int(settings.batch * settings.fresh_share))
         batch = self.pool.draw(settings.batch, fresh)
@@ -157,7 +155,7 @@ class LiveRegion:
         self.changed = True
         return loss
 
-    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+    def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget evidence and samples between two corners [3]."""
         self.evidence.clear(self.voxels(low[None])[0], self.voxels(high[None])[0])
         self.pool.forget(low - self.centre, high - self.centre)
@@ -165,7 +163,7 @@ class LiveRegion:
             self.budget_samples = 0
         self.changed = True
 
-    def voxels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def voxels(self, points: Doubles) -> Doubles:
         """Voxel coordinates [N, 3] of points."""
         return leaf_coordinates(self._settings, points - self.centre)
 
@@ -197,7 +195,12 @@ class LiveRegion:
     def record(self) -> Region:
         """The region with its training state as plain arrays, sharing nothing with this one."""
         samples = self.pool.sample(_CHECKPOINT_SAMPLES)
-        state = training_state(self.field, samples, self.budget_samples)
+        state = training_state(
+            self.field,
+            points=samples.points,
+            labels=samples.labels,
+            budget_samples=self.budget_samples,
+        )
         return region_record(self.index, self.field, self.evidence.freeze(), state)
 
     def _cooling(self) -> float:

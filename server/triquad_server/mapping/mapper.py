@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from torch import Tensor
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.region import MapRecord, RegionIndex
 
-from triquad_server.engine.compiled_trainer import GradientSums
-from triquad_server.engine.trainer import Loss
-from triquad_server.epochs.epoch import Epoch, FrozenRegion
+from triquad_server.engine.trainer import GradientSums
+from triquad_server.epochs import Epoch, FrozenRegion
 from triquad_server.intake.scan import ScanRays, ScanRefusedError, usable_rays
 from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.normals import SurfaceNormals
@@ -65,7 +65,7 @@ class Mapper:
         self._epoch: Epoch | None = None
         self._structure_changed = True
         self.samples_trained = 0
-        self._loss: Loss | None = None
+        self._loss: float | Tensor | None = None
         for region in record.regions if record else ():
             self._regions[region.index] = LiveRegion.restore(region, self._setup)
         self._share_pool()
@@ -91,10 +91,7 @@ class Mapper:
         return sum(len(region.pool) for region in self._regions.values())
 
     def ingest(
-        self,
-        points: NDArray[np.float32],
-        world_from_sensor: NDArray[np.float64],
-        stamp_s: int = 0,
+        self, points: Floats, world_from_sensor: Doubles, stamp_s: int = 0
     ) -> dict[str, int]:
         """Take in a scan: ``points`` [N, 3] in metres of the sensor frame, pose [4, 4].
 
@@ -150,7 +147,7 @@ class Mapper:
         self._structure_changed = False
         return self._epoch
 
-    def reset(self, minimum: NDArray[np.float64], maximum: NDArray[np.float64]) -> None:
+    def reset(self, minimum: Doubles, maximum: Doubles) -> None:
         """Forget what lies between two corners [3]; regions wholly between them disappear."""
         half = self._field_settings.region_side_m / 2
         for index, region in list(self._regions.items()):
@@ -183,11 +180,7 @@ class Mapper:
             newest,
         )
 
-    def _freeze(
-        self,
-        region: LiveRegion,
-        before: dict[RegionIndex, FrozenRegion],
-    ) -> FrozenRegion:
+    def _freeze(self, region: LiveRegion, before: dict[RegionIndex, FrozenRegion]) -> FrozenRegion:
         """The region as it is now; the last frozen one where it did not change since."""
         if not region.changed and region.index in before:
             return before[region.index]

@@ -9,16 +9,16 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from triquad_format.wire.messages import ResetReply, ResetRequest
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
-from triquad_server.epochs.gate import QueryGate
-from triquad_server.epochs.history import EpochHistory, EpochLimits
+from triquad_server.epochs import EpochHistory, EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan import ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.intake.sources import SourceLedger
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.tile_queries import check_box
 from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
@@ -49,31 +49,21 @@ class _Command:
     result: Future[Any]
 
 
-@dataclass(frozen=True)
-class MapperInputs:
-    """What the mapper thread reads from, and reports to."""
-
-    scans: ScanQueue
-    ledger: SourceLedger
-    gate: QueryGate
-    scans_dropped: Counter
-    points_dropped: Counter
-
-
 class MapperThread:
     """Runs a :class:`Mapper`; everything that touches the live map goes through here."""
 
     def __init__(
         self,
         mapper: Mapper,
-        inputs: MapperInputs,
+        scans: ScanQueue,
         publish_period_s: float,
         kept: EpochLimits,
         failed: Callable[[], None],
     ) -> None:
         """Publish the first epoch; ``failed`` is called where an internal error ends the thread."""
         self._mapper = mapper
-        self._inputs = inputs
+        self._scans = scans
+        self.points_dropped = Counter()  # of scans that were taken, by reason
         self._period_s = publish_period_s
         self._failed = failed
         self._lock = threading.Lock()
@@ -134,6 +124,20 @@ class MapperThread:
         self._wake.set()
         return result.result()
 
+    def reset(self, request: ResetRequest) -> ResetReply:
+        """Forget what lies in the request's box; answered once an epoch shows it.
+
+        Raises:
+            RefusedError: it is not a box.
+        """
+        check_box(request.minimum, request.maximum)
+
+        def reset(mapper: Mapper) -> int:
+            mapper.reset(request.minimum, request.maximum)
+            return mapper.publish().number
+
+        return ResetReply(self.call(reset))
+
     def _run(self) -> None:
         lower_priority(NICENESS)
         ended = "the mapper has stopped"
@@ -159,12 +163,14 @@ class MapperThread:
         took_scan = self._ingest_next()
         if not self._mapper.settled:
             # However many ask, training waits a third of its time at most.
-            self._inputs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
+            self.epochs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
             started = time.monotonic()
             self._mapper.train()
             self._step_s = time.monotonic() - started
             self._unpublished = True
-        if self._publish_soon.is_set() or self._publish_due():
+        if self._publish_soon.is_set() or (
+            self._unpublished and time.monotonic() >= self._next_publish
+        ):
             self._publish_soon.clear()
             self._publish()
         self._record_progress()
@@ -196,7 +202,7 @@ class MapperThread:
 
     def _ingest_next(self) -> bool:
         """Take in the oldest waiting scan; False where none waits."""
-        scan = self._inputs.scans.take()
+        scan = self._scans.take()
         if scan is None:
             return False
         try:
@@ -204,23 +210,20 @@ class MapperThread:
                 scan.points, scan.world_from_sensor, scan.stamp_ns // 1_000_000_000
             )
         except ScanRefusedError as error:
-            self._inputs.scans_dropped.add(error.reason)
-            self._inputs.ledger.refuse(scan, str(error))
+            self._scans.dropped.add(error.reason)
+            self._scans.ledger.refuse(scan, str(error))
             _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
         except Exception as error:  # bad input, whatever it is, must not stop the server
-            self._inputs.scans_dropped.add("internal")
-            self._inputs.ledger.refuse(scan, f"internal error of the server: {error!r}")
+            self._scans.dropped.add("internal")
+            self._scans.ledger.refuse(scan, f"internal error of the server: {error!r}")
             _log.exception("scan %d of %s could not be taken in", scan.sequence, scan.source)
         else:
             for reason, count in points_dropped.items():
-                self._inputs.points_dropped.add(reason, count)
+                self.points_dropped.add(reason, count)
             self._scans_taken += 1
             self._unpublished = True
-            self._inputs.ledger.take(scan)
+            self._scans.ledger.take(scan)
         return True
-
-    def _publish_due(self) -> bool:
-        return self._unpublished and time.monotonic() >= self._next_publish
 
     def _publish(self) -> None:
         started = time.monotonic()
@@ -231,7 +234,7 @@ class MapperThread:
         self._unpublished = False
         now = time.monotonic()
         self._next_publish = now + max(self._period_s, _MIN_PUBLISH_SHARE * (now - started))
-        self._inputs.ledger.publish()
+        self._scans.ledger.publish()
 
     def _rest_s(self) -> float | None:
         """How long there is nothing to do; None: until woken."""

@@ -6,7 +6,7 @@ fine grid serves where it has a plane, the coarse one where it has not.
 """
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats, Ints, Longs
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import (
@@ -25,15 +25,15 @@ _MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a p
 _FULL = 65_536  # points of a cell, above which older ones count for less
 _RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
 
-PointMoments = NDArray[np.float32]
-Normals = NDArray[np.float32]
-Rows = NDArray[np.int32]
-Counts = NDArray[np.float32]
+PointMoments = Floats
+Normals = Floats
+Rows = Ints
+Counts = Floats
 
 
 @kernel()
 def _add(
-    points: NDArray[np.float64],
+    points: Doubles,
     start: int,
     cell_m: float,
     index: Index,
@@ -71,13 +71,7 @@ def _add(
 
 
 @kernel()
-def _gather(
-    row: int,
-    cell_m: float,
-    index: Index,
-    moments: PointMoments,
-    total: NDArray[np.float64],
-) -> None:
+def _gather(row: int, cell_m: float, index: Index, moments: PointMoments, total: Doubles) -> None:
     """Sum the moments of the 27 cells around that of a row, relative to its centre."""
     total[:] = 0
     x, y, z = unpack(index.row_keys[row])
@@ -103,7 +97,7 @@ def _gather(
 
 
 @kernel()
-def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
+def _plane_normal(m: Doubles, normal: Doubles) -> bool:
     """Normal of the plane through points with the moments ``m``; False where there is none."""
     n = m[0]
     if n < _MIN_POINTS:
@@ -142,9 +136,7 @@ def _plane_normal(m: NDArray[np.float64], normal: NDArray[np.float64]) -> bool:
 
 
 @kernel()
-def _outdated(
-    rows: Rows, normals: NDArray[np.float64], moments: PointMoments, basis: Counts
-) -> Rows:
+def _outdated(rows: Rows, normals: Doubles, moments: PointMoments, basis: Counts) -> Rows:
     """Cells of points without a normal whose own is of far fewer points than there are.
 
     Their ``basis`` is brought up to date.
@@ -174,7 +166,7 @@ def _estimate(
 
 
 @kernel()
-def _adopt(rows: Rows, of_cells: Normals, normals: NDArray[np.float64]) -> None:
+def _adopt(rows: Rows, of_cells: Normals, normals: Doubles) -> None:
     """Replace those of ``normals`` that are NaN by those of their cells."""
     for i in range(len(rows)):
         if np.isnan(normals[i, 0]):
@@ -194,27 +186,21 @@ class MomentGrid:
         # Points in each cell when its normal was estimated.
         self._basis = np.zeros(1024, np.float32)
 
-    def add(self, points: NDArray[np.float64]) -> Rows:
+    def add(self, points: Doubles) -> Rows:
         """Add points [N, 3], metres, map frame; returns the row of each one's cell."""
         rows = np.empty(len(points), np.int32)
         done = 0
         while done < len(points):
             index, count = self._cells.arrays, self._cells.count
             done, self._cells.count = _add(
-                points,
-                done,
-                self._cell_m,
-                index,
-                self._moments,
-                rows,
-                count,
+                points, done, self._cell_m, index, self._moments, rows, count
             )
             if done < len(points):
                 self._cells.grow()
                 self._refit(slice(None))
         return rows
 
-    def fill(self, normals: NDArray[np.float64], rows: Rows) -> None:
+    def fill(self, normals: Doubles, rows: Rows) -> None:
         """Replace those of ``normals`` [N, 3] that are NaN by those of the cells ``rows`` [N]."""
         outdated = _outdated(rows, normals, self._moments, self._basis)
 
@@ -225,12 +211,12 @@ class MomentGrid:
         self._team.split(len(outdated), work)
         _adopt(rows, self._normals, normals)
 
-    def keep_nearest(self, place: NDArray[np.float64], cells: int) -> None:
+    def keep_nearest(self, place: Doubles, cells: int) -> None:
         """Keep the moments of the ``cells`` nearest to a ``place`` [3] only."""
         distance = np.linalg.norm(self._centres() - place, axis=1)
         self._keep(np.sort(np.argpartition(distance, cells)[:cells]))
 
-    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+    def forget(self, low: Doubles, high: Doubles) -> None:
         """Drop the moments of cells between the corners ``low`` and ``high`` [3]."""
         centres = self._centres()
         self._keep(np.flatnonzero(((centres < low) | (centres > high)).any(axis=1)))
@@ -240,14 +226,14 @@ class MomentGrid:
         """Cells in use."""
         return self._cells.count
 
-    def _centres(self) -> NDArray[np.float64]:
+    def _centres(self) -> Doubles:
         return np.asarray((self._cells.cells() + 0.5) * self._cell_m, np.float64)
 
-    def _keep(self, rows: NDArray[np.int64]) -> None:
+    def _keep(self, rows: Longs) -> None:
         self._cells = VoxelIndex.of_cells(self._cells.cells()[rows])
         self._refit(rows)
 
-    def _refit(self, rows: NDArray[np.int64] | slice) -> None:
+    def _refit(self, rows: Longs | slice) -> None:
         """Keep some rows, with as much room as the cells have."""
         capacity = self._cells.capacity
         self._moments = with_room(self._moments[rows], capacity)
@@ -268,7 +254,7 @@ class SurfaceNormals:
         self._grids = (MomentGrid(fine_m, team), MomentGrid(coarse_m, team))
         self._max_cells = max_cells
 
-    def add(self, points: NDArray[np.float64], sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+    def add(self, points: Doubles, sensor: Doubles) -> Doubles:
         """Add the end points [N, 3] of a scan from ``sensor`` [3], metres, map frame.
 
         Returns:
@@ -281,7 +267,7 @@ class SurfaceNormals:
                 grid.keep_nearest(sensor, self._max_cells // 2)
         return normals
 
-    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+    def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget the surfaces between the corners ``low`` and ``high`` [3]."""
         for grid in self._grids:
             grid.forget(low, high)

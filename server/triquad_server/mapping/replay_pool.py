@@ -9,24 +9,25 @@ import math
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from triquad_format.records.arrays import Doubles, Floats, Ints, Longs
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import with_room
 
-from triquad_server.engine.batch import Batch
-from triquad_server.mapping.ray_intervals import COLUMNS, END
-from triquad_server.mapping.sampling import Placement, draw_ordered_samples, draw_samples
+from triquad_server.engine.trainer import Batch
+from triquad_server.mapping.ray_intervals import (
+    COLUMNS,
+    END,
+    Placement,
+    draw_ordered_samples,
+    draw_samples,
+)
 
 _BIN_M = 0.8
 _BINS = 1 << 18
 _AHEAD = 16  # places that are brought into the cache before their turn
-
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
-Places = NDArray[np.int64]
 
 
 @kernel()
@@ -40,7 +41,7 @@ def _bin(interval: Floats) -> int:
 @kernel()
 def _best_to_push_out(
     size: int, count: int, first: int, stride: int, offset: int, bins: Ints, occupancy: Ints
-) -> Places:
+) -> Longs:
     """Different places whose intervals are the best to push out, ``count <= size // 2`` of them.
 
     The pool is paired up, each place once, and of a pair the one goes whose bin holds more.
@@ -56,7 +57,7 @@ def _best_to_push_out(
 
 @kernel()
 def _put(
-    new: Floats, places: Places, used: int, intervals: Floats, bins: Ints, occupancy: Ints
+    new: Floats, places: Longs, used: int, intervals: Floats, bins: Ints, occupancy: Ints
 ) -> None:
     """Put new intervals into places; those below ``used`` hold one that is pushed out."""
     for i in range(len(places)):
@@ -128,7 +129,7 @@ class ReplayPool:
         if self._size > capacity:
             self._keep(self._rng.permutation(self._size)[:capacity])
 
-    def forget(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+    def forget(self, low: Doubles, high: Doubles) -> None:
         """Drop the intervals that end between the corners ``low`` and ``high`` [3]."""
         ends = self._intervals[: self._size, END : END + 3]
         self._keep(np.flatnonzero(~((ends >= low) & (ends <= high)).all(axis=1)))
@@ -150,7 +151,7 @@ class ReplayPool:
     def _random(self, below: int, count: int) -> Tensor:
         return torch.randint(below, (count,), generator=self._generator, device=self._device)
 
-    def _keep(self, places: Places) -> None:
+    def _keep(self, places: Longs) -> None:
         self._intervals = self._intervals[places]
         self._bins = self._bins[places]
         self._occupancy = np.bincount(self._bins, minlength=_BINS).astype(np.int32)
@@ -170,7 +171,7 @@ class ReplayPool:
         if self._device.type != "cpu":
             self._on_device = torch.from_numpy(self._intervals).to(self._device)
 
-    def _best_to_push_out(self, count: int) -> Places:
+    def _best_to_push_out(self, count: int) -> Longs:
         half = self._size // 2
         count = min(count, half)
         if count == 0:

@@ -8,35 +8,35 @@ saw a surface are kept: elsewhere the field has zeros that no ray taught it.
 
 import functools
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
+from triquad_format.records.region import BLOCK_VOXELS
 from triquad_format.records.status import Status
 from triquad_format.wire.tile_codec import STEPS, TileSurface
 from triquad_map.compiled.kernel import kernel
+from triquad_map.composition.composed_view import ComposedView
 
+from triquad_server.epochs import Epoch
 from triquad_server.mesh.marching_cubes import Crossings
-from triquad_server.mesh.tile_border import TileBorder
-from triquad_server.mesh.tile_lattice import TileLattice
-
-TileIndex = tuple[int, int, int]
+from triquad_server.mesh.tile_lattice import TileBorder, TileIndex, TileLattice, tiles_meeting
 
 
 @dataclass(frozen=True)
 class TileMesh:
     """Triangles of one tile. Vertices are numbered in the order in which faces use them."""
 
-    origin: NDArray[np.float64]  # [3] metres, map frame: the tile's minimum corner
+    origin: Doubles  # [3] metres, map frame: the tile's minimum corner
     cell_m: float
     points: NDArray[np.uint16]  # [V, 3] lower lattice points of the edges that hold the vertices
-    axes: NDArray[np.uint8]  # [V] along which the edges run
-    fractions: NDArray[np.float64]  # [V] how far along them, 0 to 1
-    faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
+    axes: Bytes  # [V] along which the edges run
+    fractions: Doubles  # [V] how far along them, 0 to 1
+    faces: Ints  # [F, 3] counter-clockwise seen from free space
     border: TileBorder  # what it was made of on its faces
 
     @property
-    def vertices(self) -> NDArray[np.float32]:
+    def vertices(self) -> Floats:
         """The vertices [V, 3], metres, relative to the origin."""
         places = self.points.astype(np.float64)
         places[np.arange(len(places)), self.axes] += self.fractions
@@ -49,21 +49,21 @@ class TileMesh:
         return TileSurface(self.points, self.axes, steps, self.faces)
 
 
-class SurfaceSource(Protocol):
-    """What the mesher asks of a map: its distances, and where a surface was seen."""
-
-    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Signed distances [N] at points [N, 3], metres."""
-
-    def status(self, points: NDArray[np.float64], reach_m: float) -> NDArray[np.uint8]:
-        """Status values [N] at points [N, 3]."""
+def surface_tiles(epoch: Epoch, lattice: TileLattice) -> Ints:
+    """Tiles [T, 3], sorted, that meet a block with seen surface, or what is meshed around it."""
+    settings = epoch.field_settings
+    side_m = BLOCK_VOXELS * settings.leaf_m
+    tiles: set[TileIndex] = set()
+    for region in epoch.frozen_regions:
+        corner = region.centre - settings.region_side_m / 2
+        low = region.evidence.surface_cells() * side_m + corner
+        around = tiles_meeting(low, low + side_m, lattice.reach_m, lattice)
+        tiles.update((x, y, z) for x, y, z in around.tolist())
+    return np.array(sorted(tiles), np.int32).reshape(-1, 3)
 
 
 def mesh_tile(
-    source: SurfaceSource,
-    tile: TileIndex,
-    lattice: TileLattice,
-    around: TileBorder | None = None,
+    source: ComposedView, tile: TileIndex, lattice: TileLattice, around: TileBorder | None = None
 ) -> TileMesh:
     """The surface within one tile.
 
@@ -93,9 +93,7 @@ def mesh_tile(
     )
 
 
-def _seen_cells(
-    source: SurfaceSource, first: NDArray[np.int64], lattice: TileLattice
-) -> NDArray[np.int64]:
+def _seen_cells(source: ComposedView, first: Longs, lattice: TileLattice) -> Longs:
     """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
     reach_m = lattice.cell_m / 2 + lattice.reach_m
     groups = _grid(-(-lattice.cells // lattice.group)) * lattice.group
@@ -109,7 +107,7 @@ def _seen_cells(
 
 
 @kernel()
-def _cells_of(groups: NDArray[np.int64], group_side: int, side: int) -> NDArray[np.int64]:
+def _cells_of(groups: Longs, group_side: int, side: int) -> Longs:
     """Cells [C, 3] of groups, named by their least corners, of a tile of ``side`` cells."""
     cells = np.empty((len(groups) * group_side**3, 3), np.int64)
     count = 0
@@ -123,9 +121,7 @@ def _cells_of(groups: NDArray[np.int64], group_side: int, side: int) -> NDArray[
 
 
 @kernel()
-def _positions(
-    cells: NDArray[np.int64], offset: float, first: NDArray[np.int64], cell_m: float
-) -> NDArray[np.float64]:
+def _positions(cells: Longs, offset: float, first: Longs, cell_m: float) -> Doubles:
     """Where cells [C, 3] of the tile are in the map frame, ``offset`` cells from their corners."""
     positions = np.empty(cells.shape)
     for i in range(len(cells)):
@@ -135,7 +131,7 @@ def _positions(
 
 
 @kernel()
-def _centroids(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+def _centroids(vertices: Doubles, faces: Ints) -> Doubles:
     centroids = np.empty((len(faces), 3))
     for i in range(len(faces)):
         a, b, c = vertices[faces[i, 0]], vertices[faces[i, 1]], vertices[faces[i, 2]]
@@ -145,9 +141,7 @@ def _centroids(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArr
 
 
 @kernel()
-def _renumbered(
-    faces: NDArray[np.int32], vertices: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def _renumbered(faces: Ints, vertices: int) -> tuple[Longs, Ints]:
     """The vertices that faces use, in the order in which they do, and the faces with these."""
     numbers = np.full(vertices, -1, np.int32)
     used = np.empty(vertices, np.int64)
@@ -165,15 +159,15 @@ def _renumbered(
 
 
 @functools.lru_cache(maxsize=8)
-def _grid(side: int) -> NDArray[np.int64]:
+def _grid(side: int) -> Longs:
     """Cells [side**3, 3] of a cube."""
     axes = [np.arange(side, dtype=np.int64)] * 3
-    cells: NDArray[np.int64] = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    cells: Longs = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     return cells.reshape(-1, 3)
 
 
 @kernel()
-def _corners(seen: NDArray[np.int64], volume: NDArray[np.float32]) -> NDArray[np.int64]:
+def _corners(seen: Longs, volume: Floats) -> Longs:
     """The lattice points [P, 3] at the corners of cells [C, 3]; they become NaN in ``volume``."""
     points = np.empty((8 * len(seen), 3), np.int64)
     count = 0
@@ -188,12 +182,8 @@ def _corners(seen: NDArray[np.int64], volume: NDArray[np.float32]) -> NDArray[np
 
 
 def _lattice_values(
-    source: SurfaceSource,
-    seen: NDArray[np.int64],
-    first: NDArray[np.int64],
-    lattice: TileLattice,
-    around: TileBorder | None,
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    source: ComposedView, seen: Longs, first: Longs, lattice: TileLattice, around: TileBorder | None
+) -> tuple[Floats, Longs]:
     """Distances on the tile's lattice points [cells + 1] * 3, and the points [P, 3] at seen cells.
 
     Those of other points mean nothing.

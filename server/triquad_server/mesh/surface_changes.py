@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import RegionIndex
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.compiled.team import Team
 
-from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.epochs import FrozenRegion
 
 _KEY_BITS = 20  # of each coordinate of a voxel, or of a group, in its region
 
@@ -24,17 +25,17 @@ fewer, training is the cause, which never leaves all voxels alone."""
 class Changes:
     """Where the surface changed. Positions are metres in the map frame."""
 
-    places: NDArray[np.float64]  # [N, 3] centres of voxels whose surface is new or gone
-    drifted: NDArray[np.float64]  # [G, 3] centres of groups whose surface moved as a whole
+    places: Doubles  # [N, 3] centres of voxels whose surface is new or gone
+    drifted: Doubles  # [G, 3] centres of groups whose surface moved as a whole
 
 
 @dataclass(frozen=True)
 class _Voxels:
     """The voxels of a region with seen surface."""
 
-    keys: NDArray[np.int64]  # [V] increasing
-    centres: NDArray[np.float64]  # [V, 3] metres, map frame
-    groups: NDArray[np.float64]  # [G, 3] centres of the groups
+    keys: Longs  # [V] increasing
+    centres: Doubles  # [V, 3] metres, map frame
+    groups: Doubles  # [G, 3] centres of the groups
     group: NDArray[np.intp]  # [V] of each voxel
 
 
@@ -44,7 +45,7 @@ class _Recorded:
 
     region: FrozenRegion
     voxels: _Voxels
-    offsets: NDArray[np.float32]  # [V] metres from each voxel's centre to the surface
+    offsets: Floats  # [V] metres from each voxel's centre to the surface
 
 
 class SurfaceChanges:
@@ -97,14 +98,15 @@ class SurfaceChanges:
         gone = np.zeros((0, 3))
         if voxels is not old.voxels:
             before = np.full(len(voxels.keys), np.nan, np.float32)
-            rows, found = _find(voxels.keys, old.voxels.keys)
-            before[found] = old.offsets[rows[found]]
-            _, kept = _find(old.voxels.keys, voxels.keys)
-            gone = old.voxels.centres[~kept]
+            _, rows, old_rows = np.intersect1d(
+                voxels.keys, old.voxels.keys, assume_unique=True, return_indices=True
+            )
+            before[rows] = old.offsets[old_rows]
+            gone = np.delete(old.voxels.centres, old_rows, axis=0)
         moved = np.abs(new.offsets - before)
         is_new = np.isnan(before)
 
-        def count(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+        def count(chosen: Bools) -> NDArray[np.intp]:
             return np.bincount(voxels.group[chosen], minlength=len(voxels.groups))
 
         size = np.bincount(voxels.group, minlength=len(voxels.groups))
@@ -119,10 +121,8 @@ class SurfaceChanges:
         )
 
     def _measure(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
-        if old is not None and old.region.evidence is region.evidence:
-            voxels = old.voxels
-        else:
-            voxels = self._voxels(region)
+        unchanged = old if old and old.region.evidence is region.evidence else None
+        voxels = unchanged.voxels if unchanged else self._voxels(region)
         return _Recorded(region, voxels, self._offsets(region, voxels.centres))
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
@@ -138,7 +138,7 @@ class SurfaceChanges:
         groups = ((cells[first] + 0.5) * self._group_m).astype(np.float64)
         return _Voxels(keys[order], centres, groups, group.ravel())
 
-    def _offsets(self, region: FrozenRegion, centres: NDArray[np.float64]) -> NDArray[np.float32]:
+    def _offsets(self, region: FrozenRegion, centres: Doubles) -> Floats:
         """How far [V] the surface is from the centres; at most a voxel: beyond are others."""
         offsets = np.empty(len(centres), np.float32)
         leaf_m = self._settings.leaf_m
@@ -154,17 +154,6 @@ class SurfaceChanges:
         return offsets
 
 
-def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def _key(cells: Longs) -> Longs:
     """One number for each of cells [N, 3], none of them negative."""
     return (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
-
-
-def _find(
-    keys: NDArray[np.int64], among: NDArray[np.int64]
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Where increasing keys [N] are among others, and whether they are there at all."""
-    rows = np.searchsorted(among, keys)
-    if len(among) == 0:
-        return rows, np.zeros(len(keys), np.bool_)
-    rows = np.minimum(rows, len(among) - 1)
-    return rows, among[rows] == keys

@@ -2,23 +2,159 @@
 
 import hashlib
 import threading
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.compiled.team import Team
 from triquad_map.composition.composed_view import ComposedView
 
-from triquad_server.epochs.epoch import Epoch
-from triquad_server.mesh.mesher import TileIndex, mesh_tile
-from triquad_server.mesh.surface_changes import SurfaceChanges
-from triquad_server.mesh.tile_border import TileBorder
-from triquad_server.mesh.tile_bytes import TileBytes
-from triquad_server.mesh.tile_lattice import TileLattice, tile_lattice
-from triquad_server.mesh.tile_level import CachedTile, TileDelta, TileLevel
+from triquad_server.epochs import Epoch
+from triquad_server.mesh.mesher import mesh_tile
+from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
+from triquad_server.mesh.tile_lattice import (
+    TileBorder,
+    TileIndex,
+    TileLattice,
+    tile_lattice,
+    tiles_meeting,
+)
 from triquad_server.settings import MeshSettings
+
+_AROUND = [
+    (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
+]
+
+TileKey = tuple[int, TileIndex]
+"""Level of detail and index of a tile."""
+
+
+class TileBytes:
+    """Encoded tiles in memory; those unused for longest are dropped where there are too many."""
+
+    def __init__(self, limit: int) -> None:
+        """Keep at most ``limit`` bytes, or a single tile that is larger."""
+        self._limit = limit
+        self.size = 0  # bytes of the tiles that are kept
+        self._data: OrderedDict[TileKey, bytes] = OrderedDict()  # longest unused first
+
+    def get(self, key: TileKey) -> bytes | None:
+        """The bytes of a tile, None where they are gone."""
+        data = self._data.get(key)
+        if data is not None:
+            self._data.move_to_end(key)
+        return data
+
+    def put(self, key: TileKey, data: bytes) -> None:
+        """Keep the bytes of a tile."""
+        self.size += len(data) - len(self._data.pop(key, b""))
+        self._data[key] = data
+        while self.size > self._limit and len(self._data) > 1:
+            _, dropped = self._data.popitem(last=False)
+            self.size -= len(dropped)
+
+
+@dataclass(frozen=True)
+class CachedTile:
+    """A tile that was made. Its bytes may be gone; what neighbours need of it never is."""
+
+    index: TileIndex
+    version: int  # epoch of which its bytes are
+    revision: int  # its place in the order in which bytes came to differ
+    made: int  # epoch with which it was last found to agree
+    empty: bool  # without faces
+    digest: bytes
+    border: TileBorder
+
+
+@dataclass(frozen=True)
+class TileDelta:
+    """What somebody does not know of the tiles of a box."""
+
+    ready: list[CachedTile]  # by increasing revision; empty ones are to be removed
+    removed: list[TileIndex]  # that the other side has, and that were never here
+    to_make: list[TileIndex]  # those that changed first come first
+    revision: int  # who knows all of this knows everything up to here
+
+
+class _TileLevel:
+    """The tiles of one level of detail: which there are, and which of them are out of date."""
+
+    def __init__(self, lattice: TileLattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, CachedTile] = {}  # as they were last made
+        self.changed: dict[TileIndex, int] = {}  # epoch in which the surface last changed
+        self._indices = np.zeros((0, 3), np.int64)  # of ``changed``
+
+    def clean(self, index: TileIndex) -> CachedTile | None:
+        """The tile where it shows what the map has; None where it has to be made."""
+        tile = self.tiles.get(index)
+        return tile if tile is not None and self.changed.get(index, 0) <= tile.made else None
+
+    def record(self, changes: Changes, half_m: float, epoch: int) -> None:
+        """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
+        low, high = changes.places - half_m, changes.places + half_m
+        touched = [
+            *tiles_meeting(low, high, self.lattice.margin_m, self.lattice).tolist(),
+            *tiles_meeting(changes.drifted, changes.drifted, 0.0, self.lattice).tolist(),
+        ]
+        known = len(self.changed)
+        for x, y, z in touched:
+            self.changed[x, y, z] = epoch
+        if len(self.changed) > known:
+            self._indices = np.array(list(self.changed), np.int64)
+
+    def delta(
+        self,
+        low: Doubles,
+        high: Doubles,
+        known_to: int,
+        held: Mapping[TileIndex, int],
+        revision: int,
+    ) -> TileDelta:
+        """What is new in a box to somebody who knows everything up to the revision ``known_to``.
+
+        ``held`` are versions of tiles that are known whatever the revision; ``revision`` is that of
+        the newest tile of any level.
+        """
+        ready: list[CachedTile] = []
+        to_make: list[TileIndex] = []
+        inside = self._indices[self.lattice.meets(self._indices, low, high)]
+        for x, y, z in inside.tolist():
+            index = (x, y, z)
+            tile = self.clean(index)
+            if tile is None:
+                to_make.append(index)
+                continue
+            unknown = tile.revision > known_to and held.get(index) != tile.version
+            if unknown and (not tile.empty or known_to or index in held):
+                ready.append(tile)
+        ready.sort(key=lambda tile: tile.revision)
+        to_make.sort(key=lambda index: (self.changed[index], index))
+        removed = [index for index in held if index not in self.changed]
+        return TileDelta(ready, removed, to_make, revision)
+
+    def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
+        """What a tile has to agree with, by the tiles whose it is, in its own lattice.
+
+        That is its own border where only its bytes are gone, and those of all neighbours that show
+        what the map has: these agree with each other. The others will be made to fit it.
+        """
+        found: dict[TileIndex, TileBorder] = {}
+        own = self.clean(index)
+        if own is not None:
+            found[index] = own.border
+        for offset in _AROUND:
+            x, y, z = (a + b for a, b in zip(index, offset, strict=True))
+            neighbour = self.clean((x, y, z))
+            if neighbour is not None:
+                found[x, y, z] = neighbour.border.seen_from(offset, self.lattice.cells)
+        return found
 
 
 class TileCache:
@@ -32,33 +168,18 @@ class TileCache:
         self._lock = threading.Lock()
         self._team = team
         self._settings = settings
-        self._levels = [TileLevel(tile_lattice(settings, level)) for level in range(LEVELS)]
+        self._levels = [_TileLevel(tile_lattice(settings, level)) for level in range(LEVELS)]
         self._changes: SurfaceChanges | None = None
         self._epoch: Epoch | None = None
         self._view: ComposedView | None = None  # of that epoch
-        self._revision = 0
-        self._made = 0
+        self.revision = 0  # how often bytes of any tile came to differ
+        self.tiles_made = 0  # so far
         self._bytes = TileBytes(settings.cache_bytes)
 
     @property
     def epoch(self) -> int:
         """Number of the epoch of the last refresh; -1 before any."""
         return -1 if self._epoch is None else self._epoch.number
-
-    @property
-    def revision(self) -> int:
-        """How often bytes of any tile came to differ."""
-        return self._revision
-
-    @property
-    def tiles_made(self) -> int:
-        """How many tiles were meshed so far."""
-        return self._made
-
-    @property
-    def size(self) -> int:
-        """Bytes of the encoded tiles that are kept."""
-        return self._bytes.size
 
     def lattice(self, level: int) -> TileLattice:
         """Where the tiles of a level lie."""
@@ -85,20 +206,15 @@ class TileCache:
                 epoch.number, epoch.field_settings, epoch.frozen_regions, self._team.split
             )
 
-    def changed(self, level: int, indices: NDArray[np.integer]) -> NDArray[np.int64]:
+    def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
         """Epochs [T] in which the surface of tiles [T, 3] last changed; 0 where none was seen."""
         with self._lock:
             tiles = self._levels[level]
-            epochs = [tiles.changed((x, y, z)) for x, y, z in indices.tolist()]
+            epochs = [tiles.changed.get((x, y, z), 0) for x, y, z in indices.tolist()]
         return np.array(epochs, np.int64)
 
     def delta(
-        self,
-        level: int,
-        low: NDArray[np.float64],
-        high: NDArray[np.float64],
-        known_to: int,
-        held: Mapping[TileIndex, int],
+        self, level: int, low: Doubles, high: Doubles, known_to: int, held: Mapping[TileIndex, int]
     ) -> TileDelta:
         """What is new in a box to somebody who knows everything up to the revision ``known_to``.
 
@@ -106,7 +222,7 @@ class TileCache:
         """
         with self._lock:
             return self._levels[level].delta(
-                low, high, known_to=known_to, held=held, revision=self._revision
+                low, high, known_to=known_to, held=held, revision=self.revision
             )
 
     def make(self, level: int, index: TileIndex) -> CachedTile:
@@ -121,13 +237,13 @@ class TileCache:
         data = encode_tile(mesh.surface)
         digest = hashlib.sha256(data).digest()
         with self._lock:
-            self._made += 1
-            old = tiles.tile(index)
+            self.tiles_made += 1
+            old = tiles.tiles.get(index)
             if old is not None and old.digest == digest:
                 version, revision = old.version, old.revision
             else:
-                self._revision += 1
-                version, revision = view.epoch, self._revision
+                self.revision += 1
+                version, revision = view.epoch, self.revision
             tile = CachedTile(
                 index=index,
                 version=version,
@@ -137,7 +253,7 @@ class TileCache:
                 digest=digest,
                 border=mesh.border,
             )
-            tiles.put(tile)
+            tiles.tiles[index] = tile
             self._bytes.put((level, index), data)
         return tile
 
@@ -148,7 +264,7 @@ class TileCache:
 
     def _agreeing(
         self,
-        tiles: TileLevel,
+        tiles: _TileLevel,
         index: TileIndex,
         borders: Mapping[TileIndex, TileBorder],
         view: ComposedView,
@@ -163,12 +279,12 @@ class TileCache:
         for other, border in borders.items():
             near = np.abs(border.values) < lattice.cell_m
             places = (border.points[near] + corner) * lattice.cell_m
-            neighbour = tiles.tile(other)
+            neighbour = tiles.tiles.get(other)
             outdated = neighbour is not None and neighbour.made < view.epoch and other != index
             if len(places) and outdated:
                 moved = np.abs(view.distances(places) - border.values[near])
                 if 2 * np.count_nonzero(moved > self._settings.tolerance_m) > len(moved):
                     with self._lock:
-                        tiles.invalidate(other, view.epoch)
+                        tiles.changed[other] = max(tiles.changed[other], view.epoch)
                     continue
             yield border

@@ -9,17 +9,18 @@ from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.epochs.gate import QueryGate
-from triquad_server.epochs.history import EpochHistory
-from triquad_server.mesh.bandwidth import BURST_S
-from triquad_server.mesh.follower import Follower, new_follower
-from triquad_server.mesh.mesher import TileIndex
-from triquad_server.mesh.request_checks import check_updates
-from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.mesh.tile_level import CachedTile, TileDelta
-from triquad_server.mesh.tile_reply import TileReply
-from triquad_server.mesh.tile_senders import TileSenders
-from triquad_server.net.request import Request
+from triquad_server.epochs import EpochHistory
+from triquad_server.mesh.followers import (
+    BURST_S,
+    Follower,
+    TileReply,
+    TileSenders,
+    check_updates,
+    new_follower,
+)
+from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
+from triquad_server.mesh.tile_lattice import TileIndex
+from triquad_server.net.requests import Request
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import NICENESS
 
@@ -43,16 +44,17 @@ class TileFeed:
         self,
         cache: TileCache,
         epochs: EpochHistory,
-        gate: QueryGate,
         *,
         server: str,
         settings: MeshSettings,
         limit: int,
     ) -> None:
-        """At most ``limit`` requests are pending; ``server`` is the name that replies carry."""
+        """Begin to answer; ``server`` is the name that replies carry.
+
+        At most ``limit`` requests are pending.
+        """
         self._cache = cache
         self._epochs = epochs
-        self._gate = gate
         self._server = server
         self._settings = settings
         self._limit = limit
@@ -62,9 +64,6 @@ class TileFeed:
         self._next_refresh_s = 0.0
         self._senders = TileSenders()
         self._thread = threading.Thread(target=self._run, name="meshing")
-
-    def start(self) -> None:
-        """Begin to answer."""
         self._thread.start()
 
     def close(self) -> None:
@@ -72,8 +71,7 @@ class TileFeed:
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
-        if self._thread.ident is not None:
-            self._thread.join()
+        self._thread.join()
         self._senders.close()
 
     def add(self, request: Request, asks: TileUpdatesRequest) -> None:
@@ -136,7 +134,8 @@ class TileFeed:
             return self._serve(follower)
         except Exception as error:
             _log.exception("a follower of the mesh met an internal error")
-            self._remove(follower)
+            with self._changed:
+                self._pending.remove(follower)
             follower.request.refuse("internal", f"{type(error).__name__}: {error}")
             return True
 
@@ -147,7 +146,7 @@ class TileFeed:
             return self._answer_if_late(follower, knows_all=follower.nothing_at == state)
         asks = follower.asks
         delta = self._cache.delta(
-            follower.level,
+            follower.asks.level,
             asks.minimum,
             asks.maximum,
             known_to=follower.known_to,
@@ -157,7 +156,7 @@ class TileFeed:
             self._send(follower, self._filled(follower, delta))
             return True
         if delta.to_make:
-            self._make(follower.level, delta.to_make)
+            self._make(follower.asks.level, delta.to_make)
             return True
         if follower.restart and self._is_current_for(follower):
             self._send(follower, TileReply(complete=True, revision=delta.revision))
@@ -183,7 +182,7 @@ class TileFeed:
         """Make tiles for a moment; queries come first."""
         ends_s = time.monotonic() + _SLICE_S
         for index in indices:
-            self._gate.give_way(_GIVE_WAY_S)
+            self._epochs.gate.give_way(_GIVE_WAY_S)
             self._cache.make(level, index)
             if time.monotonic() > ends_s or self._stopping:
                 return
@@ -199,7 +198,7 @@ class TileFeed:
             complete=not delta.to_make, revision=follower.known_to, removed=delta.removed
         )
         for tile in delta.ready:
-            data = b"" if tile.empty else self._encoded(follower.level, tile)
+            data = b"" if tile.empty else self._encoded(follower.asks.level, tile)
             if data is None:  # its bytes are others now: a later delta has it
                 reply.complete = False
             elif not reply.fits(data, limit):
@@ -217,7 +216,7 @@ class TileFeed:
         data = self._cache.data(level, tile)
         if data is not None:
             return data
-        self._gate.give_way(_GIVE_WAY_S)
+        self._epochs.gate.give_way(_GIVE_WAY_S)
         if self._cache.make(level, tile.index).revision != tile.revision:
             return None
         return self._cache.data(level, tile)
@@ -227,12 +226,8 @@ class TileFeed:
             server=self._server,
             epoch=self._cache.epoch,
             restart=follower.restart,
-            lattice=self._cache.lattice(follower.level),
+            lattice=self._cache.lattice(follower.asks.level),
         )
         with self._changed:  # it counts as pending or as being sent, never as neither
             self._senders.send(follower, message)
-            self._pending.remove(follower)
-
-    def _remove(self, follower: Follower) -> None:
-        with self._changed:
             self._pending.remove(follower)

@@ -39,7 +39,7 @@ def open_session(options: NetworkOptions) -> zenoh.Session:
         endpoints = ", ".join(listen_endpoints(options)) or "the configured endpoints"
         raise ListenError(
             f"cannot open {endpoints}: {first_line(error)} (is another server running there? "
-            "choose another endpoint with --listen)",
+            "choose another endpoint with --listen)"
         ) from error
 
 

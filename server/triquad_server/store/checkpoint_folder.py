@@ -1,11 +1,15 @@
-"""The files of a map's checkpoints: whether they are as they were, and which are deleted."""
+"""The folder of a map's checkpoints: who writes to it, whether files are as they were, and which
+are deleted."""
 
 import contextlib
+import fcntl
 import logging
+import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from triquad_format.errors import MapFileError
 from triquad_format.mapfile.checkpoint_folder import (
@@ -15,11 +19,15 @@ from triquad_format.mapfile.checkpoint_folder import (
     open_manifest,
 )
 
-from triquad_server.store.retention import KeptCheckpoint, Retention
+from triquad_server.errors import StoreError
+from triquad_server.settings import StoreSettings
 
 _log = logging.getLogger(__name__)
 
+_LOCK = "lock"
 _UNFINISHED = ".epoch-*.tmp"  # left by a server that was killed while it wrote
+_MIN_KEPT = 2
+"""The newest checkpoints that always stay: should one be damaged, there is another."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +41,53 @@ class _FileIdentity:
     changed_ns: int  # when anything about it changed: nobody can set this back
 
 
-class CheckpointFolder:
-    """The folder in which the checkpoints of one map lie."""
+@dataclass(frozen=True)
+class _Checkpoint:
+    """What decides whether a checkpoint stays."""
 
-    def __init__(self, path: Path, retention: Retention) -> None:
+    stamp_ns: int  # when it was written, nanoseconds since 1970
+    files: frozenset[str]  # that it consists of
+
+
+class CheckpointFolder:
+    """The folder in which the checkpoints of one map lie; one process at a time may write to it.
+
+    A locked file in it sees to that; the system lets go of it however the process ends.
+    """
+
+    def __init__(self, path: Path, retention: StoreSettings) -> None:
+        """Take the folder, which is made if need be; delete what is unfinished in it.
+
+        Raises:
+            StoreError: another process holds it.
+            OSError: it cannot be written to.
+        """
+        path.mkdir(parents=True, exist_ok=True)
         self.path = path
+        self._lock = _locked(path / _LOCK)
         self._retention = retention
         self._needed: dict[Path, frozenset[str]] = {}  # names of files, by checkpoint
         self._identities: dict[str, _FileIdentity | None] = {}  # of files that were valid
+        _delete(path.glob(_UNFINISHED))
+
+    def close(self) -> None:
+        """Let go."""
+        self._lock.close()
+
+    def renew_lock(self) -> None:
+        """Take the folder again where the locked file is no longer the one that others see.
+
+        Whoever deletes it, alone or with the folder, would let another process in.
+
+        Raises:
+            StoreError: another process has come first.
+            OSError: the file cannot be made.
+        """
+        path = self.path / _LOCK
+        if path.exists() and os.path.samestat(os.fstat(self._lock.fileno()), path.stat()):
+            return
+        lost, self._lock = self._lock, _locked(path)
+        lost.close()
 
     def record(self, names: Iterable[str]) -> None:
         """Record files as they are now: they are valid."""
@@ -55,10 +102,6 @@ class CheckpointFolder:
                 return False
         return True
 
-    def delete_unfinished(self) -> None:
-        """Delete what a server left that was killed while it wrote."""
-        _delete(self.path.glob(_UNFINISHED))
-
     def delete_old(self, newest: int) -> None:
         """Delete the files that no checkpoint needs which is to stay.
 
@@ -69,19 +112,35 @@ class CheckpointFolder:
             files = [file for file in checkpoint_files(self.path) if file.epoch <= newest]
             sizes = {file.path.name: file.path.stat().st_size for file in files}
             checkpoints = [
-                KeptCheckpoint(file.path.stat().st_mtime_ns, self._needed_by(file))
+                _Checkpoint(file.path.stat().st_mtime_ns, self._needed_by(file))
                 for file in newest_of_each(files)
             ]
         except OSError as error:
             _log.warning("old checkpoints in %s stay: %s", self.path, error)
             return
-        count = self._retention.kept(checkpoints, sizes, time.time_ns())
+        count = self._kept(checkpoints, sizes)
         needed = frozenset().union(*(checkpoint.files for checkpoint in checkpoints[:count]))
         old = [file.path for file in files if file.path.name not in needed]
         for path in old:
             self._needed.pop(path, None)
             self._identities.pop(path.name, None)
         _delete(old)
+
+    def _kept(self, checkpoints: Sequence[_Checkpoint], sizes: Mapping[str, int]) -> int:
+        """How many stay of ``checkpoints``, which are sorted, the newest first.
+
+        ``sizes`` are the bytes of each file; files that several checkpoints need count once.
+        """
+        now_ns, settings = time.time_ns(), self._retention
+        needed: set[str] = set()
+        for number, checkpoint in enumerate(checkpoints):
+            needed |= checkpoint.files
+            too_many = settings.keep <= number
+            too_old = 0 < settings.keep_age_s * 1e9 < now_ns - checkpoint.stamp_ns
+            too_large = 0 < settings.keep_bytes < sum(sizes.get(name, 0) for name in needed)
+            if number >= _MIN_KEPT and (too_many or too_old or too_large):
+                return number
+        return len(checkpoints)
 
     def _needed_by(self, file: CheckpointFile) -> frozenset[str]:
         """Names of the files that a checkpoint consists of."""
@@ -101,11 +160,7 @@ def _file_identity(path: Path) -> _FileIdentity | None:
     except OSError:
         return None
     return _FileIdentity(
-        device=status.st_dev,
-        inode=status.st_ino,
-        size=status.st_size,
-        modified_ns=status.st_mtime_ns,
-        changed_ns=status.st_ctime_ns,
+        status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
     )
 
 
@@ -115,3 +170,13 @@ def _delete(paths: Iterable[Path]) -> None:
             path.unlink(missing_ok=True)
         except OSError as error:
             _log.warning("%s is not needed, but cannot be deleted: %s", path, error)
+
+
+def _locked(path: Path) -> IO[bytes]:
+    file = path.open("a+b")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise StoreError(f"store {path.parent} is in use by another server") from None
+    return file

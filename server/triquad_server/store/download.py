@@ -11,7 +11,7 @@ from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, Map
 
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.preview import previews_of
-from triquad_server.store.stamp import stamp_now_ns
+from triquad_server.store.store import stamp_now_ns
 
 CHUNK_BYTES = 2**20
 FILES_KEPT = 2
@@ -51,10 +51,7 @@ class MapDownloads:
         previews = previews_of(record, distances=newest.distances, stamp_ns=stamp_ns)
         written = write_map(record, buffer, stamp_ns=stamp_ns, previews=previews)
         info = MapInfo(
-            epoch=written.epoch,
-            bytes=written.bytes,
-            sha256=written.sha256,
-            chunk_bytes=CHUNK_BYTES,
+            epoch=written.epoch, bytes=written.bytes, sha256=written.sha256, chunk_bytes=CHUNK_BYTES
         )
         with self._lock:
             self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())

@@ -66,7 +66,7 @@ def newest_valid(folder: Path) -> ValidCheckpoint | None:
     if damaged:
         raise StoreError(
             f"all {len(damaged)} checkpoints in {folder} are damaged; move them away to "
-            "start with an empty map",
+            "start with an empty map"
         )
     return None
 

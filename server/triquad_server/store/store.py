@@ -1,9 +1,10 @@
 """Checkpoints on disk: one folder per map.
 
 A checkpoint holds what changed since the one before and refers to older files for the rest; now
-and then all is folded into one file. How far back they reach, the retention decides.
+and then all is folded into one file. How far back they reach, the settings decide.
 """
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -20,24 +21,24 @@ from triquad_format.wire.messages import CheckpointInfo
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mesh.preview import preview_schema
+from triquad_server.settings import StoreSettings
 from triquad_server.store.checkpoint_folder import CheckpointFolder
 from triquad_server.store.checkpoint_parts import (
+    KnownParts,
     StoppedError,
     checkpoint_parts,
     copied_parts,
+    known_parts,
+    own_bytes,
     unless,
 )
-from triquad_server.store.folder_lock import FolderLock
-from triquad_server.store.known_parts import KnownParts, known_parts, own_bytes
 from triquad_server.store.restore import ValidCheckpoint, newest_valid
-from triquad_server.store.retention import Retention
-from triquad_server.store.stamp import stamp_now_ns
 
 
 class Store:
     """The checkpoints of one map, for one thread. One server at a time holds the folder."""
 
-    def __init__(self, root: Path, map_name: str, retention: Retention) -> None:
+    def __init__(self, root: Path, map_name: str, settings: StoreSettings) -> None:
         """Take possession of ``root/map_name``, which is made if need be.
 
         Raises:
@@ -45,17 +46,14 @@ class Store:
         """
         self.folder = root / map_name
         self._known: KnownParts | None = None
-        self._files = CheckpointFolder(self.folder, retention)
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = FolderLock(self.folder)
+            self._files = CheckpointFolder(self.folder, settings)
         except OSError as error:
             raise StoreError(f"store {self.folder} cannot be written to: {error}") from error
-        self._files.delete_unfinished()
 
     def close(self) -> None:
         """Let go of the folder."""
-        self._lock.close()
+        self._files.close()
 
     @property
     def base_epoch(self) -> int | None:
@@ -141,7 +139,7 @@ class Store:
     def _writing(self, failure: str) -> Iterator[OtherFiles]:
         """The older files, while a new one is written; errors begin with ``failure``."""
         try:
-            self._lock.renew()
+            self._files.renew_lock()
             with closing(OtherFiles(files_in(self.folder))) as others:
                 yield others
         except MapFileError as error:
@@ -174,3 +172,8 @@ def _info(path: Path, written: WrittenMap) -> CheckpointInfo:
         sha256=info.sha256,
         stamp_ns=path.stat().st_mtime_ns,
     )
+
+
+def stamp_now_ns() -> int:
+    """Nanoseconds since 1970; within what a file can hold, whatever the clock says."""
+    return min(max(time.time_ns(), 0), 2**63 - 1)

@@ -12,16 +12,16 @@ import torch
 from numpy.typing import NDArray
 from triquad_format.records.status import Status
 from triquad_server.engine.adam import Rates
-from triquad_server.engine.batch import Batch
 from triquad_server.engine.tensor_field import TensorField
-from triquad_server.engine.tensor_trainer import TensorTrainer
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.engine.trainer import Batch, TensorTrainer
+from triquad_server.epochs import Epoch
+from triquad_server.launch import warm_up
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.epoch_mesh import EpochMesh
+from triquad_server.mesh.mesher import mesh_tile, surface_tiles
+from triquad_server.mesh.tile_lattice import tile_lattice
 from triquad_server.settings import MeshSettings, Settings
 from triquad_server.threads import Teams
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure, compare, seconds
 from triquad_tools.benchmarks.street import BenchStreet
@@ -128,12 +128,13 @@ def _queries(epoch: Epoch, region: LiveRegion, points: NDArray[np.float64]) -> l
 
 
 def _mesh_s(epoch: Epoch, made: BenchStreet) -> float:
-    mesh = EpochMesh(epoch, MeshSettings())
-    tiles = mesh.tiles(*made.drive.scene.bounds).tolist()
+    lattice = tile_lattice(MeshSettings(), 0)
+    tiles = surface_tiles(epoch, lattice)
+    tiles = tiles[lattice.meets(tiles, *made.drive.scene.bounds)]
 
     def mesh_all() -> None:
-        for x, y, z in tiles:
-            mesh.tile((x, y, z))
+        for x, y, z in tiles.tolist():
+            mesh_tile(epoch, (x, y, z), lattice)
 
     return statistics.median(seconds(mesh_all) for _ in range(3))
 

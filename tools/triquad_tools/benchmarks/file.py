@@ -17,7 +17,7 @@ from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.region import MapRecord
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.reference.evaluator import MapEvaluator
-from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs import Epoch
 from triquad_server.mesh.preview import previews_of
 from triquad_server.settings import Settings
 

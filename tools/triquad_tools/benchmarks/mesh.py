@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_client import Client, Mesh, MeshWatch
 from triquad_format.wire.tile_codec import decode_tile
-from triquad_server.epochs.epoch import Epoch
-from triquad_server.mesh.mesher import TileIndex
+from triquad_server.epochs import Epoch
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.mesh.tile_lattice import tile_lattice, tiles_meeting
+from triquad_server.mesh.tile_lattice import TileIndex, tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings, Settings
 from triquad_server.threads import Teams
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street

@@ -1,0 +1,179 @@
+"""The published states of the map: what each answers, which can be asked for, and when training
+gives way to that."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from triquad_format.errors import RefusedError
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import MapRecord, RegionIndex
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.surfels.surfel_map import SurfelMap
+from triquad_map.composition.composed_view import ComposedView
+from triquad_map.composition.region import Split
+
+from triquad_server.engine.live_field import FrozenField, region_record
+
+
+@dataclass(frozen=True)
+class FrozenRegion:
+    """A region as it was when it was published."""
+
+    index: RegionIndex
+    centre: Doubles  # [3] map frame
+    engine: FrozenField
+    evidence: FrozenEvidence
+    surfels: SurfelMap
+    vertices: int
+    parameters: int
+    changed: int  # epoch of its last change
+
+
+class Epoch(ComposedView):
+    """An immutable map: every answer comes from the same state. Safe to read from any thread."""
+
+    def __init__(
+        self,
+        name: str,
+        number: int,
+        settings: FieldSettings,
+        regions: tuple[FrozenRegion, ...],
+        split: Split,
+    ) -> None:
+        """The map called ``name``; ``split`` runs the work of its answers."""
+        super().__init__(number, settings, regions, split)
+        self.frozen_regions = regions
+        self._name = name
+
+    @property
+    def number(self) -> int:
+        """Number of this epoch."""
+        return self.epoch
+
+    @property
+    def regions(self) -> int:
+        """Regions of the map."""
+        return len(self.frozen_regions)
+
+    @property
+    def field_settings(self) -> FieldSettings:
+        """Shape of the field."""
+        return self._settings
+
+    @property
+    def vertices(self) -> int:
+        """Quadtree vertices of all regions."""
+        return sum(region.vertices for region in self.frozen_regions)
+
+    @property
+    def parameters(self) -> int:
+        """Learnable numbers of all regions."""
+        return sum(region.parameters for region in self.frozen_regions)
+
+    def record(self) -> MapRecord:
+        """The epoch as a map file holds it, without training state."""
+        regions = tuple(
+            region_record(region.index, region.engine, region.evidence, training=None)
+            for region in self.frozen_regions
+        )
+        return MapRecord(self._name, self.number, self._settings, regions)
+
+
+class QueryGate:
+    """Counts the queries in flight: training waits a moment between slices while there are any."""
+
+    def __init__(self) -> None:
+        self._idle = threading.Condition()
+        self._in_flight = 0
+
+    @contextmanager
+    def query(self) -> Iterator[None]:
+        """A query is being answered."""
+        with self._idle:
+            self._in_flight += 1
+        try:
+            yield
+        finally:
+            with self._idle:
+                self._in_flight -= 1
+                if self._in_flight == 0:
+                    self._idle.notify_all()
+
+    def give_way(self, limit_s: float) -> None:
+        """Return once no query is in flight, or after ``limit_s``: training never starves."""
+        with self._idle:
+            self._idle.wait_for(lambda: self._in_flight == 0, limit_s)
+
+
+@dataclass(frozen=True)
+class EpochLimits:
+    """Which epochs stay."""
+
+    kept: int  # so many of the newest stay, at least 1
+    pinned: int  # so many older ones stay at most: those that were asked for by number last
+    pin_s: float  # an older epoch stays for so long after it was last asked for
+
+
+class EpochHistory:
+    """The newest epochs, and older ones while they are asked for by number."""
+
+    def __init__(
+        self, first: Epoch, limits: EpochLimits, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """``clock`` tells seconds that never run backwards."""
+        self.gate = QueryGate()
+        self.newest = first  # the epoch published last
+        self._lock = threading.Lock()
+        self._limits = limits
+        self._clock = clock
+        self._epochs = {first.number: first}  # oldest first
+        self._asked: dict[int, float] = {}  # when, by number; longest ago first
+
+    def add(self, epoch: Epoch) -> None:
+        """Make ``epoch`` the newest; older ones may go."""
+        with self._lock:
+            self.newest = epoch
+            self._epochs[epoch.number] = epoch
+            self._tidy()
+
+    def get(self, number: int) -> Epoch:
+        """The epoch of that number, or the newest for 0.
+
+        Asking for an epoch by number pins it: a long request in many parts, or many requests that
+        belong together, do not lose their epoch while they go on.
+
+        Raises:
+            RefusedError: ``epoch_gone``.
+        """
+        with self._lock:
+            epoch = self._epochs.get(number) if number else self.newest
+            if epoch is None:
+                raise RefusedError(
+                    "epoch_gone", f"epoch {number} is not kept; kept are {sorted(self._epochs)}"
+                )
+            if number:
+                self._asked.pop(number, None)
+                self._asked[number] = self._clock()
+            self._tidy()
+            return epoch
+
+    @contextmanager
+    def view(self, number: int) -> Iterator[Epoch]:
+        """The epoch of that number, or the newest for 0; training gives way while it is asked."""
+        with self.gate.query():
+            yield self.get(number)
+
+    def _tidy(self) -> None:
+        """Let go of older epochs whose time is over, or that exceed the limit."""
+        older = list(self._epochs)[: -self._limits.kept]
+        since = self._clock() - self._limits.pin_s
+        pinned = [n for n, asked in self._asked.items() if n in older and asked >= since]
+        stay = pinned[max(0, len(pinned) - self._limits.pinned) :]
+        for number in older:
+            if number not in stay:
+                del self._epochs[number]
+                self._asked.pop(number, None)

@@ -1,1 +1,0 @@
-"""Published, immutable states of the map."""
