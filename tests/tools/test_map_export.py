@@ -1,9 +1,12 @@
 """Meshes and grids that ``triquad-pack`` writes, opened by the libraries that people use."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
+from support.exact_maps import exact_map, table
 from support.map_records import random_record
 from support.mapfile_edit import file_bytes
 from support.small_world import settings, settled_mapper, world
@@ -18,6 +21,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import mesh_tile, surface_tiles
 from triquad_server.mesh.tile_lattice import tile_lattice
 from triquad_tools.commands.pack import main
+from triquad_tools.mapfiles.mesh import surface_mesh
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapfiles.seen_space import surface_voxels
 
@@ -177,10 +181,21 @@ def test_refusals(map_file, tmp_path, capsys):
     refused("nowhere is not a folder", "nowhere/mesh.ply")
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".npz"])
-def test_regions_too_far_for_compiled_code_are_told(tmp_path, capsys, suffix):
-    source, out = tmp_path / "far.triquad", tmp_path / f"far{suffix}"
-    write_map(random_record(0, indices=((2**31 - 1, 0, 0),)), source)
-    assert main([str(source), str(out), "--cell", "1"]) == 2
+def at(index):
+    """A table in a region of its own."""
+    record = exact_map(table(0.1, 0.5))
+    region = dataclasses.replace(record.regions[0], index=(index, 0, 0))
+    return dataclasses.replace(record, regions=(region,))
+
+
+def test_far_regions_are_meshed_as_near_ones():
+    near, far = (surface_mesh(at(index), None, 0.2) for index in (0, 2**31 - 1))
+    assert len(near.faces) == len(far.faces) > 10_000
+
+
+def test_blocks_that_are_too_far_for_their_indices_are_told(tmp_path, capsys):
+    source, out = tmp_path / "far.triquad", tmp_path / "far.npz"
+    write_map(at(2**31 - 1), source)
+    assert main([str(source), str(out), "--sparse"]) == 2
     assert "too far from the origin" in capsys.readouterr().err
     assert not out.exists()

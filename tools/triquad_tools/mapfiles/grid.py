@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.mapfile.durable_file import replacing
-from triquad_format.records.region import MapRecord, region_centre
+from triquad_format.records.region import MapRecord
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
 
@@ -50,26 +50,13 @@ def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool,
     filled = box if box is not None else evidence_bounds(record)
     if filled is None:
         raise ToolError("no ray has shown anything of this map: there is no box to fill")
-    view = open_record(record)
+    view = open_view(record).view
     grid = _sparse(view, record, box, cell_m) if sparse else _dense(view, filled, cell_m)
     with replacing(path) as stream:
         np.savez(stream, epoch=record.epoch, cell_m=cell_m, **grid)
         size = stream.tell()
     shape = " x ".join(str(count) for count in grid["sdf"].shape)
     return f"{size:,} bytes, distances {shape}"
-
-
-def open_record(record: MapRecord) -> MapView:
-    """The map in a record as something to ask, compiled where numba is installed.
-
-    Raises:
-        ToolError: it has regions that compiled code does not reach.
-    """
-    view = open_view(record).view
-    centres = [region_centre(record.settings, region.index) for region in record.regions]
-    if centres and np.isnan(view.query(np.stack(centres)).sdf).any():
-        raise ToolError("its regions lie too far from the origin: use --crop")
-    return view
 
 
 def cells_of_boxes(
@@ -110,6 +97,8 @@ def _sparse(view: MapView, record: MapRecord, box: Box | None, cell_m: float) ->
     count = len(indices) * BLOCK_CELLS**3
     if count > MAX_CELLS:
         raise _too_many(f"{len(indices):,} blocks", count, "--crop")
+    if np.abs(indices).max(initial=0) > np.iinfo(np.int32).max:
+        raise ToolError("its regions lie too far from the origin for --sparse: use --crop")
 
     def positions(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
         block, inner = np.divmod(numbers, BLOCK_CELLS**3)

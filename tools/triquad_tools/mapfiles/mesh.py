@@ -16,11 +16,12 @@ from triquad_client import Mesh
 from triquad_client.mesh.mesh import Triangles, joined
 from triquad_format.mapfile.durable_file import replacing
 from triquad_format.records.region import MapRecord
+from triquad_map.record_view import open_view
 from triquad_map.view import MapView
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.mapfiles.grid import cells_of_boxes, open_record
+from triquad_tools.mapfiles.grid import cells_of_boxes
 from triquad_tools.mapfiles.seen_space import surface_voxels
 from triquad_tools.mapfiles.source import Box
 
@@ -49,7 +50,7 @@ def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -
     """Write the mesh of a map; returns what was written.
 
     Raises:
-        ToolError: the mesh is too large, or its regions are too far away.
+        ToolError: the mesh is too large.
         OSError: the file cannot be written.
     """
     mesh = surface_mesh(record, box, cell_m)
@@ -65,9 +66,9 @@ def surface_mesh(record: MapRecord, box: Box | None, cell_m: float) -> Mesh:
     Given a box, it has the faces whose centroids lie in it.
 
     Raises:
-        ToolError: there are too many faces, or regions too far away.
+        ToolError: there are too many faces.
     """
-    view = open_record(record)
+    view = open_view(record).view
     low, high = _EVERYWHERE if box is None else box
     blocks = list(_blocks(_voxels(record, low, high, cell_m)))
     tiles: list[Triangles] = []
