@@ -182,7 +182,7 @@ def _pack_training(
         "mlp_means": [pack_array(mean) for mean in training.mlp_means],
         "mlp_variances": [pack_array(variance) for variance in training.mlp_variances],
         "mlp_steps": training.mlp_steps,
-        "visits_owed": training.budget_samples,
+        "training_budget": training.budget_samples,
         "samples": len(training.sample_points),
     }
     yield _pack_part(PartKey(TRAINING, region.index), fields)

@@ -80,7 +80,7 @@ def read_training_head(body: PartBody) -> TrainingHead:
         mlp_means=body.arrays("mlp_means", 2 * MLP_LAYERS),
         mlp_variances=body.arrays("mlp_variances", 2 * MLP_LAYERS),
         mlp_steps=body.count("mlp_steps"),
-        budget_samples=body.count("visits_owed"),
+        budget_samples=body.count("training_budget"),
         samples=body.count("samples"),
     )
 
