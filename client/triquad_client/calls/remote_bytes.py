@@ -1,6 +1,6 @@
 """A map file on the server, of which only the bytes that are asked for travel."""
 
-from triquad_format.mapfile.mcap.random_access import check_range
+from triquad_format.mapfile.files import check_range
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo
 

@@ -10,9 +10,9 @@ from triquad_format.errors import (
     MapFileError,
     NoIndexError,
 )
+from triquad_format.mapfile.files import FileBytes, RandomAccess
 from triquad_format.mapfile.manifest import Entry, FileRef, unpack_manifest
 from triquad_format.mapfile.mcap.index import McapIndex
-from triquad_format.mapfile.mcap.random_access import FileBytes, RandomAccess
 from triquad_format.mapfile.metadata import (
     METADATA_NAME,
     check_agreement,

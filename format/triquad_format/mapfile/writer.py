@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import BinaryIO
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
 from triquad_format.mapfile.mcap.chunks import total_limit
 from triquad_format.mapfile.mcap.writer import ChannelSpec, McapWriter, SchemaSpec

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError
 from triquad_format.records import morton
-from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
     AXES,
@@ -24,6 +23,7 @@ from triquad_format.records.region import (
     Region,
     TrainingState,
     VertexTable,
+    surface_counts,
 )
 from triquad_format.wire.array import ArraySpec
 from triquad_format.wire.keys import check_name

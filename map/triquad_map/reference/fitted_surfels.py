@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
-from triquad_format.records.evidence_voxels import seen_voxels, surface_counts
-from triquad_format.records.region import Evidence
+from triquad_format.records.region import Evidence, seen_voxels, surface_counts
 
 from triquad_map.nearest import NearestSurfels
 from triquad_map.reference.seen_blocks import SeenBlocks

@@ -5,9 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
-from triquad_format.records.evidence_voxels import seen_voxels
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import Region, region_corner
+from triquad_format.records.region import Region, region_corner, seen_voxels
 
 NET_LEAVES = 2
 """Side of the cells in which the surface is searched for, in leaves: 0.4 m."""

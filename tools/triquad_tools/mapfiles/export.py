@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError

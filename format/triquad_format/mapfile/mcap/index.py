@@ -4,8 +4,8 @@ import itertools
 from dataclasses import dataclass
 
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
+from triquad_format.mapfile.files import RandomAccess
 from triquad_format.mapfile.mcap.chunks import chunk_crc, chunk_messages
-from triquad_format.mapfile.mcap.random_access import RandomAccess
 from triquad_format.mapfile.mcap.records import (
     CHANNEL,
     CHUNK,

@@ -30,7 +30,6 @@ from triquad_format.mapfile.parts.part import (
     cube_shift,
     square_shift,
 )
-from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
     AXES,
@@ -39,6 +38,7 @@ from triquad_format.records.region import (
     RegionIndex,
     TrainingState,
     VertexTable,
+    surface_counts,
 )
 from triquad_format.wire.array import pack_array
 

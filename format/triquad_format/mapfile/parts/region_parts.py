@@ -27,7 +27,6 @@ from triquad_format.mapfile.parts.unpack import (
     read_head,
     read_training_head,
 )
-from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
     AXES,
@@ -37,6 +36,7 @@ from triquad_format.records.region import (
     RegionIndex,
     TrainingState,
     VertexTable,
+    surface_counts,
 )
 
 _Integer = TypeVar("_Integer", bound=np.integer)

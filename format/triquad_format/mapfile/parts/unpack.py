@@ -27,9 +27,15 @@ from triquad_format.mapfile.parts.part import (
     cube_shift,
     square_shift,
 )
-from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import BLOCK_BYTES, MAX_SEEN_S, MLP_LAYERS, Evidence, Mlp
+from triquad_format.records.region import (
+    BLOCK_BYTES,
+    MAX_SEEN_S,
+    MLP_LAYERS,
+    Evidence,
+    Mlp,
+    surface_counts,
+)
 
 Columns = tuple[NDArray[Any], ...]
 """Columns of equal length: some rows of a table."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
+from triquad_format.records.region import surface_counts
 
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, find_ends, find_status
 from triquad_map.compiled.evidence.unknown_search import find_unknown

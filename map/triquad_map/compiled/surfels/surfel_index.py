@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
-from triquad_format.records.evidence_voxels import surface_counts
-from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, surface_counts
 
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT
