@@ -12,7 +12,7 @@ from triquad_format.errors import (
 )
 from triquad_format.mapfile.files import FileBytes, RandomAccess
 from triquad_format.mapfile.manifest import Entry, FileRef, unpack_manifest
-from triquad_format.mapfile.mcap.index import McapIndex
+from triquad_format.mapfile.mcap.reader import McapIndex
 from triquad_format.mapfile.metadata import (
     METADATA_NAME,
     check_agreement,

@@ -10,9 +10,8 @@ from triquad_format.errors import DamagedMapFileError, TooLargeMapFileError
 from triquad_format.mapfile.files import named, open_regular
 from triquad_format.mapfile.index import OtherFiles, files_in
 from triquad_format.mapfile.manifest import DIGEST_BYTES, Entry, Manifest, unpack_manifest
-from triquad_format.mapfile.mcap.chunks import total_limit
 from triquad_format.mapfile.mcap.reader import McapFile
-from triquad_format.mapfile.mcap.records import Message
+from triquad_format.mapfile.mcap.records import Message, total_limit
 from triquad_format.mapfile.metadata import (
     MAX_MAP_BYTES,
     METADATA_NAME,

@@ -21,8 +21,14 @@ from triquad_format.errors import (
 from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.index import file_in
 from triquad_format.mapfile.manifest import Manifest, unpack_manifest
-from triquad_format.mapfile.mcap.chunks import chunk_messages, declared_size, total_limit
-from triquad_format.mapfile.mcap.records import Channel, Message, Record, metadata_entries
+from triquad_format.mapfile.mcap.records import (
+    Channel,
+    Message,
+    Record,
+    metadata_entries,
+    read_chunk,
+    total_limit,
+)
 from triquad_format.mapfile.metadata import METADATA_NAME, MapFacts, check_readable, unpack_facts
 from triquad_format.mapfile.parts.body import unpack_body
 from triquad_format.mapfile.parts.part import (
@@ -203,10 +209,11 @@ def intact_messages(data: bytes, max_bytes: int) -> Iterator[Message]:
             continue
         budget -= len(record.content)
         try:
-            messages = list(chunk_messages(record, dict(channels)))
+            chunk = read_chunk(record)
+            messages = list(chunk.messages(dict(channels)))
         except FormatError:
             continue
-        max_bytes -= declared_size(record)
+        max_bytes -= chunk.size
         if max_bytes < 0:
             raise TooLargeMapFileError("its intact chunks exceed the limit given for its size")
         yield from messages
