@@ -21,7 +21,8 @@ from triquad_format.mapfile.metadata import (
     pack_map_part,
     pack_metadata,
 )
-from triquad_format.mapfile.parts.pack import FEATURE_DTYPES, pack_record
+from triquad_format.mapfile.parts.columns import FLOATS
+from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import (
     ENCODINGS,
     EVIDENCE,
@@ -118,8 +119,8 @@ def write_map(
         FormatError: the record is not valid, or exceeds a limit of the format.
         OSError: the file cannot be written.
     """
-    if feature_dtype not in FEATURE_DTYPES:
-        raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FEATURE_DTYPES}")
+    if feature_dtype not in FLOATS:
+        raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FLOATS}")
     if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
         raise FormatError(f"stamp_ns = {stamp_ns} is out of range: use 0 to 2**63 - 1")
     check_record(record)

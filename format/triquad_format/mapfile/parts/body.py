@@ -2,7 +2,7 @@
 
 import reprlib
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgpack
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from triquad_format.errors import DamagedMapFileError, WireError
 from triquad_format.mapfile.parts.columns import (
     MAX_CODE_BYTES,
+    Column,
     join_integers,
     unshuffle,
     unshuffle_codes,
@@ -21,8 +22,8 @@ from triquad_format.records.region import RegionIndex
 from triquad_format.wire.array import ArraySpec, unpack_array
 from triquad_format.wire.structure import MAX_OBJECTS, binary_offsets, check_structure
 
-MAX_REGION_INDEX = 2**31 - 1
-MAX_ITEMS = 64
+_MAX_REGION_INDEX = 2**31 - 1
+_MAX_ITEMS = 64
 _OBJECTS_PER_ITEM = 8  # of a manifest's longest list
 _MAX_STRING_BYTES = 4096
 _MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
@@ -41,7 +42,7 @@ def repack_part(key: PartKey, payload: bytes) -> Part:
     """A part that was read and checked, to be written again."""
     if not key.topic.startswith(PREFIX):
         return Part(key, payload)
-    body = msgpack.unpackb(payload, max_map_len=MAX_ITEMS, max_ext_len=0)
+    body = msgpack.unpackb(payload, max_map_len=_MAX_ITEMS, max_ext_len=0)
     return Part(key, payload, _seams(payload, body))
 
 
@@ -70,7 +71,7 @@ def _plane_counts(value: object) -> Iterator[int]:
             yield from _plane_counts(item)
 
 
-def unpack_body(topic: str, payload: bytes, max_items: int = MAX_ITEMS) -> "PartBody":
+def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "PartBody":
     """The body of a part.
 
     Args:
@@ -87,7 +88,7 @@ def unpack_body(topic: str, payload: bytes, max_items: int = MAX_ITEMS) -> "Part
             payload,
             max_str_len=_MAX_STRING_BYTES,
             max_array_len=max_items,
-            max_map_len=MAX_ITEMS,
+            max_map_len=_MAX_ITEMS,
             max_ext_len=0,
         )
     except (WireError, ValueError, msgpack.exceptions.UnpackException) as error:
@@ -142,7 +143,7 @@ class PartBody:
         """The index of the region to which the part belongs."""
         value = self.value("region", list)
         if len(value) != 3 or not all(
-            type(number) is int and abs(number) <= MAX_REGION_INDEX for number in value
+            type(number) is int and abs(number) <= _MAX_REGION_INDEX for number in value
         ):
             raise DamagedMapFileError(
                 f"{self.topic}: region = {reprlib.repr(value)} is not an index"
@@ -166,6 +167,11 @@ class PartBody:
             arrays.append(array)
         return tuple(arrays)
 
+    def mapping(self, key: str) -> Mapping[str, object]:
+        """A nested map."""
+        value: Mapping[str, object] = self.value(key, dict)
+        return value
+
     def maps(self, key: str, count: int) -> tuple["PartBody", ...]:
         """``count`` nested maps."""
         return tuple(PartBody(self.topic, item) for item in self._items(key, count))
@@ -173,17 +179,24 @@ class PartBody:
     def codes(self, key: str, most: int) -> NDArray[np.int64]:
         """Morton codes [V], of which no more than ``most`` are decoded: each takes eight bytes."""
         planes = self.array(key, "|u1", (None, None))
-        self.limit(key, planes.shape[1], most)
+        self._limit(key, planes.shape[1], most)
         if not 1 <= len(planes) <= MAX_CODE_BYTES:
             raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per code")
         return unshuffle_codes(planes)
 
-    def floats(self, key: str, *shape: int | None) -> NDArray[Any]:
-        """A shuffled array of ``<f2`` or ``<f4``."""
-        planes = self.array(key, "|u1", (None, *shape))
-        if len(planes) not in (2, 4):
-            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
-        return unshuffle(planes, f"<f{len(planes)}")
+    def column(self, column: Column, count: int | None) -> NDArray[Any]:
+        """A shuffled column of ``count`` rows; ``None``: of any number."""
+        planes = self.array(column.name, "|u1", (None, count, *column.row))
+        for dtype in column.dtypes:
+            if np.dtype(dtype).itemsize == len(planes):
+                return unshuffle(planes, dtype)
+        raise DamagedMapFileError(f"{self.topic}: {column.name} has {len(planes)} bytes per value")
+
+    def columns(self, columns: Sequence[Column], most: int) -> tuple[NDArray[Any], ...]:
+        """Shuffled columns of equal length, which is at most ``most``."""
+        first = self.column(columns[0], None)
+        self._limit(columns[0].name, len(first), most)
+        return (first, *(self.column(column, len(first)) for column in columns[1:]))
 
     def integers(self, key: str, count: int, size: int) -> NDArray[np.int16]:
         """Integers [count, size] of one or two bytes."""
@@ -192,22 +205,17 @@ class PartBody:
             raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
         return join_integers(planes)
 
-    def limit(self, key: str, count: int, most: int) -> None:
-        """Refuse a field of more than ``most`` rows."""
-        if count > most:
-            raise DamagedMapFileError(f"{self.topic}: {key} has {count} rows, above {most}")
-
     def has(self, key: str) -> bool:
         """Whether there is a field ``key``."""
         return key in self._body
-
-    def mapping(self, key: str) -> Mapping[str, object]:
-        """A nested map."""
-        value: Mapping[str, object] = self.value(key, dict)
-        return value
 
     def _items(self, key: str, count: int) -> list[Any]:
         items: list[Any] = self.value(key, list)
         if len(items) != count:
             raise DamagedMapFileError(f"{self.topic}: {key} holds {len(items)} items, not {count}")
         return items
+
+    def _limit(self, key: str, count: int, most: int) -> None:
+        """Refuse a field of more than ``most`` rows."""
+        if count > most:
+            raise DamagedMapFileError(f"{self.topic}: {key} has {count} rows, above {most}")
