@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -18,9 +19,10 @@ from triquad_format.mapfile.metadata import (
     MAX_MAP_BYTES,
     METADATA_NAME,
     MapFacts,
-    pack_map_part,
+    pack_facts,
     pack_metadata,
 )
+from triquad_format.mapfile.parts.body import pack_part
 from triquad_format.mapfile.parts.columns import FLOATS
 from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import (
@@ -155,22 +157,14 @@ def write_parts(
         FormatError: a limit of the format is exceeded, or there are previews without their schema.
         OSError: the file cannot be written.
     """
-    if isinstance(file, (str, Path)):
-        with replacing(Path(file)) as stream:
-            return write_parts(
-                stream,
-                facts,
-                parts,
-                stamp_ns=stamp_ns,
-                known=known,
-                preview_schema=preview_schema,
-            )
     # Where parts of other files are known, some of them are nearly always needed.
     needs_others = any(entry.file is not None for entry in known.values())
     metadata = pack_metadata(facts, stamp_ns=stamp_ns, needs_other_files=needs_others)
-    mcap = _mcap_writer(file, metadata["producer"], preview_schema)
-    mcap.add_metadata(METADATA_NAME, metadata)
-    return _PartsWriter(mcap, facts, stamp_ns=stamp_ns, known=known).write(parts)
+    opened = replacing(Path(file)) if isinstance(file, (str, Path)) else nullcontext(file)
+    with opened as stream:
+        mcap = _mcap_writer(stream, metadata["producer"], preview_schema)
+        mcap.add_metadata(METADATA_NAME, metadata)
+        return _PartsWriter(mcap, facts, stamp_ns=stamp_ns, known=known).write(parts)
 
 
 def _mcap_writer(file: BinaryIO, producer: str, preview_schema: bytes | None) -> McapWriter:
@@ -201,7 +195,7 @@ class _PartsWriter:
         self._total = 0
 
     def write(self, parts: Iterable[Part | Entry]) -> WrittenMap:
-        whole = pack_map_part(self._facts)
+        whole = pack_part(PartKey(MAP), pack_facts(self._facts))
         self._put(whole, self._stamp_ns)
         self._entries.append(self._changed(whole))
         for part in parts:
@@ -234,11 +228,10 @@ class _PartsWriter:
 
     def _changed(self, part: Part) -> Entry:
         """The entry of a part that this epoch changed."""
-        digest = hashlib.sha256(part.payload).digest()
         return Entry(
             part.key,
             size=len(part.payload),
-            sha256=digest,
+            sha256=hashlib.sha256(part.payload).digest(),
             epoch=self._facts.epoch,
             stamp_ns=self._stamp_ns,
         )

@@ -7,10 +7,11 @@ its checksum. So nothing that is damaged hides what lies behind it.
 import contextlib
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from triquad_format.errors import (
     FormatError,
@@ -41,6 +42,8 @@ from triquad_format.mapfile.parts.part import (
     PartKey,
 )
 from triquad_format.records.region import RegionIndex
+
+_Content = TypeVar("_Content")
 
 _HEAD_BYTES = 9  # of a record: opcode and length
 
@@ -91,10 +94,11 @@ def intact_parts(path: Path, max_bytes: int) -> IntactParts:
         OSError: it cannot be read.
     """
     messages = list(_messages(path, max_bytes))
-    manifest = _manifest(messages, path.stat().st_size)
+    size = path.stat().st_size
+    manifest = _first(messages, MANIFEST, lambda data: unpack_manifest(data, size))
     if manifest is not None:
         return _listed_parts(manifest, messages, path.parent, max_bytes=max_bytes)
-    facts = _facts(messages)
+    facts = _first(messages, MAP, lambda data: unpack_facts(unpack_body(MAP, data)))
     if facts is None:
         raise MapFileError("nothing can be saved: neither its first part nor its last is intact")
     keyed = ((_own_key(message), message.data) for message in messages)
@@ -127,23 +131,15 @@ def _refuse_newer(metadata: dict[str, str]) -> None:
         return  # damaged, too: the parts will tell
 
 
-def _manifest(messages: Iterable[Message], file_bytes: int) -> Manifest | None:
+def _first(
+    messages: Iterable[Message], topic: str, read: Callable[[bytes], _Content]
+) -> _Content | None:
+    """What the first part of a topic holds; ``None``: there is none, or it is malformed."""
     for message in messages:
-        if message.channel.topic == MANIFEST:
-            try:
-                return unpack_manifest(message.data, file_bytes)
-            except FormatError:
-                return None
-    return None
-
-
-def _facts(messages: Iterable[Message]) -> MapFacts | None:
-    for message in messages:
-        if message.channel.topic == MAP:
-            try:
-                return unpack_facts(unpack_body(MAP, message.data))
-            except FormatError:
-                return None
+        if message.channel.topic == topic:
+            with contextlib.suppress(FormatError):
+                return read(message.data)
+            break
     return None
 
 
