@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.parts.body import repack_part
-from triquad_format.mapfile.parts.part import PartKey
+from triquad_format.mapfile.parts.part import Part, PartKey
 from triquad_format.mapfile.reader import assemble
 from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.record_check import check_record
@@ -188,5 +187,5 @@ class _Parts:
         """Replace the file at ``path``, all of it or nothing."""
         manifest = self._stored.manifest
         own = {entry.key: dataclasses.replace(entry, file=None) for entry in self.wanted}
-        parts = (repack_part(entry.key, self._payloads[entry.key]) for entry in self.wanted)
+        parts = (Part(entry.key, self._payloads[entry.key]) for entry in self.wanted)
         write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns or None, known=own)

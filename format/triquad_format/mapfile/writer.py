@@ -22,7 +22,7 @@ from triquad_format.mapfile.metadata import (
     pack_facts,
     pack_metadata,
 )
-from triquad_format.mapfile.parts.body import pack_part
+from triquad_format.mapfile.parts.body import pack_part, seams
 from triquad_format.mapfile.parts.columns import FLOATS
 from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import (
@@ -250,7 +250,7 @@ class _PartsWriter:
         self._total += len(part.payload)
         _check_total(self._total)
         self._mcap.add_message(
-            topic, part.payload, time_ns=stamp_ns, level=_LEVELS[topic], seams=part.seams
+            topic, part.payload, time_ns=stamp_ns, level=_LEVELS[topic], seams=seams(part)
         )
 
 

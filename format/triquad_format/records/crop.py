@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,8 @@ from triquad_format.records.region import (
 
 SLACK_LEAVES = 1 / 16
 """Kept around a box: points are rounded to float32, at depth 15 by up to 1/128 of a leaf."""
+
+_Number = TypeVar("_Number", bound=np.number)
 
 _REACH_VOXELS = 0.5
 """A point is near a surface where one was seen this far away."""
@@ -137,9 +140,7 @@ def _crop_training(
         training,
         table_means=_rows(training.table_means, kept),
         table_variances=_rows(training.table_variances, kept),
-        table_steps=tuple(
-            steps[rows] for steps, rows in zip(training.table_steps, kept, strict=True)
-        ),
+        table_steps=_rows(training.table_steps, kept),
         sample_points=training.sample_points[inside],
         sample_labels=training.sample_labels[inside],
         budget_samples=-(-owed // max(len(leaves), 1)),
@@ -147,8 +148,8 @@ def _crop_training(
 
 
 def _rows(
-    columns: tuple[NDArray[np.floating], ...], kept: list[NDArray[np.intp]]
-) -> tuple[NDArray[np.floating], ...]:
+    columns: tuple[NDArray[_Number], ...], kept: list[NDArray[np.intp]]
+) -> tuple[NDArray[_Number], ...]:
     return tuple(column[rows] for column, rows in zip(columns, kept, strict=True))
 
 

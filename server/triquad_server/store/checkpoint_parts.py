@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Iterator
 from triquad_format.errors import MapFileError
 from triquad_format.mapfile.index import OtherFiles
 from triquad_format.mapfile.manifest import Entry
-from triquad_format.mapfile.parts.body import repack_part
 from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.mapfile.parts.part import MAP, Part
 
@@ -49,7 +48,7 @@ def copied_parts(entries: Iterable[Entry], others: OtherFiles) -> Iterator[Part]
             payload = others.payload(entry)
         except OSError as error:  # of reading: the file that is written is another
             raise MapFileError(f"a file that holds parts cannot be read: {error}") from error
-        yield repack_part(entry.key, payload)
+        yield Part(entry.key, payload)
 
 
 def unless(stopping: Callable[[], bool], parts: Iterator[Part]) -> Iterator[Part]:

@@ -1,4 +1,4 @@
-"""The msgpack map of a part: packed with its seams, and read back with every field checked."""
+"""The msgpack map of a part: packed, and read back with every field checked."""
 
 import reprlib
 import typing
@@ -30,31 +30,22 @@ _MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
 
 def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
-    """A part of this body: numbers, strings, lists, maps and packed arrays.
-
-    Its seams lie between the byte planes of its arrays.
-    """
-    payload = typing.cast(bytes, msgpack.packb(body))
-    return Part(key, payload, _seams(payload, body))
+    """A part of this body: numbers, strings, lists, maps and packed arrays."""
+    return Part(key, typing.cast(bytes, msgpack.packb(body)))
 
 
-def repack_part(key: PartKey, payload: bytes) -> Part:
-    """A part that was read and checked, to be written again."""
-    if not key.topic.startswith(PREFIX):
-        return Part(key, payload)
-    body = msgpack.unpackb(payload, max_map_len=_MAX_ITEMS, max_ext_len=0)
-    return Part(key, payload, _seams(payload, body))
-
-
-def _seams(payload: bytes, body: Mapping[str, object]) -> tuple[int, ...]:
-    """Where byte planes begin and end in a payload."""
-    seams: list[int] = []
-    for place, planes in zip(binary_offsets(payload), _plane_counts(body), strict=True):
+def seams(part: Part) -> list[int]:
+    """Offsets in a valid part's payload at which byte planes of its arrays begin and end."""
+    if not part.key.topic.startswith(PREFIX):
+        return []
+    body = msgpack.unpackb(part.payload, max_ext_len=0)
+    offsets: list[int] = []
+    for place, planes in zip(binary_offsets(part.payload), _plane_counts(body), strict=True):
         size = len(place)
         if size >= _MIN_SEAM_BYTES:
             step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
-            seams.extend(range(place.start, place.stop + 1, step))
-    return tuple(seams)
+            offsets.extend(range(place.start, place.stop + 1, step))
+    return offsets
 
 
 def _plane_counts(value: object) -> Iterator[int]:

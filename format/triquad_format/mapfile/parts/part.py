@@ -67,7 +67,6 @@ class Part:
 
     key: PartKey
     payload: bytes
-    seams: tuple[int, ...] = ()  # offsets in the payload where bytes of another kind begin
 
 
 def square_shift(settings: FieldSettings, level: int) -> int:

@@ -4,7 +4,7 @@ Sizes are checked before anything is decoded, which takes more memory than a par
 """
 
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,6 @@ _MAX_SEEN_BYTES = (MAX_SEEN_S.bit_length() + 7) // 8
 
 _Columns = tuple[NDArray[Any], ...]
 """Columns of equal length: some rows of a table."""
-
-_Integer = TypeVar("_Integer", bound=np.integer)
 
 
 class RegionParts:
@@ -243,28 +241,23 @@ def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
     """
     if len(portions) == 1:
         return portions[0]
-    masks = np.zeros((0, BLOCK_BYTES), np.uint8)
-    levels = [portion.levels for portion in portions]
-    seen_s = [portion.seen_s for portion in portions]
-    counts = [int(surface_counts(portion.surface).sum()) for portion in portions]
+    codes, masks = np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8)
+    levels = [_levels_of(portion) for portion in portions]
+    seen_s = [_seen_of(portion) for portion in portions]
     return Evidence(
-        np.concatenate([np.zeros(0, np.int64), *(portion.codes for portion in portions)]),
+        np.concatenate([codes, *(portion.codes for portion in portions)]),
         np.concatenate([masks, *(portion.surface for portion in portions)]),
         np.concatenate([masks, *(portion.free for portion in portions)]),
-        levels=_filled(levels, counts, np.uint8),
-        seen_s=_filled(seen_s, [len(portion.codes) for portion in portions], np.int64),
+        levels=np.concatenate(levels) if any(p.levels is not None for p in portions) else None,
+        seen_s=np.concatenate(seen_s) if any(p.seen_s is not None for p in portions) else None,
     )
 
 
-def _filled(
-    columns: Sequence[NDArray[_Integer] | None], counts: Sequence[int], kind: type[_Integer]
-) -> NDArray[_Integer] | None:
-    """The columns in one, with zeros in place of those that are missing."""
-    if all(column is None for column in columns):
-        return None
-    return np.concatenate(
-        [
-            np.zeros(count, kind) if column is None else column
-            for column, count in zip(columns, counts, strict=True)
-        ]
-    )
+def _levels_of(evidence: Evidence) -> NDArray[np.uint8]:
+    if evidence.levels is not None:
+        return evidence.levels
+    return np.zeros(int(surface_counts(evidence.surface).sum()), np.uint8)
+
+
+def _seen_of(evidence: Evidence) -> NDArray[np.int64]:
+    return np.zeros(len(evidence.codes), np.int64) if evidence.seen_s is None else evidence.seen_s
