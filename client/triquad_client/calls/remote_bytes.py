@@ -9,7 +9,7 @@ from triquad_client.net.call import Ask, Run, ask_each
 
 
 class RemoteBytes:
-    """The bytes of one map file on the server; see :class:`triquad_format.RandomAccess`."""
+    """The bytes of one map file on the server, as :class:`RandomAccess` of map files gives them."""
 
     def __init__(self, run: Run, info: MapInfo) -> None:
         self.name = f"the map of epoch {info.epoch}"

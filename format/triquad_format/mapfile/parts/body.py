@@ -38,28 +38,27 @@ def seams(part: Part) -> list[int]:
     """Offsets in a valid part's payload at which byte planes of its arrays begin and end."""
     if not part.key.topic.startswith(PREFIX):
         return []
-    body = msgpack.unpackb(part.payload, max_ext_len=0)
+    binaries = list(_binaries(msgpack.unpackb(part.payload, max_ext_len=0)))
+    if all(size < _MIN_SEAM_BYTES for size, _ in binaries):
+        return []
     offsets: list[int] = []
-    for place, planes in zip(binary_offsets(part.payload), _plane_counts(body), strict=True):
-        size = len(place)
+    for place, (size, planes) in zip(binary_offsets(part.payload), binaries, strict=True):
         if size >= _MIN_SEAM_BYTES:
             step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
             offsets.extend(range(place.start, place.stop + 1, step))
     return offsets
 
 
-def _plane_counts(value: object) -> Iterator[int]:
-    """Byte planes of each binary in a body, in the order of the payload."""
+def _binaries(value: object) -> Iterator[tuple[int, int]]:
+    """Size and number of byte planes of each binary in a body, in the order of the payload."""
     if isinstance(value, bytes):
-        yield 1
-    elif isinstance(value, Mapping) and isinstance(value.get("data"), bytes):
-        yield value["shape"][0] if value["dtype"] in ("|u1", "|i1") and value["shape"] else 1
-    elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from _plane_counts(item)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _plane_counts(item)
+        yield len(value), 1
+    elif isinstance(value, dict) and isinstance(value.get("data"), bytes):
+        shuffled = value["dtype"] in ("|u1", "|i1") and value["shape"]
+        yield len(value["data"]), value["shape"][0] if shuffled else 1
+    elif isinstance(value, (dict, list)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _binaries(item)
 
 
 def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "PartBody":
