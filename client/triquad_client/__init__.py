@@ -13,19 +13,17 @@ from triquad_format.errors import MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_map.questions.align import Alignment
-from triquad_map.questions.distance import Distances
+from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
 from triquad_map.questions.grid import Grid
-from triquad_map.questions.polyline import Polyline
 from triquad_map.questions.rays import RayRanges
-from triquad_map.questions.segments import Segments
+from triquad_map.questions.segments import Polyline, Segments
 from triquad_map.questions.spheres import Spheres
-from triquad_map.unknown import Unknown, UnknownSpaceError
 
 from triquad_client.async_client import AsyncClient, connect_async
 from triquad_client.calls.async_queries import AsyncPinnedMap
 from triquad_client.calls.queries import MapQueries, PinnedMap
+from triquad_client.calls.questions import SdfResult
 from triquad_client.calls.scans import FlushReport
-from triquad_client.calls.sdf import SdfResult
 from triquad_client.checks import Bounds
 from triquad_client.client import Client, connect
 from triquad_client.errors import (
@@ -40,14 +38,12 @@ from triquad_client.errors import (
     UnknownMapError,
 )
 from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
-from triquad_client.mesh.followed_mesh import MeshUpdate
+from triquad_client.mesh.followed_mesh import KnownTiles, MeshTile, MeshUpdate
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_tiles import KnownTiles, MeshTile
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.async_synced_map import AsyncSyncedMap
-from triquad_client.offline.local_copy import SyncReport
 from triquad_client.offline.offline_map import OfflineMap, open_map
-from triquad_client.offline.synced_map import SyncedMap
+from triquad_client.offline.synced_map import SyncedMap, SyncReport
 
 __all__ = [
     "Alignment",

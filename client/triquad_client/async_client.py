@@ -10,16 +10,15 @@ from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
-from triquad_client.calls import admin, download, meshes, sdf
+from triquad_client.calls import admin, download, questions
 from triquad_client.calls.async_queries import AsyncMapQueries, AsyncPinnedMap
 from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds
 from triquad_client.client import Client
 from triquad_client.documentation import documented_as
 from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
-from triquad_client.mesh.followed_mesh import FollowedMesh
-from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_tiles import KnownTiles
+from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
+from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.net.async_driver import AsyncDriver
 from triquad_client.net.connection import Connection, open_connection
 from triquad_client.offline.async_synced_map import AsyncSyncedMap
@@ -68,16 +67,16 @@ class AsyncClient(AsyncMapQueries):
         return await self._run(admin.settle(timeout_s))
 
     async def pinned(self) -> AsyncPinnedMap:
-        return AsyncPinnedMap(self._run, await self._run(sdf.pin_newest()))
+        return AsyncPinnedMap(self._run, await self._run(questions.pin_newest()))
 
     async def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
-        return await self._run(meshes.tiles(bounds, level))
+        return await self._run(fetch_tiles(bounds, level))
 
     async def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
-        return await self._run(meshes.tile(x, y, z, level))
+        return await self._run(fetch_tile(x, y, z, level))
 
     async def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
-        return await self._run(meshes.mesh(bounds, level))
+        return await self._run(fetch_mesh(bounds, level))
 
     def watch_mesh(
         self,
@@ -151,18 +150,9 @@ def connect_async(
 ) -> Connecting:
     """Connect to a map server: ``async with connect_async(...) as client``, or await it and close.
 
-    Args:
-        endpoint: Zenoh endpoint of the server, or of a router that leads to it.
-        map: name of the map.
-        timeout_s: for connecting and for each request.
-        config: Zenoh configuration file (JSON5), for TLS or credentials; the endpoint is added.
-
-    Raises:
-        ConnectError: nothing listens at the endpoint, or it does not let us in.
-        UnknownMapError: no server there has this map.
+    Arguments and errors are those of :func:`connect`.
     """
-    file = None if config is None else Path(config)
-    return Connecting(lambda: open_connection(endpoint, map, timeout_s, file))
+    return Connecting(lambda: open_connection(endpoint, map, timeout_s, config))
 
 
 def _close_late(opening: "Future[Connection]") -> None:

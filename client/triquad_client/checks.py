@@ -1,4 +1,7 @@
-"""Arguments turned into arrays of known dtype and shape, or refused."""
+"""Arguments turned into values of known type, shape and range.
+
+What cannot be is refused with :class:`InvalidInputError`, of scans with :class:`InvalidScanError`.
+"""
 
 import math
 import operator
@@ -9,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
-from triquad_map.unknown import Unknown
+from triquad_map.questions.distance import Unknown
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
 
@@ -20,11 +23,7 @@ FARTHEST_M = 1e9
 
 
 def query_points(points: ArrayLike) -> NDArray[np.float64]:
-    """Points [N, 3] as float64, all finite and at most ``FARTHEST_M`` from the map's origin.
-
-    Raises:
-        InvalidInputError: they are not.
-    """
+    """Points [N, 3] as float64, all finite and at most ``FARTHEST_M`` from the map's origin."""
     array = _points(points, np.float64, InvalidInputError)
     # All at once, as point by point takes ten times as long.
     if not np.isfinite(array).all():
@@ -34,17 +33,13 @@ def query_points(points: ArrayLike) -> NDArray[np.float64]:
         index = int((np.abs(array) > FARTHEST_M).any(axis=1).argmax())
         raise InvalidInputError(
             f"point {index} is {array[index]}, more than {FARTHEST_M:g} m from the map's origin; "
-            "are these metres of the map frame?",
+            "are these metres of the map frame?"
         )
     return array
 
 
 def scan_points(points: ArrayLike) -> NDArray[np.float32]:
-    """Points [N, 3] of a scan as float32; points that are not finite may be among them.
-
-    Raises:
-        InvalidScanError: they are not such points, or there are none.
-    """
+    """Points [N, 3] of a scan as float32; points that are not finite may be among them."""
     array = _points(points, np.float32, InvalidScanError)
     if len(array) == 0:
         raise InvalidScanError("the scan has no points")
@@ -52,11 +47,7 @@ def scan_points(points: ArrayLike) -> NDArray[np.float32]:
 
 
 def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
-    """A pose [4, 4] as float64: a rotation and a translation, within 1e-3.
-
-    Raises:
-        InvalidScanError: it is not.
-    """
+    """A pose [4, 4] as float64: a rotation and a translation, within 1e-3."""
     try:
         pose = np.asarray(world_from_sensor, np.float64)
     except (TypeError, ValueError) as error:
@@ -68,11 +59,11 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
     if not is_rotation(pose):
         raise InvalidScanError(
             f"world_from_sensor is not rigid: R R^T is off by {rotation_error(pose):.2g}, "
-            f"det R = {np.linalg.det(pose[:3, :3]):.3g}; remove scale, shear and mirroring",
+            f"det R = {np.linalg.det(pose[:3, :3]):.3g}; remove scale, shear and mirroring"
         )
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InvalidScanError(
-            f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?",
+            f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?"
         )
     exact: NDArray[np.float64] = pose.copy()
     exact[3] = (0, 0, 0, 1)
@@ -80,22 +71,14 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
 
 
 def stamp_ns(stamp_s: float) -> int:
-    """A stamp in seconds since 1970 as nanoseconds.
-
-    Raises:
-        InvalidScanError: it is not a time.
-    """
+    """A stamp in seconds since 1970 as nanoseconds."""
     if not math.isfinite(stamp_s) or not 0 <= stamp_s < 2**63 / 1e9:
         raise InvalidScanError(f"stamp_s = {stamp_s!r} is not a time in seconds since 1970")
     return round(stamp_s * 1e9)
 
 
 def chosen_epoch(at_epoch: int | None) -> int | None:
-    """The number of an epoch, or ``None`` for the newest.
-
-    Raises:
-        InvalidInputError: it is neither.
-    """
+    """The number of an epoch, or ``None`` for the newest."""
     if at_epoch is None:
         return None
     try:
@@ -110,11 +93,7 @@ def chosen_epoch(at_epoch: int | None) -> int | None:
 
 
 def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The corners [3] of ``bounds``; ``None`` is everywhere.
-
-    Raises:
-        InvalidInputError: they are not the corners of a box.
-    """
+    """The corners [3] of ``bounds``; ``None`` is everywhere."""
     if bounds is None:
         return np.full(3, -np.inf), np.full(3, np.inf)
     try:
@@ -129,33 +108,21 @@ def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def level_of_detail(level: int) -> int:
-    """``level`` where the mesh has such a level of detail.
-
-    Raises:
-        InvalidInputError: it has not.
-    """
+    """``level`` where the mesh has such a level of detail."""
     if type(level) is not int or not 0 <= level < LEVELS:
         raise InvalidInputError(f"level = {level!r}: use 0 to {LEVELS - 1}")
     return level
 
 
 def bytes_per_second(limit: int | None) -> int:
-    """A limit as it is sent: 0 is none.
-
-    Raises:
-        InvalidInputError: nothing could be sent within it.
-    """
+    """A limit as it is sent: 0 is none."""
     if limit is not None and (type(limit) is not int or limit < 1):
         raise InvalidInputError(f"max_bytes_per_s = {limit!r}: use 1 or more, or None")
     return limit or 0
 
 
 def finite_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The corners [3] of ``bounds``, infinite sides at ``FARTHEST_M``.
-
-    Raises:
-        InvalidInputError: the box holds nothing.
-    """
+    """The corners [3] of ``bounds``, infinite sides at ``FARTHEST_M``."""
     minimum, maximum = (np.clip(corner, -FARTHEST_M, FARTHEST_M) for corner in box(bounds))
     if not (minimum < maximum).all():
         raise InvalidInputError(f"bounds = {bounds!r} hold nothing")
@@ -163,11 +130,7 @@ def finite_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def unknown_policy(unknown: Unknown | str) -> Unknown:
-    """How unknown space is to count.
-
-    Raises:
-        InvalidInputError: there is no such way.
-    """
+    """How unknown space is to count."""
     try:
         return Unknown(unknown)
     except ValueError as error:
@@ -178,11 +141,7 @@ def unknown_policy(unknown: Unknown | str) -> Unknown:
 def within(
     name: str, value: float, most: float = MAX_DISTANCE_M, *, least: float = MIN_LENGTH_M
 ) -> float:
-    """A number from ``least`` to ``most``.
-
-    Raises:
-        InvalidInputError: it is none.
-    """
+    """A number from ``least`` to ``most``."""
     try:
         number = float(value)
     except (TypeError, ValueError) as error:
@@ -193,11 +152,7 @@ def within(
 
 
 def radii(values: ArrayLike, count: int) -> NDArray[np.float32]:
-    """Radii [count], from as many or a single one.
-
-    Raises:
-        InvalidInputError: they are not numbers from 0 to ``MAX_DISTANCE_M``.
-    """
+    """Radii [count], from as many or a single one."""
     try:
         array = np.broadcast_to(np.asarray(values, np.float32), (count,))
     except (TypeError, ValueError) as error:
@@ -211,22 +166,8 @@ def radii(values: ArrayLike, count: int) -> NDArray[np.float32]:
     return array
 
 
-def place_or_places(points: ArrayLike) -> NDArray[np.float64]:
-    """Points [N, 3] or one [1, 3], from [3] or [N, 3].
-
-    Raises:
-        InvalidInputError: they are not.
-    """
-    array = np.asarray(points)
-    return query_points(array[None] if array.shape == (3,) else array)
-
-
 def directions(vectors: ArrayLike) -> NDArray[np.float64]:
-    """Unit vectors [N, 3] along ``vectors``.
-
-    Raises:
-        InvalidInputError: they are not vectors, or one has no direction.
-    """
+    """Unit vectors [N, 3] along ``vectors``."""
     array = query_points(vectors)
     lengths = np.linalg.norm(array, axis=1)
     if not (lengths > 0).all():

@@ -6,16 +6,15 @@ from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
-from triquad_client.calls import admin, download, meshes, sdf
+from triquad_client.calls import admin, download, questions
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds
-from triquad_client.mesh.followed_mesh import FollowedMesh
-from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_tiles import KnownTiles
+from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
+from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.net.connection import Connection, open_connection
-from triquad_client.net.remote_driver import RemoteDriver
+from triquad_client.net.driver import RemoteDriver
 from triquad_client.offline.synced_map import SyncedMap
 
 
@@ -95,7 +94,7 @@ class Client(MapQueries):
 
     def pinned(self) -> PinnedMap:
         """The map as it is now, for queries that belong together."""
-        return PinnedMap(self._run, self._run(sdf.pin_newest()))
+        return PinnedMap(self._run, self._run(questions.pin_newest()))
 
     def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
         """The mesh tiles that meet ``bounds``, with the epoch in which each last changed.
@@ -104,11 +103,11 @@ class Client(MapQueries):
             bounds: corners of a box; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells and tiles twice as large as the one before.
         """
-        return self._run(meshes.tiles(bounds, level))
+        return self._run(fetch_tiles(bounds, level))
 
     def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
         """The newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
-        return self._run(meshes.tile(x, y, z, level))
+        return self._run(fetch_tile(x, y, z, level))
 
     def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
         """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch.
@@ -117,7 +116,7 @@ class Client(MapQueries):
             bounds: corners of a box; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
         """
-        return self._run(meshes.mesh(bounds, level))
+        return self._run(fetch_mesh(bounds, level))
 
     def watch_mesh(
         self,
@@ -223,6 +222,6 @@ def connect(
     Raises:
         ConnectError: nothing listens at the endpoint, or it does not let us in.
         UnknownMapError: no server there has this map.
+        InvalidInputError: there cannot be a map of this name.
     """
-    file = None if config is None else Path(config)
-    return Client(open_connection(endpoint, map, timeout_s, file))
+    return Client(open_connection(endpoint, map, timeout_s, config))

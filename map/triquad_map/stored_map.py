@@ -1,7 +1,7 @@
 """A map file that answers without being read whole: parts are read when a point needs them."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 
@@ -18,16 +18,21 @@ from triquad_format.mapfile.parts.part import (
     VERTICES,
     PartKey,
     cells_near,
+    cube_shift,
     extent,
+    square_shift,
     vertex_reach,
 )
+from triquad_format.mapfile.parts.region_parts import RegionParts
 from triquad_format.mapfile.reader import assemble
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import SLACK_LEAVES, LeafBox, check_box, leaf_box, whole_region
-from triquad_format.records.record_check import check_record
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.record_check import check_record, check_region
 from triquad_format.records.region import (
     AXES,
     MapRecord,
+    Region,
     RegionIndex,
     leaf_coordinates,
     region_centre,
@@ -35,7 +40,8 @@ from triquad_format.records.region import (
 
 from triquad_map.composition.field_view import FieldView
 from triquad_map.reference.evaluator import checked_points, in_chunks
-from triquad_map.reference.partial_region import PartialRegion
+from triquad_map.reference.region_field import RegionField
+from triquad_map.reference.seen_blocks import SeenBlocks
 from triquad_map.view import FieldAnswer
 
 
@@ -195,3 +201,43 @@ class StoredMap:
         # Blending adds up regions in their order, which is that of the file.
         there = [self._regions[index] for index in self._indices if index in self._regions]
         self._view = FieldView(self._settings, there, split=in_chunks)
+
+
+class PartialRegion:
+    """Field and status of a region; they are right where all is there that they depend on."""
+
+    def __init__(self, settings: FieldSettings, index: RegionIndex, head: bytes) -> None:
+        """A region of which nothing is there but its ``head``: the part ``/triquad/region``.
+
+        Raises:
+            FormatError: it is malformed.
+        """
+        self.index = index
+        self.centre = region_centre(settings, index)
+        self._settings = settings
+        self._head = head
+        shifts = {level: square_shift(settings, level) for level in settings.levels}
+        self.engine = RegionField(settings, self._read({}), shifts)
+        self.evidence = SeenBlocks(settings, cube_shift())
+
+    def add(self, cells: Mapping[PartKey, bytes]) -> None:
+        """Add squares of vertices and cubes of evidence, each once, by their keys.
+
+        What is there already is neither read nor checked again.
+
+        Raises:
+            FormatError: a part is malformed; nothing was added.
+        """
+        region = self._read(cells)
+        self.engine.add(region.tables)
+        self.evidence.add(region.evidence)
+
+    def _read(self, cells: Mapping[PartKey, bytes]) -> Region:
+        """A region of these cells alone."""
+        parts = RegionParts(self.index, self._settings)
+        parts.add(PartKey(REGION, self.index), self._head)
+        for key, payload in cells.items():
+            parts.add(key, payload)
+        region = parts.region()
+        check_region(self._settings, region)
+        return region

@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from triquad_format.records.arrays import Bytes, Doubles, Floats
-
-from triquad_map.nearest import NearestSurface, NearestUnknown
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 
 
 @dataclass(frozen=True)
@@ -15,6 +13,31 @@ class FieldAnswer:
     sdf: Floats  # [N] metres, positive in free space; NaN where no region is
     status: Bytes  # [N] triquad_format.records.status.Status
     gradient: Floats | None  # [N, 3] d(sdf)/dx, map frame; NaN as the sdf
+
+
+@dataclass(frozen=True)
+class NearestSurface:
+    """The nearest seen surface of N points, map frame, metres.
+
+    Where none was found within the limit, the distance is the limit and the rest is 0.
+    """
+
+    found: Bools  # [N]
+    distance: Doubles  # [N] to the point
+    point: Doubles  # [N, 3] the nearest point of it
+    mean: Doubles  # [N, 3] about the same, over all that is nearly as near
+    confidence: Floats  # [N] in [0, 1]
+
+
+@dataclass(frozen=True)
+class NearestUnknown:
+    """The nearest unknown space of N points, map frame, metres.
+
+    Where there is none within the limit, the distance is the limit and the point means nothing.
+    """
+
+    distance: Doubles  # [N] 0 in unknown space
+    point: Doubles  # [N, 3] the nearest point of it
 
 
 class MapView(Protocol):

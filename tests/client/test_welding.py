@@ -1,5 +1,5 @@
 import numpy as np
-from triquad_client.mesh.welding import compacted, welded
+from triquad_client.mesh.mesh import compacted, welded
 
 
 def test_vertices_on_a_common_face_become_one():

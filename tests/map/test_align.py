@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.exact_view import ExactView
 from support.small_world import settings, settled_mapper, world
-from triquad_map.questions.align import Alignment, AlignOptions, align
-from triquad_map.questions.thinning import thinned
+from triquad_map.questions.align import Alignment, AlignOptions, align, thinned
 from triquad_tools.benchmarks.align import Offset, attempts, displaced, recorded
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene

@@ -2,10 +2,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.status import Status
-from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.evidence import FrozenEvidence, LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
-from triquad_map.surface.confidence import LEVELS
+from triquad_map.surface import LEVELS
 
 SIDE = 64
 RNG = np.random.default_rng(0)

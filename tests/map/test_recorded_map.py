@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from support.exact_maps import exact_map, flat, table
 from support.map_records import SMALL, random_record, with_levels
 from triquad_format.records.region import MapRecord
-from triquad_map.compiled.compiled_view import CompiledView
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.recorded_view import RecordedView
-from triquad_map.compiled.surfels.surfel_index import surfel_index, surfel_places
+from triquad_map.compiled.surfels.surfel_map import surfel_index, surfel_places
 from triquad_map.compiled.surfels.surfel_search import find_nearest
-from triquad_map.nearest import no_surfels
+from triquad_map.composition.composed_view import ComposedView
+from triquad_map.composition.region import no_surfels
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
 from triquad_map.questions.rays import RayOptions, rays
@@ -22,7 +22,7 @@ from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_map.questions.spheres import spheres
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.reference.surfel_cloud import SurfelCloud
-from triquad_map.surface.surfels import SurfelKind, Surfels
+from triquad_map.surface import SurfelKind, Surfels
 from triquad_map.view import MapView
 
 TWO = ((0, 0, 0), (1, 0, 0))
@@ -30,7 +30,7 @@ APART = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (-4, 2, 1))
 """Neighbours by a face and by an edge, and one far away."""
 
 
-def both(record: MapRecord) -> tuple[CompiledView, MapEvaluator]:
+def both(record: MapRecord) -> tuple[ComposedView, MapEvaluator]:
     return RecordedView(record), MapEvaluator(record)
 
 
@@ -71,7 +71,9 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
     fast = no_surfels(np.full(400, reach))
     find_nearest(points, surfel_index(places, surfels), fast)
     slow = no_surfels(np.full(400, reach))
-    SurfelCloud(places.voxels, surfels).find_nearest(points, slow)
+    count = len(places.voxels)
+    cloud = SurfelCloud(places.voxels, surfels, np.ones(count), np.zeros(count, int))
+    cloud.find_nearest(points, slow)
     np.testing.assert_allclose(fast.distances, slow.distances, atol=1e-4)
     np.testing.assert_array_equal(fast.rows >= 0, slow.rows >= 0)
     hit = slow.rows >= 0
@@ -94,7 +96,7 @@ def random_surfels(rng: np.random.Generator, count: int) -> Surfels:
 
 
 @pytest.fixture(scope="module", params=["flat", "table"])
-def ground(request) -> tuple[CompiledView, MapEvaluator]:
+def ground(request) -> tuple[ComposedView, MapEvaluator]:
     """The views of a ground whose field is exact."""
     return both(exact_map(flat(0.07) if request.param == "flat" else table(0.0, 1.3)))
 

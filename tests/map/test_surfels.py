@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 from support import small_world
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.surfels.surfel_map import SurfelMap, SurfelTask, first_surfels
-from triquad_map.composition.field_samples import field_samples
-from triquad_map.composition.split import in_one
-from triquad_map.nearest import NearestSurfels, no_surfels
-from triquad_map.surface.surfels import FieldSample, SurfelKind, fit_surfels
+from triquad_map.compiled.evidence.evidence import LiveEvidence
+from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
+from triquad_map.composition.region import NearestSurfels, field_samples, in_one, no_surfels
+from triquad_map.surface import FieldSample, SurfelKind, fit_surfels
 from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.mapping.mapper import Mapper
 
@@ -74,11 +72,11 @@ def test_surfels_kept_up_to_date_are_those_made_anew():
     rng = np.random.default_rng(0)
     evidence = random_evidence(rng, 300)
     before, after = (plane(np.array([0.6, 0, 0.8]), height) for height in (43.0, 43.3))
-    surfels = first_surfels(evidence.freeze(), before, SurfelTask(1, None))
+    surfels = first_surfels(evidence.freeze(), before, 1)
     evidence.mark_surface(rng.uniform((0, 0, 25), (SIDE, SIDE, 35), (200, 3)))
     evidence.clear(np.array([0.0, 0, 0]), np.array([20.0, 20, 64]))
-    kept = surfels.updated(evidence.freeze(), after, SurfelTask(2, None))
-    anew = first_surfels(evidence.freeze(), after, SurfelTask(2, None))
+    kept = surfels.updated(evidence.freeze(), after, 2, None)
+    anew = first_surfels(evidence.freeze(), after, 2)
     assert len(kept) == len(anew) > 300
     points = rng.uniform(0, SIDE, (500, 3))
     for mine, wanted in zip(nearest(kept, points), nearest(anew, points), strict=True):
@@ -89,14 +87,14 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
     rng = np.random.default_rng(1)
     evidence = random_evidence(rng, 400)
     low, high = (plane(np.array([0.0, 0, 1]), height) for height in (29.5, 31.5))
-    surfels = first_surfels(evidence.freeze(), low, SurfelTask(1, None))
+    surfels = first_surfels(evidence.freeze(), low, 1)
     new = np.array([[10.5, 10.5, 50.5]])
     evidence.mark_surface(new)
     points = np.concatenate([new + (0, 0, 3.0), rng.uniform((0, 0, 36), (SIDE, SIDE, 40), (50, 3))])
-    wanted = first_surfels(evidence.freeze(), high, SurfelTask(1, None))
+    wanted = first_surfels(evidence.freeze(), high, 1)
     rounds = 0
     while not np.array_equal(nearest(surfels, points).closest, nearest(wanted, points).closest):
-        surfels = surfels.updated(evidence.freeze(), high, SurfelTask(2 + rounds, 100))
+        surfels = surfels.updated(evidence.freeze(), high, 2 + rounds, 100)
         rounds += 1
         np.testing.assert_allclose(nearest(surfels, points[:1]).distances, 3.0)
         assert rounds < 10
@@ -105,7 +103,7 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
 
 def surfels_of(region: FrozenRegion, mapper_settings: object) -> SurfelMap:
     samples = field_samples(region.engine, mapper_settings, in_one)  # type: ignore[arg-type]
-    return first_surfels(region.evidence, samples, SurfelTask(1, None))
+    return first_surfels(region.evidence, samples, 1)
 
 
 def test_a_settled_map_answers_from_the_field_as_it_is():

@@ -5,9 +5,8 @@ import pytest
 import torch
 from support import small_world
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.batch import load, new_batch
-from triquad_map.compiled.field.encoding import locate
-from triquad_map.compiled.field.frozen_field import make_field
+from triquad_map.compiled.field.encoding import load, locate, new_batch
+from triquad_map.compiled.field.field import make_field
 from triquad_server.engine.adam import Rates, step_rows, step_where
 from triquad_server.engine.batch import Batch
 from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums

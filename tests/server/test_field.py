@@ -8,7 +8,7 @@ import torch
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_server.engine.adam import Rates
 from triquad_server.engine.batch import Batch
 from triquad_server.engine.field_record import field_from_record, region_record

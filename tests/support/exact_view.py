@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.status import Status
-from triquad_map.nearest import NearestSurface, NearestUnknown
-from triquad_map.view import FieldAnswer
+from triquad_map.view import FieldAnswer, NearestSurface, NearestUnknown
 from triquad_tools.simulation.scene import Scene
 
 

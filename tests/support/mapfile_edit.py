@@ -18,7 +18,7 @@ from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import MANIFEST
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map, write_parts
-from triquad_format.wire.array import pack_array, unpack_array
+from triquad_format.wire.codec import pack_array, unpack_array
 from triquad_map.stored_map import StoredMap
 from triquad_server.mesh.preview import previews_of
 

@@ -8,7 +8,7 @@ from support.map_records import random_record
 from support.mapfile_edit import file_bytes
 from support.small_world import settings, settled_mapper, world
 from triquad_client import Mesh
-from triquad_client.mesh.welding import joined
+from triquad_client.mesh.mesh import joined
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record

@@ -15,7 +15,7 @@ from triquad_format.wire.messages import (
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import RequestTimeoutError
-from triquad_client.net.call import Ask, Call, ask, pause
+from triquad_client.net.call import Ask, Call, Pause, ask
 
 _SLOW_S = 60.0
 """For requests that write to the server's disk."""
@@ -34,7 +34,7 @@ def settle(timeout_s: float) -> Call[ServerStatus]:
     while not (now := (yield from status())).settled:
         if time.monotonic() > deadline:
             raise RequestTimeoutError(f"the server still learns after {timeout_s:g} s")
-        yield from pause(_SETTLE_PAUSE_S)
+        yield Pause(_SETTLE_PAUSE_S)
     return now
 
 

@@ -2,17 +2,15 @@
 
 from numpy.typing import ArrayLike
 from triquad_map.questions.align import Alignment, AlignOptions
-from triquad_map.questions.distance import DistanceOptions, Distances
+from triquad_map.questions.distance import DistanceOptions, Distances, Unknown
 from triquad_map.questions.grid import Grid
-from triquad_map.questions.polyline import Polyline
 from triquad_map.questions.rays import RayOptions, RayRanges
-from triquad_map.questions.segments import SegmentOptions, Segments
+from triquad_map.questions.segments import Polyline, SegmentOptions, Segments
 from triquad_map.questions.spheres import Spheres
-from triquad_map.unknown import Unknown
 
-from triquad_client.calls import alignment, distance, grid, rays, sdf, segments, spheres
+from triquad_client.calls import questions
 from triquad_client.calls.queries import MapQueries
-from triquad_client.calls.sdf import SdfResult
+from triquad_client.calls.questions import SdfResult
 from triquad_client.checks import Bounds
 from triquad_client.documentation import documented_as
 from triquad_client.net.call import AsyncRun
@@ -30,7 +28,7 @@ class AsyncMapQueries:
     async def query_sdf(
         self, points: ArrayLike, gradient: bool = False, at_epoch: int | None = None
     ) -> SdfResult:
-        return await self._run(sdf.query(points, gradient, self._chosen(at_epoch)))
+        return await self._run(questions.sdf(points, gradient, self._chosen(at_epoch)))
 
     async def query_distance(
         self,
@@ -43,12 +41,12 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> Distances:
         options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
-        return await self._run(distance.query(points, options, unknown, self._chosen(at_epoch)))
+        return await self._run(questions.distance(points, options, unknown, self._chosen(at_epoch)))
 
     async def query_spheres(
         self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Spheres:
-        return await self._run(spheres.query(centres, radii_m, self._chosen(at_epoch)))
+        return await self._run(questions.spheres(centres, radii_m, self._chosen(at_epoch)))
 
     async def query_segments(
         self,
@@ -59,7 +57,7 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> Segments:
         options = SegmentOptions(radius_m, max_distance_m)
-        return await self._run(segments.query(starts, ends, options, self._chosen(at_epoch)))
+        return await self._run(questions.segments(starts, ends, options, self._chosen(at_epoch)))
 
     async def query_polyline(
         self,
@@ -69,7 +67,7 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> Polyline:
         options = SegmentOptions(radius_m, max_distance_m)
-        return await self._run(segments.query_polyline(points, options, self._chosen(at_epoch)))
+        return await self._run(questions.polyline(points, options, self._chosen(at_epoch)))
 
     async def query_rays(
         self,
@@ -80,7 +78,7 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> RayRanges:
         options = RayOptions(max_range_m, through_unknown)
-        return await self._run(rays.query(origins, directions, options, self._chosen(at_epoch)))
+        return await self._run(questions.rays(origins, directions, options, self._chosen(at_epoch)))
 
     async def query_grid(
         self,
@@ -89,7 +87,8 @@ class AsyncMapQueries:
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Grid:
-        return await self._run(grid.query(bounds, cell_m, max_distance_m, self._chosen(at_epoch)))
+        call = questions.grid(bounds, cell_m, max_distance_m, self._chosen(at_epoch))
+        return await self._run(call)
 
     async def align(
         self,
@@ -99,7 +98,7 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> Alignment:
         options = AlignOptions(max_distance_m)
-        call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
+        call = questions.align(points, world_from_sensor_guess, options, self._chosen(at_epoch))
         return await self._run(call)
 
     def _chosen(self, at_epoch: int | None) -> int | None:

@@ -2,16 +2,14 @@
 
 from numpy.typing import ArrayLike
 from triquad_map.questions.align import Alignment, AlignOptions
-from triquad_map.questions.distance import DistanceOptions, Distances
+from triquad_map.questions.distance import DistanceOptions, Distances, Unknown
 from triquad_map.questions.grid import Grid
-from triquad_map.questions.polyline import Polyline
 from triquad_map.questions.rays import RayOptions, RayRanges
-from triquad_map.questions.segments import SegmentOptions, Segments
+from triquad_map.questions.segments import Polyline, SegmentOptions, Segments
 from triquad_map.questions.spheres import Spheres
-from triquad_map.unknown import Unknown
 
-from triquad_client.calls import alignment, distance, grid, rays, sdf, segments, spheres
-from triquad_client.calls.sdf import SdfResult
+from triquad_client.calls import questions
+from triquad_client.calls.questions import SdfResult
 from triquad_client.checks import Bounds
 from triquad_client.net.call import Run
 
@@ -40,7 +38,7 @@ class MapQueries:
             gradient: whether the gradient is wanted.
             at_epoch: see :class:`MapQueries`.
         """
-        return self._run(sdf.query(points, gradient, self._chosen(at_epoch)))
+        return self._run(questions.sdf(points, gradient, self._chosen(at_epoch)))
 
     def query_distance(
         self,
@@ -67,13 +65,13 @@ class MapQueries:
             UnknownSpaceError: ``unknown`` is ``"error"`` and unknown space is nearer somewhere.
         """
         options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
-        return self._run(distance.query(points, options, unknown, self._chosen(at_epoch)))
+        return self._run(questions.distance(points, options, unknown, self._chosen(at_epoch)))
 
     def query_spheres(
         self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Spheres:
         """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one number or [N]."""
-        return self._run(spheres.query(centres, radii_m, self._chosen(at_epoch)))
+        return self._run(questions.spheres(centres, radii_m, self._chosen(at_epoch)))
 
     def query_segments(
         self,
@@ -93,7 +91,7 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = SegmentOptions(radius_m, max_distance_m)
-        return self._run(segments.query(starts, ends, options, self._chosen(at_epoch)))
+        return self._run(questions.segments(starts, ends, options, self._chosen(at_epoch)))
 
     def query_polyline(
         self,
@@ -104,7 +102,7 @@ class MapQueries:
     ) -> Polyline:
         """What a ball meets that moves along ``points`` [N, 3], as :meth:`query_segments`."""
         options = SegmentOptions(radius_m, max_distance_m)
-        return self._run(segments.query_polyline(points, options, self._chosen(at_epoch)))
+        return self._run(questions.polyline(points, options, self._chosen(at_epoch)))
 
     def query_rays(
         self,
@@ -124,7 +122,7 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = RayOptions(max_range_m, through_unknown)
-        return self._run(rays.query(origins, directions, options, self._chosen(at_epoch)))
+        return self._run(questions.rays(origins, directions, options, self._chosen(at_epoch)))
 
     def query_grid(
         self,
@@ -141,7 +139,7 @@ class MapQueries:
             max_distance_m: surfaces are looked for up to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
-        return self._run(grid.query(bounds, cell_m, max_distance_m, self._chosen(at_epoch)))
+        return self._run(questions.grid(bounds, cell_m, max_distance_m, self._chosen(at_epoch)))
 
     def align(
         self,
@@ -159,7 +157,7 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = AlignOptions(max_distance_m)
-        call = alignment.query(points, world_from_sensor_guess, options, self._chosen(at_epoch))
+        call = questions.align(points, world_from_sensor_guess, options, self._chosen(at_epoch))
         return self._run(call)
 
     def _chosen(self, at_epoch: int | None) -> int | None:

@@ -50,11 +50,7 @@ class ScanPublisher:
         self._sources: dict[str, _Source] = {}
 
     def publish(
-        self,
-        points: ArrayLike,
-        world_from_sensor: ArrayLike,
-        stamp_s: float | None,
-        source: str,
+        self, points: ArrayLike, world_from_sensor: ArrayLike, stamp_s: float | None, source: str
     ) -> None:
         """Send a scan; arguments as in ``Client.publish_scan``."""
         try:
@@ -72,7 +68,7 @@ class ScanPublisher:
             if stamp_ns < state.stamp_ns:
                 raise InvalidScanError(
                     f"stamp_s = {stamp_s!r} lies before {state.stamp_ns / 1e9!r}, that of an "
-                    f"earlier scan of source {source!r}; publish in order",
+                    f"earlier scan of source {source!r}; publish in order"
                 )
             scan = Scan(
                 points=cloud,

@@ -7,8 +7,7 @@ from typing import Any
 from triquad_client.documentation import documented_as
 from triquad_client.mesh.followed_mesh import FollowedMesh, MeshUpdate
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.mesh.watched_mesh import WatchClosedError, WatchedMesh
+from triquad_client.mesh.mesh_watch import MeshWatch, WatchClosedError, WatchedMesh
 from triquad_client.net.call import AsyncRun, Call, ResultT, offload
 
 
@@ -68,7 +67,7 @@ class AsyncMeshWatch(WatchedMesh):
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
             if asking.done():
                 return asking.result()
-            raise WatchClosedError
+            raise WatchClosedError("the watch is closed")
         finally:
             asking.cancel()
             await asyncio.wait({asking})  # until its requests are cancelled

@@ -1,17 +1,32 @@
-"""A surface as triangles, and its files."""
+"""A surface as triangles: fetched, joined from the meshes of tiles, and written to files.
 
-from collections.abc import Callable
+What is fetched goes in the background of all else.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.wire import keys
+from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
+from triquad_client import checks
+from triquad_client.checks import Bounds
 from triquad_client.errors import InvalidInputError
+from triquad_client.net.call import NEWEST, Ask, Call, Run, ask, ask_each, offload, retried
 
 if TYPE_CHECKING:
     import trimesh
+
+WELD_M = 1e-4
+"""Vertices closer than about this are one."""
+
+_SHIFTS = np.array([(0.5, 0.5, 0.5), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0)])
+"""Vertices that lie on a lattice edge may fall on two sides of a rounding boundary along it, and
+along it only: a second round, shifted along that axis, brings them together."""
 
 _Y_UP = np.array([(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1.0)])
 """The map's axes, of which z points upwards, as those of a glTF scene."""
@@ -65,6 +80,110 @@ class Mesh:
         return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
 
 
+class Triangles(NamedTuple):
+    """A surface in the map frame."""
+
+    vertices: NDArray[np.float64]  # [V, 3] metres
+    faces: NDArray[np.int32]  # [F, 3]
+
+
+def fetch_tiles(bounds: Bounds | None, level: int) -> Call[TileList]:
+    """The tiles that meet the bounds."""
+    minimum, maximum = checks.box(bounds)
+    request = TileListRequest(minimum, maximum, NEWEST, checks.level_of_detail(level))
+    return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
+
+
+def fetch_tile(x: int, y: int, z: int, level: int) -> Call[Mesh]:
+    """The newest mesh of one tile."""
+    tile = yield from ask(_ask_tile((x, y, z), NEWEST, checks.level_of_detail(level)))
+    return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
+
+
+def fetch_mesh(bounds: Bounds | None, level: int) -> Call[Mesh]:
+    """The faces whose centroids lie in the bounds, from one epoch."""
+    minimum, maximum = checks.box(bounds)
+
+    def fetch() -> Call[Mesh]:
+        listed = yield from fetch_tiles(bounds, level)
+        indices = listed.tiles.tolist()
+        tiles = yield from ask_each(indices, lambda index: _ask_tile(index, listed.epoch, level))
+
+        def join(_: Run) -> Mesh:
+            parts = [Triangles(tile.origin + tile.vertices, tile.faces) for tile in tiles]
+            whole = joined(parts, listed.tile_side_m, minimum, maximum)
+            return Mesh(whole.vertices, whole.faces, listed.epoch)
+
+        return (yield from offload(join))
+
+    return (yield from retried("epoch_gone", fetch))
+
+
+def _ask_tile(index: Sequence[int], epoch: int, level: int) -> Ask[Tile]:
+    x, y, z = index
+    return Ask(keys.TILE, TileRequest(x, y, z, epoch, level), Tile, background=True)
+
+
+def joined(
+    tiles: Sequence[Triangles],
+    tile_side_m: float,
+    minimum: NDArray[np.float64],
+    maximum: NDArray[np.float64],
+) -> Triangles:
+    """One mesh of the tiles' faces whose centroids lie in the box between two corners [3]."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in tiles)])
+    shifted = [faces + int(start) for (_, faces), start in zip(tiles, starts, strict=False)]
+    vertices, faces = welded(
+        np.concatenate([np.zeros((0, 3)), *(vertices for vertices, _ in tiles)]),
+        np.concatenate([np.zeros((0, 3), np.int32), *shifted]).astype(np.int32),
+        tile_side_m,
+    )
+    centroids = vertices[faces].mean(axis=1)
+    inside = ((centroids >= minimum) & (centroids <= maximum)).all(axis=1)
+    return compacted(vertices, faces[inside])
+
+
+def welded(
+    vertices: NDArray[np.float64], faces: NDArray[np.int32], tile_side_m: float
+) -> Triangles:
+    """The mesh with one vertex where tiles had several.
+
+    Args:
+        vertices: [V, 3], metres.
+        faces: [F, 3].
+        tile_side_m: side of the tiles; only vertices on their faces are looked at.
+
+    Returns:
+        The mesh without faces that welding made degenerate.
+    """
+    steps = vertices / tile_side_m
+    border = (np.abs(steps - np.round(steps)) < WELD_M / tile_side_m).any(axis=1)
+    shared = np.flatnonzero(border)
+    target = np.arange(len(vertices))
+    target[shared] = shared[_representatives(vertices[shared])]
+    joined = target[faces]
+    a, b, c = joined.T
+    return compacted(vertices, joined[(a != b) & (b != c) & (c != a)])
+
+
+def compacted(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> Triangles:
+    """The mesh without vertices that no face uses."""
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    number = np.cumsum(used) - 1
+    return Triangles(vertices[used], number[faces].astype(np.int32).reshape(-1, 3))
+
+
+def _representatives(points: NDArray[np.float64]) -> NDArray[np.intp]:
+    """For each point [N, 3], the index of the point that stands for it."""
+    chosen = np.arange(len(points))
+    for shift in _SHIFTS:
+        cells = np.floor(points[chosen] / WELD_M + shift).astype(np.int64)
+        _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        chosen = chosen[first[inverse.reshape(-1)]]
+    return chosen
+
+
 def _ply(mesh: Mesh) -> bytes:
     """Binary PLY in double precision; that of trimesh is single, and this one needs no library."""
     header = (
@@ -91,14 +210,6 @@ def _glb(mesh: Mesh) -> bytes:
     return _exported(scene, "glb")
 
 
-def _obj(mesh: Mesh) -> bytes:
-    return _exported(mesh.to_trimesh(), "obj")
-
-
-def _stl(mesh: Mesh) -> bytes:
-    return _exported(mesh.to_trimesh(), "stl")
-
-
 def _exported(surface: "trimesh.Trimesh | trimesh.Scene", kind: str) -> bytes:
     data = surface.export(file_type=kind)
     return data.encode("ascii") if isinstance(data, str) else cast(bytes, data)
@@ -107,6 +218,6 @@ def _exported(surface: "trimesh.Trimesh | trimesh.Scene", kind: str) -> bytes:
 _FORMATS: dict[str, Callable[[Mesh], bytes]] = {
     ".ply": _ply,
     ".glb": _glb,
-    ".obj": _obj,
-    ".stl": _stl,
+    ".obj": lambda mesh: _exported(mesh.to_trimesh(), "obj"),
+    ".stl": lambda mesh: _exported(mesh.to_trimesh(), "stl"),
 }

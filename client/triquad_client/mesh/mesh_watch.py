@@ -1,17 +1,105 @@
-"""Following the mesh of a box, in the thread that asks."""
+"""Following the mesh of a box: only what changed travels."""
 
-from collections.abc import Iterator
+import math
+import threading
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from types import MappingProxyType
 
 import zenoh
 from triquad_format.errors import TriquadError
+from triquad_format.wire import keys
+from triquad_format.wire.messages import TileUpdates
 
-from triquad_client.mesh.followed_mesh import FollowedMesh, MeshUpdate
+from triquad_client.errors import ClosedError, RequestTimeoutError
+from triquad_client.mesh.followed_mesh import (
+    FollowedMesh,
+    KnownTiles,
+    MeshTile,
+    MeshUpdate,
+    TileIndex,
+    unpacked,
+)
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.watched_mesh import WatchClosedError, WatchedMesh
-from triquad_client.net.call import Call, ResultT
+from triquad_client.net.call import Ask, Call, ResultT, ask, offload
 from triquad_client.net.connection import Connection
-from triquad_client.net.remote_driver import RemoteDriver
+from triquad_client.net.driver import RemoteDriver
+
+_LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
+
+
+class WatchClosedError(ClosedError):
+    """The watch was closed, before the call or meanwhile."""
+
+
+class WatchedMesh:
+    """The tiles of a watch, and the calls that change them; no matter who waits for the replies."""
+
+    def __init__(self, followed: FollowedMesh) -> None:
+        self._followed = followed
+        self._changing = threading.Lock()
+
+    @property
+    def tiles(self) -> Mapping[TileIndex, MeshTile]:
+        """The tiles as of the last update, by their indices; later updates do not change it."""
+        return MappingProxyType(self._followed.tiles)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last reply left nothing waiting."""
+        return self._followed.complete
+
+    @property
+    def level(self) -> int:
+        """Level of detail."""
+        return self._followed.level
+
+    def known_tiles(self) -> KnownTiles:
+        """The tiles, for a later watch to go on with."""
+        return self._followed.known_tiles()
+
+    def _next(self, timeout_s: float | None) -> Call[MeshUpdate | None]:
+        ends = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            left_s = max(0.0, ends - time.monotonic())
+            update = yield from self._update(min(left_s, _LONGEST_WAIT_S))
+            if update.changed or update.removed:
+                return update
+            if time.monotonic() >= ends:
+                return None
+
+    def _catch_up(self, timeout_s: float) -> Call[None]:
+        ends = time.monotonic() + timeout_s
+        wait_s = 0.0
+        while not (update := (yield from self._update(wait_s))).complete:
+            if time.monotonic() > ends:
+                raise RequestTimeoutError(f"the mesh is not complete after {timeout_s:g} s")
+            # Nothing came although there is something: the bandwidth is used up for a while.
+            wait_s = 0.0 if update.changed else 1.0
+
+    def _update(self, wait_s: float) -> Call[MeshUpdate]:
+        """What one reply changed: nothing where that of another call came first."""
+        before = self._followed
+        request = before.request(wait_s)
+        reply = yield from ask(
+            Ask(keys.TILE_UPDATES, request, TileUpdates, background=True, server_wait_s=wait_s)
+        )
+        changed = yield from offload(lambda _: unpacked(reply))
+        after = before.after(reply, changed)
+        with self._changing:
+            now = self._followed
+            if now is not before:  # by what is known now, the reply may be old
+                return MeshUpdate((), (), now.epoch, now.complete, size_bytes=0)
+            self._followed = after
+        removed = tuple(sorted(before.tiles.keys() - after.tiles.keys()))
+        return MeshUpdate(
+            changed=tuple(changed),
+            removed=removed,
+            epoch=after.epoch,
+            complete=after.complete,
+            size_bytes=len(reply.data),
+        )
 
 
 class MeshWatch(WatchedMesh):
@@ -79,5 +167,5 @@ class MeshWatch(WatchedMesh):
             return self._driver.run(call)
         except TriquadError as error:
             if self._closed:
-                raise WatchClosedError from error
+                raise WatchClosedError("the watch is closed") from error
             raise

@@ -12,16 +12,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import zenoh
 
 from triquad_client.net.call import Ask, Batch, Run
 from triquad_client.net.connection import Connection, Receiver, closed_error, map_names
-from triquad_client.net.driver import Driver, exchange
-from triquad_client.net.remote_driver import RemoteDriver
+from triquad_client.net.driver import Driver, RemoteDriver, exchange
 
-REQUESTS_IN_FLIGHT = 32
+_REQUESTS_IN_FLIGHT = 32
 """Requests of one operation, over all calls, that wait for their replies at the same time. Servers
 refuse what exceeds their queue (64, where it is not set otherwise) as ``busy``."""
 
@@ -29,6 +28,8 @@ _WORKERS = 32
 """Downloads and long computations that go on at the same time."""
 
 DoneT = TypeVar("DoneT")
+
+_Replies: TypeAlias = "asyncio.Future[list[zenoh.Reply]]"
 
 
 class AsyncDriver(Driver):
@@ -40,7 +41,7 @@ class AsyncDriver(Driver):
         self._sender = sender
         self._workers = ThreadPoolExecutor(_WORKERS, "triquad-worker")
         self._slots: defaultdict[str, asyncio.Semaphore] = defaultdict(
-            lambda: asyncio.Semaphore(REQUESTS_IN_FLIGHT)
+            lambda: asyncio.Semaphore(_REQUESTS_IN_FLIGHT)
         )
 
     async def in_order(self, job: Callable[[], DoneT]) -> DoneT:
@@ -74,7 +75,7 @@ class AsyncDriver(Driver):
     async def _pause(self, seconds: float) -> None:
         await asyncio.sleep(seconds)
 
-    async def _send(self, cancellation: zenoh.CancellationToken, ask: Ask[Any]) -> "_Pending":
+    async def _send(self, cancellation: zenoh.CancellationToken, ask: Ask[Any]) -> _Replies:
         slot = self._slots[ask.operation]
         await slot.acquire()
         arrival = _Arrival.expected()
@@ -84,14 +85,12 @@ class AsyncDriver(Driver):
         except BaseException:
             arrival.replies.cancel()
             raise
-        return _Pending(ask, arrival)
+        return arrival.replies
 
-    async def _receive(self, pending: "_Pending") -> Any:
-        for reply in await pending.arrival.replies:
-            return self._connection.read(pending.ask, reply)
-        if self._connection.closed:
-            raise closed_error()
-        raise self._connection.no_reply_error(pending.ask, await self.maps())
+    async def _receive(self, ask: Ask[Any], replies: _Replies) -> Any:
+        for reply in await replies:
+            return self._connection.read(ask, reply)
+        raise self._connection.no_reply_error(ask, await self.maps())
 
     async def _work(self, job: Callable[[Run], Any]) -> Any:
         """What a job returns; where the task is cancelled, so are the requests of the job."""
@@ -110,14 +109,14 @@ class AsyncDriver(Driver):
 class _Arrival:
     """Where the replies to a request will be, and what Zenoh shall do with them."""
 
-    replies: asyncio.Future[list[zenoh.Reply]]
+    replies: _Replies
     receiver: Receiver
 
     @classmethod
     def expected(cls) -> "_Arrival":
         """For the running event loop."""
         loop = asyncio.get_running_loop()
-        future: asyncio.Future[list[zenoh.Reply]] = loop.create_future()
+        future: _Replies = loop.create_future()
         replies: list[zenoh.Reply] = []
 
         def settle() -> None:
@@ -129,14 +128,6 @@ class _Arrival:
                 loop.call_soon_threadsafe(settle)
 
         return cls(future, zenoh.handlers.Callback(replies.append, end, indirect=False))
-
-
-@dataclass(frozen=True)
-class _Pending:
-    """A request on its way."""
-
-    ask: Ask[Any]
-    arrival: _Arrival
 
 
 async def _in_thread(threads: ThreadPoolExecutor, job: Callable[[], DoneT]) -> DoneT:

@@ -1,6 +1,7 @@
 """The Zenoh session of a client, and requests over it."""
 
 import json
+import weakref
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -33,6 +34,9 @@ class Connection:
 
     def __init__(self, session: zenoh.Session, map_name: str, timeout_s: float) -> None:
         self._session = session
+        # A session that a program forgot is closed before Python ends: Zenoh's threads must not
+        # come back into an interpreter that is no longer there.
+        self._close = weakref.finalize(self, session.close)
         self.map_name = map_name
         self.timeout_s = timeout_s
 
@@ -43,7 +47,7 @@ class Connection:
 
     def close(self) -> None:
         """Close the session; closing twice does no harm. What is under way ends unanswered."""
-        self._session.close()
+        self._close()
 
     def send(
         self,
@@ -91,7 +95,10 @@ class Connection:
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
-        if not self._linked:
+        if self.closed:
+            return closed_error()
+        info = self._session.info
+        if not (info.routers_zid() or info.peers_zid()):
             return ConnectError(
                 "the link to the server is down; it is set up again once the server is back"
             )
@@ -99,7 +106,7 @@ class Connection:
             return UnknownMapError(self.map_name, available)
         return NoReplyError(
             f"no reply on {self._key(ask)} although the map is there: the server is stopping, "
-            "access control forbids the request, or a message exceeds a size limit",
+            "access control forbids the request, or a message exceeds a size limit"
         )
 
     def put(self, key: str, message: Message) -> None:
@@ -117,9 +124,7 @@ class Connection:
             raise self._broken(error) from error
 
     def look_for_maps(
-        self,
-        receiver: Receiver = None,
-        cancellation: zenoh.CancellationToken | None = None,
+        self, receiver: Receiver = None, cancellation: zenoh.CancellationToken | None = None
     ) -> Iterable[zenoh.Reply]:
         """Ask all servers that can be reached for their maps; replies as of :meth:`send`."""
         try:
@@ -132,12 +137,6 @@ class Connection:
         except zenoh.ZError as error:
             raise self._broken(error) from error
         return replies
-
-    @property
-    def _linked(self) -> bool:
-        """Whether the session has a link to anybody."""
-        info = self._session.info
-        return bool(info.routers_zid() or info.peers_zid())
 
     def _key(self, ask: Ask[Any]) -> str:
         return keys.operation_key(self.map_name, ask.operation)
@@ -162,18 +161,9 @@ def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
 
 
 def open_connection(
-    endpoint: str,
-    map_name: str,
-    timeout_s: float,
-    config: Path | None,
+    endpoint: str, map_name: str, timeout_s: float, config: str | Path | None
 ) -> Connection:
-    """A connection to the server at ``endpoint`` that has the map ``map_name``.
-
-    Raises:
-        ConnectError: nothing listens there, or it does not let us in.
-        UnknownMapError: there is no such map.
-        InvalidInputError: there cannot be a map of this name.
-    """
+    """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
     try:
         keys.check_name("map", map_name)
     except FormatError as error:
@@ -184,7 +174,7 @@ def open_connection(
         reason = str(error).split(" at /", 1)[0].strip()
         raise ConnectError(
             f"cannot connect to {endpoint}: {reason} Start triquad-server there, or check the "
-            "endpoint and its credentials.",
+            "endpoint and its credentials."
         ) from error
     connection = Connection(session, map_name, timeout_s)
     try:
@@ -197,7 +187,7 @@ def open_connection(
     return connection
 
 
-def _configuration(endpoint: str, timeout_s: float, file: Path | None) -> zenoh.Config:
+def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> zenoh.Config:
     if file is not None:
         config: zenoh.Config = zenoh.Config.from_file(str(file))
     else:

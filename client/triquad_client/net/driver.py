@@ -3,12 +3,15 @@
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import closing
 from functools import partial
 from typing import Any, TypeVar
 
+import zenoh
+
 from triquad_client.net.call import Ask, Batch, Call, Pause, ResultT, Run, Step
+from triquad_client.net.connection import Connection, map_names
 
 PendingT = TypeVar("PendingT")
 
@@ -56,7 +59,14 @@ class BlockingDriver(Driver):
 
     def run(self, call: Call[ResultT]) -> ResultT:
         """What the call returns; raises what it raises."""
-        return _result(self.run_call(call))
+        coroutine = self.run_call(call)
+        try:
+            coroutine.send(None)  # to its end: it waits for nothing, so it needs no event loop
+        except StopIteration as end:
+            result: ResultT = end.value
+            return result
+        coroutine.close()
+        raise AssertionError("a blocking driver waited for an event loop")
 
     async def _pause(self, seconds: float) -> None:
         time.sleep(seconds)
@@ -65,29 +75,45 @@ class BlockingDriver(Driver):
         return job(self.run)
 
 
+class RemoteDriver(BlockingDriver):
+    """Runs calls over a connection, in the threads that make them."""
+
+    def __init__(
+        self, connection: Connection, cancellation: zenoh.CancellationToken | None = None
+    ) -> None:
+        """Once ``cancellation`` is cancelled, every call ends with an error."""
+        self._connection = connection
+        self._cancellation = cancellation
+
+    def maps(self) -> list[str]:
+        """Names of the maps of all servers that can be reached."""
+        return map_names(self._connection.look_for_maps(cancellation=self._cancellation))
+
+    async def _replies(self, batch: Batch) -> list[Any]:
+        return await exchange(batch, self._send, self._receive)
+
+    async def _send(self, ask: Ask[Any]) -> Iterable[zenoh.Reply]:
+        return self._connection.send(ask, cancellation=self._cancellation)
+
+    async def _receive(self, ask: Ask[Any], replies: Iterable[zenoh.Reply]) -> Any:
+        for reply in replies:
+            return self._connection.read(ask, reply)
+        raise self._connection.no_reply_error(ask, self.maps())
+
+
 async def exchange(
     batch: Batch,
     send: Callable[[Ask[Any]], Awaitable[PendingT]],
-    receive: Callable[[PendingT], Awaitable[Any]],
+    receive: Callable[[Ask[Any], PendingT], Awaitable[Any]],
 ) -> list[Any]:
     """The replies to a batch, of which ``batch.at_once`` requests are under way at a time."""
-    waiting: deque[PendingT] = deque()
+    waiting: deque[tuple[Ask[Any], PendingT]] = deque()
     replies = []
     for item in batch.items:
-        waiting.append(await send(batch.request(item)))
+        ask = batch.request(item)
+        waiting.append((ask, await send(ask)))
         if len(waiting) >= batch.at_once:
-            replies.append(await receive(waiting.popleft()))
+            replies.append(await receive(*waiting.popleft()))
     while waiting:
-        replies.append(await receive(waiting.popleft()))
+        replies.append(await receive(*waiting.popleft()))
     return replies
-
-
-def _result(coroutine: Coroutine[Any, Any, ResultT]) -> ResultT:
-    """What a coroutine returns that waits for nothing: it needs no event loop."""
-    try:
-        coroutine.send(None)
-    except StopIteration as end:
-        result: ResultT = end.value
-        return result
-    coroutine.close()
-    raise AssertionError("a blocking driver waited for an event loop")

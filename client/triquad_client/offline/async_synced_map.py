@@ -7,8 +7,7 @@ from triquad_client.calls.async_queries import AsyncMapQueries
 from triquad_client.checks import Bounds
 from triquad_client.documentation import documented_as
 from triquad_client.net.call import AsyncRun, Call, ResultT
-from triquad_client.offline.local_copy import LocalCopy, SyncReport
-from triquad_client.offline.synced_map import SyncedMap
+from triquad_client.offline.synced_map import LocalCopy, SyncedMap, SyncReport
 
 
 @documented_as(SyncedMap)

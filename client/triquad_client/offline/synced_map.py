@@ -1,11 +1,149 @@
-"""A map that answers from a copy of the server's, also while the link is down."""
+"""A copy of the part of a server's map that a box needs: it answers also while the link is down."""
 
+import dataclasses
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
+from triquad_format.errors import FormatError, MapFileError
+from triquad_format.mapfile.manifest import Entry, Manifest
+from triquad_format.mapfile.parts.part import Part, PartKey
+from triquad_format.mapfile.reader import assemble
+from triquad_format.mapfile.writer import write_parts
+from triquad_format.records.record_check import check_record
+from triquad_map.stored_map import StoredMap
+
+from triquad_client import checks
+from triquad_client.calls.download import RemoteBytes, newest_file
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
-from triquad_client.net.call import Run
-from triquad_client.offline.local_copy import LocalCopy, SyncReport
+from triquad_client.errors import DownloadError
+from triquad_client.net.call import Call, ResultT, Run, offload, retried
+from triquad_client.offline.offline_map import LocalDriver
+
+
+@dataclass(frozen=True)
+class SyncReport:
+    """What it took to bring a copy up to date."""
+
+    epoch: int  # of the copy now
+    bytes_received: int  # of the map file, its index included
+    parts_received: int
+    parts_kept: int  # that were there already
+
+    @property
+    def parts(self) -> int:
+        """All that the copy holds."""
+        return self.parts_received + self.parts_kept
+
+
+@dataclass(frozen=True)
+class _State:
+    """What a copy is, as a whole: threads see one or the next."""
+
+    sha256: str  # of the file on the server that it was made from
+    driver: LocalDriver
+    checked_s: float  # of the monotonic clock, when the server had nothing newer
+    report: SyncReport  # of the last update
+
+
+class LocalCopy:
+    """The copy; for several threads. It is empty until :meth:`_update` has run."""
+
+    def __init__(self, path: Path, bounds: Bounds) -> None:
+        """``path`` is the file, ``bounds`` are the corners of the box.
+
+        Raises:
+            InvalidInputError: the bounds are not a box, or hold nothing.
+        """
+        self._path = path
+        self._low, self._high = checks.finite_box(bounds)
+        self._updating = threading.Lock()
+        self._state: _State | None = None
+
+    @property
+    def epoch(self) -> int:
+        """The server's epoch, a published state of its map, that the copy was made from."""
+        return self._current().report.epoch
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the server had nothing newer: how old the copy may be at most."""
+        return time.monotonic() - self._current().checked_s
+
+    @property
+    def report(self) -> SyncReport:
+        """What it took to bring the copy up to date the last time."""
+        return self._current().report
+
+    def _answer(self, call: Call[ResultT]) -> ResultT:
+        """Answer a call, all of it from one epoch."""
+        return self._current().driver.run(call)
+
+    def _update(self) -> Call[SyncReport]:
+        """Fetch what changed, as :meth:`SyncedMap.refresh`."""
+        return retried("chunk_gone", lambda: offload(self._fetch))
+
+    def _current(self) -> _State:
+        assert self._state is not None, "_update() comes first"
+        return self._state
+
+    def _fetch(self, run: Run) -> SyncReport:
+        with self._updating:
+            asked_s = time.monotonic()
+            info = run(newest_file(training=False))
+            known = self._state
+            if known is not None and known.sha256 == info.sha256:
+                report = SyncReport(info.epoch, 0, 0, parts_kept=known.report.parts)
+                self._state = dataclasses.replace(known, checked_s=asked_s, report=report)
+                return report
+            remote = RemoteBytes(run, info)
+            try:
+                stored = StoredMap(remote)
+                wanted = stored.parts_in(self._low, self._high)
+                kept = _kept(self._path, wanted)
+                payloads = kept | {
+                    entry.key: stored.payload(entry) for entry in wanted if entry.key not in kept
+                }
+                manifest = dataclasses.replace(stored.manifest, entries=wanted)
+                record = assemble(manifest, lambda entry: payloads[entry.key])
+                check_record(record)
+                _write(self._path, manifest, payloads)
+            except FormatError as error:
+                raise DownloadError(str(error)) from error
+            report = SyncReport(
+                epoch=info.epoch,
+                bytes_received=remote.bytes_read,
+                parts_received=len(wanted) - len(kept),
+                parts_kept=len(kept),
+            )
+            self._state = _State(info.sha256, LocalDriver(record), asked_s, report)
+            if known is not None:
+                known.driver.close()
+            return report
+
+
+def _kept(path: Path, wanted: Sequence[Entry]) -> dict[PartKey, bytes]:
+    """The wanted parts that a file has already; it may be no map file."""
+    kept: dict[PartKey, bytes] = {}
+    with suppress(FormatError, FileNotFoundError), StoredMap.open(path) as older:
+        known = {entry.key: entry for entry in older.manifest.entries}
+        for entry in wanted:
+            there = known.get(entry.key)
+            if there is not None and there.sha256 == entry.sha256:
+                with suppress(MapFileError):
+                    kept[entry.key] = older.payload(there)
+    return kept
+
+
+def _write(path: Path, manifest: Manifest, payloads: Mapping[PartKey, bytes]) -> None:
+    """Replace the file at ``path`` by one of these parts, all of it or nothing."""
+    own = {entry.key: dataclasses.replace(entry, file=None) for entry in manifest.entries}
+    parts = (Part(key, payloads[key]) for key in own)
+    write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns or None, known=own)
 
 
 class SyncedMap(LocalCopy, MapQueries):

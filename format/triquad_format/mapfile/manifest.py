@@ -21,7 +21,7 @@ from triquad_format.mapfile.parts.part import (
     Part,
     PartKey,
 )
-from triquad_format.wire.array import pack_array
+from triquad_format.wire.codec import pack_array
 
 MAX_ENTRIES = 1 << 20
 MAX_FILES = 4096

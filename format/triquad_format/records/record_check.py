@@ -23,7 +23,7 @@ from triquad_format.records.region import (
     VertexTable,
     surface_counts,
 )
-from triquad_format.wire.array import ArraySpec
+from triquad_format.wire.codec import ArraySpec
 from triquad_format.wire.keys import check_name
 
 _FLOATS = ("<f2", "<f4")

@@ -1,26 +1,33 @@
 """Encoding of messages: one generic pair of functions, driven by the dataclasses' annotations.
 
 A message is a msgpack map that holds ``triquad`` (the protocol version), ``kind`` (the name of
-its class) and its fields. The messages themselves are in :mod:`triquad_format.wire.messages`;
-``docs/wire-protocol.md`` is the specification.
+its class) and its fields; an array is one of its dtype, shape and raw little-endian bytes. The
+messages themselves are in :mod:`triquad_format.wire.messages`; ``docs/wire-protocol.md`` is the
+specification.
 """
 
 import functools
+import math
 import types
 import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, TypeVar, get_args, get_origin
 
 import msgpack
 import numpy as np
+from numpy.typing import NDArray
 
 from triquad_format.errors import ProtocolVersionError, WireError
-from triquad_format.wire.array import ArraySpec, pack_array, unpack_array
 from triquad_format.wire.structure import check_structure
 
 PROTOCOL_VERSION = 1
 MAX_MESSAGE_BYTES = 256 * 2**20
 _MAX_WIRE_STRING_BYTES = 65_536
 _MAX_ITEMS = 65_536
+
+_DTYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"})
+_MAX_DIMENSIONS = 4
 
 MessageT = TypeVar("MessageT", bound="Message")
 
@@ -35,15 +42,34 @@ class Message:
         return typing.get_type_hints(cls, include_extras=True)
 
 
+@dataclass(frozen=True)
+class ArraySpec:
+    """What a field of a message accepts: one dtype, and sizes per axis (``None``: any)."""
+
+    dtype: str
+    shape: tuple[int | None, ...]
+
+    def check(self, name: str, array: NDArray[np.generic]) -> None:
+        """Raise :class:`WireError` naming ``name`` where ``array`` does not fit."""
+        fits = array.ndim == len(self.shape) and all(
+            want is None or want == have for want, have in zip(self.shape, array.shape, strict=True)
+        )
+        if array.dtype.str != self.dtype or not fits:
+            shape = ", ".join("N" if size is None else str(size) for size in self.shape)
+            raise WireError(
+                f"{name}: expected an array [{shape}] of {self.dtype}, "
+                f"got {list(array.shape)} of {array.dtype.str}"
+            )
+
+
 def encode(message: Message) -> bytes:
     """The bytes of a message.
 
     Raises:
         WireError: a field does not fit its annotation.
     """
-    body: dict[str, object] = {"triquad": PROTOCOL_VERSION, "kind": type(message).__name__}
-    for name, annotation in message.annotations().items():
-        body[name] = _pack(f"{type(message).__name__}.{name}", annotation, getattr(message, name))
+    kind = type(message).__name__
+    body = {"triquad": PROTOCOL_VERSION, "kind": kind, **_pack_fields(kind, message)}
     return typing.cast(bytes, msgpack.packb(body))
 
 
@@ -63,7 +89,7 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
     if version != PROTOCOL_VERSION:
         raise ProtocolVersionError(
             f"protocol version {version!r} is not spoken here, only {PROTOCOL_VERSION}; "
-            "use client and server of the same release",
+            "use client and server of the same release"
         )
     if body.get("kind") != expected.__name__:
         raise WireError(f"expected a {expected.__name__}, got {body.get('kind')!r}")
@@ -75,6 +101,37 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
             raise WireError(f"{expected.__name__}.{name}: missing")
         fields[name] = _unpack(f"{expected.__name__}.{name}", annotation, body[name])
     return expected(**fields)
+
+
+def pack_array(array: NDArray[np.generic]) -> dict[str, object]:
+    """The msgpack form of an array, little endian and C order."""
+    little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
+    if little.dtype.str not in _DTYPES:
+        raise WireError(f"arrays of {array.dtype} do not travel; use one of {sorted(_DTYPES)}")
+    return {"dtype": little.dtype.str, "shape": list(array.shape), "data": little.tobytes()}
+
+
+def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
+    """The array of a msgpack form; read-only, sharing the message's bytes.
+
+    Raises:
+        WireError: the form is not complete or its sizes contradict each other. Nothing is
+            allocated for a shape that the bytes do not fill.
+    """
+    if not isinstance(packed, Mapping) or set(packed) != {"dtype", "shape", "data"}:
+        raise WireError(f"{name}: expected an array with dtype, shape and data")
+    dtype, shape, data = packed["dtype"], packed["shape"], packed["data"]
+    if not isinstance(dtype, str) or dtype not in _DTYPES:
+        raise WireError(f"{name}: dtype {dtype!r} is not one of {sorted(_DTYPES)}")
+    if not isinstance(shape, list) or len(shape) > _MAX_DIMENSIONS:
+        raise WireError(f"{name}: shape {shape!r} is not a list of at most {_MAX_DIMENSIONS} sizes")
+    # Sizes beside a zero count too: numpy does not form shapes beyond 64 bits, however empty.
+    counts = all(type(size) is int and 0 <= size < 2**40 for size in shape)
+    if not counts or math.prod(size or 1 for size in shape) >= 2**40:
+        raise WireError(f"{name}: shape {shape!r} has a size that is not a count")
+    if not isinstance(data, bytes) or math.prod(shape) * np.dtype(dtype).itemsize != len(data):
+        raise WireError(f"{name}: shape {shape!r} of {dtype} does not fill its data")
+    return np.frombuffer(data, dtype).reshape(shape)
 
 
 def _unpack_map(payload: bytes) -> dict[str, object]:
@@ -95,6 +152,13 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
     return body
 
 
+def _pack_fields(name: str, message: Message) -> dict[str, object]:
+    return {
+        field: _pack(f"{name}.{field}", annotation, getattr(message, field))
+        for field, annotation in message.annotations().items()
+    }
+
+
 def _pack(name: str, annotation: Any, value: object) -> object:
     spec = _array_spec(annotation)
     if spec is not None:
@@ -108,10 +172,7 @@ def _pack(name: str, annotation: Any, value: object) -> object:
     if isinstance(annotation, type) and issubclass(annotation, Message):
         if not isinstance(value, annotation):
             raise WireError(f"{name}: expected {annotation.__name__}, got {value!r}")
-        return {
-            key: _pack(f"{name}.{key}", hint, getattr(value, key))
-            for key, hint in annotation.annotations().items()
-        }
+        return _pack_fields(name, value)
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)
         return {
@@ -135,7 +196,7 @@ def _unpack(name: str, annotation: Any, value: object) -> object:
         if not isinstance(value, dict) or not hints.keys() <= value.keys():
             raise WireError(f"{name}: expected a map with {', '.join(hints)}")
         return annotation(
-            **{key: _unpack(f"{name}.{key}", hint, value[key]) for key, hint in hints.items()},
+            **{key: _unpack(f"{name}.{key}", hint, value[key]) for key, hint in hints.items()}
         )
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)

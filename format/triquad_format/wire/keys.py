@@ -34,7 +34,7 @@ def check_name(kind: str, name: str) -> str:
     if not _NAME.fullmatch(name):
         raise FormatError(
             f"{kind} name {name!r} is not allowed: use 1 to 64 letters, digits, '_', '.', '-', "
-            "beginning with a letter or digit",
+            "beginning with a letter or digit"
         )
     return name
 

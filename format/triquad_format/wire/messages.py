@@ -11,8 +11,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.wire.array import ArraySpec
-from triquad_format.wire.codec import Message
+from triquad_format.wire.codec import ArraySpec, Message
 
 Positions = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, 3))]
 Values = Annotated[NDArray[np.float32], ArraySpec("<f4", (None,))]

@@ -10,8 +10,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.wire.array import ArraySpec
-from triquad_format.wire.codec import Message
+from triquad_format.wire.codec import ArraySpec, Message
 from triquad_format.wire.messages import MapReply, Point, Pose, Positions, StatusCodes, Values
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]

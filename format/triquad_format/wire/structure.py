@@ -12,18 +12,8 @@ from triquad_format.errors import WireError
 MAX_OBJECTS = 20_000
 MAX_DEPTH = 16
 
-_NUMBER_BYTES = {
-    0xCA: 4,
-    0xCB: 8,
-    0xCC: 1,
-    0xCD: 2,
-    0xCE: 4,
-    0xCF: 8,
-    0xD0: 1,
-    0xD1: 2,
-    0xD2: 4,
-    0xD3: 8,
-}
+# Floating-point numbers, unsigned and signed integers.
+_NUMBER_BYTES = dict(zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True))
 _LENGTH_BYTES = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}  # binaries and strings
 _BINARIES = (0xC4, 0xC5, 0xC6)
 _COUNT_BYTES = {0xDC: 2, 0xDD: 4, 0xDE: 2, 0xDF: 4}  # arrays and maps

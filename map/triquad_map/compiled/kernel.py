@@ -3,37 +3,27 @@
 numba finds compiled code again as long as the file of a kernel is the same, whatever became of the
 functions and constants that the kernel takes from other files. Here the code of a module's kernels
 is kept in a folder that is named by a digest of the module and of all that it imports of these
-packages, directly or not; folders of earlier digests are removed.
+packages, directly or not; folders of earlier digests are removed. Versions of numba and kinds of
+processors numba tells apart itself.
 """
 
 import ast
 import functools
 import hashlib
 import os
-import platform
 import shutil
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import llvmlite.binding
 import numba
 import numpy as np
 
 _OURS = "triquad_"
 """What the names of the packages begin with whose modules count."""
-
-_BUILD = (
-    platform.python_version(),
-    numba.__version__,
-    np.__version__,
-    llvmlite.binding.get_host_cpu_name(),
-)
-"""All else that compiled code depends on."""
 
 _numba_config: Any = numba.config
 _choosing_folder = threading.Lock()
@@ -49,33 +39,29 @@ def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
     """
 
     def compiled(function: FunctionT) -> FunctionT:
-        with _choosing_folder, _code_in(_code_folder(function.__module__)) as cached:
-            done: FunctionT = numba.njit(cache=cached, nogil=True, **options)(function)
+        with _choosing_folder:
+            chosen = _numba_config.CACHE_DIR
+            folder = _code_folder(function.__module__, chosen)
+            _numba_config.CACHE_DIR = str(folder or chosen)
+            try:
+                jit = numba.njit(cache=folder is not None, nogil=True, **options)
+                done: FunctionT = jit(function)
+            finally:
+                _numba_config.CACHE_DIR = chosen
         return done
 
     return compiled
 
 
-@contextmanager
-def _code_in(folder: Path | None) -> Iterator[bool]:
-    """Have numba keep code in a folder; yields whether there is one."""
-    before = _numba_config.CACHE_DIR
-    _numba_config.CACHE_DIR = str(folder or before)
-    try:
-        yield folder is not None
-    finally:
-        _numba_config.CACHE_DIR = before
-
-
 @functools.cache
-def _code_folder(module: str) -> Path | None:
+def _code_folder(module: str, chosen: str) -> Path | None:
     """Where the compiled code of a module is kept; ``None`` where nothing can be written."""
-    base = _base_folder(_numba_config.CACHE_DIR)
+    base = _base_folder(chosen)
     if base is None:
         return None
     place = f"{sys.implementation.cache_tag} {_file_of(module)}"  # installations do not mix
     versions = base / f"{module}-{hashlib.sha256(place.encode()).hexdigest()[:12]}"
-    folder = versions / source_digest(module)
+    folder = versions / _source_digest(module)
     for other in versions.glob("*"):
         if other != folder:
             shutil.rmtree(other, ignore_errors=True)
@@ -89,8 +75,14 @@ def _base_folder(chosen: str) -> Path | None:
     folder = Path(chosen) if chosen else caches / "triquad" / "kernels"
     if _can_write(folder):
         return folder
-    shared = Path(tempfile.gettempdir()) / f"triquad-kernels-{_user_id()}"
-    return shared if _can_write(shared) and _is_private(shared) else None
+    user = 0 if sys.platform == "win32" else os.getuid()
+    shared = Path(tempfile.gettempdir()) / f"triquad-kernels-{user}"
+    if not _can_write(shared):
+        return None
+    # Compiled code that lies there is run: nobody else may be able to write to it.
+    state = shared.stat()
+    private = state.st_uid == user and not state.st_mode & 0o022
+    return shared if private or sys.platform == "win32" else None
 
 
 def _can_write(folder: Path) -> bool:
@@ -102,24 +94,14 @@ def _can_write(folder: Path) -> bool:
     return True
 
 
-def _is_private(folder: Path) -> bool:
-    """Whether nobody else can write to a folder: compiled code that lies in it is run."""
-    state = folder.stat()
-    return sys.platform == "win32" or (state.st_uid == _user_id() and not state.st_mode & 0o022)
-
-
-def _user_id() -> int:
-    return 0 if sys.platform == "win32" else os.getuid()
-
-
-def source_digest(module: str) -> str:
+def _source_digest(module: str) -> str:
     """A digest of a module and of all modules of these packages that it imports."""
     reached, waiting = {module}, [module]
     while waiting:
         new = _imports(waiting.pop()) - reached
         reached |= new
         waiting.extend(new)
-    digest = hashlib.sha256(repr(_BUILD).encode())
+    digest = hashlib.sha256(np.__version__.encode())
     for name in sorted(reached):
         digest.update(name.encode() + hashlib.sha256(_file_of(name).read_bytes()).digest())
     return digest.hexdigest()[:24]

@@ -1,20 +1,19 @@
 """A map of many regions, and the questions that they answer together."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import leaf_coordinates
+from triquad_format.records.region import RegionIndex, leaf_coordinates, owned_blocks
 
 from triquad_map.composition.field_view import FieldView
-from triquad_map.composition.region import MapRegion
-from triquad_map.composition.region_lattice import Lattice
-from triquad_map.composition.split import Split, in_one
-from triquad_map.composition.unknown_space import UnknownSpace
-from triquad_map.nearest import NearestSurface, NearestUnknown, no_surfels
-from triquad_map.surface.confidence import faded
+from triquad_map.composition.region import MapRegion, Split, in_one, no_surfels
+from triquad_map.surface import faded
+from triquad_map.view import NearestSurface, NearestUnknown
 
+_FARTHEST_CELL = 1 << 20
 _LEAST_SEARCHES = 1024
 """Points for which it is worth while to start another thread that searches."""
 
@@ -27,14 +26,13 @@ class ComposedView(FieldView):
         epoch: int,
         settings: FieldSettings,
         regions: Sequence[MapRegion],
-        lattice: Lattice | None = None,
         split: Split = in_one,
     ) -> None:
-        """``lattice`` finds owners and ``split`` shares work; they differ in speed alone."""
-        super().__init__(settings, regions, lattice, split)
+        """``split`` shares the work of a question among threads."""
+        super().__init__(settings, regions, split)
         self.epoch = epoch
         self.region_views = tuple(regions)
-        self._unknown = UnknownSpace(settings, self.region_views)
+        self._by_index = {region.index: region for region in regions}
         self._newest_s = max((region.evidence.newest_s for region in regions), default=0)
 
     @property
@@ -44,7 +42,14 @@ class ComposedView(FieldView):
 
     def nearest_surface(self, points: Doubles, max_distance_m: float) -> NearestSurface:
         """The nearest seen surface to points [N, 3], searched for as far as ``max_distance_m``."""
-        nearest = NearestSurface.none(len(points), max_distance_m)
+        count = len(points)
+        nearest = NearestSurface(
+            found=np.zeros(count, np.bool_),
+            distance=np.full(count, max_distance_m),
+            point=np.zeros((count, 3)),
+            mean=np.zeros((count, 3)),
+            confidence=np.zeros(count, np.float32),
+        )
         # Here, not in the threads of the split: to make surfels may take all of these.
         near = [
             region for region in self._regions_near(points, max_distance_m) if len(region.surfels)
@@ -52,19 +57,22 @@ class ComposedView(FieldView):
 
         def work(first: int, last: int) -> None:
             for region in near:
-                self._improve(nearest, points, slice(first, last), region)
+                self._improve_surface(nearest, points, range(first, last), region)
 
-        self._split(len(points), work, _LEAST_SEARCHES)
+        self._split(count, work, _LEAST_SEARCHES)
         return nearest
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
-        """The nearest unknown space to points [N, 3], searched for as far as ``max_distance_m``."""
+        """The nearest unknown space to points [N, 3], searched for as far as ``max_distance_m``.
+
+        What lies in no region is unknown, too.
+        """
         nearest = NearestUnknown(np.full(len(points), max_distance_m), points.copy())
 
         def work(first: int, last: int) -> None:
             part = slice(first, last)
             mine = NearestUnknown(nearest.distance[part], nearest.point[part])
-            self._unknown.improve(mine, points[part])
+            self._improve_unknown(mine, points[part])
 
         self._split(len(points), work, _LEAST_SEARCHES)
         return nearest
@@ -79,22 +87,88 @@ class ComposedView(FieldView):
             if (region.centre - half <= high).all() and (region.centre + half >= low).all():
                 yield region
 
-    def _improve(
-        self, nearest: NearestSurface, points: Doubles, part: slice, region: MapRegion
+    def _improve_surface(
+        self, nearest: NearestSurface, points: Doubles, part: range, region: MapRegion
     ) -> None:
-        """Take what is nearer in a region."""
-        leaf_m = self._settings.leaf_m
-        offsets = points[part] - region.centre
-        beyond = np.maximum(np.abs(offsets) - self._settings.region_side_m / 2, 0.0)
-        near = np.flatnonzero((beyond**2).sum(axis=1) < nearest.distance[part] ** 2)
+        """Take what is nearer in a region to the ``part`` of the points."""
+        leaf_m, half_m = self._settings.leaf_m, self._settings.region_side_m / 2
+        offsets = points[part.start : part.stop] - region.centre
+        limits = nearest.distance[part.start : part.stop]
+        beyond = np.maximum(np.abs(offsets) - half_m, 0.0)
+        near = np.flatnonzero((beyond**2).sum(axis=1) < limits**2)
         if not len(near):
             return
-        found = no_surfels(nearest.distance[part][near] / leaf_m)
+        found = no_surfels(limits[near] / leaf_m)
         surfels = region.surfels
         surfels.find_nearest(leaf_coordinates(self._settings, offsets[near]), found)
         hits = np.flatnonzero(found.rows >= 0)
-        found = found.at(hits)
-        age_s = (self._newest_s - surfels.seen_s[found.rows]).astype(np.float64)
-        confidence = np.multiply(surfels.confidence[found.rows], faded(age_s))
+        rows, to = found.rows[hits], near[hits] + part.start
+        corner = region.centre - half_m
+        nearest.found[to] = True
+        nearest.distance[to] = found.distances[hits] * leaf_m
+        nearest.point[to] = corner + found.closest[hits] * leaf_m
+        nearest.mean[to] = corner + found.means[hits] * leaf_m
+        age_s = (self._newest_s - surfels.seen_s[rows]).astype(np.float64)
+        nearest.confidence[to] = surfels.confidence[rows] * faded(age_s)
+
+    def _improve_unknown(self, found: NearestUnknown, points: Doubles) -> None:
+        """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""
+        homes, owners = np.unique(self._cells_of(points), axis=0, return_inverse=True)
+        owners = owners.reshape(-1)
+        known = np.array([tuple(home) in self._by_index for home in homes.tolist()], np.bool_)
+        # Most points that are far from the map need nothing more, however many cells they lie in.
+        nowhere = np.flatnonzero(~known[owners])
+        found.distance[nowhere] = 0.0
+        found.point[nowhere] = points[nowhere]
+        for number in np.flatnonzero(known):
+            rows = np.flatnonzero(owners == number)
+            near = NearestUnknown(found.distance[rows], found.point[rows])
+            x, y, z = homes[number].tolist()
+            self._improve_in_cell(near, points[rows], (x, y, z))
+            found.distance[rows], found.point[rows] = near.distance, near.point
+
+    def _improve_in_cell(self, found: NearestUnknown, points: Doubles, home: RegionIndex) -> None:
+        """As :meth:`_improve_unknown`, of points in the cell of one region."""
+        # Mostly that is all: what it finds is nearer than the other cells.
+        self._search_region(found, points, self._by_index[home])
+        for cell in self._cells_around(points, float(found.distance.max())):
+            region = self._by_index.get(cell)
+            if region is None:
+                self._search_empty_cell(found, points, cell)
+            elif cell != home:
+                self._search_region(found, points, region)
+
+    def _cells_of(self, points: Doubles) -> Longs:
+        """Cells [N, 3] of the region lattice that hold the points; far ones at its ends."""
+        cells = np.floor(points / self._settings.region_pitch_m + 0.5)
+        return np.clip(cells, -_FARTHEST_CELL, _FARTHEST_CELL).astype(np.int64)
+
+    def _cells_around(self, points: Doubles, reach_m: float) -> list[RegionIndex]:
+        """Cells that come within ``reach_m`` of the box around the points."""
+        low = self._cells_of(points.min(axis=0) - reach_m).tolist()
+        high = self._cells_of(points.max(axis=0) + reach_m).tolist()
+        x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
+        return list(itertools.product(x, y, z))
+
+    def _search_empty_cell(self, found: NearestUnknown, points: Doubles, cell: RegionIndex) -> None:
+        """Nothing is known of a cell without a region."""
+        pitch = self._settings.region_pitch_m
+        middle = np.asarray(cell) * pitch
+        nearest = np.clip(points, middle - pitch / 2, middle + pitch / 2)
+        distance = np.linalg.norm(points - nearest, axis=1)
+        nearer = distance < found.distance
+        found.distance[nearer] = distance[nearer]
+        found.point[nearer] = nearest[nearer]
+
+    def _search_region(self, found: NearestUnknown, points: Doubles, region: MapRegion) -> None:
+        """Search what a region owns of the space around."""
+        leaf_m = self._settings.leaf_m
+        voxels = leaf_coordinates(self._settings, points - region.centre)
+        distances = found.distance / leaf_m
+        before = distances.copy()
+        nearest = np.empty((len(points), 3))
+        region.evidence.find_unknown(voxels, owned_blocks(self._settings), distances, nearest)
+        nearer = distances < before
+        found.distance[nearer] = distances[nearer] * leaf_m
         corner = region.centre - self._settings.region_side_m / 2
-        nearest.take(near[hits] + (part.start or 0), found, corner, leaf_m, confidence)
+        found.point[nearer] = corner + nearest[nearer] * leaf_m

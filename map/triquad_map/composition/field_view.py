@@ -1,43 +1,54 @@
-"""The field and the status of a map of many regions."""
+"""The field and the status of a map of many regions.
 
-from collections.abc import Iterable, Sequence
+Regions stand on a fixed lattice and overlap. Each point is owned by the region whose centre is
+nearest and has the status that this one gives it; the field is blended where regions overlap. In
+its core, away from the overlap, a region is the only one that covers a point.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from triquad_format.records.arrays import Bytes, Doubles, Floats
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import leaf_coordinates
 from triquad_format.records.status import Status
 
-from triquad_map.composition.blended_field import BlendedField
-from triquad_map.composition.region import FieldRegion
-from triquad_map.composition.region_lattice import Lattice, Owned, RegionLattice
-from triquad_map.composition.split import Split, in_one
+from triquad_map.composition.region import FieldRegion, FieldValues, Split, in_one
 from triquad_map.view import FieldAnswer
 
 _REACH_VOXELS = 0.5
 """How far a surface is felt beyond the voxels in which rays ended."""
 
 
-class FieldView:
-    """Field and status of an immutable map, for any thread.
+@dataclass(frozen=True)
+class _Owned:
+    """Points of a query that one region answers for."""
 
-    Each point has one status, that of the region that owns it; the field is blended where regions
-    overlap.
-    """
+    region: FieldRegion
+    points: slice | NDArray[np.intp]  # which of the query's
+
+
+@dataclass(frozen=True)
+class _Owners:
+    """Who answers for N points."""
+
+    groups: Sequence[_Owned]  # the points that have an owner, region by region
+    shared: Bools  # [N] whether other regions may cover each point, too
+
+
+class FieldView:
+    """Field and status of an immutable map, for any thread."""
 
     def __init__(
-        self,
-        settings: FieldSettings,
-        regions: Sequence[FieldRegion],
-        lattice: Lattice | None = None,
-        split: Split = in_one,
+        self, settings: FieldSettings, regions: Sequence[FieldRegion], split: Split = in_one
     ) -> None:
-        """``lattice`` finds owners and ``split`` shares work; they differ in speed alone."""
+        """``split`` shares the work of a question among threads."""
         self._settings = settings
         self._field_regions = tuple(regions)
         self._split = split
-        self._field = BlendedField(settings, self._field_regions)
-        self._lattice = lattice or RegionLattice(settings, [region.index for region in regions])
+        self._cells = np.array([region.index for region in regions], np.float64).reshape(-1, 3).T
 
     def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
         """Signed distance, status and, on request, gradient at points [N, 3] of the map frame."""
@@ -48,12 +59,12 @@ class FieldView:
 
         def work(first: int, last: int) -> None:
             part = slice(first, last)
-            owners = self._lattice.owners(points[part])
-            values = self._field.values(points[part], owners, gradient)
+            owners = self._owners(points[part])
+            values = self._values(points[part], owners, gradient)
             sdf[part] = values.sdf
             if slopes is not None:
                 slopes[part] = values.gradient
-            status[part] = self._status(points[part], owners.groups, _REACH_VOXELS)
+            status[part] = self._status(points[part], owners, _REACH_VOXELS)
 
         self._split(count, work)
         return FieldAnswer(sdf, status, slopes)
@@ -63,9 +74,8 @@ class FieldView:
         distances = np.empty(len(points), np.float32)
 
         def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            owners = self._lattice.owners(points[part])
-            distances[part] = self._field.values(points[part], owners, False).sdf
+            part = points[first:last]
+            distances[first:last] = self._values(part, self._owners(part), False).sdf
 
         self._split(len(points), work)
         return distances
@@ -80,17 +90,108 @@ class FieldView:
         status = np.empty(len(points), np.uint8)
 
         def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            groups = self._lattice.owners(points[part]).groups
-            status[part] = self._status(points[part], groups, reach)
+            part = points[first:last]
+            status[first:last] = self._status(part, self._owners(part), reach)
 
         self._split(len(points), work)
         return status
 
-    def _status(self, points: Doubles, groups: Iterable[Owned], reach: float) -> Bytes:
+    def _owners(self, points: Doubles) -> _Owners:
+        """Who answers for points [N, 3], metres, map frame."""
+        # Axis by axis, which makes every step here one of long vectors.
+        places = np.ascontiguousarray(points.T) / self._settings.region_pitch_m
+        cells = np.floor(places + 0.5)
+        with np.errstate(invalid="ignore"):  # of points that are nowhere
+            places -= cells
+        core_m = self._settings.region_side_m / 2 - self._settings.overlap_m
+        off_m = np.abs(places, out=places).max(axis=0, initial=0.0) * self._settings.region_pitch_m
+        low = cells.min(axis=1, initial=np.inf)[:, None]
+        high = cells.max(axis=1, initial=-np.inf)[:, None]
+        outside = ((self._cells < low) | (self._cells > high)).any(axis=0)
+        groups = []
+        for number in np.flatnonzero(~outside).tolist():
+            region = self._field_regions[number]
+            if (low == high).all():
+                groups.append(_Owned(region, slice(None)))
+                continue
+            x, y, z = region.index
+            mine = np.flatnonzero((cells[0] == x) & (cells[1] == y) & (cells[2] == z))
+            if len(mine):
+                groups.append(_Owned(region, mine))
+        return _Owners(groups, off_m > core_m)
+
+    def _status(self, points: Doubles, owners: _Owners, reach: float) -> Bytes:
         status = np.full(len(points), Status.UNKNOWN, np.uint8)
-        for owned in groups:
-            region = self._field_regions[owned.region]
-            voxels = leaf_coordinates(self._settings, points[owned.points] - region.centre)
-            status[owned.points] = region.evidence.status(voxels, reach)
+        for owned in owners.groups:
+            offsets = points[owned.points] - owned.region.centre
+            voxels = leaf_coordinates(self._settings, offsets)
+            status[owned.points] = owned.region.evidence.status(voxels, reach)
         return status
+
+    def _values(self, points: Doubles, owners: _Owners, gradient: bool) -> FieldValues:
+        """The field at points [N, 3], whose owners are known."""
+        several = np.flatnonzero(owners.shared)
+        if len(owners.groups) == 1 and not len(several):
+            (owned,) = owners.groups
+            if isinstance(owned.points, slice):
+                return _owners_values(owned, points, gradient)
+        count = len(points)
+        values = FieldValues(
+            np.full(count, np.nan, np.float32),
+            np.full((count if gradient else 0, 3), np.nan, np.float32),
+        )
+        for owned in owners.groups:
+            _put(values, owned.points, _owners_values(owned, points, gradient))
+        if len(several):
+            _put(values, several, self._blend(points[several], gradient))
+        return values
+
+    def _blend(self, points: Doubles, gradient: bool) -> FieldValues:
+        """Blend the regions that cover each point, so that there is no step where they overlap."""
+        half = self._settings.region_side_m / 2
+        weight_sum = np.zeros(len(points))
+        value_sum = np.zeros(len(points))
+        slope_sum = np.zeros((len(points), 3))  # of weight * value
+        tilt_sum = np.zeros((len(points), 3))  # of weight
+        for region in self._field_regions:
+            offsets = points - region.centre
+            mine = np.flatnonzero((np.abs(offsets) < half).all(axis=1))
+            if len(mine) == 0:
+                continue
+            inside = half - np.abs(offsets[mine])
+            ramps = np.clip(inside / self._settings.overlap_m, 0, 1)
+            weights = ramps.prod(axis=1)
+            values = region.engine.evaluate(offsets[mine].astype(np.float32), gradient)
+            weight_sum[mine] += weights
+            value_sum[mine] += weights * values.sdf
+            if gradient:
+                tilt = _ramp_gradient(offsets[mine], ramps, self._settings.overlap_m)
+                slope_sum[mine] += weights[:, None] * values.gradient + tilt * values.sdf[:, None]
+                tilt_sum[mine] += tilt
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sdf = value_sum / weight_sum
+            slopes = (slope_sum - sdf[:, None] * tilt_sum) / weight_sum[:, None]
+        slopes = slopes[: len(points) if gradient else 0]
+        return FieldValues(sdf.astype(np.float32), slopes.astype(np.float32))
+
+
+def _owners_values(owned: _Owned, points: Doubles, gradient: bool) -> FieldValues:
+    """The field of the region that owns some of the points [N, 3]."""
+    local = (points[owned.points] - owned.region.centre).astype(np.float32)
+    return owned.region.engine.evaluate(local, gradient)
+
+
+def _put(values: FieldValues, where: slice | NDArray[np.intp], new: FieldValues) -> None:
+    """Put ``new`` values in their places."""
+    values.sdf[where] = new.sdf
+    if len(values.gradient):
+        values.gradient[where] = new.gradient
+
+
+def _ramp_gradient(offsets: Doubles, ramps: Doubles, overlap_m: float) -> Doubles:
+    """Gradient [N, 3] of the product of the three ramps."""
+    slopes = np.where((ramps > 0) & (ramps < 1), -np.sign(offsets) / overlap_m, 0.0)
+    others = np.stack(
+        [ramps[:, 1] * ramps[:, 2], ramps[:, 0] * ramps[:, 2], ramps[:, 0] * ramps[:, 1]], axis=1
+    )
+    return slopes * others

@@ -1,12 +1,16 @@
-"""What one region of a map can do. The composition is put together from this alone."""
+"""What one region of a map can do; the composition is put together from this alone."""
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
-from triquad_format.records.region import RegionIndex
+import numpy as np
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import RegionIndex, region_centre
 
-from triquad_map.nearest import NearestSurfels
+from triquad_map.surface import FieldSample, SampleField
 
 
 @dataclass(frozen=True)
@@ -24,22 +28,18 @@ class FieldEngine(Protocol):
         """The field at points [N, 3], metres from the region's centre."""
 
 
-class SeenStatus(Protocol):
-    """What tells the status of a region's points."""
-
-    def status(self, voxels: Doubles, reach: float) -> Bytes:
-        """Status values [N] at leaf coordinates [N, 3].
-
-        ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
-        """
-
-
-class SeenSpace(SeenStatus, Protocol):
+class SeenSpace(Protocol):
     """What rays have shown of a region."""
 
     @property
     def newest_s(self) -> int:
         """When a ray last ended anywhere, seconds since 1970; 0: never, or not known."""
+
+    def status(self, voxels: Doubles, reach: float) -> Bytes:
+        """Values of :class:`Status` [N] at leaf coordinates [N, 3].
+
+        ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
+        """
 
     def find_unknown(
         self, voxels: Doubles, blocks: range, distances: Doubles, nearest: Doubles
@@ -49,6 +49,23 @@ class SeenSpace(SeenStatus, Protocol):
         Points are leaf coordinates, as are the ``nearest`` [N, 3] of unknown space; distances are
         in voxels. Only blocks whose indices are in ``blocks`` on each axis are searched.
         """
+
+
+class NearestSurfels(NamedTuple):
+    """The nearest surfels of N points of one region, in leaf coordinates; improved in place."""
+
+    distances: Doubles  # [N] voxels; what lies farther than this is not searched for
+    closest: Doubles  # [N, 3] their points that are nearest
+    means: Doubles  # [N, 3] about the same, over all that is nearly as near
+    rows: Ints  # [N] number of the surfel, -1 where there is none
+
+
+def no_surfels(limits: Doubles) -> NearestSurfels:
+    """What is known of points before surfels less than ``limits`` [N] voxels away are found."""
+    count = len(limits)
+    return NearestSurfels(
+        limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.int32)
+    )
 
 
 class RegionSurfels(Protocol):
@@ -84,7 +101,7 @@ class FieldRegion(Protocol):
         """What computes its field."""
 
     @property
-    def evidence(self) -> SeenStatus:
+    def evidence(self) -> SeenSpace:
         """What rays have shown of it."""
 
 
@@ -92,9 +109,70 @@ class MapRegion(FieldRegion, Protocol):
     """A region of which all is known; surfels may be made when they are asked for."""
 
     @property
-    def evidence(self) -> SeenSpace:
-        """What rays have shown of it."""
+    def surfels(self) -> RegionSurfels:
+        """What stands for its surface. Not to be asked for within a :class:`Split`."""
+
+
+Work = Callable[[int, int], None]
+"""Does the part ``range(first, last)`` of some work."""
+
+
+class Split(Protocol):
+    """Runs work over ``range(count)``, in parts at the same time where it is worth it."""
+
+    def __call__(self, count: int, work: Work, least: int = ...) -> None:
+        """``least`` is how many a part has at least, where the default is too many."""
+
+
+def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
+    """A :class:`Split` for the caller's thread alone."""
+    work(0, count)
+
+
+def field_samples(engine: FieldEngine, settings: FieldSettings, split: Split) -> SampleField:
+    """The field of a region in voxels, at its leaf coordinates."""
+    middle = 1 << (settings.depth - 1)
+
+    def sample(voxels: Doubles) -> FieldSample:
+        local = ((voxels - middle) * settings.leaf_m).astype(np.float32)
+        values = np.empty(len(local), np.float32)
+        gradients = np.empty((len(local), 3), np.float32)
+
+        def work(first: int, last: int) -> None:
+            part = engine.evaluate(local[first:last], True)
+            values[first:last] = part.sdf / settings.leaf_m
+            gradients[first:last] = part.gradient
+
+        split(len(local), work)
+        return FieldSample(values, gradients)
+
+    return sample
+
+
+class RecordedRegion:
+    """A region as a file holds it, whose surfels are fitted when they are first asked for."""
+
+    def __init__(
+        self,
+        settings: FieldSettings,
+        index: RegionIndex,
+        engine: FieldEngine,
+        evidence: SeenSpace,
+        fit: Callable[[], RegionSurfels],
+    ) -> None:
+        """``fit`` makes the surfels, which takes a while; it is called once at most."""
+        self.index = index
+        self.centre = region_centre(settings, index)
+        self.engine = engine
+        self.evidence = evidence
+        self._fit = fit
+        self._fitting = threading.Lock()
+        self._surfels: RegionSurfels | None = None
 
     @property
     def surfels(self) -> RegionSurfels:
-        """What stands for its surface. Not to be asked for within a :class:`Split`."""
+        """What stands for its surface; the first who asks waits until all are fitted."""
+        with self._fitting:
+            if self._surfels is None:
+                self._surfels = self._fit()
+            return self._surfels

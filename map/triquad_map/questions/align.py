@@ -9,8 +9,6 @@ from triquad_format.records.pose import orthonormal
 from triquad_format.records.status import Status
 
 from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.questions.pose import moved
-from triquad_map.questions.thinning import thinned
 from triquad_map.view import MapView
 
 _COARSE_POINTS = 500
@@ -242,3 +240,54 @@ def _judged(view: MapView, points: Doubles, found: _Found, options: AlignOptions
         points=len(points),
         epoch=view.epoch,
     )
+
+
+_CELLS = 1 << 20  # along an axis
+_MARGIN = 1.1
+"""More than are wanted, by so much, are as good: to thin once more changes nothing."""
+
+
+def thinned(points: Doubles, most: int) -> Doubles:
+    """Some ``most`` of points [N, 3], evenly in space: the first of each cell of a grid.
+
+    Points that are not finite are left out. What was thinned before stays as it is.
+
+    Raises:
+        ValueError: ``points`` are not of this shape.
+    """
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points have the shape {points.shape}: give [N, 3]")
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) <= _MARGIN * most:
+        return points
+    offsets = points - np.median(points, axis=0)
+    # From cells of which the surfaces in sight fill more, to those of which they do not.
+    side_m = max(float(np.median(np.abs(offsets))), 1e-3) / 256
+    while True:
+        cells = np.clip(np.floor(offsets / side_m) + _CELLS / 2, 0, _CELLS - 1).astype(np.int64)
+        keys = (cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2]
+        first = np.sort(np.unique(keys, return_index=True)[1])
+        points, offsets = points[first], offsets[first]
+        if len(points) <= _MARGIN * most:
+            return points
+        side_m *= max(1.1, math.sqrt(len(points) / most))
+
+
+def moved(pose: Doubles, translation: Doubles, rotation: Doubles) -> Doubles:
+    """A pose moved [3], and turned about itself by a rotation vector [3], both in the map frame."""
+    result: Doubles = pose.copy()
+    result[:3, :3] = _rotation(rotation) @ pose[:3, :3]
+    result[:3, 3] += translation
+    return result
+
+
+def _rotation(vector: Doubles) -> Doubles:
+    """The rotation [3, 3] about a vector [3] by its length (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    first = float(np.sinc(angle / math.pi))
+    second = 0.5 * float(np.sinc(angle / (2 * math.pi))) ** 2
+    rotation: Doubles = np.eye(3) + first * cross + second * (cross @ cross)
+    return rotation

@@ -2,20 +2,47 @@
 
 import dataclasses
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
+from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
-from triquad_map.nearest import NearestSurface
-from triquad_map.unknown import Unknown, refuse_unknown
-from triquad_map.view import MapView
+from triquad_map.view import MapView, NearestSurface
 
 _FIELD_VOXELS = 0.5
 """Up to here the trained field counts alone."""
 
 _SURFEL_VOXELS = 1.5
 """From here on the distance to the surfels counts alone."""
+
+
+class UnknownSpaceError(TriquadError):
+    """What was asked about meets unknown space, which was to count as an error."""
+
+    def __init__(self, what: str, index: int, count: int) -> None:
+        others = f", and {count - 1} others do" if count > 1 else ""
+        super().__init__(
+            f"{what} {index} meets unknown space{others}: look there first, or let unknown space "
+            "count as 'obstacle' or 'free'"
+        )
+        self.index = index
+        self.count = count
+
+
+class Unknown(str, Enum):
+    """What unknown space counts as."""
+
+    OBSTACLE = "obstacle"
+    FREE = "free"
+    ERROR = "error"  # to meet it raises UnknownSpaceError
+
+
+def refuse_unknown(what: str, meets: Bools) -> None:
+    """Raise :class:`UnknownSpaceError` where any of N things meets unknown space."""
+    if meets.any():
+        raise UnknownSpaceError(what, int(meets.argmax()), int(meets.sum()))
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles
 from triquad_format.records.status import Status
 
-from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.unknown import Unknown, refuse_unknown
+from triquad_map.questions.distance import DistanceOptions, Unknown, distances, refuse_unknown
 from triquad_map.view import MapView
 
 

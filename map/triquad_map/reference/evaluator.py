@@ -12,12 +12,10 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord, Region
 
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.composition.field_samples import field_samples
-from triquad_map.composition.recorded_region import RecordedRegion
-from triquad_map.composition.split import Work
-from triquad_map.reference.fitted_surfels import FittedSurfels
+from triquad_map.composition.region import RecordedRegion, Work, field_samples
 from triquad_map.reference.region_field import RegionField
 from triquad_map.reference.seen_blocks import SeenBlocks
+from triquad_map.reference.surfel_cloud import fitted_surfels
 from triquad_map.view import FieldAnswer
 
 CHUNK_POINTS = 65_536
@@ -53,12 +51,12 @@ def _recorded(settings: FieldSettings, region: Region) -> RecordedRegion:
         region.index,
         engine,
         evidence,
-        lambda: FittedSurfels.of(region.evidence, evidence, field),
+        lambda: fitted_surfels(region.evidence, evidence, field),
     )
 
 
 def in_chunks(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
-    """A :class:`~triquad_map.composition.split.Split` that bounds memory."""
+    """A :class:`~triquad_map.composition.region.Split` that bounds memory."""
     for first in range(0, count, CHUNK_POINTS):
         work(first, min(first + CHUNK_POINTS, count))
 

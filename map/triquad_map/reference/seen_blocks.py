@@ -11,7 +11,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, Evidence
 from triquad_format.records.status import Status
 
-from triquad_map.reference.coded_rows import ONE_CELL, CodedRows, FoundRows
+from triquad_map.reference.coded_rows import ONE_CELL, CodedRows
 
 _BLOCKS_AT_ONCE = 2048
 
@@ -34,10 +34,7 @@ class SeenBlocks:
             self.newest_s = max(self.newest_s, int(evidence.seen_s.max(initial=0)))
 
     def status(self, voxels: Doubles, reach: float) -> Bytes:
-        """Status values [N] at leaf coordinates [N, 3].
-
-        ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
-        """
+        """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
         free = self._holds(self._free, np.floor(voxels).astype(np.int64))
         status = np.where(free, Status.FREE, Status.UNKNOWN).astype(np.uint8)
         low = np.floor(voxels - reach).astype(np.int64)
@@ -93,11 +90,11 @@ class SeenBlocks:
             bits = np.unpackbits(masks[first : first + _BLOCKS_AT_ONCE], axis=1, bitorder="little")
             _search_inside(voxels, low[some], going[some], bits.astype(np.bool_), squares, nearest)
 
-    def _holds(self, masks: CodedRows[np.uint8], voxels: Longs) -> Bools:
+    def _holds(self, masks: CodedRows, voxels: Longs) -> Bools:
         """Whether the bits of voxels [N, 3] are set."""
         inside = np.all((voxels >= 0) & (voxels < self._side), axis=1)
         blocks, inner = np.divmod(np.where(inside[:, None], voxels, 0), BLOCK_VOXELS)
-        found: FoundRows[np.uint8] = masks.find(morton.encode(blocks))
+        found = masks.find(morton.encode(blocks))
         octets = found.rows[np.arange(len(voxels)), inner[:, 0] * BLOCK_VOXELS + inner[:, 1]]
         return np.asarray(inside & (octets >> inner[:, 2] & 1 == 1), np.bool_)
 

@@ -4,11 +4,21 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Doubles, Longs
-from triquad_format.records.region import BLOCK_VOXELS
+from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
+from triquad_format.records.region import BLOCK_VOXELS, Evidence, seen_voxels, surface_counts
 
-from triquad_map.nearest import NearestSurfels
-from triquad_map.surface.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind, Surfels
+from triquad_map.composition.region import NearestSurfels
+from triquad_map.reference.seen_blocks import SeenBlocks
+from triquad_map.surface import (
+    DISC_RADIUS,
+    OUTSIDE,
+    SMOOTHING,
+    SampleField,
+    SurfelKind,
+    Surfels,
+    fit_surfels,
+    support_confidence,
+)
 
 _PAIRS = 1 << 19
 """Points with blocks or surfels that are compared together: what bounds the memory."""
@@ -17,8 +27,13 @@ _PAIRS = 1 << 19
 class SurfelCloud:
     """Surfels by blocks of voxels."""
 
-    def __init__(self, voxels: Longs, surfels: Surfels) -> None:
-        """``surfels`` of ``voxels`` [S, 3], of which those of a block follow each other."""
+    def __init__(self, voxels: Longs, surfels: Surfels, confidence: Floats, seen_s: Longs) -> None:
+        """``surfels`` of ``voxels`` [S, 3], of which those of a block follow each other.
+
+        Each has a ``confidence`` [S], and was ``seen_s`` [S] last, seconds since 1970.
+        """
+        self.confidence = confidence
+        self.seen_s = seen_s
         kept = np.flatnonzero(surfels.kinds != SurfelKind.NONE)
         self._rows = kept
         self._positions = voxels[kept] + 0.5 + surfels.offsets[kept]
@@ -29,6 +44,9 @@ class SurfelCloud:
         first[1:] = (cells[1:] != cells[:-1]).any(axis=1)
         self._starts = np.append(np.flatnonzero(first), len(cells))
         self._corners = cells[first] * BLOCK_VOXELS
+
+    def __len__(self) -> int:
+        return len(self.confidence)
 
     def find_nearest(self, points: Doubles, found: NearestSurfels) -> None:
         """Improve ``found`` where a surfel lies nearer to ``points`` [N, 3], voxels."""
@@ -121,3 +139,13 @@ def _portions(sizes: Longs) -> Iterator[slice]:
         last = max(first + 1, int(np.searchsorted(ends, before + _PAIRS, "right")))
         yield slice(first, last)
         first = last
+
+
+def fitted_surfels(record: Evidence, seen: SeenBlocks, field: SampleField) -> SurfelCloud:
+    """The surfels of all voxels in which rays ended; ``seen`` holds what ``record`` does."""
+    voxels = seen_voxels(record, record.surface)
+    surfels = fit_surfels(voxels, field, seen.ended_in)
+    levels = np.zeros(len(voxels), np.uint8) if record.levels is None else record.levels
+    seen_s = np.zeros(len(record.codes), np.int64) if record.seen_s is None else record.seen_s
+    seen_s = np.repeat(seen_s, surface_counts(record.surface))
+    return SurfelCloud(voxels, surfels, support_confidence(levels, surfels.kinds), seen_s)

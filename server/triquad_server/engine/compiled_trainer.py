@@ -3,8 +3,7 @@
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from triquad_map.compiled.field.field import Touched, accumulate
-from triquad_map.compiled.field.frozen_field import make_field
+from triquad_map.compiled.field.field import Touched, accumulate, make_field
 from triquad_map.compiled.field.mlp import Mlp
 from triquad_map.compiled.team import THREADS, Team, share
 

@@ -6,10 +6,13 @@ import torch
 from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
-from triquad_map.compiled.field import morton
-from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
-from triquad_map.compiled.field.vertices import PLANE_BITS
-from triquad_map.compiled.sparse.voxel_index import MULTIPLIER, longest_probe
+from triquad_map.compiled.field.quadtree import (
+    PLANE_BITS,
+    FrozenQuadtree,
+    LiveQuadtree,
+    morton_code,
+)
+from triquad_map.compiled.voxel_index import MULTIPLIER, longest_probe
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class CornerIndex:
         side = 1 << self._settings.levels[0]
         inside = ((block >= 0) & (block < side)).all(dim=1)
         block = block.clamp(0, side - 1)
-        keys = morton.encode(block[:, 0], block[:, 1]) + (plane << PLANE_BITS)
+        keys = morton_code(block[:, 0], block[:, 1]) + (plane << PLANE_BITS)
         mask = len(self._keys) - 1
         slots = ((keys * MULTIPLIER) >> 32) & mask
         numbers = torch.zeros_like(self._numbers[slots])

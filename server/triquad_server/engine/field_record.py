@@ -15,7 +15,7 @@ from triquad_format.records.region import (
     TrainingState,
     VertexTable,
 )
-from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
 
 from triquad_server.engine.batch import Batch
 from triquad_server.engine.live_field import LiveField, StoredField

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.frozen_field import FieldArrays, FrozenCompiledField
+from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
 from triquad_map.composition.region import FieldEngine
 

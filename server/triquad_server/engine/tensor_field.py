@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.frozen_field import FieldArrays
+from triquad_map.compiled.field.field import FieldArrays
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
 from triquad_map.composition.region import FieldValues
 

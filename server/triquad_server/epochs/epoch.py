@@ -2,26 +2,33 @@
 
 from dataclasses import dataclass
 
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord
-from triquad_map.compiled.compiled_view import CompiledView, RegionView
-from triquad_map.composition.split import Split
+from triquad_format.records.region import MapRecord, RegionIndex
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.surfels.surfel_map import SurfelMap
+from triquad_map.composition.composed_view import ComposedView
+from triquad_map.composition.region import Split
 
 from triquad_server.engine.field_record import region_record
 from triquad_server.engine.live_field import FrozenField
 
 
 @dataclass(frozen=True)
-class FrozenRegion(RegionView):
+class FrozenRegion:
     """A region as it was when it was published."""
 
+    index: RegionIndex
+    centre: Doubles  # [3] map frame
     engine: FrozenField
+    evidence: FrozenEvidence
+    surfels: SurfelMap
     vertices: int
     parameters: int
     changed: int  # epoch of its last change
 
 
-class Epoch(CompiledView):
+class Epoch(ComposedView):
     """An immutable map: every answer comes from the same state. Safe to read from any thread."""
 
     def __init__(

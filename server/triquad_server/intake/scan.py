@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Longs
 from triquad_format.records.pose import is_rigid, rotation_error
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.thinning import enter
-from triquad_map.compiled.sparse.voxel_index import empty_keys
+from triquad_map.compiled.voxel_index import empty_keys, enter
 
 from triquad_server.settings import ScanSettings
 

@@ -13,12 +13,12 @@ from triquad_format.records.region import (
     leaf_coordinates,
     region_centre,
 )
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
-from triquad_map.compiled.sparse.thinning import thin
-from triquad_map.compiled.surfels.surfel_map import SurfelTask, first_surfels
+from triquad_map.compiled.surfels.surfel_map import first_surfels
 from triquad_map.compiled.team import Team
-from triquad_map.composition.field_samples import field_samples
+from triquad_map.compiled.voxel_index import thin
+from triquad_map.composition.region import field_samples
 
 from triquad_server.engine.adam import Rates
 from triquad_server.engine.compiled_trainer import GradientSums
@@ -177,11 +177,11 @@ class LiveRegion:
         self.changed = False
         field, evidence = self.field.freeze(), self.evidence.freeze()
         samples = field_samples(field, self._settings, self._setup.team.split)
-        task = SurfelTask(epoch, _SURFELS_REFITTED if self.budget_samples else None)
+        most = _SURFELS_REFITTED if self.budget_samples else None
         surfels = (
-            first_surfels(evidence, samples, task)
+            first_surfels(evidence, samples, epoch)
             if before is None
-            else before.surfels.updated(evidence, samples, task)
+            else before.surfels.updated(evidence, samples, epoch, most)
         )
         return FrozenRegion(
             index=self.index,

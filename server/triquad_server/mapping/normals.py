@@ -8,16 +8,16 @@ fine grid serves where it has a plane, the coarse one where it has not.
 import numpy as np
 from numpy.typing import NDArray
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.rows import with_room
-from triquad_map.compiled.sparse.voxel_index import (
+from triquad_map.compiled.team import Team
+from triquad_map.compiled.voxel_index import (
     Index,
     VoxelIndex,
     find_row,
     make_row,
     pack,
     unpack,
+    with_room,
 )
-from triquad_map.compiled.team import Team
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.rows import with_room
 from triquad_map.compiled.team import Team
+from triquad_map.compiled.voxel_index import with_room
 
 from triquad_server.engine.batch import Batch
 from triquad_server.mapping.ray_intervals import COLUMNS, END

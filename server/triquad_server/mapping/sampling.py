@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_map.compiled.field.feature_rows import prefetch_row
-from triquad_map.compiled.field.morton import encode
+from triquad_map.compiled.field.quadtree import morton_code
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 
@@ -79,7 +79,7 @@ def _draw(
         samples[i, 3] = row[LABEL] - offset * row[SLOPE]
         u = min(max(int(samples[i, 0] * per_m + _CELLS), 0), 2 * _CELLS - 1)
         v = min(max(int(samples[i, 1] * per_m + _CELLS), 0), 2 * _CELLS - 1)
-        cells[i] = encode(u, v)
+        cells[i] = morton_code(u, v)
 
 
 @kernel()

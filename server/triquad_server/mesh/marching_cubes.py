@@ -15,7 +15,7 @@ takes 4 ms for a tile of 64^3 cells, without Python's lock: the other takes 8 ms
 import numpy as np
 from numpy.typing import NDArray
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.voxel_index import EMPTY, empty_keys, find_slot
+from triquad_map.compiled.voxel_index import EMPTY, empty_keys, find_slot
 
 # A corner of a cell is 4 x + 2 y + z; the edge from corner c along axis a is 3 c + a.
 _AXIS_BIT = (4, 2, 1)

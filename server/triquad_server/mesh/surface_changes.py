@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import RegionIndex
-from triquad_map.compiled.surfels.surfel_index import surfel_voxels
+from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.compiled.team import Team
 
 from triquad_server.epochs.epoch import FrozenRegion

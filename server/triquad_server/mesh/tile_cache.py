@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
-from triquad_map.compiled.compiled_view import CompiledView
 from triquad_map.compiled.team import Team
+from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.mesher import TileIndex, mesh_tile
@@ -35,7 +35,7 @@ class TileCache:
         self._levels = [TileLevel(tile_lattice(settings, level)) for level in range(LEVELS)]
         self._changes: SurfaceChanges | None = None
         self._epoch: Epoch | None = None
-        self._view: CompiledView | None = None  # of that epoch
+        self._view: ComposedView | None = None  # of that epoch
         self._revision = 0
         self._made = 0
         self._bytes = TileBytes(settings.cache_bytes)
@@ -81,7 +81,7 @@ class TileCache:
                 level.record(changes, epoch.field_settings.leaf_m / 2, epoch.number)
             self._epoch = epoch
             # The threads that answer queries are spared: these give way to them.
-            self._view = CompiledView(
+            self._view = ComposedView(
                 epoch.number, epoch.field_settings, epoch.frozen_regions, self._team.split
             )
 
@@ -151,7 +151,7 @@ class TileCache:
         tiles: TileLevel,
         index: TileIndex,
         borders: Mapping[TileIndex, TileBorder],
-        view: CompiledView,
+        view: ComposedView,
     ) -> Iterator[TileBorder]:
         """The borders to be taken over; tiles of others will have to be made again.
 

@@ -7,7 +7,7 @@ from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
 from triquad_map.questions.distance import DistanceOptions, Distances, distances
 from triquad_map.questions.spheres import spheres
-from triquad_map.surface.confidence import level_confidence
+from triquad_map.surface import level_confidence
 from triquad_map.view import MapView
 
 from triquad_tools.benchmarks.answer_probes import AnswerProbes, answer_probes

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 from triquad_client import Mesh
-from triquad_client.mesh.welding import Triangles, joined
+from triquad_client.mesh.mesh import Triangles, joined
 from triquad_format.records.region import MapRecord
 from triquad_map.view import MapView
 

@@ -43,7 +43,7 @@ from triquad_format.records.region import (
     VertexTable,
     surface_counts,
 )
-from triquad_format.wire.array import pack_array
+from triquad_format.wire.codec import pack_array
 
 SAMPLES_PER_PART = 1 << 17
 

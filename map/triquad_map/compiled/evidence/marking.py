@@ -4,11 +4,18 @@ Kernels stop where the index has no more room; the caller makes room and goes on
 """
 
 import numpy as np
-from triquad_format.records.arrays import Bytes, Doubles, Longs
+from triquad_format.records.arrays import Doubles, Longs
 
+from triquad_map.compiled.evidence.seen_voxels import (
+    LOW,
+    SeenVoxels,
+    bit_of,
+    block_key,
+    byte_of,
+    is_inside,
+)
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.voxel_bits import LOW, bit_of, block_key, byte_of, is_inside
-from triquad_map.compiled.sparse.voxel_index import Index, make_row
+from triquad_map.compiled.voxel_index import make_row
 
 Vector = tuple[float, float, float]
 
@@ -17,26 +24,20 @@ _NO_ROOM = -2
 
 @kernel()
 def mark_ends(
-    voxels: Doubles,
-    start: int,
-    side: int,
-    index: Index,
-    masks: Bytes,
-    count: int,
-    new: Longs,
-    found: int,
+    voxels: Doubles, start: int, seen: SeenVoxels, count: int, new: Longs, found: int
 ) -> tuple[int, int, int]:
     """Set the bits of the voxels holding points, and collect those that were not set before.
 
     Returns (points done, blocks in use, voxels collected).
     """
+    masks = seen.surface
     for i in range(start, len(voxels)):
         x = int(np.floor(voxels[i, 0]))
         y = int(np.floor(voxels[i, 1]))
         z = int(np.floor(voxels[i, 2]))
-        if not is_inside(x, y, z, side):
+        if not is_inside(x, y, z, seen.side):
             continue
-        row = make_row(index, count, block_key(x, y, z))
+        row = make_row(seen.blocks, count, block_key(x, y, z))
         if row < 0:
             return i, count, found
         count = max(count, row + 1)
@@ -79,13 +80,12 @@ def _part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[flo
 
 
 @kernel()
-def _walk(
-    at: Vector, way: Vector, reach: float, side: int, index: Index, masks: Bytes, count: int
-) -> int:
+def _walk(at: Vector, way: Vector, reach: float, seen: SeenVoxels, count: int) -> int:
     """Set the bits of the voxels on a way (Amanatides and Woo 1987).
 
     Returns the blocks in use, or ``_NO_ROOM``.
     """
+    side, index, _, masks = seen
     x, y, z = int(np.floor(at[0])), int(np.floor(at[1])), int(np.floor(at[2]))
     step_x, apart_x, next_x = _crossing(at[0], way[0])
     step_y, apart_y, next_y = _crossing(at[1], way[1])
@@ -123,14 +123,7 @@ def _walk(
 
 @kernel()
 def mark_crossed(
-    origin: Doubles,
-    ends: Doubles,
-    start: int,
-    stop_short: float,
-    side: int,
-    index: Index,
-    masks: Bytes,
-    count: int,
+    origin: Doubles, ends: Doubles, start: int, stop_short: float, seen: SeenVoxels, count: int
 ) -> tuple[int, int]:
     """Set the bits of the voxels that rays cross, each ``stop_short`` voxels less than its length.
 
@@ -143,11 +136,11 @@ def mark_crossed(
         if length <= stop_short:
             continue
         way = (dx / length, dy / length, dz / length)
-        first, last = _part_inside(at, way, length - stop_short, side)
+        first, last = _part_inside(at, way, length - stop_short, seen.side)
         if first > last:
             continue
         begin = (at[0] + first * way[0], at[1] + first * way[1], at[2] + first * way[2])
-        used = _walk(begin, way, last - first, side, index, masks, count)
+        used = _walk(begin, way, last - first, seen, count)
         if used == _NO_ROOM:
             return i, count
         count = used

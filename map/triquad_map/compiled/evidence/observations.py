@@ -7,21 +7,26 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, surface_counts
 
+from triquad_map.compiled.evidence.seen_voxels import (
+    LOW,
+    SHIFT,
+    SeenVoxels,
+    block_key,
+    byte_of,
+    is_inside,
+)
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.rows import with_room
-from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT, block_key, byte_of, is_inside
-from triquad_map.compiled.sparse.voxel_index import Index, find_row
-from triquad_map.surface.confidence import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
+from triquad_map.compiled.voxel_index import find_row, with_room
+from triquad_map.surface import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
 
 _VOXELS = BLOCK_VOXELS**3
-_NOWHERE = -1
 _MIN_CAPACITY = 64
 
 
 class Observed(NamedTuple):
     """The arrays of the observations, as kernels take them."""
 
-    places: Ints  # [blocks] where in the others a block of evidence stands; -1: none
+    places: Ints  # [blocks] where in the others a block of evidence stands; 0: nothing is known
     weights: Floats  # [places, voxels] rays, the near ones counting more
     sectors: Bytes  # [places, voxels] a bit for each eighth of the horizon looked from
     seen_s: Longs  # [places] when the last ray ended in the block
@@ -48,8 +53,7 @@ def _sector(x: float, y: float) -> int:
 def _record(
     voxels: Doubles,
     start: int,
-    side: int,
-    blocks: Index,
+    seen: SeenVoxels,
     sighting: Sighting,
     observed: Observed,
     count: int,
@@ -60,11 +64,11 @@ def _record(
         x = int(np.floor(voxels[i, 0]))
         y = int(np.floor(voxels[i, 1]))
         z = int(np.floor(voxels[i, 2]))
-        if not is_inside(x, y, z, side):
+        if not is_inside(x, y, z, seen.side):
             continue
-        row = find_row(blocks, block_key(x, y, z))
+        row = find_row(seen.blocks, block_key(x, y, z))
         place = observed.places[row]
-        if place == _NOWHERE:
+        if place == 0:
             if count == len(observed.seen_s):
                 return i, count
             place = count
@@ -94,7 +98,7 @@ def _level(weight: float, sectors: int) -> int:
 
 @kernel()
 def _levels(surface: Bytes, observed: Observed, levels: Bytes) -> None:
-    """Fill in the ``levels`` of the voxels of ``surface``; those of rows without a place stay."""
+    """Fill in the ``levels`` of the voxels of ``surface``."""
     at = 0
     for row in range(len(surface)):
         place = observed.places[row]
@@ -104,25 +108,10 @@ def _levels(surface: Bytes, observed: Observed, levels: Bytes) -> None:
                 continue
             for z in range(BLOCK_VOXELS):
                 if bits >> z & 1:
-                    if place != _NOWHERE:
-                        voxel = byte << SHIFT | z
-                        weight = observed.weights[place, voxel]
-                        levels[at] = _level(weight, observed.sectors[place, voxel])
+                    voxel = byte << SHIFT | z
+                    weight = observed.weights[place, voxel]
+                    levels[at] = _level(weight, observed.sectors[place, voxel])
                     at += 1
-
-
-@kernel()
-def _restore(surface: Bytes, levels: Bytes, observed: Observed) -> None:
-    """Give the voxels of ``surface`` the least strength of their levels, seen from one sector."""
-    at = 0
-    for row in range(len(surface)):
-        for voxel in range(_VOXELS):
-            if surface[row, voxel >> SHIFT] >> (voxel & LOW) & 1:
-                if levels[at] > 0:
-                    strength = LEAST_STRENGTH * (1 << (levels[at] - 1))
-                    observed.weights[observed.places[row], voxel] = np.float32(strength)
-                    observed.sectors[observed.places[row], voxel] = 1
-                at += 1
 
 
 class Observations:
@@ -130,74 +119,70 @@ class Observations:
 
     def __init__(self, blocks: int) -> None:
         """``blocks`` is how many rows there is room for."""
-        self._count = 0
+        self._count = 1  # places in use
         self._observed = _arrays(blocks, _MIN_CAPACITY)
 
-    def record(self, voxels: Doubles, side: int, blocks: Index, sighting: Sighting) -> None:
-        """Count rays that ended at ``voxels`` [N, 3], whose ``blocks`` are all there."""
-        self._make_room(len(blocks.row_keys))
+    def make_room(self, blocks: int) -> None:
+        """Make room for so many rows."""
+        places = with_room(self._observed.places, blocks)
+        self._observed = self._observed._replace(places=places)
+
+    def record(self, voxels: Doubles, seen: SeenVoxels, sighting: Sighting) -> None:
+        """Count rays that ended at ``voxels`` [N, 3], whose blocks are all in ``seen``."""
         done = 0
         while done < len(voxels):
-            done, self._count = _record(
-                voxels, done, side, blocks, sighting, self._observed, self._count
-            )
+            done, self._count = _record(voxels, done, seen, sighting, self._observed, self._count)
             if done < len(voxels):
-                self._grow(2 * len(self._observed.seen_s))
+                self._grow()
 
     def levels(self, surface: Bytes) -> Bytes:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
-        levels = np.zeros(int(surface_counts(surface).sum()), np.uint8)
-        self._make_room(len(surface))
+        levels = np.empty(int(surface_counts(surface).sum()), np.uint8)
         _levels(surface, self._observed, levels)
         return levels
 
     def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
-        self._make_room(blocks)
-        places = self._observed.places[:blocks]
-        return np.where(places == _NOWHERE, 0, self._observed.seen_s[places])
+        return self._observed.seen_s[self._observed.places[:blocks]]
 
     def forget(self, blocks: NDArray[np.intp], surface: Bytes) -> None:
         """Forget, in the rows ``blocks`` [N], voxels that are not set in ``surface`` any more."""
-        self._make_room(len(surface))
-        rows = blocks[self._observed.places[blocks] != _NOWHERE]
-        kept = np.unpackbits(surface[rows], axis=1, bitorder="little")
-        places = self._observed.places[rows]
+        places = self._observed.places[blocks]
+        kept = np.unpackbits(surface[blocks], axis=1, bitorder="little")
         self._observed.weights[places] *= kept
         self._observed.sectors[places] *= kept
 
     @classmethod
     def restore(cls, surface: Bytes, levels: Bytes, seen_s: Longs) -> "Observations":
         """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels."""
-        observations = cls(len(surface))
         used = np.flatnonzero(surface.any(axis=1))
-        observations._count = len(used)
-        observations._observed = _arrays(len(surface), max(_MIN_CAPACITY, 2 * len(used)))
-        observations._observed.places[used] = np.arange(len(used))
-        observations._observed.seen_s[: len(used)] = seen_s[used]
-        _restore(surface, levels, observations._observed)
+        places = slice(1, 1 + len(used))
+        observed = _arrays(len(surface), max(_MIN_CAPACITY, 2 * len(used)))
+        observed.places[used] = np.arange(1, 1 + len(used))
+        observed.seen_s[places] = seen_s[used]
+        # The least strength of each level, seen from one sector.
+        ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
+        known = levels > 0
+        observed.weights[places][ended] = known * LEAST_STRENGTH * 2.0 ** (levels - 1.0)
+        observed.sectors[places][ended] = known
+        observations = cls(len(surface))
+        observations._count, observations._observed = 1 + len(used), observed
         return observations
 
-    def _make_room(self, blocks: int) -> None:
-        known = len(self._observed.places)
-        if blocks > known:
-            places = np.full(blocks, _NOWHERE, np.int32)
-            places[:known] = self._observed.places
-            self._observed = self._observed._replace(places=places)
-
-    def _grow(self, capacity: int) -> None:
-        old = self._observed
+    def _grow(self) -> None:
+        places, weights, sectors, seen_s = self._observed
+        capacity = 2 * len(seen_s)
         self._observed = Observed(
-            old.places,
-            with_room(old.weights, capacity),
-            with_room(old.sectors, capacity),
-            with_room(old.seen_s, capacity),
+            places,
+            with_room(weights, capacity),
+            with_room(sectors, capacity),
+            with_room(seen_s, capacity),
         )
 
 
 def _arrays(blocks: int, capacity: int) -> Observed:
     return Observed(
-        np.full(blocks, _NOWHERE, np.int32),
+        np.zeros(blocks, np.int32),
         np.zeros((capacity, _VOXELS), np.float32),
         np.zeros((capacity, _VOXELS), np.uint8),
         np.zeros(capacity, np.int64),

@@ -4,10 +4,9 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
 
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT, SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.voxel_bits import LOW, SHIFT
-from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, find_row, pack
+from triquad_map.compiled.voxel_index import CELL_LIMIT, find_row, pack
 
 _SIDE = float(BLOCK_VOXELS)
 _ALL = 0xFF
@@ -95,11 +94,10 @@ def _search(at: Place, seen: SeenVoxels, cells: tuple[int, int], state: Doubles)
 def find_unknown(
     points: Doubles, seen: SeenVoxels, cells: tuple[int, int], distances: Doubles, nearest: Doubles
 ) -> None:
-    """Lower ``distances`` [N] to those from ``points`` [N, 3] to the nearest unknown voxel.
+    """Find unknown voxels, see :class:`triquad_map.composition.region.SeenSpace`.
 
-    Points are leaf coordinates of the region, as are the ``nearest`` [N, 3] of unknown space;
-    distances are in voxels. Only blocks whose indices are in ``range(*cells)`` on each axis are
-    searched; where there is none, all is unknown.
+    Only blocks whose indices are in ``range(*cells)`` on each axis are searched; where there is
+    none, all is unknown.
     """
     state = np.empty(4)
     for i in range(len(points)):

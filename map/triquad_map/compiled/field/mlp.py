@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Floats
 
-from triquad_map.compiled.field.batch import BATCH, PointBatch
+from triquad_map.compiled.field.encoding import BATCH, PointBatch
 from triquad_map.compiled.kernel import kernel
 
 _ZERO = np.float32(0)

@@ -1,26 +1,151 @@
-"""The three planar quadtrees of a region: which vertices exist, and which rows they own."""
+"""The three planar quadtrees of a region: which vertices exist, and which rows they own.
+
+A vertex is keyed by plane, level and 2-D Morton code (3QFP, section III-A). One hash table per
+plane and level would cost 12 H probes a point, so vertices are kept by *block*, a node of the
+coarsest level that carries features: a block holds the rows of all vertices within it and on its
+border (4 + 9 + 25 for H = 3), and one probe per plane finds them all. A vertex on a border is in
+all blocks that it touches.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numba.extending import register_jitable
 from triquad_format.records import morton
-from triquad_format.records.arrays import Longs
+from triquad_format.records.arrays import Bytes, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import AXES
 
-from triquad_map.compiled.field.vertices import (
-    NEW_BLOCKS,
-    NEW_ROWS,
-    Shape,
-    Vertices,
-    grow_vertices,
-    restore_vertices,
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.voxel_index import Index, VoxelIndex, make_row, with_room
+
+_SPREAD = (
+    (16, 0x0000FFFF0000FFFF),
+    (8, 0x00FF00FF00FF00FF),
+    (4, 0x0F0F0F0F0F0F0F0F),
+    (2, 0x3333333333333333),
+    (1, 0x5555555555555555),
 )
-from triquad_map.compiled.sparse.rows import with_room
-from triquad_map.compiled.sparse.voxel_index import VoxelIndex
 
+CoordinateT = TypeVar("CoordinateT")
+
+
+_AXES = np.array(AXES)
+PLANE_BITS = 40
+"""Keys of blocks are Morton codes below this bit, and the number of the plane above it."""
+
+_NEW_BLOCKS = 27  # at most, of a leaf: 9 on each plane
+_NEW_ROWS = 48  # and as many vertices: 4 on each plane and level
 _NO_BLOCK = -2  # key of row 0, which is found by no other
 _MIN_CAPACITY = 256
+
+
+class Vertices(NamedTuple):
+    """The arrays of a tree that grow with it, as kernels take them."""
+
+    blocks: Index  # rows of ``rows``, by the key of a block
+    rows: Ints  # [blocks, vertices of a block] of the feature table; 0 for an absent vertex
+    codes: Longs  # [rows] Morton code of each vertex
+    owners: Bytes  # [rows] its plane and level: ``1 + plane * H + h``
+
+
+class Shape(NamedTuple):
+    """The numbers of a tree that never change."""
+
+    levels: int  # H
+    limit: int  # blocks along the side of the cube
+    starts: Longs  # [H] first vertex of each level within a block
+
+
+@register_jitable
+def morton_code(first: CoordinateT, second: CoordinateT) -> CoordinateT:
+    """2-D Morton codes of non-negative int64 coordinates below 2**31: numbers or tensors.
+
+    Those of :mod:`triquad_format.records.morton`.
+    """
+    codes: CoordinateT = _spread(first) | (_spread(second) << 1)
+    return codes
+
+
+@register_jitable
+def _spread(bits: Any) -> Any:
+    for shift, mask in _SPREAD:
+        bits = (bits | (bits << shift)) & mask
+    return bits
+
+
+@kernel(inline="always")
+def block_key(plane: int, u: int, v: int) -> int:
+    """Key of the block ``(u, v)`` on a plane."""
+    key: int = morton_code(u, v) | (plane << PLANE_BITS)
+    return key
+
+
+@kernel()
+def _enter(
+    shape: Shape, vertices: Vertices, plane: int, h: int, u: int, v: int, row: int, count: int
+) -> int:
+    """Give ``row`` to vertex ``(u, v)`` in all blocks that it touches; returns the blocks now."""
+    side = (1 << h) + 1
+    for block_u in range((u - 1) >> h, (u >> h) + 1):
+        for block_v in range((v - 1) >> h, (v >> h) + 1):
+            if min(block_u, block_v) < 0 or max(block_u, block_v) >= shape.limit:
+                continue
+            block = make_row(vertices.blocks, count, block_key(plane, block_u, block_v))
+            count = max(count, block + 1)
+            local = (u - (block_u << h)) * side + v - (block_v << h)
+            vertices.rows[block, shape.starts[h] + local] = row
+    vertices.codes[row] = morton_code(u, v)
+    vertices.owners[row] = 1 + plane * shape.levels + h
+    return count
+
+
+@kernel()
+def grow_vertices(
+    shape: Shape, vertices: Vertices, leaves: Longs, start: int, blocks: int, rows: int
+) -> tuple[int, int, int]:
+    """Make the nodes that ``leaves`` project into; returns (leaves done, blocks, rows)."""
+    for i in range(start, len(leaves)):
+        if blocks + _NEW_BLOCKS > len(vertices.rows) or rows + _NEW_ROWS > len(vertices.codes):
+            return i, blocks, rows
+        for plane in range(3):
+            u, v = leaves[i, _AXES[plane, 0]], leaves[i, _AXES[plane, 1]]
+            for h in range(shape.levels):
+                down = shape.levels - 1 - h
+                node_u, node_v = u >> down, v >> down
+                block_u, block_v = node_u >> h, node_v >> h
+                block = make_row(vertices.blocks, blocks, block_key(plane, block_u, block_v))
+                blocks = max(blocks, block + 1)
+                for corner in range(4):
+                    corner_u, corner_v = node_u + (corner & 1), node_v + (corner >> 1)
+                    local = (corner_u - (block_u << h)) * ((1 << h) + 1) + corner_v - (block_v << h)
+                    if vertices.rows[block, shape.starts[h] + local] == 0:
+                        blocks = _enter(shape, vertices, plane, h, corner_u, corner_v, rows, blocks)
+                        rows += 1
+    return len(leaves), blocks, rows
+
+
+@kernel()
+def restore_vertices(
+    shape: Shape,
+    vertices: Vertices,
+    plane: int,
+    h: int,
+    coordinates: Longs,
+    start: int,
+    blocks: int,
+    rows: int,
+) -> tuple[int, int, int]:
+    """Give the next rows to vertices [V, 2]; returns (vertices done, blocks, rows)."""
+    for i in range(start, len(coordinates)):
+        if blocks + _NEW_BLOCKS > len(vertices.rows) or rows + _NEW_ROWS > len(vertices.codes):
+            return i, blocks, rows
+        u, v = coordinates[i, 0], coordinates[i, 1]
+        blocks = _enter(shape, vertices, plane, h, u, v, rows, blocks)
+        rows += 1
+    return len(coordinates), blocks, rows
 
 
 @dataclass(frozen=True)
@@ -112,13 +237,13 @@ class LiveQuadtree:
 
     def _make_room(self) -> None:
         """Make room for what one more leaf may need."""
-        if self._blocks.count + NEW_BLOCKS > self._blocks.capacity:
+        if self._blocks.count + _NEW_BLOCKS > self._blocks.capacity:
             self._blocks.grow()
             self.vertices = self.vertices._replace(
                 blocks=self._blocks.arrays,
                 rows=with_room(self.vertices.rows, self._blocks.capacity),
             )
-        if self._rows + NEW_ROWS > len(self.vertices.codes):
+        if self._rows + _NEW_ROWS > len(self.vertices.codes):
             capacity = 2 * len(self.vertices.codes)
             self.vertices = self.vertices._replace(
                 codes=with_room(self.vertices.codes, capacity),

@@ -1,31 +1,139 @@
-"""The surfels of a region at one epoch, kept up to date from those of the epoch before."""
+"""The surfels of a region at one epoch, kept up to date from those of the epoch before.
+
+Surfels stand in the order of the evidence: block by block, and within a block voxel by voxel.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Ints
+from triquad_format.records import morton
+from triquad_format.records.arrays import Bytes, Doubles, Ints, Longs
+from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, surface_counts
 
-from triquad_map.compiled.evidence.frozen_evidence import FrozenEvidence
-from triquad_map.compiled.surfels.surfel_index import (
-    SurfelPlaces,
-    moved_rows,
-    surfel_index,
-    surfel_places,
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.surfels.surfel_search import (
+    GROUP_SHIFT,
+    BlockGroups,
+    SurfelIndex,
+    find_nearest,
 )
-from triquad_map.compiled.surfels.surfel_search import find_nearest
-from triquad_map.nearest import NearestSurfels
-from triquad_map.surface.confidence import support_confidence
-from triquad_map.surface.surfels import SampleField, Surfels, fit_surfels
+from triquad_map.compiled.voxel_index import VoxelIndex
+from triquad_map.composition.region import NearestSurfels
+from triquad_map.surface import SampleField, SurfelKind, Surfels, fit_surfels, support_confidence
 
+_FAR = 1e6  # voxels
 _NEVER = -1
 
 
 @dataclass(frozen=True)
-class SurfelTask:
-    """What an update of surfels is to do."""
+class SurfelPlaces:
+    """Where the surfels of the voxels in which rays ended stand."""
 
-    epoch: int  # number of the epoch that they are for
-    most: int | None  # surfels that are fitted again at most, new ones apart; None: all
+    surface: Bytes  # [blocks, BLOCK_BYTES] these voxels
+    starts: Ints  # [blocks + 1] first surfel of each block
+    voxels: Longs  # [S, 3] voxel of each surfel
+    groups: BlockGroups
+
+
+def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
+    """Places for the voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks at ``cells`` [, 3]."""
+    starts = np.concatenate([[0], np.cumsum(surface_counts(surface))]).astype(np.int32)
+    voxels = surfel_voxels(cells, surface, int(starts[-1]))
+    return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface))
+
+
+def surfel_index(places: SurfelPlaces, surfels: Surfels) -> SurfelIndex:
+    """The ``surfels`` [S] that stand in some places."""
+    positions = (places.voxels % BLOCK_VOXELS).astype(np.float32)
+    positions += surfels.offsets + np.float32(0.5)
+    positions[surfels.kinds == SurfelKind.NONE] = _FAR
+    return SurfelIndex(
+        places.groups,
+        places.starts,
+        np.ascontiguousarray(positions.T),
+        surfels.normals,
+        surfels.kinds,
+    )
+
+
+@kernel()
+def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
+    """The voxels [count, 3] of surfels, given the blocks' ``cells`` [blocks, 3]."""
+    voxels = np.empty((count, 3), np.int64)
+    at = 0
+    for row in range(len(surface)):
+        for byte in range(BLOCK_BYTES):
+            bits = int(surface[row, byte])
+            for z in range(BLOCK_VOXELS):
+                if bits >> z & 1:
+                    voxels[at, 0] = (cells[row, 0] << SHIFT) + (byte >> SHIFT)
+                    voxels[at, 1] = (cells[row, 1] << SHIFT) + (byte & LOW)
+                    voxels[at, 2] = (cells[row, 2] << SHIFT) + z
+                    at += 1
+    return voxels
+
+
+@kernel()
+def moved_rows(before: Bytes, before_starts: Ints, now: Bytes, count: int) -> Ints:
+    """For each surfel [count] of ``now``, its number in ``before``; -1 where it is new.
+
+    Blocks are those of ``before`` and more.
+    """
+    rows = np.full(count, -1, np.int32)
+    at = 0
+    for row in range(len(now)):
+        known = row < len(before)
+        old = before_starts[row] if known else 0
+        for byte in range(BLOCK_BYTES):
+            bits = int(now[row, byte])
+            old_bits = int(before[row, byte]) if known else 0
+            for z in range(BLOCK_VOXELS):
+                if bits >> z & 1:
+                    if old_bits >> z & 1:
+                        rows[at] = old
+                    at += 1
+                old += old_bits >> z & 1
+    return rows
+
+
+@kernel()
+def _block_boxes(cells: Longs, surface: Bytes, rows: Longs) -> Ints:
+    """The boxes [M, 6] around the seen surface of some blocks."""
+    boxes = np.empty((len(rows), 6), np.int32)
+    for i, row in enumerate(rows):
+        for axis in range(3):
+            boxes[i, axis], boxes[i, axis + 3] = BLOCK_VOXELS, 0
+        for byte in range(BLOCK_BYTES):
+            for z in range(BLOCK_VOXELS):
+                if surface[row, byte] >> z & 1:
+                    for axis, place in enumerate((byte >> SHIFT, byte & LOW, z)):
+                        boxes[i, axis] = min(boxes[i, axis], place)
+                        boxes[i, axis + 3] = max(boxes[i, axis + 3], place + 1)
+        for side in range(6):
+            boxes[i, side] += cells[row, side % 3] << SHIFT
+    return boxes
+
+
+def block_groups(cells: Longs, surface: Bytes) -> BlockGroups:
+    """The blocks at ``cells`` [blocks, 3] that hold any of ``surface``, in groups."""
+    used = np.flatnonzero(surface.any(axis=1))
+    codes, owners = np.unique(morton.encode(cells[used] >> GROUP_SHIFT), return_inverse=True)
+    order = np.argsort(owners, kind="stable")
+    starts = np.searchsorted(owners[order], np.arange(len(codes) + 1))
+    boxes = _block_boxes(cells, surface, used[order])
+    around = np.zeros((len(codes), 6), np.int32)
+    if len(codes):
+        around[:, :3] = np.minimum.reduceat(boxes[:, :3], starts[:-1])
+        around[:, 3:] = np.maximum.reduceat(boxes[:, 3:], starts[:-1])
+    return BlockGroups(
+        VoxelIndex.of_cells(morton.decode(codes, 3)).arrays,
+        around,
+        starts.astype(np.int32),
+        used[order].astype(np.int32),
+        np.ascontiguousarray(boxes.T, np.float32),
+    )
 
 
 @dataclass(frozen=True)
@@ -55,16 +163,19 @@ class SurfelMap:
         find_nearest(points, self._index, found)
 
     def updated(
-        self, evidence: FrozenEvidence, field: SampleField, task: SurfelTask
+        self, evidence: FrozenEvidence, field: SampleField, epoch: int, most: int | None
     ) -> "SurfelMap":
-        """The surfels of a later epoch: new ones are fitted, and of the others the oldest."""
-        return _fitted_again(evidence, _carried(self._fitted, evidence), field, task)
+        """The surfels of a later epoch: new ones are fitted, and of the others the oldest.
+
+        At most so many of the others are fitted; ``None``: all.
+        """
+        return _fitted_again(evidence, _carried(self._fitted, evidence), field, epoch, most)
 
 
-def first_surfels(evidence: FrozenEvidence, field: SampleField, task: SurfelTask) -> SurfelMap:
-    """The surfels of all seen voxels."""
+def first_surfels(evidence: FrozenEvidence, field: SampleField, epoch: int) -> SurfelMap:
+    """The surfels of all seen voxels, for an epoch."""
     places = surfel_places(evidence.cells, evidence.surface)
-    return _fitted_again(evidence, _nothing_in(places), field, task)
+    return _fitted_again(evidence, _nothing_in(places), field, epoch, most=None)
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
@@ -91,15 +202,15 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
 
 
 def _fitted_again(
-    evidence: FrozenEvidence, fitted: _Fitted, field: SampleField, task: SurfelTask
+    evidence: FrozenEvidence, fitted: _Fitted, field: SampleField, epoch: int, most: int | None
 ) -> SurfelMap:
-    """Fit what was never fitted, and as much of the rest as the task says; changes ``fitted``."""
+    """Fit what was never fitted, and at most so many of the rest; changes ``fitted``."""
     known = np.flatnonzero(fitted.epochs != _NEVER)
-    if task.most is not None and len(known) > task.most:
-        known = known[np.argpartition(fitted.epochs[known], task.most)[: task.most]]
+    if most is not None and len(known) > most:
+        known = known[np.argpartition(fitted.epochs[known], most)[:most]]
     chosen = np.concatenate([np.flatnonzero(fitted.epochs == _NEVER), known])
     new = fit_surfels(fitted.places.voxels[chosen], field, evidence.ended_in)
     for name, array in vars(new).items():
         getattr(fitted.surfels, name)[chosen] = array
-    fitted.epochs[chosen] = task.epoch
+    fitted.epochs[chosen] = epoch
     return SurfelMap(evidence, fitted)

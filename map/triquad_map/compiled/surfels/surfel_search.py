@@ -1,23 +1,26 @@
 """The search for the nearest surfel.
 
-Groups of blocks first, then their blocks, then the surfels of a block, each level by the boxes
-around what it holds. All of it becomes one function, and arrays are in local variables where a loop
-uses them: to pass them on, or to reach into tuples for them, takes longer than the arithmetic.
+Groups of blocks first, cubes of 4 x 4 x 4, so that empty space costs nothing; then their blocks,
+then the surfels of a block, each level by the boxes around what it holds. All of it becomes one
+function, and arrays are in local variables where a loop uses them: to pass them on, or to reach
+into tuples for them, takes longer than the arithmetic.
 """
 
 import itertools
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Floats, Ints
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints
 from triquad_format.records.region import BLOCK_VOXELS
 
+from triquad_map.compiled.evidence.seen_voxels import LOW
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.sparse.voxel_bits import LOW
-from triquad_map.compiled.sparse.voxel_index import CELL_LIMIT, find_row, pack, unpack
-from triquad_map.compiled.surfels.surfel_index import GROUP_SHIFT, GROUP_VOXELS, SurfelIndex
-from triquad_map.nearest import NearestSurfels
-from triquad_map.surface.surfels import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
+from triquad_map.compiled.voxel_index import CELL_LIMIT, Index, find_row, pack, unpack
+from triquad_map.composition.region import NearestSurfels
+from triquad_map.surface import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
+
+GROUP_SHIFT = 2
+_GROUP_VOXELS = float(BLOCK_VOXELS << GROUP_SHIFT)
 
 _STEPS = np.array(
     sorted(itertools.product((-1, 0, 1), repeat=3), key=lambda step: np.abs(step).sum())
@@ -38,6 +41,29 @@ _NONE = -1
 _SURFEL, _MEMBER, _COUNT = range(3)
 
 Place = tuple[float, float, float]
+
+
+class BlockGroups(NamedTuple):
+    """The blocks that hold seen surface, in groups, with the boxes around that.
+
+    A box is its least and its greatest corner, in voxels; surfels reach ``OUTSIDE`` of it.
+    """
+
+    places: Index  # of groups
+    boxes: Ints  # [groups, 6]
+    starts: Ints  # [groups + 1] first member of each
+    members: Ints  # [M] rows of blocks
+    member_boxes: Floats  # [6, M]
+
+
+class SurfelIndex(NamedTuple):
+    """Surfels as kernels take them."""
+
+    groups: BlockGroups
+    starts: Ints  # [blocks + 1] first surfel of each block
+    positions: Floats  # [3, surfels] from the block's corner, voxels; far away where there is none
+    normals: Floats  # [surfels, 3]
+    kinds: Bytes  # [surfels] SurfelKind
 
 
 class Search(NamedTuple):
@@ -164,14 +190,14 @@ def _reaches(index: SurfelIndex, group: int, at: Place, search: Search) -> bool:
 def _search(index: SurfelIndex, at: Place, search: Search) -> None:
     """Search the groups around a point, then at all others."""
     places = index.groups.places
-    x = int(np.floor(at[0] / GROUP_VOXELS))
-    y = int(np.floor(at[1] / GROUP_VOXELS))
-    z = int(np.floor(at[2] / GROUP_VOXELS))
+    x = int(np.floor(at[0] / _GROUP_VOXELS))
+    y = int(np.floor(at[1] / _GROUP_VOXELS))
+    z = int(np.floor(at[2] / _GROUP_VOXELS))
     for turn in range(_NEIGHBOURS + len(index.groups.boxes)):
         if turn < _NEIGHBOURS:
             key = pack(x + _STEPS[turn, 0], y + _STEPS[turn, 1], z + _STEPS[turn, 2])
             group = find_row(places, key)
-        elif _wider(search.best[0], SMOOTHING) <= GROUP_VOXELS * GROUP_VOXELS:
+        elif _wider(search.best[0], SMOOTHING) <= _GROUP_VOXELS * _GROUP_VOXELS:
             break
         else:
             group = turn - _NEIGHBOURS

@@ -1,12 +1,16 @@
-"""Surfels: small discs of surface, one in each voxel in which rays ended.
+"""Surfels, small discs that stand for the seen surface, and how well each is supported.
 
 The field is right within the band where it is trained and saturates beyond it. So distances over
-any range are measured to surfels: where the field crosses zero in a voxel with seen surface, and
-which way it faces there. A surfel depends on the field around one voxel alone, which makes it cheap
-to keep up to date.
+any range are measured to surfels, one in each voxel in which rays ended: where the field crosses
+zero there, and which way it faces. A surfel depends on the field around one voxel alone, which
+makes it cheap to keep up to date. Surfels are in voxel units: one is the side of a leaf, and the
+voxel at integer coordinates ``v`` is the cube ``[v, v + 1)`` of leaf coordinates (see
+:mod:`triquad_format.records.region`).
 
-Everything here is in voxel units: one is the side of a leaf, and the voxel at integer coordinates
-``v`` is the cube ``[v, v + 1)`` of leaf coordinates (see :mod:`triquad_format.records.region`).
+The support of a surface is a level that fits a file, and a confidence for planners. Each ray that
+ends in a voxel adds to its strength, the more the nearer the sensor was; rays from several
+directions count for more than as many from one. The level is the strength on a logarithmic scale.
+``docs/queries.md`` shows how far measured errors fall as the confidence rises.
 """
 
 from collections.abc import Callable
@@ -14,7 +18,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
+from triquad_format.records.region import MAX_LEVEL
 
 DISC_RADIUS = 0.45
 """Of a surfel, in voxels: discs of neighbours overlap where a surface goes on, and jut out little
@@ -37,6 +43,23 @@ _ON_SURFACE = 0.15
 
 _IN_VOXEL = 0.525
 _NEXT_VOXEL = 1.0
+
+LEVELS = MAX_LEVEL + 1
+
+NEAR_M = 10.0
+"""At this range a ray counts half as much as at the sensor."""
+
+SECTORS_COUNTED = 5
+"""Of the eight sectors of the horizon that a surface was looked at from; more add nothing."""
+
+LEAST_STRENGTH = 0.25
+"""Of level 1; each further level is twice as strong."""
+
+HALF_LIFE_S = 86_400.0
+"""While the rest of the map was seen again, confidence in what was not halves in this time."""
+
+POINT_SHARE = 0.5
+"""Of the confidence, where rays ended but the field shows no surface."""
 
 
 class SurfelKind(IntEnum):
@@ -100,3 +123,20 @@ def _step(sample: FieldSample) -> Doubles:
     lengths = np.linalg.norm(steps, axis=1)
     shorter = np.minimum(1.0, _LONGEST_STEP / np.maximum(lengths, 1e-9))
     return np.asarray(steps * shorter[:, None], np.float64)
+
+
+def support_confidence(levels: Bytes, kinds: Bytes) -> Floats:
+    """The confidence [N] of surfels of some :class:`SurfelKind` at these levels, just seen."""
+    shares = np.where(kinds == SurfelKind.POINT, np.float32(POINT_SHARE), np.float32(1))
+    return np.asarray(level_confidence()[levels] * shares, np.float32)
+
+
+def level_confidence() -> Floats:
+    """The confidence [LEVELS] of each level, just seen."""
+    strength = LEAST_STRENGTH * 2.0 ** (np.arange(LEVELS) - 0.5)
+    return np.asarray(strength / (strength + 1.0), np.float32)
+
+
+def faded(age_s: NDArray[np.floating]) -> Floats:
+    """The share [N] of its confidence that a surface keeps, seen last so many seconds ago."""
+    return np.asarray(0.5 ** (np.maximum(age_s, 0.0) / HALF_LIFE_S), np.float32)

@@ -3,10 +3,11 @@
 Everything that is sparse in space is kept in rows that such an index finds.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Ints, Longs
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Ints, Longs
 
 from triquad_map.compiled.kernel import kernel
 
@@ -14,6 +15,8 @@ EMPTY = np.int64(-1)
 MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed number
 CELL_LIMIT = 1 << 20
 """Cells lie in ``[-CELL_LIMIT, CELL_LIMIT)`` on each axis."""
+
+_LOW = (1 << 21) - 1  # the bits of a key that tell one coordinate
 
 
 class Index(NamedTuple):
@@ -29,12 +32,6 @@ def empty_keys(cells: int) -> Longs:
     return np.full(1 << max(4, int(2 * cells - 1).bit_length()), EMPTY)
 
 
-def _new_index(capacity: int) -> Index:
-    """Empty arrays for ``capacity`` cells."""
-    keys = empty_keys(capacity)
-    return Index(keys, np.zeros(len(keys), np.int32), np.zeros(capacity, np.int64))
-
-
 @kernel(inline="always")
 def pack(x: int, y: int, z: int) -> int:
     """Key of a cell."""
@@ -44,8 +41,7 @@ def pack(x: int, y: int, z: int) -> int:
 @kernel()
 def unpack(key: int) -> tuple[int, int, int]:
     """The cell of a key."""
-    low = (1 << 21) - 1
-    return ((key >> 42) - CELL_LIMIT, ((key >> 21) & low) - CELL_LIMIT, (key & low) - CELL_LIMIT)
+    return (key >> 42) - CELL_LIMIT, (key >> 21 & _LOW) - CELL_LIMIT, (key & _LOW) - CELL_LIMIT
 
 
 @kernel(inline="always")
@@ -98,13 +94,9 @@ def longest_probe(index: Index) -> int:
     return longest
 
 
-@kernel()
 def cells_of(keys: Longs) -> Longs:
     """The cells [N, 3] of ``keys`` [N]."""
-    cells = np.empty((len(keys), 3), np.int64)
-    for i in range(len(keys)):
-        cells[i, 0], cells[i, 1], cells[i, 2] = unpack(keys[i])
-    return cells
+    return np.stack([keys >> 42, keys >> 21 & _LOW, keys & _LOW], axis=1) - CELL_LIMIT
 
 
 class VoxelIndex:
@@ -115,17 +107,16 @@ class VoxelIndex:
     """
 
     def __init__(self, capacity: int) -> None:
-        self.count = 0
-        self.arrays = _new_index(capacity)
+        self._refill(np.zeros(0, np.int64), capacity)
 
     @property
     def capacity(self) -> int:
-        """Ints that there is room for."""
+        """Cells that there is room for."""
         return len(self.arrays.row_keys)
 
     def cells(self) -> Longs:
         """The cells [count, 3], by row."""
-        return np.asarray(cells_of(self.arrays.row_keys[: self.count]))
+        return cells_of(self.arrays.row_keys[: self.count])
 
     def grow(self) -> None:
         """Double the room."""
@@ -145,7 +136,41 @@ class VoxelIndex:
         return index
 
     def _refill(self, keys: Longs, capacity: int) -> None:
-        self.arrays = _new_index(capacity)
-        self.arrays.row_keys[: len(keys)] = keys
+        slots = empty_keys(capacity)
+        row_keys = with_room(keys, capacity)
+        self.arrays = Index(slots, np.zeros(len(slots), np.int32), row_keys)
         self.count = len(keys)
         _reindex(self.arrays, self.count)
+
+
+def with_room(rows: NDArray[Any], capacity: int) -> NDArray[Any]:
+    """A copy of ``rows`` [N, ...] with room for ``capacity`` of them; the new ones are zero."""
+    roomy = np.zeros((capacity, *rows.shape[1:]), rows.dtype)
+    roomy[: len(rows)] = rows
+    return roomy
+
+
+@kernel(inline="always")
+def enter(keys: Longs, x: float, y: float, z: float, cell_m: float) -> bool:
+    """Put the cell of a point into a set; False where it is there already."""
+    key = pack(int(np.floor(x / cell_m)), int(np.floor(y / cell_m)), int(np.floor(z / cell_m)))
+    slot = find_slot(keys, key)
+    if keys[slot] == key:
+        return False
+    keys[slot] = key
+    return True
+
+
+@kernel()
+def _first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Longs) -> Bools:
+    chosen = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        chosen[i] = enter(keys, points[i, 0], points[i, 1], points[i, 2], cell_m)
+    return chosen
+
+
+def thin(points: NDArray[np.floating], cell_m: float) -> Bools:
+    """Mask [N] that keeps one of the points [N, 3] per cell of side ``cell_m``, the first."""
+    return np.asarray(
+        _first_per_cell(np.ascontiguousarray(points), cell_m, empty_keys(len(points)))
+    )

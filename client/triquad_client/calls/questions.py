@@ -1,0 +1,264 @@
+"""Questions about the map: arguments checked, asked in parts of one epoch, and the replies joined.
+
+:mod:`triquad_map.questions.answers` is the other side. ``at_epoch`` is the number of an epoch;
+``None`` is the newest.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_RANGE_M
+from triquad_format.wire.messages import SdfReply, SdfRequest
+from triquad_format.wire.query_messages import (
+    AlignReply,
+    AlignRequest,
+    DistanceReply,
+    DistanceRequest,
+    GridReply,
+    GridRequest,
+    RaysReply,
+    RaysRequest,
+    SegmentsReply,
+    SegmentsRequest,
+    SpheresReply,
+    SpheresRequest,
+)
+from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions, thinned
+from triquad_map.questions.distance import DistanceOptions, Distances, Unknown, with_unknown
+from triquad_map.questions.grid import Grid, GridShape
+from triquad_map.questions.rays import RayOptions, RayRanges
+from triquad_map.questions.segments import Polyline, SegmentOptions, Segments, along_polyline
+from triquad_map.questions.spheres import Spheres
+
+from triquad_client import checks
+from triquad_client.checks import Bounds
+from triquad_client.errors import InvalidInputError
+from triquad_client.net.call import (
+    NEWEST,
+    Ask,
+    Call,
+    ask,
+    in_parts,
+    joined,
+    offload,
+    offsets,
+    origin_of,
+    retried,
+)
+
+# Items of one request: it takes the server some tens of milliseconds, and others wait as long.
+_PART_SDF_POINTS = 100_000
+_PART_POINTS = 20_000  # around which something is searched for
+_PART_WAYS = 2_000  # segments or rays
+_PART_CELLS = 20_000  # unless a layer has more
+
+_MAX_CELLS = 100_000_000
+
+
+@dataclass(frozen=True)
+class SdfResult:
+    """What the map says of N points, all of it from one epoch."""
+
+    sdf: NDArray[np.float32]  # [N] metres, positive in free space; NaN where the map has nothing
+    status: NDArray[np.uint8]  # [N] Status values
+    gradient: NDArray[np.float32] | None  # [N, 3] d(sdf)/dx, map frame, pointing to free space
+    epoch: int
+
+
+def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResult]:
+    """The trained field at ``points`` [N, 3] of the map frame, metres."""
+    if isinstance(points, np.ndarray) and points.size > 3 * _PART_SDF_POINTS:
+        checked = yield from offload(lambda _: checks.query_points(points))
+    else:
+        checked = checks.query_points(points)
+
+    def request(part: slice, epoch: int) -> Ask[SdfReply]:
+        return _ask_sdf(checked[part], gradient, epoch)
+
+    parts = yield from in_parts(len(checked), _PART_SDF_POINTS, request, at_epoch)
+    if len(parts) == 1:
+        return SdfResult(**joined(parts))
+    return (yield from offload(lambda _: SdfResult(**joined(parts))))
+
+
+def pin_newest() -> Call[int]:
+    """The newest epoch, once the server keeps it for us: it was asked for by number."""
+    nowhere = np.zeros((0, 3))
+
+    def pin() -> Call[int]:
+        newest = yield from ask(_ask_sdf(nowhere, False, NEWEST))
+        return (yield from ask(_ask_sdf(nowhere, False, newest.epoch))).epoch
+
+    return (yield from retried("epoch_gone", pin))
+
+
+def _ask_sdf(points: NDArray[np.float64], gradient: bool, epoch: int) -> Ask[SdfReply]:
+    origin = origin_of(points)
+    request = SdfRequest(origin, offsets(points, origin), gradient, epoch)
+    return Ask(keys.SDF, request, SdfReply)
+
+
+def distance(
+    points: ArrayLike, options: DistanceOptions, unknown: Unknown | str, at_epoch: int | None
+) -> Call[Distances]:
+    """True distances to the nearest surface at ``points`` [N, 3] of the map frame, metres."""
+    checked = checks.query_points(points)
+    policy = checks.unknown_policy(unknown)
+    reach_m = checks.within("max_distance_m", options.max_distance_m)
+
+    def request(part: slice, epoch: int) -> Ask[DistanceReply]:
+        origin = origin_of(checked[part])
+        message = DistanceRequest(
+            origin=origin,
+            points=offsets(checked[part], origin),
+            max_distance_m=reach_m,
+            surface_point=options.surface_point,
+            unknown_distance=options.unknown_distance or policy is not Unknown.FREE,
+            epoch=epoch,
+        )
+        return Ask(keys.DISTANCE, message, DistanceReply)
+
+    parts = yield from in_parts(len(checked), _PART_POINTS, request, at_epoch)
+    fields = joined(parts, flags=["found"])
+    for name in ("surface_point", "unknown_point"):
+        if fields[name] is not None:
+            fields[name] = fields[name] + _origins(checked, [len(part.found) for part in parts])
+    return with_unknown(Distances(**fields), checked, policy)
+
+
+def _origins(points: NDArray[np.float64], counts: list[int]) -> NDArray[np.float64]:
+    """The origin [N, 3] from which each of ``points`` [N, 3] was sent, in parts of ``counts``."""
+    starts = range(0, max(1, len(points)), _PART_POINTS)
+    origins = [origin_of(points[start : start + _PART_POINTS]) for start in starts]
+    return np.repeat(origins, counts, axis=0)
+
+
+def spheres(centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None) -> Call[Spheres]:
+    """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one number or [N]."""
+    checked = checks.query_points(centres)
+    radii = checks.radii(radii_m, len(checked))
+
+    def request(part: slice, epoch: int) -> Ask[SpheresReply]:
+        origin = origin_of(checked[part])
+        message = SpheresRequest(origin, offsets(checked[part], origin), radii[part], epoch)
+        return Ask(keys.SPHERES, message, SpheresReply)
+
+    parts = yield from in_parts(len(checked), _PART_POINTS, request, at_epoch)
+    return Spheres(**joined(parts))
+
+
+def segments(
+    starts: ArrayLike, ends: ArrayLike, options: SegmentOptions, at_epoch: int | None
+) -> Call[Segments]:
+    """What a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
+    first, last = checks.query_points(starts), checks.query_points(ends)
+    if len(first) != len(last):
+        raise InvalidInputError(f"{len(first)} starts and {len(last)} ends: give as many")
+    radius_m = checks.within("radius_m", options.radius_m, least=0.0)
+    reach_m = checks.within("max_distance_m", options.max_distance_m)
+
+    def request(part: slice, epoch: int) -> Ask[SegmentsReply]:
+        origin = origin_of(first[part])
+        message = SegmentsRequest(
+            origin=origin,
+            starts=offsets(first[part], origin),
+            ends=offsets(last[part], origin),
+            radius_m=radius_m,
+            max_distance_m=reach_m,
+            epoch=epoch,
+        )
+        return Ask(keys.SEGMENTS, message, SegmentsReply)
+
+    parts = yield from in_parts(len(first), _PART_WAYS, request, at_epoch)
+    return Segments(**joined(parts, flags=["blocked", "meets_unknown"]))
+
+
+def polyline(points: ArrayLike, options: SegmentOptions, at_epoch: int | None) -> Call[Polyline]:
+    """What a ball meets that moves along ``points`` [N, 3], metres, map frame."""
+    checked = checks.query_points(points)
+    if len(checked) < 2:
+        raise InvalidInputError(f"a polyline of {len(checked)} points: give two or more")
+    return along_polyline((yield from segments(checked[:-1], checked[1:], options, at_epoch)))
+
+
+def rays(
+    origins: ArrayLike, directions: ArrayLike, options: RayOptions, at_epoch: int | None
+) -> Call[RayRanges]:
+    """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3]."""
+    ways = checks.directions(directions)
+    given = np.asarray(origins)
+    places = checks.query_points(given[None] if given.shape == (3,) else given)
+    if len(places) not in (1, len(ways)):
+        raise InvalidInputError(
+            f"{len(places)} origins for {len(ways)} directions: one, or as many"
+        )
+    starts = np.broadcast_to(places, ways.shape)
+    reach_m = checks.within("max_range_m", options.max_range_m, MAX_RANGE_M)
+
+    def request(part: slice, epoch: int) -> Ask[RaysReply]:
+        origin = origin_of(starts[part])
+        message = RaysRequest(
+            origin=origin,
+            starts=offsets(starts[part], origin),
+            directions=ways[part].astype(np.float32),
+            max_range_m=reach_m,
+            through_unknown=options.through_unknown,
+            epoch=epoch,
+        )
+        return Ask(keys.RAYS, message, RaysReply)
+
+    parts = yield from in_parts(len(ways), _PART_WAYS, request, at_epoch)
+    return RayRanges(**joined(parts))
+
+
+def grid(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | None) -> Call[Grid]:
+    """The map at the cells that fill ``bounds``; a flat box is one layer of them."""
+    shape = _grid_shape(bounds, checks.within("cell_m", cell_m))
+    reach_m = checks.within("max_distance_m", max_distance_m)
+    columns, *layer = shape.counts
+
+    def request(part: slice, epoch: int) -> Ask[GridReply]:
+        corner = shape.corner + (part.start * shape.cell_m, 0.0, 0.0)
+        counts = np.array([min(part.stop, columns) - part.start, *layer], np.int32)
+        message = GridRequest(corner, shape.cell_m, counts, reach_m, epoch)
+        return Ask(keys.GRID, message, GridReply)
+
+    at_once = max(1, _PART_CELLS // (layer[0] * layer[1]))
+    parts = yield from in_parts(columns, at_once, request, at_epoch)
+    return Grid(shape, **joined(parts))
+
+
+def _grid_shape(bounds: Bounds, cell_m: float) -> GridShape:
+    low, high = checks.box(bounds)
+    if not np.isfinite([low, high]).all():
+        raise InvalidInputError(f"bounds = {bounds!r}: a grid needs finite ones")
+    counts = np.maximum(np.ceil((high - low) / cell_m - 1e-6), 1.0)
+    if counts.prod() > _MAX_CELLS:
+        raise InvalidInputError(
+            f"{counts.prod():.3g} cells of {cell_m:g} m in {bounds!r}: "
+            f"ask for at most {_MAX_CELLS:g}"
+        )
+    # A flat box lies in the middle of its layer.
+    corner = np.where(high > low, low, low - cell_m / 2)
+    return GridShape(corner, cell_m, (int(counts[0]), int(counts[1]), int(counts[2])))
+
+
+def align(
+    points: ArrayLike, guess: ArrayLike, options: AlignOptions, at_epoch: int | None
+) -> Call[Alignment]:
+    """The pose of ``points`` [N, 3] of the sensor frame, near a guess [4, 4]."""
+    epoch = checks.chosen_epoch(at_epoch)
+    cloud = checks.scan_points(points)
+    # Here, not only where it is answered: a hundredth of a scan travels.
+    few = yield from offload(lambda _: thinned(cloud.astype(np.float64), FINE_POINTS))
+    request = AlignRequest(
+        points=few.astype(np.float32),
+        world_from_sensor=checks.rigid_pose(guess),
+        max_distance_m=checks.within("max_distance_m", options.max_distance_m),
+        max_iterations=options.max_iterations,
+        epoch=NEWEST if epoch is None else epoch,
+    )
+    reply = yield from ask(Ask(keys.ALIGN, request, AlignReply))
+    return Alignment(**vars(reply))

@@ -1,0 +1,208 @@
+"""What the rays have shown of a region: sparse voxels in which a surface or free space was seen.
+
+Three planes alias: where all three projections of an unobserved point are occupied, the field
+answers as if it had been seen. Only a 3-D record can tell such ghosts from surfaces.
+
+All coordinates here are voxel coordinates of the region (see :mod:`triquad_format.records.region`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from triquad_format.records import morton
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
+from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, surface_counts
+from triquad_format.records.region import Evidence as EvidenceRecord
+
+from triquad_map.compiled.evidence.marking import mark_crossed, mark_ends
+from triquad_map.compiled.evidence.observations import Observations, Sighting
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, find_ends, find_status
+from triquad_map.compiled.evidence.unknown_search import find_unknown
+from triquad_map.compiled.voxel_index import VoxelIndex, cells_of, with_room
+
+_SEEN_STEP_S = 60
+
+
+@dataclass(frozen=True)
+class FrozenEvidence:
+    """Evidence that does not change, for any thread."""
+
+    seen: SeenVoxels
+    levels: Bytes  # [S] how well each voxel in ``surface`` is supported, in their order
+    seen_s: Longs  # [B] when a ray last ended in each block, seconds since 1970; 0: never
+
+    @property
+    def surface(self) -> Bytes:
+        """The voxels in which rays ended [B, BLOCK_BYTES]."""
+        return self.seen.surface
+
+    @property
+    def cells(self) -> Longs:
+        """The blocks [B, 3], in units of blocks."""
+        return cells_of(self.seen.blocks.row_keys)
+
+    @property
+    def newest_s(self) -> int:
+        """When a ray last ended anywhere, seconds since 1970; 0: never, or not known."""
+        return int(self.seen_s.max(initial=0))
+
+    def status(self, voxels: Doubles, reach: float = 0.5) -> Bytes:
+        """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
+        status = np.empty(len(voxels), np.uint8)
+        find_status(voxels, reach, self.seen, status)
+        return status
+
+    def ended_in(self, voxels: Longs) -> Bools:
+        """Whether rays ended in ``voxels`` [N, 3]."""
+        ended = np.empty(len(voxels), np.bool_)
+        find_ends(voxels, self.seen, ended)
+        return ended
+
+    def find_unknown(
+        self, voxels: Doubles, blocks: range, distances: Doubles, nearest: Doubles
+    ) -> None:
+        """Find unknown voxels; see :class:`triquad_map.composition.region.SeenSpace`."""
+        find_unknown(voxels, self.seen, (blocks.start, blocks.stop), distances, nearest)
+
+    def surface_cells(self) -> Longs:
+        """Blocks [B, 3], in units of blocks, that hold any seen surface."""
+        return self.cells[self.surface.any(axis=1)]
+
+    def record(self) -> EvidenceRecord:
+        """The evidence as the map file holds it; empty blocks are left out."""
+        surface, free = self.seen.surface, self.seen.free
+        used = np.flatnonzero((surface | free).any(axis=1))
+        codes = morton.encode(self.cells[used])
+        order = np.argsort(codes)
+        used = used[order]
+        counts = surface_counts(surface)
+        firsts = np.cumsum(counts) - counts
+        # The levels block by block, in the order of the record.
+        runs = np.repeat(firsts[used] - (np.cumsum(counts[used]) - counts[used]), counts[used])
+        levels = self.levels[runs + np.arange(len(runs))]
+        # In whole minutes: else each scan would change every part that it sees.
+        seen_s = np.where(counts > 0, self.seen_s // _SEEN_STEP_S * _SEEN_STEP_S, 0)
+        return EvidenceRecord(codes[order], surface[used], free[used], levels, seen_s[used])
+
+    @classmethod
+    def from_record(cls, side: int, record: EvidenceRecord) -> "FrozenEvidence":
+        """The evidence of a record, of a region of ``side`` voxels."""
+        index = VoxelIndex.of_cells(morton.decode(record.codes, 3)).freeze()
+        levels, seen_s = record.levels, record.seen_s
+        if levels is None:
+            levels = np.zeros(int(surface_counts(record.surface).sum()), np.uint8)
+        if seen_s is None:
+            seen_s = np.zeros(len(record.codes), np.int64)
+        masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
+        return cls(SeenVoxels(side, index, *masks), levels, seen_s)
+
+
+_MIN_CAPACITY = 256
+
+
+class LiveEvidence:
+    """Two bit masks over the voxels of a region, in sparse blocks of 8 x 8 x 8.
+
+    One thread owns and changes it; :meth:`freeze` gives what others may read.
+    """
+
+    def __init__(self, side: int) -> None:
+        """``side`` is that of the region, voxels."""
+        self._blocks = VoxelIndex(_MIN_CAPACITY)
+        masks = np.zeros((2, _MIN_CAPACITY, BLOCK_BYTES), np.uint8)
+        self._seen = SeenVoxels(side, self._blocks.arrays, *masks)
+        self._observations = Observations(_MIN_CAPACITY)
+        self._frozen: FrozenEvidence | None = None  # until anything changes
+
+    @property
+    def blocks(self) -> int:
+        """Blocks in use."""
+        return self._blocks.count
+
+    def mark_surface(self, voxels: Doubles, sighting: Sighting | None = None) -> Longs:
+        """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out.
+
+        ``sighting`` tells from where and when; without it they support the surface no better.
+
+        Returns:
+            The voxels [M, 3] in which no ray had ended before.
+        """
+        self._frozen = None
+        new = np.empty((len(voxels), 3), np.int64)
+        done = found = 0
+        while done < len(voxels):
+            done, self._blocks.count, found = mark_ends(
+                voxels, done, self._seen, self._blocks.count, new, found
+            )
+            if done < len(voxels):
+                self._grow()
+        if sighting is not None:
+            self._observations.record(voxels, self._seen, sighting)
+        return new[:found]
+
+    def carve(self, origin: Doubles, ends: Doubles, stop_short: float) -> None:
+        """Record the free space between ``origin`` [3] and ``ends`` [N, 3].
+
+        Args:
+            origin: sensor position, may lie outside the region.
+            ends: end points of the rays.
+            stop_short: voxels before its end point where a ray stops to prove free space.
+        """
+        self._frozen = None
+        done = 0
+        while done < len(ends):
+            done, self._blocks.count = mark_crossed(
+                origin, ends, done, stop_short, self._seen, self._blocks.count
+            )
+            if done < len(ends):
+                self._grow()
+
+    def clear(self, low: Doubles, high: Doubles) -> None:
+        """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
+        self._frozen = None
+        corners = self._blocks.cells() * BLOCK_VOXELS
+        near = ((corners < high) & (corners + BLOCK_VOXELS > low)).all(axis=1)
+        offsets = np.stack(np.meshgrid(*[np.arange(BLOCK_VOXELS)] * 3, indexing="ij"), -1)
+        for row in np.flatnonzero(near):
+            centres = corners[row] + offsets + 0.5
+            kept = ~((centres > low) & (centres < high)).all(axis=-1)
+            keep = np.packbits(kept, axis=-1, bitorder="little").reshape(BLOCK_BYTES)
+            self._seen.surface[row] &= keep
+            self._seen.free[row] &= keep
+        self._observations.forget(np.flatnonzero(near), self._seen.surface[: self.blocks])
+
+    def freeze(self) -> FrozenEvidence:
+        """The evidence as it is now; the same object until anything changes."""
+        if self._frozen is None:
+            side, _, *masks = self._seen
+            surface, free = (mask[: self.blocks].copy() for mask in masks)
+            self._frozen = FrozenEvidence(
+                SeenVoxels(side, self._blocks.freeze(), surface, free),
+                self._observations.levels(surface),
+                self._observations.seen_s(self.blocks),
+            )
+        return self._frozen
+
+    @classmethod
+    def from_record(cls, side: int, record: EvidenceRecord) -> "LiveEvidence":
+        """The evidence of a record, of a region of ``side`` voxels."""
+        evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
+        evidence._blocks = VoxelIndex.of_cells(frozen.cells)
+        evidence._seen = frozen.seen
+        if record.levels is not None:
+            evidence._observations = Observations.restore(
+                frozen.surface, frozen.levels, frozen.seen_s
+            )
+        evidence._make_room()
+        return evidence
+
+    def _grow(self) -> None:
+        self._blocks.grow()
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Make room for as many blocks as the index has room for."""
+        side, _, *masks = self._seen
+        roomy = (with_room(mask, self._blocks.capacity) for mask in masks)
+        self._seen = SeenVoxels(side, self._blocks.arrays, *roomy)
+        self._observations.make_room(self._blocks.capacity)

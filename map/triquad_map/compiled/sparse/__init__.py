@@ -1,1 +1,0 @@
-"""What is sparse in space: rows that grow, found by the voxel that they belong to."""

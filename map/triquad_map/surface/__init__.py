@@ -1,1 +1,0 @@
-"""Surfels: what stands for the seen surface, and how well it is supported."""

@@ -1,0 +1,80 @@
+"""Each point is answered for by the region whose centre is nearest; fields are blended between."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import RegionIndex, region_centre
+from triquad_format.records.status import Status
+from triquad_map.composition.field_view import FieldView
+from triquad_map.composition.region import FieldValues
+
+FIELD = FieldSettings(depth=8)
+REGIONS = [(0, 0, 0), (1, 0, 0), (-1, 2, 0), (3, 3, -1)]
+PITCH_M = FIELD.region_pitch_m
+
+
+class NumberedRegion:
+    """A region whose field and status are its number everywhere."""
+
+    def __init__(self, number: int, index: RegionIndex) -> None:
+        self.index = index
+        self.centre = region_centre(FIELD, index)
+        self.engine = self.evidence = self
+        self.number = number
+
+    def evaluate(self, points: np.ndarray, gradient: bool) -> FieldValues:
+        slopes = np.zeros((len(points) if gradient else 0, 3), np.float32)
+        return FieldValues(np.full(len(points), self.number, np.float32), slopes)
+
+    def status(self, voxels: np.ndarray, reach: float) -> np.ndarray:
+        return np.full(len(voxels), self.number, np.uint8)
+
+
+def view_of(regions: list[RegionIndex]) -> FieldView:
+    numbered = [NumberedRegion(number, index) for number, index in enumerate(regions, start=10)]
+    return FieldView(FIELD, numbered)  # type: ignore[arg-type]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 3000), st.floats(0.01, 3.0))
+def test_every_point_has_the_status_that_the_nearest_region_gives(
+    seed: int, count: int, spread: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    middle = rng.uniform(-PITCH_M, 3 * PITCH_M, 3)
+    points = middle + rng.uniform(-spread * PITCH_M, spread * PITCH_M, (count, 3))
+    cells = map(tuple, np.floor(points / PITCH_M + 0.5).astype(int).tolist())
+    expected = [10 + REGIONS.index(c) if c in REGIONS else Status.UNKNOWN for c in cells]
+    view = view_of(REGIONS)
+    assert view.status(points).tolist() == expected
+    answer = view.query(points, gradient=True)
+    assert answer.status.tolist() == expected
+    owned = np.array(expected) >= 10
+    assert np.isfinite(answer.sdf[owned]).all()
+
+
+def test_the_field_is_blended_where_regions_overlap_and_only_there() -> None:
+    core_m = FIELD.region_side_m / 2 - FIELD.overlap_m
+    inner, outer, middle = core_m - 0.01, core_m + 0.01, PITCH_M / 2
+    points = np.array([[0, 0, 0], [inner, 0, 0], [outer, 0, 0], [middle, 0, 0], [0, -outer, 0]])
+    sdf = view_of(REGIONS).query(points).sdf
+    assert sdf[[0, 1, 4]].tolist() == [10, 10, 10]
+    assert 10 < sdf[2] < 10.5
+    assert sdf[3] == 10.5
+
+
+def test_what_is_no_place_has_no_owner() -> None:
+    one_axis = np.eye(3, dtype=bool)
+    bad = (np.nan, np.inf, -np.inf, 1e300, -1e12)
+    nowhere = np.concatenate([np.where(one_axis, value, 0.0) for value in bad])
+    for points in (nowhere, nowhere[:1]):
+        answer = view_of(REGIONS).query(np.concatenate([points, np.zeros((1, 3))]))
+        assert answer.status.tolist() == [Status.UNKNOWN] * len(points) + [10]
+        assert np.isnan(answer.sdf[:-1]).all()
+
+
+def test_a_map_without_regions_knows_nothing() -> None:
+    answer = view_of([]).query(np.zeros((5, 3)))
+    assert (answer.status == Status.UNKNOWN).all()
+    assert np.isnan(answer.sdf).all()
