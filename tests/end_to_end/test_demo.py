@@ -2,7 +2,6 @@ import dataclasses
 import json
 import signal
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +9,9 @@ from support import servers
 from triquad_client import RequestTimeoutError, SdfResult
 from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands import demo
+from triquad_tools.console.command import ToolError
 from triquad_tools.demo import steps
-from triquad_tools.demo.probe import Probe, ProbeError, ProbeReport, ask_until
+from triquad_tools.demo.probe import Probe, ProbeReport, ask_until
 from triquad_tools.demo.results import (
     DemoResults,
     Intake,
@@ -20,7 +20,7 @@ from triquad_tools.demo.results import (
     broken_promises,
     table_rows,
 )
-from triquad_tools.demo.server import DemoServer, DemoServerError, ServerOptions
+from triquad_tools.demo.server import DemoServer
 from triquad_tools.evaluation.map_scores import StreetScores
 from triquad_tools.evaluation.metrics import MeshScores
 from triquad_tools.mapfiles.meshfile import read_mesh
@@ -117,9 +117,8 @@ def test_a_map_that_still_learns_may_change_over_a_restart() -> None:
 def test_a_server_that_cannot_start_is_reported_with_its_last_line(tmp_path) -> None:
     (tmp_path / "store").write_text("a file")
     log = tmp_path / "server.log"
-    options = ServerOptions(servers.free_endpoint(), "demo", tmp_path / "store", log)
-    with pytest.raises(DemoServerError, match="the server did not start: .*store") as caught:
-        DemoServer(options)
+    with pytest.raises(ToolError, match="the server did not start: .*store") as caught:
+        DemoServer(tmp_path, "demo")
     assert str(log) in str(caught.value)
     assert str(tmp_path / "store") in log.read_text()
 
@@ -150,12 +149,11 @@ def test_queries_are_counted_with_their_errors_and_epochs() -> None:
     assert 0.0 < report.latency_p50_ms <= report.latency_p99_ms <= report.latency_max_ms
 
 
-def test_queries_without_a_server_fail(tmp_path: Path) -> None:
-    np.save(tmp_path / "points.npy", np.zeros((1, 3)))
+def test_queries_without_a_server_fail() -> None:
     endpoint = servers.free_endpoint()
     with (
-        Probe(endpoint, "demo", tmp_path / "points.npy") as probe,
-        pytest.raises(ProbeError, match="exit code 1"),
+        Probe(endpoint, "demo", np.zeros((1, 3))) as probe,
+        pytest.raises(ToolError, match="exit code 1"),
     ):
         probe.finish()
 

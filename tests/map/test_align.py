@@ -13,7 +13,7 @@ from triquad_map.questions.align import Alignment, AlignOptions, align, thinned
 from triquad_tools.benchmarks.align import Offset, attempts, displaced, recorded
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.solids import Label, Solid, box, cylinder, half_space
+from triquad_tools.simulation.solids import Solid, box, cylinder, half_space
 
 SEOSAN = Path(__file__).resolve().parents[3] / "shared" / "data" / "seosan01"
 LIDAR = Lidar(beams=32, columns=360)
@@ -27,7 +27,7 @@ def scene(*solids: Solid) -> Scene:
 
 
 def wall(x: float, y: float, half_x: float, half_y: float, yaw: float = 0.0) -> Solid:
-    return box(Label.HOUSE, (x, y, 2.0), (half_x, half_y, 4.0), yaw)
+    return box((x, y, 2.0), (half_x, half_y, 4.0), yaw)
 
 
 YARD = scene(
@@ -35,7 +35,7 @@ YARD = scene(
     wall(-4.0, 11.0, 8.0, 1.0, 0.2),
     wall(-14.0, -2.0, 2.0, 3.0),
     wall(3.0, -9.0, 4.0, 1.5, -0.4),
-    cylinder(Label.POLE, (5.0, 6.0, 2.0), 0.2, 3.0),
+    cylinder((5.0, 6.0, 2.0), 0.2, 3.0),
 )
 PLAIN = scene()
 CORRIDOR = scene(wall(0.0, 3.0, 500.0, 0.5), wall(0.0, -3.0, 500.0, 0.5))

@@ -5,7 +5,7 @@ import pytest
 from triquad_tools.recordings.cloud import thin
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.solids import Label, box, half_space, sphere
+from triquad_tools.simulation.solids import box, half_space, sphere
 from triquad_tools.simulation.street import street
 
 SMALL = Lidar(beams=32, columns=180)
@@ -24,8 +24,8 @@ def _to_world(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
 def test_ranges_to_simple_solids_are_right() -> None:
     solids = (
         half_space(0.0),
-        box(Label.HOUSE, (10.0, 0.0, 5.0), (2.0, 3.0, 4.0)),
-        sphere(Label.TREE, (0.0, 8.0, 2.0), 1.5),
+        box((10.0, 0.0, 5.0), (2.0, 3.0, 4.0)),
+        sphere((0.0, 8.0, 2.0), 1.5),
     )
     scene = Scene(solids, np.array([[-20.0] * 3, [20.0] * 3]))
     directions = np.array(

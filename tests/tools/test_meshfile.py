@@ -3,7 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from triquad_client import Mesh
-from triquad_tools.mapfiles.meshfile import MeshFileError, read_mesh
+from triquad_tools.console.command import ToolError
+from triquad_tools.mapfiles.meshfile import read_mesh
 
 TETRAHEDRON = Mesh(
     np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]]),
@@ -37,19 +38,19 @@ def test_glb_round_trip_has_z_up_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.gltf", "a", "a.pkl"])
 def test_other_formats_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(MeshFileError, match=r"\.ply, \.glb, \.obj, \.stl"):
+    with pytest.raises(ToolError, match=r"\.ply, \.glb, \.obj, \.stl"):
         read_mesh(tmp_path / name)
 
 
 def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(MeshFileError, match="no such file"):
+    with pytest.raises(ToolError, match="no such file"):
         read_mesh(tmp_path / "missing.ply")
     for name in ("broken.ply", "broken.glb"):
         (tmp_path / name).write_bytes(b"this is not a mesh")
-        with pytest.raises(MeshFileError, match="cannot be read as a mesh"):
+        with pytest.raises(ToolError, match="cannot be read as a mesh"):
             read_mesh(tmp_path / name)
     cut = tmp_path / "cut.ply"
     TETRAHEDRON.save(cut)
     cut.write_bytes(cut.read_bytes()[:-7])
-    with pytest.raises(MeshFileError, match="cannot be read as a mesh"):
+    with pytest.raises(ToolError, match="cannot be read as a mesh"):
         read_mesh(cut)

@@ -10,7 +10,7 @@ from triquad_tools.evaluation.metrics import (
     score_against_scene,
 )
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.solids import Label, half_space, sphere
+from triquad_tools.simulation.solids import half_space, sphere
 
 NOTHING = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int64))
 BOUNDS = np.array([[0.0, 0.0, -1.0], [4.0, 2.0, 1.0]])
@@ -129,7 +129,7 @@ def test_samples_lie_on_a_sphere_of_triangles() -> None:
 
     ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
     samples = sample_mesh(Mesh(ball.vertices, ball.faces), 10_000, _rng())
-    scene = Scene((sphere(Label.TREE, (0.0, 0.0, 0.0), 1.0),), np.array([[-1.0] * 3, [1.0] * 3]))
+    scene = Scene((sphere((0.0, 0.0, 0.0), 1.0),), np.array([[-1.0] * 3, [1.0] * 3]))
     assert np.abs(scene.sdf(samples)).max() < 0.003
 
 

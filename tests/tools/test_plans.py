@@ -10,11 +10,10 @@ from support.map_records import random_record
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands.inspect import main
-from triquad_tools.mapfiles.seen_space import seen_columns, surface_columns
-from triquad_tools.plots.change_ages import latest_epochs
+from triquad_tools.mapfiles.seen_space import seen_columns
 from triquad_tools.plots.diff_plan import ADDED, GONE
+from triquad_tools.plots.map_plan import latest_epochs, sample_errors
 from triquad_tools.plots.plan import FREE, UNKNOWN, Layer, PlanGrid, Scale, draw_layers, draw_values
-from triquad_tools.plots.sample_errors import sample_errors
 from triquad_tools.plots.slice_plan import SURFACE
 
 
@@ -110,7 +109,7 @@ def test_a_legend_names_every_colour():
 
 def test_columns_have_their_highest_surface():
     record = exact_map(table(0.1, 1.1))
-    columns = surface_columns(record)
+    columns = seen_columns(record, surface_only=True)
     assert len(columns.tops) == 100 * 100
     inside = np.abs(columns.middles).max(axis=1) < 2.0
     np.testing.assert_allclose(columns.tops[inside], 1.1)

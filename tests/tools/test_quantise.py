@@ -15,7 +15,6 @@ from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.field_change import draw_probes, field_change
 from triquad_tools.mapfiles.packing import INTEGER_ERROR_M
 from triquad_tools.mapfiles.quantise import dequantised, quantise
-from triquad_tools.mapfiles.region_probes import RegionProbes
 
 OTHER_SEED = 77
 
@@ -63,23 +62,6 @@ def test_statuses_stay(street, coarse):
     points = draw_probes(street.settings, region, np.random.default_rng(5), 2000).points
     before, after = (MapEvaluator(record).query(points) for record in (street, coarse.record))
     np.testing.assert_array_equal(before.status, after.status)
-
-
-def test_probes_agree_with_the_evaluator(street):
-    region = street.regions[0]
-    moved = tuple(dataclasses.replace(t, features=t.features * 1.01) for t in region.tables)
-    change = RegionProbes(street.settings, region, np.random.default_rng(0)).change(
-        [table.vectors() for table in moved]
-    )
-    alone = dataclasses.replace(street, regions=(dataclasses.replace(region, index=(0, 0, 0)),))
-    after = dataclasses.replace(
-        alone, regions=(dataclasses.replace(alone.regions[0], tables=moved),)
-    )
-    probes = draw_probes(street.settings, region, np.random.default_rng(0))
-    before, now = (MapEvaluator(record).query(probes.points).sdf for record in (alone, after))
-    inside = np.isfinite(before)
-    expected = probes.change(np.where(inside, now - before, 0))
-    assert change.near_m == pytest.approx(expected.near_m, rel=0.02)
 
 
 def test_the_error_is_from_the_map_that_was_packed(street, fine):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from triquad_client import Mesh
-from triquad_tools.benchmarks.tile_changes import changed_tiles
+from triquad_tools.benchmarks.mesh import changed_tiles
 
 CELL_M = 0.1
 TOLERANCE_M = 0.01

@@ -1,20 +1,28 @@
-"""``triquad-bench`` of the map file: how small, how true, how quickly opened."""
+"""``triquad-bench`` of map files: how small, how true, how quickly opened, how fast offline."""
 
 import dataclasses
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+from triquad_client import OfflineMap, open_map
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.region import MapRecord
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.preview import previews_of
 from triquad_server.settings import Settings
 
-from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.core import seen_points
+from triquad_tools.benchmarks.figures import Figure, compare, seconds
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
 from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
 from triquad_tools.mapfiles.field_change import field_change
@@ -25,6 +33,8 @@ from triquad_tools.mapfiles.quantise import quantise
 _LARGE_BYTES = 100_000_000
 _MESH_SAMPLES = 3_000_000
 _SEED = 2  # of the points at which the file is compared with the live map
+_OFFLINE_SEED = 4
+_ROUNDS = 7
 
 _OPEN = """
 import sys, time
@@ -107,3 +117,61 @@ def _opening(record: MapRecord, folder: Path) -> list[Figure]:
         Figure("the same with starting Python", process_s, "s"),
         Figure("large file, read whole and checked", time.perf_counter() - started, "s"),
     ]
+
+
+def measure_offline(made: BenchStreet) -> list[Figure]:
+    """Figures of the street's map, opened offline, against the settled server's epoch."""
+    epoch = settled_mapper("the street", made.scans).publish()
+    points = seen_points(epoch, made, np.random.default_rng(_OFFLINE_SEED))
+    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
+        path = Path(name) / "street.triquad"
+        write_map(epoch.record(), path)
+        open_map(path).query_distance(points[:10])  # compiled code is loaded
+        opening_s = seconds(lambda: open_map(path))
+        with open_map(path) as offline:
+            first_s = seconds(lambda: offline.query_distance(points[:1]))
+            figures = _differences(offline, epoch, points) + _ratios(offline, epoch, points)
+        plain = MapEvaluator(read_map(path))
+    few = points[:1000]
+    distances(plain, few[:1], DistanceOptions())
+    plain_s = seconds(lambda: distances(plain, few, DistanceOptions()))
+    return [
+        *figures,
+        Figure("open the file of the street", opening_s, "s", at_most=2),
+        Figure("the first distance, with fitting all surfels", first_s, "s", at_most=2),
+        Figure("1,000 distances without compiled code", 1e3 * plain_s, "ms"),
+    ]
+
+
+def _differences(offline: OfflineMap, epoch: Epoch, points: NDArray[np.float64]) -> list[Figure]:
+    field, live_field = offline.query_sdf(points), epoch.query(points)
+    have, want = offline.query_distance(points), distances(epoch, points, DistanceOptions())
+    sdf_m = np.quantile(np.abs(field.sdf - live_field.sdf), 0.99)
+    distance_m = np.quantile(np.abs(have.distance_m - want.distance_m), 0.99)
+    equal = np.mean((field.status == live_field.status) & (have.status == want.status))
+    return [
+        Figure("offline against live, SDF, 99 %", 1e3 * float(sdf_m), "mm", at_most=1),
+        Figure("offline against live, distance, 99 %", 1e3 * float(distance_m), "mm", at_most=1),
+        Figure("equal status", 100 * float(equal), "%", at_least=99.99),
+        Figure("found alike", 100 * float(np.mean(have.found == want.found)), "%", at_least=99.9),
+    ]
+
+
+def _ratios(offline: OfflineMap, epoch: Epoch, points: NDArray[np.float64]) -> list[Figure]:
+    """How many times as long as the server's epoch the file takes."""
+    figures = []
+    for count in (1_000, 100_000):
+        some = points[:count]
+        repeats = 20 if count < 10_000 else 2
+        ways: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
+            "SDF": (partial(offline.query_sdf, some), partial(epoch.query, some)),
+            "distances": (
+                partial(offline.query_distance, some),
+                partial(distances, epoch, some, DistanceOptions()),
+            ),
+        }
+        for name, (here, there) in ways.items():
+            taken = 1 / compare(here, there, _ROUNDS, repeats).ratio
+            label = f"{count:,} {name}, times the server's epoch"
+            figures.append(Figure(label, taken, "", at_most=1.2))
+    return figures

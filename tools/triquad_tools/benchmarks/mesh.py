@@ -2,9 +2,12 @@
 
 import threading
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from triquad_client import Client, Mesh, MeshWatch
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_server.epochs.epoch import Epoch
@@ -15,9 +18,8 @@ from triquad_server.settings import MeshSettings, Settings
 from triquad_server.threads import Teams
 
 from triquad_tools.benchmarks.figures import Figure, seconds
-from triquad_tools.benchmarks.served import served
+from triquad_tools.benchmarks.served import latency_figures, served
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
-from triquad_tools.benchmarks.tile_changes import changed_tiles
 from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.demo.probe import ask_until
@@ -28,6 +30,7 @@ _FETCH_LIMIT_S = 300.0
 _ASKED = 1_000
 _NEEDLESS = 0.4  # of the tiles that are meshed again; where all are, or some at random, it is more
 _NEXT = 50  # the scan that comes again, from half a metre on
+_CANDIDATES = 8  # triangles that are tried for each point: those of the nearest centroids
 _EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
 
@@ -134,12 +137,7 @@ def _levels(client: Client, planner: Client, made: BenchStreet) -> list[Figure]:
         stop.set()
         met = asking.result()
     name = "1,000 points with gradient while tiles are meshed"
-    return [
-        *figures,
-        Figure(f"{name}, median", met.latency_p50_ms, "ms"),
-        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms"),
-        Figure(f"{name}, errors", met.errors, "", at_most=0),
-    ]
+    return figures + latency_figures(name, met)
 
 
 def _one_more(made: BenchStreet) -> SimulatedScan:
@@ -221,3 +219,57 @@ def _make(cache: TileCache) -> set[TileIndex]:
             cache.make(0, index)
         made.update(to_make)
     return made
+
+
+def changed_tiles(
+    before: Mapping[TileIndex, Mesh],
+    after: Mapping[TileIndex, Mesh],
+    tolerance_m: float,
+    cell_m: float,
+) -> set[TileIndex]:
+    """Tiles whose surface came, went or moved.
+
+    That is where a vertex is farther than ``cell_m`` from all triangles of the other time, or more
+    than half of them are farther than ``tolerance_m``. Triangles have to be about as large as
+    cells. Vertices are in the map frame: those of neighbouring tiles count as well, so that nothing
+    comes or goes where a surface crosses from one tile to the next.
+    """
+    old, new = _Triangles(before), _Triangles(after)
+    return {
+        index
+        for index in before.keys() | after.keys()
+        if (index in before and _left(before[index].vertices, new, tolerance_m, cell_m))
+        or (index in after and _left(after[index].vertices, old, tolerance_m, cell_m))
+    }
+
+
+def _left(
+    points: NDArray[np.floating], triangles: "_Triangles", tolerance_m: float, cell_m: float
+) -> bool:
+    moved = points[triangles.farther(points, tolerance_m)]
+    return 2 * len(moved) > len(points) or bool(triangles.farther(moved, cell_m).any())
+
+
+class _Triangles:
+    """The triangles of all tiles."""
+
+    def __init__(self, tiles: Mapping[TileIndex, Mesh]) -> None:
+        corners = [mesh.vertices[mesh.faces] for mesh in tiles.values()]
+        self._corners = np.concatenate([np.zeros((0, 3, 3)), *corners])  # [F, 3, 3]
+        self._tree = cKDTree(self._corners.mean(axis=1))
+
+    def farther(self, points: NDArray[np.floating], limit_m: float) -> NDArray[np.bool_]:
+        """Whether points [N, 3] are farther from the triangles."""
+        from trimesh.triangles import closest_point  # slow to import
+
+        far = np.ones(len(points), np.bool_)
+        count = min(_CANDIDATES, len(self._corners))
+        if count == 0 or len(points) == 0:
+            return far
+        _, candidates = self._tree.query(points, range(1, count + 1), workers=-1)
+        for rows in candidates.T:
+            left = np.flatnonzero(far)
+            corners = self._corners[rows[left]]
+            nearest = closest_point(corners, points[left])
+            far[left] = np.linalg.norm(nearest - points[left], axis=1) > limit_m
+        return far

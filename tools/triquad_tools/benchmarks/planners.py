@@ -18,7 +18,7 @@ from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.answers import REACH_M, measure_answers
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.served import MAP, Served, served, stream
+from triquad_tools.benchmarks.served import MAP, Served, latency_figures, served, stream
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.settling import wait_until_settled
 from triquad_tools.demo.probe import ProbeReport
@@ -76,12 +76,7 @@ def _one(server: Served, made: BenchStreet, points: Points) -> list[Figure]:
         stream(server.client, made.scans, "streaming beside one planner")
         met = probe.finish()
     name = f"{_ASKED} distances to {REACH_M:g} m with gradient while streaming"
-    return [
-        Figure(f"{name}, median", met.latency_p50_ms, "ms", at_most=5),
-        Figure(f"{name}, 99 %", met.latency_p99_ms, "ms", at_most=20),
-        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms"),
-        Figure(f"{name}, errors", met.errors, "", at_most=0),
-    ]
+    return latency_figures(name, met, 5, 20)
 
 
 def _sixteen(server: Served, made: BenchStreet, points: Sequence[Points]) -> list[Figure]:

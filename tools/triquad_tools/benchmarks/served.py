@@ -14,10 +14,12 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 
-from triquad_tools.benchmarks.street import BenchStreet, PosedScan
+from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
-from triquad_tools.demo.server import DemoServer, ServerOptions
+from triquad_tools.demo.server import DemoServer
+from triquad_tools.recordings.cloud import PosedScan
 
 MAP = "bench"
 
@@ -40,9 +42,7 @@ class Served:
 
     def planner(self, points: NDArray[np.float64], question: str) -> Probe:
         """A process that asks a question at points [N, 3], for a ``with`` statement."""
-        with tempfile.NamedTemporaryFile(dir=self.folder, suffix=".npy", delete=False) as file:
-            np.save(file, points)
-        return Probe(self.endpoint, MAP, Path(file.name), question)
+        return Probe(self.endpoint, MAP, points, question)
 
 
 @contextmanager
@@ -50,13 +50,12 @@ def served(record: MapRecord | None = None) -> Iterator[Served]:
     """A server with an empty map, or with that of a record, in a folder that goes in the end."""
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         folder = Path(name)
-        options = ServerOptions.within(folder, MAP)
         if record is not None:
-            store = options.store / MAP
+            store = folder / "store" / MAP
             store.mkdir(parents=True)
             write_map(record, store / checkpoint_name(record.epoch, complete=True))
         with (
-            DemoServer(options) as server,
+            DemoServer(folder, MAP) as server,
             connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client,
         ):
             yield Served(folder, server.endpoint, client)
@@ -87,3 +86,15 @@ def stream_beside_planner(
     with server.planner(points, "gradient") as probe:
         stream(server.client, made.scans, published=published)
         return probe.finish()
+
+
+def latency_figures(
+    name: str, met: ProbeReport, median_ms: float | None = None, tail_ms: float | None = None
+) -> list[Figure]:
+    """How soon a planner's queries were answered, and what the median and 99 % should be."""
+    return [
+        Figure(f"{name}, median", met.latency_p50_ms, "ms", at_most=median_ms),
+        Figure(f"{name}, 99 %", met.latency_p99_ms, "ms", at_most=tail_ms),
+        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms"),
+        Figure(f"{name}, errors", met.errors, "", at_most=0),
+    ]

@@ -5,20 +5,17 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_client import Client, Mesh
 from triquad_format.mapfile.reader import read_map
-from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.core import seen_points
 from triquad_tools.benchmarks.figures import Figure, seconds
-from triquad_tools.benchmarks.served import served, stream_beside_planner
+from triquad_tools.benchmarks.served import latency_figures, served, stream_beside_planner
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, wait_until_settled
-from triquad_tools.demo.probe import ProbeReport
-from triquad_tools.evaluation.map_scores import StreetScores, score_street
+from triquad_tools.evaluation.map_scores import score_street
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
 
 _SOON_S = 2.0  # after the last scan
@@ -33,7 +30,8 @@ def measure_server(made: BenchStreet) -> list[Figure]:
         client = server.client
         met = stream_beside_planner(server, made)
         time.sleep(_SOON_S)
-        figures = _latency(met) + _early(client, made)
+        name = "1,000 points with gradient while streaming"
+        figures = latency_figures(name, met, 4, 15) + _early(client, made)
         started = time.monotonic()
         wait_until_settled(client, _SETTLE_LIMIT_S)
         settled_s = time.monotonic() - started
@@ -45,22 +43,12 @@ def measure_server(made: BenchStreet) -> list[Figure]:
     return figures
 
 
-def _latency(met: ProbeReport) -> list[Figure]:
-    name = "1,000 points with gradient while streaming"
-    return [
-        Figure(f"{name}, median", met.latency_p50_ms, "ms", at_most=4),
-        Figure(f"{name}, 99 %", met.latency_p99_ms, "ms", at_most=15),
-        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms"),
-        Figure(f"{name}, errors", met.errors, "", at_most=0),
-    ]
-
-
 def _early(client: Client, made: BenchStreet) -> list[Figure]:
     """The map soon after the last scan: all of it is taken from the epoch of that moment."""
     trained = client.status().samples_trained / 1e6
     mesh = client.mesh(_bounds(made))
     lost = client.flush(FLUSH_TIMEOUT_S)
-    scores = _mesh_scores(mesh.vertices, mesh.faces, made)
+    scores = _mesh_scores(mesh, made)
     return [
         Figure("scans dropped of 100", lost.lost + lost.refused, "", at_most=0),
         Figure("samples trained 2 s after the last scan", trained, "M"),
@@ -70,13 +58,10 @@ def _early(client: Client, made: BenchStreet) -> list[Figure]:
 
 
 def _converged(client: Client, made: BenchStreet) -> list[Figure]:
-    street: StreetScores = score_street(client.query_sdf, made.probes)
-    times = []
-    for _ in range(3):
-        started = time.perf_counter()
-        mesh = client.mesh(_bounds(made))
-        times.append(time.perf_counter() - started)
-    scores = _mesh_scores(mesh.vertices, mesh.faces, made)
+    street = score_street(client.query_sdf, made.probes)
+    mesh = client.mesh(_bounds(made))
+    times = [seconds(lambda: client.mesh(_bounds(made))) for _ in range(3)]
+    scores = _mesh_scores(mesh, made)
     return [
         Figure("converged: F-score", 100 * scores.f_score, "%", at_least=98),
         Figure("converged: accuracy, mean", 100 * scores.accuracy_m, "cm", at_most=0.9),
@@ -94,8 +79,8 @@ def _converged(client: Client, made: BenchStreet) -> list[Figure]:
 def _network(client: Client, made: BenchStreet, folder: Path) -> list[Figure]:
     """Queries of 100,000 points through the network, against the same map in this process."""
     client.download_map(folder / "map.triquad")
-    epoch: Epoch = Mapper("bench", Settings(), "cpu", read_map(folder / "map.triquad")).publish()
-    points: NDArray[np.float64] = seen_points(epoch, made, np.random.default_rng(0))
+    epoch = Mapper("bench", Settings(), "cpu", read_map(folder / "map.triquad")).publish()
+    points = seen_points(epoch, made, np.random.default_rng(0))
     times: list[float] = []
     ratios: list[float] = []
     for _ in range(_REPEATS):
@@ -115,9 +100,6 @@ def _bounds(made: BenchStreet) -> tuple[list[float], list[float]]:
     return low, high
 
 
-def _mesh_scores(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32], made: BenchStreet
-) -> MeshScores:
+def _mesh_scores(mesh: Mesh, made: BenchStreet) -> MeshScores:
     settings = ScoreSettings(samples_max=_MESH_SAMPLES)
-    mesh = Mesh(vertices, faces)
     return score_against_scene(mesh, made.drive.scene, made.visible, settings)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from triquad_server.warm_up import warm_up
 
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
+from triquad_tools.recordings.cloud import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
@@ -19,18 +19,6 @@ SCANS = 100
 _LENGTH_M = 110.0  # so that the map has some 2 million parameters
 _COLUMNS = 1024  # some 60,000 points a scan
 _VISIBLE_VOXEL_M = 0.05
-
-
-class PosedScan(Protocol):
-    """A scan and where it was taken."""
-
-    @property
-    def points(self) -> NDArray[np.floating]:
-        """``[N, 3]`` metres, sensor frame."""
-
-    @property
-    def world_from_sensor(self) -> NDArray[np.float64]:
-        """``[4, 4]``."""
 
 
 @dataclass(frozen=True)

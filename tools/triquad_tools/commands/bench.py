@@ -64,9 +64,8 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
         return []
     from triquad_tools.benchmarks.align import measure_align  # slow to import
     from triquad_tools.benchmarks.core import measure_core
-    from triquad_tools.benchmarks.file import measure_file
+    from triquad_tools.benchmarks.file import measure_file, measure_offline
     from triquad_tools.benchmarks.mesh import measure_mesh
-    from triquad_tools.benchmarks.offline import measure_offline
     from triquad_tools.benchmarks.planners import measure_planners
     from triquad_tools.benchmarks.server import measure_server
     from triquad_tools.benchmarks.store import measure_store
@@ -159,7 +158,3 @@ def _parser() -> argparse.ArgumentParser:
     add("--json", type=Path, metavar="FILE", help="write the figures there, too")
     add("--record", type=Path, metavar="FILE.md", help="add a table to this page")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -14,7 +14,9 @@ from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, 
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo import steps
 from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
-from triquad_tools.demo.server import DemoServer, ServerOptions
+from triquad_tools.demo.server import DemoServer
+from triquad_tools.evaluation.map_scores import driven_street
+from triquad_tools.simulation.street import street_drive
 
 _COMMAND = "triquad-demo"
 
@@ -49,22 +51,25 @@ def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
         ToolError, TriquadError, FormatError, OSError: a step failed; the server is stopped.
     """
     laps = _Laps()
-    server_options = ServerOptions.within(out, steps.MAP)
-    _prepare(out)
-    street = steps.simulate(scans, street_seed)
+    out.mkdir(parents=True, exist_ok=True)
+    # What an earlier demonstration left in its store and log is forgotten.
+    shutil.rmtree(out / "store" / steps.MAP, ignore_errors=True)
+    (out / "server.log").unlink(missing_ok=True)
+    street = driven_street(street_drive(street_seed, scans))
     laps.end("simulate")
     _say("starting triquad-server (the first run of all compiles kernels: a minute more) ...")
-    with DemoServer(server_options) as server:
+    with DemoServer(out, steps.MAP) as server:
         laps.end("start")
-        learnt = steps.learn(server.endpoint, street, out)
+        learnt = steps.learn(server.endpoint, street)
         laps.end("learn")
-        _say_if_unsettled(learnt.intake.settled)
+        if not learnt.intake.settled:
+            _say("the server is still learning; it is scored as it is now")
         scored = steps.score(server.endpoint, street)
         laps.end("score")
         server.stop()
         laps.end("stop")
     _say("starting triquad-server again, from its checkpoint ...")
-    with DemoServer(server_options) as server:
+    with DemoServer(out, steps.MAP) as server:
         restart = steps.compare(server.endpoint, scored)
         server.stop()
     laps.end("restart")
@@ -93,18 +98,6 @@ class _Laps:
         self._since = now
 
 
-def _prepare(out: Path) -> None:
-    """Make the folder; forget what an earlier demonstration left in its store and log."""
-    out.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(out / "store" / steps.MAP, ignore_errors=True)
-    (out / "server.log").unlink(missing_ok=True)
-
-
-def _say_if_unsettled(settled: bool) -> None:
-    if not settled:
-        _say("the server is still learning; it is scored as it is now")
-
-
 def _say(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
 
@@ -122,7 +115,3 @@ def _parser() -> argparse.ArgumentParser:
     add("--scans", type=count, default=60, metavar="N", help="a metre apart (default: 60)")
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

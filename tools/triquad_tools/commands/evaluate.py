@@ -1,7 +1,6 @@
 """``triquad-eval``: how good a mesh or a map is."""
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_client import Client, Mesh
+from triquad_client import Client
 
 from triquad_tools.console.arguments import count, not_negative, positive, seed
 from triquad_tools.console.command import OK, ToolError, run
@@ -53,7 +52,8 @@ def _evaluate(options: argparse.Namespace) -> int:
         print(json_text(results))
         return OK
     for name, scores in results.items():
-        print_rows(_TITLES[name], _ROWS[name](scores))
+        title, rows = _TABLES[name]
+        print_rows(title, rows(scores))
     return OK
 
 
@@ -88,10 +88,9 @@ def _on_street(options: argparse.Namespace) -> Results:
         results: Results = {"street": score_street(opened.query_sdf, probes)}
         if isinstance(opened, Client):  # a file has no mesh
             low, high = drive.scene.bounds.tolist()
-            found = opened.mesh((low, high))
+            mesh = opened.mesh((low, high))
             visible = drive.true_hits(_STREET_VOXEL_M)
             settings = ScoreSettings(samples_max=_SERVER_SAMPLES_MAX)
-            mesh = Mesh(found.vertices, found.faces)
             results["mesh"] = score_against_scene(mesh, drive.scene, visible, settings)
     return results
 
@@ -166,15 +165,10 @@ def withheld_rows(scores: WithheldScores) -> list[Row]:
     ]
 
 
-_TITLES = {
-    "mesh": "Mesh",
-    "street": "Map, against the exact street",
-    "withheld": "Map, at the points of withheld scans",
-}
-_ROWS: dict[str, Callable[[Any], list[Row]]] = {
-    "mesh": mesh_rows,
-    "street": street_rows,
-    "withheld": withheld_rows,
+_TABLES: dict[str, tuple[str, Callable[[Any], list[Row]]]] = {
+    "mesh": ("Mesh", mesh_rows),
+    "street": ("Map, against the exact street", street_rows),
+    "withheld": ("Map, at the points of withheld scans", withheld_rows),
 }
 
 
@@ -248,7 +242,3 @@ def _add_street(parser: argparse.ArgumentParser, truth: Any) -> None:
         "--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)"
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -186,7 +185,3 @@ def _diff(options: argparse.Namespace) -> int:
 
 def _title(path: Path, file: MapFile) -> str:
     return f"{path}: map {file.record.name!r}, epoch {file.record.epoch}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

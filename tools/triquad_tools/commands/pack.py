@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,14 +15,14 @@ from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 
 from triquad_tools.console.arguments import error_limit, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
-from triquad_tools.mapfiles.packing import chosen_precision, pack_map, print_packed
+from triquad_tools.mapfiles.grid import export_grid
+from triquad_tools.mapfiles.packing import chosen_precision, pack_map
 from triquad_tools.mapfiles.source import (
     Box,
     NothingLeftError,
     SourceMap,
     chosen_file,
     cropped,
-    epoch_of,
     read_source,
 )
 
@@ -34,6 +33,7 @@ _SUFFIXES = (_MAP, *_MESHES, _GRID)
 _PLANES = ("XY", "XZ", "YZ")
 _MESH_CELL_M, _GRID_CELL_M = 0.1, 0.2
 _CELL_RANGE_M = (0.01, 10.0)
+_MARGIN_CELLS = 16  # so far around its box a map is needed for a mesh or a grid
 
 _Add = Callable[..., argparse.Action]
 
@@ -105,7 +105,8 @@ def _pack(options: argparse.Namespace) -> int:
     path = chosen_file(options.input, options.at)
     _check_target(path, options.output, options.force)
     if path != options.input:
-        print(f"epoch {epoch_of(path)}, from {path}")
+        checkpoint = checkpoint_file(path)
+        print(f"epoch {checkpoint and checkpoint.epoch}, from {path}")
         if options.at is None:
             _tell_set_aside(path)
     write = _pack_map if options.output.suffix == _MAP else _export
@@ -162,23 +163,24 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
     precision = chosen_precision(options.precision, options.max_error)
     training = not options.no_training and precision.max_error_m is None
     source, complete = _source(options, path, _box(options.crop), training)
-    packed = pack_map(source, precision, options.output)
-    print_packed(options.output, packed, path.stat().st_size)
+    written = pack_map(source, precision, options.output, path.stat().st_size)
+    print(f"{options.output}: {written}")
     return OK if complete else FAILED
 
 
 def _export(options: argparse.Namespace, path: Path) -> int:
-    from triquad_tools.mapfiles.export import MARGIN_CELLS, export_grid, export_mesh  # slow
-
     box, output = _box(options.crop), options.output
     grid = output.suffix == _GRID
     cell_m = options.cell or (_GRID_CELL_M if grid else _MESH_CELL_M)
     check_range("--cell", cell_m, *_CELL_RANGE_M)
-    needed = None if box is None else box + [[-MARGIN_CELLS * cell_m], [MARGIN_CELLS * cell_m]]
+    margin_m = _MARGIN_CELLS * cell_m
+    needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
     if grid:
         written = export_grid(source.record, box, cell_m, options.sparse, output)
     else:
+        from triquad_tools.mapfiles.mesh import export_mesh  # slow to import
+
         written = export_mesh(source.record, box, cell_m, output)
     print(f"{output}: {written}")
     return OK if complete else FAILED
@@ -230,7 +232,3 @@ def _where(loss: Loss) -> str:
         return ""
     bounds = zip("xyz", loss.minimum.tolist(), loss.maximum.tolist(), strict=True)
     return ", " + ", ".join(f"{axis} {low:.1f} to {high:.1f} m" for axis, low, high in bounds)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

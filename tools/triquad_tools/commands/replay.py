@@ -1,7 +1,6 @@
 """``triquad-replay``: publish a recorded folder of scans to a map server."""
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,10 +59,8 @@ def _replay(options: argparse.Namespace) -> int:
     indices = [i for i in range(len(folder)) if not is_withheld(i, options.skip_every)]
     if not indices:
         raise ToolError(f"{options.folder}: --skip-every {options.skip_every} leaves no scan")
-    pace = Pace(options.rate, options.as_recorded)
     with connect(options.connect, options.map) as client:
-        publisher = _Publisher(client, options.source, pace)
-        report = publisher.replay(folder, indices, options.range_min)
+        report = _publish_all(client, folder, indices, options)
         print(_summary(report))
         if options.settle:
             status = wait_until_settled(client)
@@ -72,46 +69,34 @@ def _replay(options: argparse.Namespace) -> int:
     return OK if report.complete else FAILED
 
 
-class _Publisher:
-    """Publishes scans of a folder through a client."""
-
-    def __init__(self, client: Client, source: str, pace: Pace) -> None:
-        self._client = client
-        self._source = source
-        self._pace = pace
-
-    def replay(
-        self, folder: KittiFolder, indices: Sequence[int], range_min_m: float
-    ) -> ReplayReport:
-        """Publish the scans ``indices`` and wait until the server has dealt with them."""
-        before = self._client.status().scans_dropped
-        due_s = due_times(self._pace, [int(folder.stamps_ns[index]) for index in indices])
-        published = skipped = 0
-        started = time.monotonic()
-        with progress("publishing", len(indices)) as report:
-            for done, index in enumerate(indices):
-                _wait_until(started + due_s[done])
-                sent = self._publish(folder, index, range_min_m)
-                published += sent
-                skipped += not sent
-                if sent and self._pace.by_server:
-                    keep_few_pending(self._client, published)
-                report(done + 1, f"{done + 1} of {len(indices)} scans")
-            flush = self._client.flush(FLUSH_TIMEOUT_S) if published else None
-        seconds = time.monotonic() - started
-        after = self._client.status().scans_dropped
-        refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
-        refusals = {reason: count for reason, count in refusals.items() if count > 0}
-        return ReplayReport(published, skipped, flush, refusals, seconds)
-
-    def _publish(self, folder: KittiFolder, index: int, range_min_m: float) -> bool:
-        """Publish one scan; False where no point of it is left."""
-        points = points_in_range(folder.read_points(index), range_min_m)
-        if not len(points):
-            return False
-        stamp_s = int(folder.stamps_ns[index]) / 1e9
-        self._client.publish_scan(points, folder.poses[index], stamp_s, self._source)
-        return True
+def _publish_all(
+    client: Client, folder: KittiFolder, indices: Sequence[int], options: argparse.Namespace
+) -> ReplayReport:
+    """Publish the scans ``indices`` and wait until the server has dealt with them."""
+    pace = Pace(options.rate, options.as_recorded)
+    before = client.status().scans_dropped
+    due_s = due_times(pace, [int(folder.stamps_ns[index]) for index in indices])
+    published = skipped = 0
+    started = time.monotonic()
+    with progress("publishing", len(indices)) as report:
+        for done, index in enumerate(indices):
+            time.sleep(max(0.0, started + due_s[done] - time.monotonic()))
+            points = points_in_range(folder.read_points(index), options.range_min)
+            if len(points):
+                stamp_s = int(folder.stamps_ns[index]) / 1e9
+                client.publish_scan(points, folder.poses[index], stamp_s, options.source)
+                published += 1
+                if pace.by_server:
+                    keep_few_pending(client, published)
+            else:
+                skipped += 1
+            report(done + 1, f"{done + 1} of {len(indices)} scans")
+        flush = client.flush(FLUSH_TIMEOUT_S) if published else None
+    seconds = time.monotonic() - started
+    after = client.status().scans_dropped
+    refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
+    refusals = {reason: count for reason, count in refusals.items() if count > 0}
+    return ReplayReport(published, skipped, flush, refusals, seconds)
 
 
 def due_times(pace: Pace, stamps_ns: Sequence[int]) -> list[float]:
@@ -120,13 +105,6 @@ def due_times(pace: Pace, stamps_ns: Sequence[int]) -> list[float]:
         return [(stamp - stamps_ns[0]) / 1e9 for stamp in stamps_ns]
     period_s = 0.0 if pace.rate_hz is None else 1.0 / pace.rate_hz
     return [index * period_s for index in range(len(stamps_ns))]
-
-
-def _wait_until(due: float) -> None:
-    """Return at the monotonic time ``due``, at once where it has passed."""
-    wait_s = due - time.monotonic()
-    if wait_s > 0.0:
-        time.sleep(wait_s)
 
 
 def _summary(report: ReplayReport) -> str:
@@ -189,7 +167,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--settle", action="store_true", help="wait until the server has learnt all of it")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,10 +34,6 @@ QUESTIONS: "dict[str, Callable[[Client, NDArray[np.float64]], int]]" = {
 """What the planner may ask; each returns the epoch that answered."""
 
 
-class ProbeError(ToolError):
-    """A process of queries that failed."""
-
-
 @dataclass(frozen=True)
 class ProbeReport:
     """What the planner met; latencies are NaN where no query was answered."""
@@ -58,12 +53,15 @@ class ProbeReport:
 class Probe:
     """The planner's process; leaving the ``with`` statement ends it in any case."""
 
-    def __init__(self, endpoint: str, map_name: str, points: Path, question: str = "sdf") -> None:
-        """Start to ask a question of ``QUESTIONS`` at ``points``, an ``.npy`` file ``[N, 3]``."""
-        command = [sys.executable, "-m", __name__, endpoint, map_name, str(points), question]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+    def __init__(
+        self, endpoint: str, map_name: str, points: NDArray[np.float64], question: str = "sdf"
+    ) -> None:
+        """Start to ask a question of ``QUESTIONS`` at points [N, 3], a few thousand at most."""
+        command = [sys.executable, "-m", __name__, endpoint, map_name, question, str(len(points))]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        assert self._process.stdin is not None
+        self._process.stdin.write(points.astype("<f8").tobytes())
+        self._process.stdin.flush()
 
     def __enter__(self) -> "Probe":
         return self
@@ -77,22 +75,19 @@ class Probe:
         """End the queries and say what they met.
 
         Raises:
-            ProbeError: the process failed.
+            ToolError: the process failed.
         """
         try:
             output, _ = self._process.communicate(timeout=_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            raise ProbeError(f"the queries did not end within {_STOP_TIMEOUT_S:g} s") from None
+            raise ToolError(f"the queries did not end within {_STOP_TIMEOUT_S:g} s") from None
         if self._process.returncode != 0:
-            raise ProbeError(f"the queries ended with exit code {self._process.returncode}")
+            raise ToolError(f"the queries ended with exit code {self._process.returncode}")
         return ProbeReport(**json.loads(output))
 
 
 def ask_until(
-    stop: threading.Event,
-    client: "Client",
-    points: NDArray[np.float64],
-    question: str = "sdf",
+    stop: threading.Event, client: "Client", points: NDArray[np.float64], question: str = "sdf"
 ) -> ProbeReport:
     """Ask a question of ``QUESTIONS`` at ``points`` [N, 3] until ``stop`` is set."""
     from triquad_client import TriquadError
@@ -110,45 +105,31 @@ def ask_until(
             errors += 1
             last_error = f"{type(error).__name__}: {error}"
         stop.wait(PERIOD_S - (time.perf_counter() - started))
-    return _report(latencies_s, epochs, errors, last_error, len(points))
-
-
-def _report(
-    latencies_s: Sequence[float],
-    epochs: Sequence[int],
-    errors: int,
-    last_error: str | None,
-    points: int,
-) -> ProbeReport:
     quantiles = [float("nan")] * 4
     if latencies_s:
         quantiles = (1e3 * np.quantile(latencies_s, [0.5, 0.95, 0.99, 1.0])).tolist()
-    return ProbeReport(
-        len(latencies_s) + errors,
-        errors,
-        last_error,
-        len(set(epochs)),
-        sum(later < before for before, later in zip(epochs, epochs[1:], strict=False)),
-        points,
-        *quantiles,
-    )
+    backwards = sum(later < before for before, later in zip(epochs, epochs[1:], strict=False))
+    queries = len(latencies_s) + errors
+    different = len(set(epochs))
+    return ProbeReport(queries, errors, last_error, different, backwards, len(points), *quantiles)
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the process; ``argv`` is endpoint, map, file of points and question."""
+    """Run the process; ``argv`` is endpoint, map, question and how many points are read."""
     from triquad_client import connect
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    endpoint, map_name, points, question = argv
+    endpoint, map_name, question, count = argv
+    points = np.frombuffer(sys.stdin.buffer.read(24 * int(count)), "<f8").reshape(-1, 3)
     stop = threading.Event()
 
     def wait_for_end() -> None:
-        sys.stdin.read()
+        sys.stdin.buffer.read()
         stop.set()
 
     threading.Thread(target=wait_for_end, daemon=True).start()
     with connect(endpoint, map_name) as client:
-        report = ask_until(stop, client, np.load(points), question)
+        report = ask_until(stop, client, points, question)
     print(json.dumps(asdict(report)))
     return 0
 

@@ -10,12 +10,6 @@ if TYPE_CHECKING:
     from triquad_tools.evaluation.map_scores import StreetScores
     from triquad_tools.evaluation.metrics import MeshScores
 
-SDF_ERROR_MAX_M = 0.02
-GRADIENT_ANGLE_MAX_DEG = 12.0
-F_SCORE_MIN = 0.95
-HOUSES_UNKNOWN_MIN = 0.98
-RESTART_DIFFERENCE_MAX_M = 0.002
-
 
 @dataclass(frozen=True)
 class Intake:
@@ -80,50 +74,32 @@ class DemoResults:
         return sum(self.phases_s.values())
 
 
-@dataclass(frozen=True)
-class Promise:
-    """A figure that has to be on the right side of a limit."""
-
-    name: str
-    value: float
-    limit: float
-    at_least: bool = False
-
-    @property
-    def kept(self) -> bool:
-        """Whether it is; NaN never is."""
-        return self.value >= self.limit if self.at_least else self.value <= self.limit
-
-
-def promises(results: DemoResults) -> list[Promise]:
-    """What the README promises of a street, against what was measured."""
-    street, restart = results.street, results.restart
-    found = [
-        Promise("SDF error (m)", street.sdf_error_m, SDF_ERROR_MAX_M),
-        Promise("gradient angle (deg)", street.gradient_angle_deg, GRADIENT_ANGLE_MAX_DEG),
-        Promise("mesh F-score", results.mesh.f_score, F_SCORE_MIN, at_least=True),
-        Promise("houses UNKNOWN", street.houses_unknown_ratio, HOUSES_UNKNOWN_MIN, at_least=True),
-        Promise("scans lost or refused", results.intake.lost + results.intake.refused, 0),
-        Promise("query errors", results.queries.errors, 0),
-        Promise("answers from an older epoch", results.queries.epochs_backwards, 0),
-    ]
-    if results.intake.settled:  # a map that still learns may change
-        found += [
-            Promise(
-                "restart difference (m)", restart.sdf_difference_max_m, RESTART_DIFFERENCE_MAX_M
-            ),
-            Promise("statuses changed by the restart", restart.statuses_changed, 0),
-        ]
-    return found
-
-
 def broken_promises(results: DemoResults) -> list[str]:
-    """One line for each promise that was not kept, with its value and limit."""
+    """One line for each promise of the README that was not kept, with its value and limit."""
+    street, restart = results.street, results.restart
+    at_least = {
+        "mesh F-score": (results.mesh.f_score, 0.95),
+        "houses UNKNOWN": (street.houses_unknown_ratio, 0.98),
+    }
+    at_most: dict[str, tuple[float, float]] = {
+        "SDF error (m)": (street.sdf_error_m, 0.02),
+        "gradient angle (deg)": (street.gradient_angle_deg, 12.0),
+        "scans lost or refused": (results.intake.lost + results.intake.refused, 0),
+        "query errors": (results.queries.errors, 0),
+        "answers from an older epoch": (results.queries.epochs_backwards, 0),
+    }
+    if results.intake.settled:  # a map that still learns may change
+        at_most["restart difference (m)"] = (restart.sdf_difference_max_m, 0.002)
+        at_most["statuses changed by the restart"] = (restart.statuses_changed, 0)
+    # NaN keeps no promise.
     return [
-        f"{promise.name} is {promise.value:.4g}; promised is "
-        f"{'at least' if promise.at_least else 'at most'} {promise.limit:g}"
-        for promise in promises(results)
-        if not promise.kept
+        f"{name} is {value:.4g}; promised is at least {limit:g}"
+        for name, (value, limit) in at_least.items()
+        if not value >= limit
+    ] + [
+        f"{name} is {value:.4g}; promised is at most {limit:g}"
+        for name, (value, limit) in at_most.items()
+        if not value <= limit
     ]
 
 

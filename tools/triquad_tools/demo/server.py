@@ -6,32 +6,12 @@ import subprocess
 import sys
 import threading
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_tools.console.command import ToolError
 
 _READY_TIMEOUT_S = 300.0  # kernels are compiled on the first start
 _STOP_TIMEOUT_S = 60.0
-
-
-class DemoServerError(ToolError):
-    """A server that does not start, or does not stop."""
-
-
-@dataclass(frozen=True)
-class ServerOptions:
-    """What the server is started with."""
-
-    endpoint: str
-    map_name: str
-    store: Path
-    log: Path  # its log is added to this file
-
-    @classmethod
-    def within(cls, folder: Path, map_name: str) -> "ServerOptions":
-        """On a free port, with store and log in a folder."""
-        return cls(_free_endpoint(), map_name, folder / "store", folder / "server.log")
 
 
 def _free_endpoint() -> str:
@@ -42,21 +22,21 @@ def _free_endpoint() -> str:
 
 
 class DemoServer:
-    """A running server; leaving the ``with`` statement stops it in any case."""
+    """A running server on a free port; leaving the ``with`` statement stops it in any case."""
 
-    def __init__(self, options: ServerOptions) -> None:
-        """Start the process and wait until it is ready.
+    def __init__(self, folder: Path, map_name: str) -> None:
+        """Start the process, with store and log in a folder, and wait until it is ready.
 
         Raises:
-            DemoServerError: it ended before, or took too long.
+            ToolError: it ended before, or took too long.
         """
-        self.endpoint = options.endpoint
-        self._options = options
+        self.endpoint = _free_endpoint()
+        self._log = folder / "server.log"
         self._started = threading.Event()  # ready, or ended
         self._ready = False
         self._last_line = "it said nothing"
-        command = [sys.executable, "-m", "triquad_server.cli", "--listen", options.endpoint]
-        command += ["--map", options.map_name, "--store", str(options.store)]
+        command = [sys.executable, "-m", "triquad_server.cli", "--listen", self.endpoint]
+        command += ["--map", map_name, "--store", str(folder / "store")]
         command += ["--no-multicast-scouting"]
         self._process = subprocess.Popen(
             command, stderr=subprocess.PIPE, text=True, errors="replace"
@@ -64,7 +44,10 @@ class DemoServer:
         self._reader = threading.Thread(target=self._read_log, name="server log")
         self._reader.start()
         try:
-            self._wait_until_ready()
+            if not self._started.wait(_READY_TIMEOUT_S):
+                raise self._failure(f"the server is not ready after {_READY_TIMEOUT_S:g} s")
+            if not self._ready:
+                raise self._failure("the server did not start")
         except BaseException:
             self._end()
             raise
@@ -79,31 +62,25 @@ class DemoServer:
         """Ask the server to stop and wait for it.
 
         Raises:
-            DemoServerError: it did not stop, or not in good order.
+            ToolError: it did not stop, or not in good order.
         """
         self._process.send_signal(signal.SIGTERM)
         try:
             code = self._process.wait(_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            raise DemoServerError(
+            raise ToolError(
                 f"the server did not stop within {_STOP_TIMEOUT_S:g} s of SIGTERM; its log is "
-                f"{self._options.log}"
+                f"{self._log}"
             ) from None
         if code != 0:
             raise self._failure(f"the server stopped with exit code {code}")
 
-    def _wait_until_ready(self) -> None:
-        if not self._started.wait(_READY_TIMEOUT_S):
-            raise self._failure(f"the server is not ready after {_READY_TIMEOUT_S:g} s")
-        if not self._ready:
-            raise self._failure("the server did not start")
-
-    def _failure(self, what: str) -> DemoServerError:
-        return DemoServerError(f"{what}: {self._last_line}; its log is {self._options.log}")
+    def _failure(self, what: str) -> ToolError:
+        return ToolError(f"{what}: {self._last_line}; its log is {self._log}")
 
     def _read_log(self) -> None:
         assert self._process.stderr is not None
-        with self._options.log.open("a", encoding="utf-8") as log:
+        with self._log.open("a", encoding="utf-8") as log:
             for line in self._process.stderr:
                 log.write(line)
                 log.flush()

@@ -18,16 +18,9 @@ from triquad_tools.console.progress import progress
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.results import Intake, MapSize, Restart
-from triquad_tools.evaluation.map_scores import (
-    DrivenStreet,
-    StreetScores,
-    driven_street,
-    score_street,
-)
+from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
-from triquad_tools.plots.camera import Camera
-from triquad_tools.plots.render import height_colours, render_mesh
-from triquad_tools.simulation.street import street_drive
+from triquad_tools.plots.render import Camera, height_colours, render_mesh
 
 MAP = "demo"
 
@@ -65,22 +58,12 @@ class Scored:
     answers: SdfResult
 
 
-def simulate(scans: int, seed: int) -> DrivenStreet:
-    """Drive along a street with a simulated lidar."""
-    return driven_street(street_drive(seed, scans))
-
-
-def learn(endpoint: str, street: DrivenStreet, out: Path) -> Learnt:
+def learn(endpoint: str, street: DrivenStreet) -> Learnt:
     """Stream the scans and wait until they are learnt, while another process asks."""
-    rng = np.random.default_rng(_SEED)
-    asked = out / "query_points.npy"
-    np.save(asked, rng.permutation(street.probes.near)[:_QUERY_POINTS])
-    try:
-        with connect(endpoint, MAP) as client, Probe(endpoint, MAP, asked) as probe:
-            intake = _stream(client, street)
-            return Learnt(intake, probe.finish())
-    finally:
-        asked.unlink()
+    points = np.random.default_rng(_SEED).permutation(street.probes.near)[:_QUERY_POINTS]
+    with connect(endpoint, MAP) as client, Probe(endpoint, MAP, points) as probe:
+        intake = _stream(client, street)
+        return Learnt(intake, probe.finish())
 
 
 def _stream(client: Client, street: DrivenStreet) -> Intake:
@@ -157,5 +140,5 @@ def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
         report(0.0, picture.name)
         camera = Camera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
         colours = height_colours(surface.vertices)
-        image = render_mesh(surface.vertices, surface.faces, camera=camera, colours=colours)
+        image = render_mesh(surface.vertices, surface.faces, colours, camera)
         imsave(picture, image)

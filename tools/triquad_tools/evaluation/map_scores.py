@@ -3,13 +3,14 @@
 ``docs/tools.md`` defines every figure. What is asked, a file or a server, is a callable here.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_client import SdfResult
 from triquad_format.records.status import Status
+from triquad_map.view import FieldAnswer
 
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import median_angle_deg
@@ -24,27 +25,8 @@ _SEED = 0  # of the points at which a driven street is asked
 _HOUSE_REACH_M = 20.0  # houses are probed up to this far from where the sensor was
 
 
-class MapAnswer(Protocol):
-    """What a map says of N points."""
-
-    @property
-    def sdf(self) -> NDArray[np.float32]:
-        """``[N]`` metres, NaN where the map has nothing."""
-
-    @property
-    def status(self) -> NDArray[np.uint8]:
-        """``[N]`` values of :class:`Status`."""
-
-    @property
-    def gradient(self) -> NDArray[np.float32] | None:
-        """``[N, 3]`` where it was asked for."""
-
-
-class MapQuery(Protocol):
-    """Asks a map for distances at points ``[N, 3]``, metres, map frame."""
-
-    def __call__(self, points: NDArray[np.float64], gradient: bool = False) -> MapAnswer:
-        """The answer."""
+MapQuery = Callable[..., SdfResult | FieldAnswer]
+"""Asks a map at points ``[N, 3]``, metres, map frame; with ``gradient=True`` for gradients, too."""
 
 
 @dataclass(frozen=True)
@@ -120,8 +102,7 @@ def driven_street(drive: SimulatedDrive) -> DrivenStreet:
 def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     """Scores of a map at ``probes``."""
     answer = query(probes.near, gradient=True)
-    if answer.gradient is None:
-        raise ValueError("the answer has no gradient although it was asked for")
+    assert answer.gradient is not None
     known = np.isfinite(answer.sdf)
     nan = float("nan")
     errors = np.abs(answer.sdf.astype(np.float64) - probes.exact_sdf)[known]

@@ -60,10 +60,7 @@ def score_against_cloud(
 
 
 def score_against_scene(
-    mesh: Mesh,
-    scene: Scene,
-    visible: NDArray[np.float64],
-    settings: ScoreSettings,
+    mesh: Mesh, scene: Scene, visible: NDArray[np.float64], settings: ScoreSettings
 ) -> MeshScores:
     """Scores of a mesh against an exact scene.
 
@@ -118,9 +115,7 @@ def _thinned_reference(
 
 
 def _samples(
-    mesh: Mesh,
-    reference: NDArray[np.float64],
-    settings: ScoreSettings,
+    mesh: Mesh, reference: NDArray[np.float64], settings: ScoreSettings
 ) -> NDArray[np.float64]:
     """Thinned samples of the mesh in the truth's bounding box.
 

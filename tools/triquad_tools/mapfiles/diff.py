@@ -35,10 +35,13 @@ class Sighting:
     status: NDArray[np.uint8]  # [N] triquad_format.records.status.Status
     leaf_m: float  # of the map whose surface it is
 
+    def part(self, rows: NDArray[np.intp]) -> "Sighting":
+        """Some of the points."""
+        return Sighting(self.points[rows], self.sdf[rows], self.status[rows], self.leaf_m)
+
     def having(self, status: Status) -> NDArray[np.float64]:
         """The points of which the other map says ``status``."""
-        points: NDArray[np.float64] = self.points[self.status == status]
-        return points
+        return np.asarray(self.points[self.status == status])
 
 
 @dataclass(frozen=True)
@@ -61,17 +64,13 @@ class Change:
     not_seen: int  # of A: B has seen nothing there
     moved_median_m: float  # of the points of A that B has near its surface; NaN if there are none
     moved_p95_m: float
-    changed_m3: (
-        float  # size of the change: swept by moves beyond NOISE_M, and what is added and gone
-    )
+    changed_m3: float  # swept by moves beyond NOISE_M, and what is added and gone
 
     @property
     def differs(self) -> bool:
         """Whether there is anything to tell."""
-        return (
-            bool(self.added or self.gone or self.newly_seen or self.not_seen)
-            or self.moved_p95_m >= STILL_M
-        )
+        only_in_one = self.added or self.gone or self.newly_seen or self.not_seen
+        return bool(only_in_one) or self.moved_p95_m >= STILL_M
 
     @property
     def size(self) -> tuple[float, float]:
@@ -126,9 +125,10 @@ def surface_points(record: MapRecord) -> NDArray[np.float64]:
         assert answer.gradient is not None
         there = np.abs(answer.sdf) <= NEAR_ENOUGH_M
         arrived[under_way[there & (answer.status == Status.SURFACE)]] = True
-        steps = _newton_steps(answer.sdf[~there], answer.gradient[~there], leaf_m / 2)
-        under_way = under_way[~there]
-        points[under_way] += steps
+        sdf, gradient, under_way = answer.sdf[~there], answer.gradient[~there], under_way[~there]
+        slope = np.maximum(np.linalg.norm(gradient, axis=1), _LEAST_SLOPE)
+        length = np.minimum(np.abs(sdf) / slope, leaf_m / 2)
+        points[under_way] += (-np.sign(sdf) * length / slope)[:, None] * gradient
         distance = np.linalg.norm(points[under_way] - middles[under_way], axis=1)
         under_way = under_way[distance <= math.sqrt(3) * leaf_m]
     found: NDArray[np.float64] = points[arrived]
@@ -142,21 +142,13 @@ def print_diff(diff: MapDiff, limit: int) -> None:
         return
     titles = ("from x m", "y m", "z m", "points A", "in B", "added %", "newly seen %", "gone %",
               "not seen %", "moved cm", "95 % cm")  # fmt: skip
-    rows = [(*_corner(tile), *_cells(tile.change)) for tile in diff.tiles[:limit]]
+    rows = [
+        (*(f"{low:g}" for low in tile.low_m), *_cells(tile.change)) for tile in diff.tiles[:limit]
+    ]
     print_columns(titles, [*rows, ("all", "", "", *_cells(diff.total))])
     left = len(diff.tiles) - len(rows)
     if left > 0:
         print(f"  and {left} more: --limit {len(diff.tiles)} shows all")
-
-
-def _newton_steps(
-    sdf: NDArray[np.float32], gradient: NDArray[np.float32], longest_m: float
-) -> NDArray[np.float64]:
-    """Steps ``[N, 3]`` towards the zero, metres, none longer than ``longest_m``."""
-    slope = np.maximum(np.linalg.norm(gradient, axis=1), _LEAST_SLOPE)
-    length = np.minimum(np.abs(sdf) / slope, longest_m)
-    steps: NDArray[np.float64] = (-np.sign(sdf) * length / slope)[:, None] * gradient
-    return steps
 
 
 def _sighting(of: MapRecord, by: MapRecord) -> Sighting:
@@ -173,21 +165,14 @@ def _tiles(comparison: Comparison, tile_m: float) -> Iterator[TileChange]:
     in_old = _rows_by_number(numbers[: len(old.points)], len(tiles))
     in_new = _rows_by_number(numbers[len(old.points) :], len(tiles))
     for cell, rows_old, rows_new in zip(tiles, in_old, in_new, strict=True):
-        low = tuple((cell * tile_m).round(6).tolist())
-        high = tuple(((cell + 1) * tile_m).round(6).tolist())
-        yield TileChange(low, high, _change(_part(old, rows_old), _part(new, rows_new)))
+        low, high = (tuple((end * tile_m).round(6).tolist()) for end in (cell, cell + 1))
+        yield TileChange(low, high, _change(old.part(rows_old), new.part(rows_new)))
 
 
 def _rows_by_number(numbers: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
     """For each number below ``count``, the rows that have it."""
     ends = np.cumsum(np.bincount(numbers, minlength=count))
     return np.split(np.argsort(numbers, kind="stable"), ends)[:count]
-
-
-def _part(sighting: Sighting, rows: NDArray[np.intp]) -> Sighting:
-    return Sighting(
-        sighting.points[rows], sighting.sdf[rows], sighting.status[rows], sighting.leaf_m
-    )
 
 
 def _change(old: Sighting, new: Sighting) -> Change:
@@ -206,10 +191,6 @@ def _change(old: Sighting, new: Sighting) -> Change:
         moved_p95_m=float(p95),
         changed_m3=swept + gone * old.leaf_m**3 + added * new.leaf_m**3,
     )
-
-
-def _corner(tile: TileChange) -> tuple[str, ...]:
-    return tuple(f"{low:g}" for low in tile.low_m)
 
 
 def _cells(change: Change) -> tuple[str, ...]:

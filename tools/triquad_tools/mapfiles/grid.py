@@ -2,22 +2,24 @@
 
 Lattice points are the multiples of the cell side, as those of the server's meshes. What the field
 says is given wherever a region is, trusted or not; the status tells. Elsewhere the distance is NaN
-and the status ``UNKNOWN``.
+and the status ``UNKNOWN``. ``docs/tools.md`` defines the arrays.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.mapfile.files import replacing
 from triquad_format.records.region import MapRecord, region_centre
 from triquad_map.record_view import open_view
-from triquad_map.view import FieldAnswer, MapView
+from triquad_map.view import MapView
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.console.progress import Report
-from triquad_tools.mapfiles.seen_space import evidence_box, surface_voxels
+from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.seen_space import evidence_bounds, surface_voxels
 from triquad_tools.mapfiles.source import Box
 
 MAX_CELLS = 200_000_000
@@ -31,31 +33,30 @@ BAND_CELLS = 3
 _POINTS_AT_ONCE = 1 << 20
 _ROUNDING = 1e-9
 
-Query = Callable[[NDArray[np.float64]], FieldAnswer]
-"""Answers at points [N, 3] of the map frame."""
+Arrays = dict[str, Any]
+"""Arrays by their names in the archive."""
+
+Positions = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+"""The places [N, 3] of numbered lattice points, metres, map frame."""
 
 
-@dataclass(frozen=True)
-class DenseGrid:
-    """All lattice points of a box: ``sdf[i, j, k]`` is at ``origin_m + cell_m * (i, j, k)``."""
+def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool, path: Path) -> str:
+    """Write distances on a lattice as a numpy archive; returns what was written.
 
-    sdf: NDArray[np.float32]  # [X, Y, Z] metres
-    status: NDArray[np.uint8]  # [X, Y, Z] Status values
-    origin_m: NDArray[np.float64]  # [3] map frame
-    cell_m: float
-
-
-@dataclass(frozen=True)
-class SparseGrid:
-    """The blocks of 8 x 8 x 8 lattice points around seen surface.
-
-    ``sdf[b, i, j, k]`` is at ``cell_m * (8 * indices[b] + (i, j, k))``.
+    Raises:
+        ToolError: the grid is too large, there is nothing to fill, or regions are too far away.
+        OSError: the file cannot be written.
     """
-
-    indices: NDArray[np.int32]  # [B, 3]
-    sdf: NDArray[np.float32]  # [B, 8, 8, 8] metres
-    status: NDArray[np.uint8]  # [B, 8, 8, 8] Status values
-    cell_m: float
+    filled = box if box is not None else evidence_bounds(record)
+    if filled is None:
+        raise ToolError("no ray has shown anything of this map: there is no box to fill")
+    view = open_record(record)
+    grid = _sparse(view, record, box, cell_m) if sparse else _dense(view, filled, cell_m)
+    with replacing(path) as stream:
+        np.savez(stream, epoch=record.epoch, cell_m=cell_m, **grid)
+        size = stream.tell()
+    shape = " x ".join(str(count) for count in grid["sdf"].shape)
+    return f"{size:,} bytes, distances {shape}"
 
 
 def open_record(record: MapRecord) -> MapView:
@@ -71,90 +72,6 @@ def open_record(record: MapRecord) -> MapView:
     return view
 
 
-def evidence_bounds(record: MapRecord) -> Box | None:
-    """The box around all that rays have shown, to whole blocks; ``None`` where that is nothing."""
-    found = [evidence_box(record.settings, region) for region in record.regions]
-    boxes = [box for box in found if box is not None]
-    if not boxes:
-        return None
-    return np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))])
-
-
-def dense_grid(query: Query, box: Box, cell_m: float, report: Report) -> DenseGrid:
-    """All lattice points within a box.
-
-    Raises:
-        ToolError: they are too many.
-    """
-    corners = list(zip(box[0].tolist(), box[1].tolist(), strict=True))
-    sides = [(high - low) / cell_m for low, high in corners]
-    if math.prod(side + 1 for side in sides) > MAX_CELLS:  # so many points at most
-        sizes = " x ".join(f"{side:.6g}" for side in sides)
-        raise _too_many(sizes, math.prod(sides), "--crop, --sparse")
-    low = [math.ceil(low / cell_m - _ROUNDING) for low, _ in corners]
-    last = [math.floor(high / cell_m + _ROUNDING) for _, high in corners]
-    x, y, z = (max(end - start + 1, 0) for start, end in zip(low, last, strict=True))
-    first = np.array(low, np.float64)
-
-    def positions(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
-        cells = np.stack(np.unravel_index(numbers, (x, y, z)), axis=1)
-        return np.asarray((first + cells) * cell_m)
-
-    sdf, status = _filled(query, x * y * z, positions, report)
-    shape = (x, y, z)
-    return DenseGrid(sdf.reshape(shape), status.reshape(shape), first * cell_m, cell_m)
-
-
-def sparse_grid(
-    query: Query, record: MapRecord, box: Box | None, cell_m: float, report: Report
-) -> SparseGrid:
-    """The blocks with a lattice point within 3 cells of a voxel in which a ray ended.
-
-    Raises:
-        ToolError: they are too many.
-    """
-    indices = _blocks_near_surface(record, box, cell_m)
-    count = len(indices) * BLOCK_CELLS**3
-    if count > MAX_CELLS:
-        raise _too_many(f"{len(indices):,} blocks", count, "--crop")
-
-    def positions(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
-        block, inner = np.divmod(numbers, BLOCK_CELLS**3)
-        inside = np.stack(np.unravel_index(inner, (BLOCK_CELLS,) * 3), axis=1)
-        return np.asarray((indices[block] * BLOCK_CELLS + inside) * cell_m)
-
-    sdf, status = _filled(query, count, positions, report)
-    shape = (len(indices), *(BLOCK_CELLS,) * 3)
-    return SparseGrid(indices.astype(np.int32), sdf.reshape(shape), status.reshape(shape), cell_m)
-
-
-def _filled(
-    query: Query,
-    count: int,
-    positions: Callable[[NDArray[np.int64]], NDArray[np.float64]],
-    report: Report,
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Distances and statuses [N] of ``count`` numbered points."""
-    sdf, status = np.empty(count, np.float32), np.empty(count, np.uint8)
-    for first in range(0, count, _POINTS_AT_ONCE):
-        last = min(first + _POINTS_AT_ONCE, count)
-        answer = query(positions(np.arange(first, last)))
-        sdf[first:last], status[first:last] = answer.sdf, answer.status
-        report(last / count, f"{last:,} points")
-    return sdf, status
-
-
-def _blocks_near_surface(record: MapRecord, box: Box | None, cell_m: float) -> NDArray[np.int64]:
-    """Indices [B, 3], in order, each once."""
-    middles = surface_voxels(record)
-    if box is not None:
-        middles = middles[((middles >= box[0]) & (middles <= box[1])).all(axis=1)]
-    reach = record.settings.leaf_m / 2 + BAND_CELLS * cell_m
-    first = np.floor(np.ceil((middles - reach) / cell_m) / BLOCK_CELLS).astype(np.int64)
-    last = np.floor(np.floor((middles + reach) / cell_m) / BLOCK_CELLS).astype(np.int64)
-    return np.unique(cells_of_boxes(first, last)[0], axis=0)
-
-
 def cells_of_boxes(
     first: NDArray[np.int64], last: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
@@ -166,6 +83,65 @@ def cells_of_boxes(
         cells.append(cell[inside])
         rows.append(inside)
     return np.concatenate(cells), np.concatenate(rows)
+
+
+def _dense(view: MapView, box: Box, cell_m: float) -> Arrays:
+    """All lattice points within a box."""
+    corners = list(zip(box[0].tolist(), box[1].tolist(), strict=True))
+    sides = [(high - low) / cell_m for low, high in corners]
+    if math.prod(side + 1 for side in sides) > MAX_CELLS:  # so many points at most
+        sizes = " x ".join(f"{side:.6g}" for side in sides)
+        raise _too_many(sizes, math.prod(sides), "--crop, --sparse")
+    low = [math.ceil(low / cell_m - _ROUNDING) for low, _ in corners]
+    last = [math.floor(high / cell_m + _ROUNDING) for _, high in corners]
+    shape = tuple(max(end - start + 1, 0) for start, end in zip(low, last, strict=True))
+    first = np.array(low, np.float64)
+
+    def positions(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+        cells = np.stack(np.unravel_index(numbers, shape), axis=1)
+        return np.asarray((first + cells) * cell_m)
+
+    return {**_filled(view, shape, positions), "origin_m": first * cell_m}
+
+
+def _sparse(view: MapView, record: MapRecord, box: Box | None, cell_m: float) -> Arrays:
+    """The blocks with a lattice point within 3 cells of a voxel in which a ray ended."""
+    indices = _blocks_near_surface(record, box, cell_m)
+    count = len(indices) * BLOCK_CELLS**3
+    if count > MAX_CELLS:
+        raise _too_many(f"{len(indices):,} blocks", count, "--crop")
+
+    def positions(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+        block, inner = np.divmod(numbers, BLOCK_CELLS**3)
+        inside = np.stack(np.unravel_index(inner, (BLOCK_CELLS,) * 3), axis=1)
+        return np.asarray((indices[block] * BLOCK_CELLS + inside) * cell_m)
+
+    grid = _filled(view, (len(indices), *(BLOCK_CELLS,) * 3), positions)
+    return {**grid, "indices": indices.astype(np.int32)}
+
+
+def _filled(view: MapView, shape: tuple[int, ...], positions: Positions) -> Arrays:
+    """Distances and statuses of lattice points, numbered in the order of an array of a shape."""
+    count = math.prod(shape)
+    sdf, status = np.empty(count, np.float32), np.empty(count, np.uint8)
+    with progress("evaluating", 1.0) as report:
+        for first in range(0, count, _POINTS_AT_ONCE):
+            last = min(first + _POINTS_AT_ONCE, count)
+            answer = view.query(positions(np.arange(first, last)))
+            sdf[first:last], status[first:last] = answer.sdf, answer.status
+            report(last / count, f"{last:,} points")
+    return {"sdf": sdf.reshape(shape), "status": status.reshape(shape)}
+
+
+def _blocks_near_surface(record: MapRecord, box: Box | None, cell_m: float) -> NDArray[np.int64]:
+    """Indices [B, 3], in order, each once."""
+    middles = surface_voxels(record)
+    if box is not None:
+        middles = middles[((middles >= box[0]) & (middles <= box[1])).all(axis=1)]
+    reach = record.settings.leaf_m / 2 + BAND_CELLS * cell_m
+    first = np.floor(np.ceil((middles - reach) / cell_m) / BLOCK_CELLS).astype(np.int64)
+    last = np.floor(np.floor((middles + reach) / cell_m) / BLOCK_CELLS).astype(np.int64)
+    return np.unique(cells_of_boxes(first, last)[0], axis=0)
 
 
 def _too_many(what: str, count: float, remedies: str) -> ToolError:

@@ -7,12 +7,14 @@ the field has zeros that nobody taught it.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 from triquad_client import Mesh
 from triquad_client.mesh.mesh import Triangles, joined
+from triquad_format.mapfile.files import replacing
 from triquad_format.records.region import MapRecord
 from triquad_map.view import MapView
 
@@ -41,6 +43,20 @@ class _Voxels:
 
     def __getitem__(self, rows: NDArray[np.intp]) -> "_Voxels":
         return _Voxels(self.places[rows], self.first[rows], self.last[rows])
+
+
+def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
+    """Write the mesh of a map; returns what was written.
+
+    Raises:
+        ToolError: the mesh is too large, or its regions are too far away.
+        OSError: the file cannot be written.
+    """
+    mesh = surface_mesh(record, box, cell_m)
+    packed = mesh.file_bytes(path.suffix)
+    with replacing(path) as stream:
+        stream.write(packed)
+    return f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
 
 
 def surface_mesh(record: MapRecord, box: Box | None, cell_m: float) -> Mesh:
@@ -97,12 +113,12 @@ def _blocks(voxels: _Voxels) -> Iterator[tuple[Cells, _Voxels]]:
 def _block_mesh(view: MapView, block: Cells, voxels: _Voxels, cell_m: float) -> Triangles:
     origin = block * _BLOCK_CELLS
     cells = _covered(voxels.first - origin, voxels.last - origin)
-    asked = np.argwhere(_corners(cells))
+    asked = np.argwhere(_any_of_eight(np.pad(cells, 1)))  # lattice points at their corners
     # Points that nobody asks for lie in free space.
     volume = np.ones((_BLOCK_CELLS + 1,) * 3, np.float32)
     volume[tuple(asked.T)] = view.query(np.asarray((origin + asked) * cell_m, np.float64)).sdf
     unknown = np.isnan(volume)  # beside the regions
-    cells &= ~_of_cells(unknown)
+    cells &= ~_any_of_eight(unknown)
     volume[unknown] = 1.0
     surface = _marched(volume, cells)
     vertices = (origin + surface.vertices) * cell_m
@@ -134,20 +150,11 @@ def _covered(first: Cells, last: Cells) -> NDArray[np.bool_]:
     return np.asarray(boxes[:-1, :-1, :-1] > 0)
 
 
-def _corners(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The lattice points at the corners of any of the cells."""
-    points = np.zeros((_BLOCK_CELLS + 1,) * 3, np.bool_)
-    for x, y, z in np.ndindex(2, 2, 2):
-        points[x : x + _BLOCK_CELLS, y : y + _BLOCK_CELLS, z : z + _BLOCK_CELLS] |= cells
-    return points
-
-
-def _of_cells(points: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The cells that have any of the lattice points at a corner."""
-    cells = np.zeros((_BLOCK_CELLS,) * 3, np.bool_)
-    for x, y, z in np.ndindex(2, 2, 2):
-        cells |= points[x : x + _BLOCK_CELLS, y : y + _BLOCK_CELLS, z : z + _BLOCK_CELLS]
-    return cells
+def _any_of_eight(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether any of 2 x 2 x 2 neighbours is set; one less along each side than ``flags``."""
+    flags = flags[:-1] | flags[1:]
+    flags = flags[:, :-1] | flags[:, 1:]
+    return flags[:, :, :-1] | flags[:, :, 1:]
 
 
 def _beside(voxels: Cells, points: NDArray[np.float64], leaf_m: float) -> NDArray[np.bool_]:

@@ -15,10 +15,6 @@ MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")
 _GLTF_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-class MeshFileError(ToolError):
-    """A mesh file that cannot be read."""
-
-
 def read_mesh(path: Path) -> Mesh:
     """The mesh of a file, vertices as float64 in a frame with z up.
 
@@ -26,16 +22,16 @@ def read_mesh(path: Path) -> Mesh:
     """
     if path.suffix not in MESH_SUFFIXES:
         names = ", ".join(MESH_SUFFIXES)
-        raise MeshFileError(f"{path}: meshes are read from {names}, not {path.suffix!r}")
+        raise ToolError(f"{path}: meshes are read from {names}, not {path.suffix!r}")
     if not path.is_file():
-        raise MeshFileError(f"{path}: no such file")
+        raise ToolError(f"{path}: no such file")
     try:
         loaded: Any = trimesh.load(path, process=False)
         geometry: Any = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
         vertices = np.array(geometry.vertices, np.float64).reshape(-1, 3)
         faces = np.array(getattr(geometry, "faces", ()), np.int32).reshape(-1, 3)
     except Exception as error:  # trimesh raises whatever its parsers stumble on
-        raise MeshFileError(f"{path}: cannot be read as a mesh: {error}") from error
+        raise ToolError(f"{path}: cannot be read as a mesh: {error}") from error
     if path.suffix == ".glb":
         vertices = vertices @ _GLTF_FROM_MAP
     return Mesh(vertices, faces)

@@ -4,10 +4,9 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.mapfile.writer import MapFileInfo, Previews, write_map
+from triquad_format.mapfile.writer import Previews, write_map
 from triquad_format.records.region import MapRecord
 
-from triquad_tools.mapfiles.field_change import FieldChange
 from triquad_tools.mapfiles.quantise import dequantised, quantise
 from triquad_tools.mapfiles.source import SourceMap
 
@@ -27,15 +26,6 @@ class Precision:
     max_error_m: float | None = None  # None: no new integers
 
 
-@dataclass(frozen=True)
-class PackedMap:
-    """What was written."""
-
-    info: MapFileInfo
-    parameters: int
-    change: FieldChange | None  # None: nothing was rounded to integers
-
-
 def chosen_precision(name: str | None, max_error_m: float | None) -> Precision:
     """What ``--precision`` and ``--max-error`` ask for."""
     if max_error_m is None and name == INTEGERS:
@@ -43,8 +33,8 @@ def chosen_precision(name: str | None, max_error_m: float | None) -> Precision:
     return Precision(DTYPES.get(name or ""), max_error_m)
 
 
-def pack_map(source: SourceMap, precision: Precision, path: Path) -> PackedMap:
-    """Write a map file.
+def pack_map(source: SourceMap, precision: Precision, path: Path, bytes_before: int) -> str:
+    """Write a map file; returns its size, and how far distances moved.
 
     Raises:
         FormatError: integers change distances by more than the limit, or features do not fit the
@@ -62,24 +52,18 @@ def pack_map(source: SourceMap, precision: Precision, path: Path) -> PackedMap:
     stamp_ns = source.stamp_ns
     previews = _previews(record, stamp_ns)
     info = write_map(record, path, feature_dtype=dtype, stamp_ns=stamp_ns, previews=previews)
-    return PackedMap(info, sum(region.parameters for region in record.regions), change)
-
-
-def print_packed(path: Path, packed: PackedMap, bytes_before: int) -> None:
-    """Print sizes, and how far distances moved."""
-    size = packed.info.bytes
-    print(f"{path}: {size:,} bytes, {size / bytes_before:.0%} of {bytes_before:,}")
-    if packed.change is None:
-        return
-    each = size / max(packed.parameters, 1)
-    print(f"  {each:.2f} bytes per learnable parameter of {packed.parameters:,}")
-    change = packed.change
-    print(
+    size = f"{info.bytes:,} bytes, {info.bytes / bytes_before:.0%} of {bytes_before:,}"
+    if change is None:
+        return size
+    parameters = sum(region.parameters for region in record.regions)
+    return (
+        f"{size}\n"
+        f"  {info.bytes / max(parameters, 1):.2f} bytes per learnable parameter of {parameters:,}\n"
         f"  99 % of distances moved by less than {_mm(change.surface_m)} at surface, "
         f"{_mm(change.near_m)} near it, {_mm(change.free_m)} in free space; "
-        f"the most by {_mm(change.largest_m)}"
+        f"the most by {_mm(change.largest_m)}\n"
+        "  without training state: it does not fit rounded features"
     )
-    print("  without training state: it does not fit rounded features")
 
 
 def _previews(record: MapRecord, stamp_ns: int | None) -> Previews | None:

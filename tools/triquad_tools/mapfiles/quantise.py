@@ -13,22 +13,23 @@ costs ``-V_t * S * log2(q_t)`` bits and a constant. The least bits for a given e
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MAX_INTEGER, MapRecord, Region, VertexTable
+from triquad_format.records.region import MAX_INTEGER, MapRecord, Region, VertexTable, masked
+from triquad_map.record_view import open_view
 
-from triquad_tools.mapfiles.field_change import FieldChange, field_change
-from triquad_tools.mapfiles.region_probes import RegionProbes
+from triquad_tools.mapfiles.field_change import FieldChange, draw_probes, field_change
 
 _SEARCH_SEED, _MEASURE_SEED = 0, 1
 _QUANTILE_PER_RMS = 3.2  # of the changes; seen 3.1 to 3.3; only where the search begins
 _MARGIN = 0.95  # of the limit: quantiles at other points differ by some percent
 _CLOSE, _AIM = 0.97, 0.985  # of the limit within that margin: where the search ends, and its aim
 _EVALUATIONS_MAX = 16
+_NOISE = 0.01  # in features, to see how much they move distances: about what rounding does
 _GROWTH_MAX = 8.0  # of the factor from one evaluation to the next
 
 
@@ -75,17 +76,19 @@ def _floats(table: VertexTable) -> VertexTable:
 
 
 def _quantise_region(settings: FieldSettings, region: Region, max_error_m: float) -> Region:
-    probes = RegionProbes(settings, region, np.random.default_rng(_SEARCH_SEED))
+    probes = _RegionProbes(settings, region)
     limit = _MARGIN * max_error_m
     weights = _relative_scales(settings, region.tables, probes)
-    factor = _first_factor(settings, region.tables, probes, limit)
+    # Where the formula of the module's head predicts the error.
+    vertices = max(sum(len(table.codes) for table in region.tables), 1)
+    factor = limit / (_QUANTILE_PER_RMS * math.sqrt(settings.feature_size * vertices / 27))
     best, error = None, 0.0
     for _ in range(_EVALUATIONS_MAX):
         tables = tuple(
             _rounded(table, factor * weight)
             for table, weight in zip(region.tables, weights, strict=True)
         )
-        error = probes.change([table.vectors() for table in tables]).quantile_m
+        error = probes.points.change(probes.moves(tables)).quantile_m
         if error <= limit:
             best = tables
             if error >= _CLOSE * limit or error == 0.0:
@@ -94,7 +97,7 @@ def _quantise_region(settings: FieldSettings, region: Region, max_error_m: float
     if best is None:
         raise FormatError(
             f"region {region.index}: integers change distances by {error * 1e3:.3f} mm, "
-            f"more than {max_error_m * 1e3:.3f} mm; allow a larger error",
+            f"more than {max_error_m * 1e3:.3f} mm; allow a larger error"
         )
     return dataclasses.replace(region, tables=best, training=None)
 
@@ -108,26 +111,51 @@ def _rounded(table: VertexTable, scale: float) -> VertexTable:
     return dataclasses.replace(table, features=integers, scale=float(used))
 
 
+class _RegionProbes:
+    """One region's field at points where rays have been, asked again with other features."""
+
+    def __init__(self, settings: FieldSettings, region: Region) -> None:
+        # At the origin, alone and without evidence: no more than its field is asked.
+        alone = dataclasses.replace(
+            region, index=(0, 0, 0), evidence=masked(region.evidence, np.uint8(0)), training=None
+        )
+        self._record = MapRecord("", 0, settings, (alone,))
+        self.points = draw_probes(settings, region, np.random.default_rng(_SEARCH_SEED))
+        self._before = self._distances(region.tables)
+
+    def moves(self, tables: tuple[VertexTable, ...]) -> NDArray[np.float32]:
+        """How far distances move [P], metres, where the region has these tables."""
+        return self._distances(tables) - self._before
+
+    def _distances(self, tables: tuple[VertexTable, ...]) -> NDArray[np.float32]:
+        """Signed distances [P], metres; 0 beside the region's cube."""
+        region = dataclasses.replace(self._record.regions[0], tables=tables)
+        opened = open_view(dataclasses.replace(self._record, regions=(region,)))
+        try:
+            return np.nan_to_num(opened.view.query(self.points.points).sdf)
+        finally:
+            opened.close()
+
+
 def _relative_scales(
-    settings: FieldSettings, tables: Sequence[VertexTable], probes: RegionProbes
+    settings: FieldSettings, tables: tuple[VertexTable, ...], probes: _RegionProbes
 ) -> list[float]:
-    """``sqrt(V) / g`` of each table."""
-    slopes = probes.level_slopes
-    least = 1e-3 * max(float(slopes.max()), 1e-12)  # no level may become arbitrarily coarse
+    """``sqrt(V) / g`` of each table; ``g`` from what noise in the features of a level does."""
+    rng = np.random.default_rng(_SEARCH_SEED)
+    rms = {}
+    for level in settings.levels:
+        noisy = tuple(_noisy(t, rng) if t.level == level else t for t in tables)
+        moves = probes.moves(noisy)
+        rms[level] = float(np.linalg.norm(moves)) / math.sqrt(max(len(moves), 1))
+    least = 1e-3 * max(rms.values()) or 1.0  # no level may become arbitrarily coarse
+    # Three planes of the level move distances by this.
+    per_slope = _NOISE * math.sqrt(settings.feature_size / 9)
     return [
-        math.sqrt(len(table.codes)) / max(float(slopes[table.level - settings.levels.start]), least)
-        for table in tables
+        math.sqrt(len(table.codes)) / (max(rms[table.level], least) / per_slope) for table in tables
     ]
 
 
-def _first_factor(
-    settings: FieldSettings, tables: Sequence[VertexTable], probes: RegionProbes, limit_m: float
-) -> float:
-    """The factor at which the formula of the module's head predicts the error."""
-    slopes = probes.level_slopes
-    weights = _relative_scales(settings, tables, probes)
-    variance = sum(
-        settings.feature_size * (weight * slopes[table.level - settings.levels.start]) ** 2 / 27
-        for table, weight in zip(tables, weights, strict=True)
-    )
-    return limit_m / (_QUANTILE_PER_RMS * math.sqrt(max(float(variance), 1e-24)))
+def _noisy(table: VertexTable, rng: np.random.Generator) -> VertexTable:
+    vectors = table.vectors()
+    noise = rng.uniform(-_NOISE / 2, _NOISE / 2, vectors.shape)
+    return dataclasses.replace(table, features=vectors + noise.astype(np.float32), scale=None)

@@ -1,6 +1,5 @@
 """The space that rays of a map have shown: voxels and columns of its evidence, in metres."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +16,6 @@ from triquad_format.records.region import (
     region_corner,
     seen_voxels,
 )
-
-_MasksOf = Callable[[Evidence], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -48,6 +45,15 @@ def evidence_box(settings: FieldSettings, region: Region) -> NDArray[np.float64]
     return region_corner(settings, region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
 
 
+def evidence_bounds(record: MapRecord) -> NDArray[np.float64] | None:
+    """The same box around all that rays have shown of a map."""
+    found = [evidence_box(record.settings, region) for region in record.regions]
+    boxes = [box for box in found if box is not None]
+    if not boxes:
+        return None
+    return np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))])
+
+
 def surface_voxels(record: MapRecord) -> NDArray[np.float64]:
     """Middles ``[N, 3]`` of the voxels in which rays ended, metres, map frame."""
     parts = [np.empty((0, 3))]
@@ -58,21 +64,13 @@ def surface_voxels(record: MapRecord) -> NDArray[np.float64]:
     return np.concatenate(parts)
 
 
-def surface_columns(record: MapRecord) -> Columns:
-    """The columns in which rays ended."""
-    return _columns(record, lambda evidence: evidence.surface)
-
-
-def seen_columns(record: MapRecord) -> Columns:
-    """The columns in which rays ended or through which they passed."""
-    return _columns(record, lambda evidence: evidence.surface | evidence.free)
-
-
-def _columns(record: MapRecord, masks_of: _MasksOf) -> Columns:
+def seen_columns(record: MapRecord, surface_only: bool = False) -> Columns:
+    """The columns in which rays ended or, unless ``surface_only``, through which they passed."""
     parts = [np.empty((0, 3))]
     for region in record.regions:
         evidence = owned_evidence(record.settings, region)
-        octets = masks_of(evidence)  # a byte holds one column
+        # A byte holds one column.
+        octets = evidence.surface if surface_only else evidence.surface | evidence.free
         rows, numbers = np.nonzero(octets)
         x, y = np.divmod(numbers, BLOCK_VOXELS)
         top = np.log2(octets[rows, numbers], dtype=np.float32).astype(np.int64)

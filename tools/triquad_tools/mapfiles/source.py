@@ -7,12 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import NoIndexError
-from triquad_format.mapfile.checkpoint_folder import (
-    checkpoint_at,
-    checkpoint_file,
-    checkpoint_files,
-    map_folder,
-)
+from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
 from triquad_format.mapfile.files import FileBytes, named
 from triquad_format.mapfile.index import MapIndex, file_in
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
@@ -44,11 +39,9 @@ class SourceMap:
 
 
 def chosen_file(path: Path, when: str | None) -> Path:
-    """The file itself, or the checkpoint in a folder that ``when`` asks for.
+    """The file itself or, in a folder of checkpoints or a store of one, the checkpoint ``when``.
 
-    Args:
-        path: a map file, a folder of checkpoints, or a store that holds one such folder.
-        when: number of an epoch, or a time; not given, the newest checkpoint is meant.
+    ``when`` is the number of an epoch, or a time; not given, the newest checkpoint is meant.
 
     Raises:
         ToolError: ``when`` is given for a file.
@@ -61,12 +54,6 @@ def chosen_file(path: Path, when: str | None) -> Path:
         return path
     folder = map_folder(path)
     return (checkpoint_files(folder)[0] if when is None else checkpoint_at(folder, when)).path
-
-
-def epoch_of(path: Path) -> int | None:
-    """The epoch in the name of a checkpoint; ``None`` for another file."""
-    checkpoint = checkpoint_file(path)
-    return None if checkpoint is None else checkpoint.epoch
 
 
 def read_whole(path: Path) -> MapFile:
@@ -89,15 +76,10 @@ def read_whole(path: Path) -> MapFile:
 
 
 def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
-    """The map in a file, cropped to a box.
+    """The map in a file, cropped to a box, with training state if that is kept.
 
-    Of a file with an index only the parts that the box needs are read, unless training state is
-    to be kept.
-
-    Args:
-        path: the file.
-        box: not given, all of the map is read.
-        training: whether training state is kept where there is some.
+    Of a file with an index only the parts that the box needs are read, unless it has training
+    state and that is kept.
 
     Raises:
         NothingLeftError: no region lies in the box.
@@ -106,7 +88,10 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
         OSError: it cannot be read.
     """
     source = None if box is None else _box(path, box, training)
-    return cropped(source or _whole(path), box, training)
+    if source is None:
+        file = read_whole(path)
+        source = SourceMap(file.record, file.manifest.stamp_ns or None)
+    return cropped(source, box, training)
 
 
 def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
@@ -115,11 +100,6 @@ def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
     if source.record.has_evidence and not record.has_evidence:
         raise NothingLeftError("nothing of the map lies in the box")
     return SourceMap(record if training else without_training(record), source.stamp_ns)
-
-
-def _whole(path: Path) -> SourceMap:
-    file = read_whole(path)
-    return SourceMap(file.record, file.manifest.stamp_ns or None)
 
 
 def _box(path: Path, box: Box, training: bool) -> SourceMap | None:

@@ -13,8 +13,8 @@ from triquad_format.mapfile.checkpoint_folder import (
 )
 from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.index import MapIndex
-from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
-from triquad_format.mapfile.parts.part import REGION_TOPICS, PartKey
+from triquad_format.mapfile.manifest import FileRef, Manifest
+from triquad_format.mapfile.parts.part import REGION_TOPICS
 from triquad_format.records.region import RegionIndex
 
 from triquad_tools.console.report import print_columns, utc_time
@@ -113,21 +113,12 @@ def _logged(file: CheckpointFile, indices: "_Indices") -> LoggedCheckpoint:
     return LoggedCheckpoint(file.path.name, file.epoch, file.complete, size, parts, problem)
 
 
-@dataclass(frozen=True)
-class _Index:
-    """What a file says of its parts."""
-
-    manifest: Manifest
-    manifest_sha256: bytes
-    digests: dict[PartKey, bytes]  # of the parts in the file itself
-
-
 class _Indices:
     """The indices of a folder's files; each is read once."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._read: dict[str, _Index] = {}
+        self._read: dict[str, MapIndex] = {}
 
     def parts(self, name: str) -> LoggedParts:
         """What the manifest of a file tells, where all of its parts are to be found."""
@@ -135,12 +126,12 @@ class _Indices:
         for file in manifest.files:
             self._check_base(manifest, file)
         epoch = manifest.facts.epoch
-        changed = {e.key.region for e in manifest.entries if e.epoch == epoch and _is_of_region(e)}
+        new = [entry.key for entry in manifest.entries if entry.epoch == epoch]
         return LoggedParts(
             time=utc_time(manifest.stamp_ns),
             stored=len(manifest.own),
             total=len(manifest.entries),
-            changed_regions=tuple(sorted(changed)),
+            changed_regions=tuple(sorted({k.region for k in new if k.topic in REGION_TOPICS})),
             other_files=tuple(file.name for file in manifest.files),
         )
 
@@ -152,19 +143,14 @@ class _Indices:
             raise MapFileError(f"it needs {file.name}, which is missing") from error
         except (FormatError, OSError) as error:
             raise MapFileError(f"it needs {file.name}: {error}") from error
+        listed = {entry.key: entry.sha256 for entry in index.manifest.own}
         wanted = [entry for entry in manifest.entries if entry.file == file]
         same = index.manifest_sha256 == file.manifest_sha256
-        if not same or any(index.digests.get(e.key) != e.sha256 for e in wanted):
+        if not same or any(listed.get(entry.key) != entry.sha256 for entry in wanted):
             raise MapFileError(f"it needs {file.name}, but not the file that now has this name")
 
-    def _index(self, name: str) -> _Index:
+    def _index(self, name: str) -> MapIndex:
         if name not in self._read:
             with closing(FileBytes(self._folder / name)) as source:
-                index = MapIndex(source)
-            digests = {entry.key: entry.sha256 for entry in index.manifest.own}
-            self._read[name] = _Index(index.manifest, index.manifest_sha256, digests)
+                self._read[name] = MapIndex(source)
         return self._read[name]
-
-
-def _is_of_region(entry: Entry) -> bool:
-    return entry.key.topic in REGION_TOPICS

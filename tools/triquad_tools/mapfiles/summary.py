@@ -126,7 +126,10 @@ def _facts(summary: MapSummary) -> Iterator[Row]:
 
 def _region_facts(region: RegionSummary) -> Iterator[Row]:
     levels = ", ".join(f"level {level}: {count:,}" for level, count in region.vertices.items())
-    yield Row("vertices", f"{levels} ({_precision(region)})")
+    precision = ", ".join(region.precision)
+    if region.scales:
+        precision = f"integers, in steps of {region.scales[0]:.3g} to {region.scales[-1]:.3g}"
+    yield Row("vertices", f"{levels} ({precision})")
     if region.evidence_box_m is not None:
         low, high = map(list, region.evidence_box_m)
         yield Row("evidence", f"{region.evidence_blocks:,} blocks in {low} to {high} m")
@@ -144,17 +147,14 @@ def _evidence(summary: MapSummary | RegionSummary) -> str:
     return f"{summary.surface_m3:,.1f} m3 surface, {summary.free_m3:,.1f} m3 free"
 
 
-def _precision(region: RegionSummary) -> str:
-    if not region.scales:
-        return ", ".join(region.precision)
-    return f"integers, in steps of {region.scales[0]:.3g} to {region.scales[-1]:.3g}"
-
-
 def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
     training = region.training
     evidence = owned_evidence(record.settings, region)
     box = evidence_box(record.settings, region)
     voxel_m3 = record.settings.leaf_m**3
+    levels = None
+    if evidence.levels is not None:
+        levels = np.bincount(evidence.levels, minlength=MAX_LEVEL + 1)
     return RegionSummary(
         index=region.index,
         centre_m=_rounded(region_centre(record.settings, region.index)),
@@ -168,15 +168,11 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
         evidence_blocks=len(region.evidence.codes),
         evidence_box_m=None if box is None else tuple(map(_rounded, box)),
         surface_m3=_bits(evidence.surface) * voxel_m3,
-        surface_levels=None if evidence.levels is None else _by_level(evidence.levels),
+        surface_levels=None if levels is None else tuple(levels.tolist()),
         free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
         samples=None if training is None else len(training.sample_points),
         budget_samples=None if training is None else training.budget_samples,
     )
-
-
-def _by_level(levels: NDArray[np.uint8]) -> tuple[int, ...]:
-    return tuple(np.bincount(levels, minlength=MAX_LEVEL + 1).tolist())
 
 
 def _bits(masks: NDArray[np.uint8]) -> int:

@@ -1,27 +1,42 @@
 """A picture of what a map file holds: what was seen, when it last changed, and how well it fits."""
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from numpy.typing import NDArray
+from triquad_format.mapfile.manifest import Manifest
+from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
 from triquad_format.mapfile.reader import MapFile
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import MapRecord, region_centre, region_corner
+from triquad_map.reference.evaluator import MapEvaluator
 
-from triquad_tools.mapfiles.seen_space import Columns, seen_columns, surface_columns
-from triquad_tools.plots.change_ages import ages_plan
+from triquad_tools.console.report import centimetres, utc_time
+from triquad_tools.mapfiles.seen_space import Columns, seen_columns
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
     Plan,
     PlanGrid,
     Scale,
+    Window,
     draw_layers,
+    draw_nothing,
     draw_values,
     save_sheet,
 )
-from triquad_tools.plots.sample_errors import errors_plan
 
-_LEAST_RANGE_M = 0.1
+_LEAST_RANGE_M = 0.1  # of heights
+_NEVER = -1
+_MOST_COLOURS = 6
+_PLAN_PLANE = 0  # XY
+_MOST_SAMPLES = 500_000
+_LEAST_RANGE_CM = 2.0  # of errors
 
 
 def draw_map(title: str, file: MapFile, path: Path) -> None:
@@ -31,12 +46,12 @@ def draw_map(title: str, file: MapFile, path: Path) -> None:
         OSError: ``path`` cannot be written.
     """
     record = file.record
-    surface, seen = surface_columns(record), seen_columns(record)
+    surface, seen = seen_columns(record, surface_only=True), seen_columns(record)
     grid = PlanGrid.around(seen.middles, record.settings.leaf_m)
     plans = [
         Plan("Coverage", partial(_draw_coverage, grid, surface, seen)),
-        ages_plan(grid, file.manifest, seen),
-        errors_plan(grid, record),
+        _ages_plan(grid, file.manifest, seen),
+        _errors_plan(grid, record),
     ]
     save_sheet(path, title, grid, plans)
 
@@ -47,3 +62,89 @@ def _draw_coverage(grid: PlanGrid, surface: Columns, seen: Columns, axes: Axes) 
     label = "height of the topmost surface in m"
     scale = Scale(label, "viridis", float(low), float(max(high, low + _LEAST_RANGE_M)))
     draw_values(axes, grid.statistic(surface.middles, surface.tops, "max"), scale)
+
+
+def _ages_plan(grid: PlanGrid, manifest: Manifest, seen: Columns) -> Plan:
+    """A plan of the epochs in which places last changed, square by square."""
+    epochs = np.where(grid.marked(seen.middles), latest_epochs(grid, manifest), _NEVER)
+    layers = _age_layers(epochs, manifest)
+    side_m = manifest.facts.settings.leaf_m * CELL_LEAVES
+    note = f"told apart in squares of {side_m:g} m"
+    return Plan("Last changed", lambda axes: draw_layers(axes, layers[::-1]), note)
+
+
+def _age_layers(epochs: NDArray[np.int64], manifest: Manifest) -> list[Layer]:
+    """The epochs in a plan, oldest first, so few layers that colours can tell them apart."""
+    stamps_ns = {entry.epoch: entry.stamp_ns for entry in manifest.entries}
+    found = np.unique(epochs[epochs != _NEVER])
+    groups = np.array_split(found, min(len(found), _MOST_COLOURS)) if len(found) else []
+    colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(groups)))[::-1]  # the latest is dark
+    layers = []
+    for group, colour in zip(groups, colours, strict=True):
+        first, last = int(group[0]), int(group[-1])
+        name = f"epoch {last}" if first == last else f"epochs {first} to {last}"
+        label = ", ".join(filter(None, (name, utc_time(stamps_ns[last]))))
+        layers.append(Layer(label, to_hex(colour), (epochs >= first) & (epochs <= last)))
+    return layers
+
+
+def latest_epochs(grid: PlanGrid, manifest: Manifest) -> NDArray[np.int64]:
+    """``[rows, columns]``: the epoch in which a place last changed; -1 where there is none."""
+    latest = np.full((grid.rows, grid.columns), _NEVER, np.int64)
+    for entry in manifest.entries:
+        window = _window(grid, manifest.facts.settings, entry.key)
+        if window is not None:
+            latest[window] = np.maximum(latest[window], entry.epoch)
+    return latest
+
+
+def _window(grid: PlanGrid, settings: FieldSettings, key: PartKey) -> Window | None:
+    """What a part covers in the plan, as far as answers of its region hang on it."""
+    if key.topic != EVIDENCE and (key.topic, key.plane) != (VERTICES, _PLAN_PLANE):
+        return None
+    box = extent(settings, key)
+    corner = region_corner(settings, key.region)[:2]
+    low, high = (corner + settings.leaf_m * end[:2] for end in (box.low, box.high))
+    centre = region_centre(settings, key.region)[:2]
+    half = settings.region_pitch_m / 2
+    return grid.window(np.maximum(low, centre - half), np.minimum(high, centre + half))
+
+
+@dataclass(frozen=True)
+class SampleErrors:
+    """Errors at replay samples near the surface."""
+
+    points: NDArray[np.float64]  # [N, 3] metres, map frame
+    errors_m: NDArray[np.float64]  # [N] |signed distance - label|
+
+
+def sample_errors(record: MapRecord) -> SampleErrors:
+    """Errors at the samples within half a leaf of the surface, or at an even share of them."""
+    points, labels = [np.empty((0, 3))], [np.empty(0)]
+    for region in record.regions:
+        if region.training is not None:
+            near = np.abs(region.training.sample_labels) <= record.settings.leaf_m / 2
+            centre = region_centre(record.settings, region.index)
+            points.append(region.training.sample_points[near] + centre)
+            labels.append(region.training.sample_labels[near].astype(np.float64))
+    every = sum(map(len, points)) // _MOST_SAMPLES + 1
+    asked = np.concatenate(points)[::every]
+    answer = MapEvaluator(record).query(asked)
+    return SampleErrors(asked, np.abs(answer.sdf - np.concatenate(labels)[::every]))
+
+
+def _errors_plan(grid: PlanGrid, record: MapRecord) -> Plan:
+    """A plan of the mean error in each column."""
+    heading = "Error at the training samples"
+    found = sample_errors(record)
+    if not len(found.points):
+        return Plan(heading, lambda axes: draw_nothing(axes, "no samples in this file"))
+    cells = grid.statistic(found.points, 100 * found.errors_m, "mean")
+    high = max(float(np.ceil(np.nanquantile(cells, 0.99))), _LEAST_RANGE_CM)
+    scale = Scale("mean |signed distance - label| in cm", "plasma_r", 0.0, high)
+    mean, p95 = found.errors_m.mean(), np.quantile(found.errors_m, 0.95)
+    note = (
+        f"mean {centimetres(mean)}, 95 % {centimetres(p95)} at {len(found.points):,} samples "
+        f"within {100 * record.settings.leaf_m / 2:g} cm of the surface"
+    )
+    return Plan(heading, lambda axes: draw_values(axes, cells, scale), note)

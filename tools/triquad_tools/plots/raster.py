@@ -77,20 +77,11 @@ def _draw(
                     weights[row, column, 2] = wc
 
 
-@kernel()
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     """Unit normals ``[V, 3]``: those of the faces around a vertex, weighted by their area."""
-    normals = np.zeros((len(vertices), 3))
-    for f in range(faces.shape[0]):
-        first, second, third = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, uy, uz = vertices[second] - vertices[first]
-        vx, vy, vz = vertices[third] - vertices[first]
-        for corner in (first, second, third):
-            normals[corner, 0] += uy * vz - uz * vy
-            normals[corner, 1] += uz * vx - ux * vz
-            normals[corner, 2] += ux * vy - uy * vx
-    for v in range(len(vertices)):
-        length = np.sqrt(np.sum(normals[v] ** 2))
-        if length > 0.0:
-            normals[v] /= length
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    shares = [np.bincount(faces.ravel(), part, len(vertices)) for part in across.repeat(3, 0).T]
+    normals: NDArray[np.float64] = np.stack(shares, axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     return normals

@@ -3,19 +3,21 @@
 Own code, as the libraries that do this want a display, a GPU driver or hundreds of megabytes.
 """
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from triquad_tools.plots.camera import Camera, birds_eye, view_axes
 from triquad_tools.plots.raster import Raster, rasterise, vertex_normals
 
+_NEAR_M = 0.1  # what is nearer than this to the eye is not drawn
 _SUPERSAMPLING = 2
 _SHADOW_PIXELS = 3072
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 
 # Colours are linear light in [0, 1].
-_CLAY = np.array([0.66, 0.62, 0.56])
 _SUN = np.array([1.0, 0.93, 0.80]) * 1.08
 _SKY_LIGHT = np.array([0.55, 0.68, 0.90]) * 0.50
 _GROUND_LIGHT = np.array([0.50, 0.44, 0.38]) * 0.22
@@ -34,13 +36,59 @@ _HEIGHT_STOPS = np.array(
 )
 
 
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera in the map frame; the picture's top is towards +z."""
+
+    eye: NDArray[np.float64]  # [3] metres
+    target: NDArray[np.float64]  # [3] metres, in the middle of the picture
+    view_deg: float = 35.0  # vertical opening angle
+
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        """Unit vectors ``[3, 3]``: to the right, down, and forward, in the map frame."""
+        return view_axes(self.target - self.eye)
+
+    def project(self, points: NDArray[np.float64], width: int, height: int) -> NDArray[np.float64]:
+        """Column, row and inverse depth ``[N, 3]`` of points ``[N, 3]``; NaN behind the eye."""
+        seen = (points - self.eye) @ self.axes.T
+        depth = np.where(seen[:, 2] > _NEAR_M, seen[:, 2], np.nan)
+        pixels = self._pixels_per_tangent(height)
+        column = 0.5 * width + pixels * seen[:, 0] / depth
+        row = 0.5 * height + pixels * seen[:, 1] / depth
+        return np.column_stack([column, row, 1.0 / depth])
+
+    def unproject(self, nearness: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points ``[H, W, 3]`` of the world that the pixels of a picture show."""
+        height, width = nearness.shape
+        pixels = self._pixels_per_tangent(height)
+        right, down, forward = self.axes
+        columns = (np.arange(width) + 0.5 - 0.5 * width) / pixels
+        rows = (np.arange(height) + 0.5 - 0.5 * height) / pixels
+        rays = columns[None, :, None] * right + rows[:, None, None] * down + forward
+        points: NDArray[np.float64] = self.eye + rays / nearness[:, :, None]
+        return points
+
+    def _pixels_per_tangent(self, height: int) -> float:
+        return 0.5 * height / math.tan(0.5 * math.radians(self.view_deg))
+
+
+def view_axes(forward: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vectors ``[3, 3]`` to the right, down and forward of a view in a direction ``[3]``."""
+    forward = forward / np.linalg.norm(forward)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
 def render_mesh(
     vertices: NDArray[np.floating],
     faces: NDArray[np.integer],
+    colours: NDArray[np.floating],
+    camera: Camera,
     width: int = 1600,
     height: int = 900,
-    camera: Camera | None = None,
-    colours: NDArray[np.floating] | None = None,
 ) -> NDArray[np.uint8]:
     """A picture ``[height, width, 3]`` of a mesh.
 
@@ -48,17 +96,16 @@ def render_mesh(
         vertices: ``[V, 3]`` metres, map frame.
         faces: ``[F, 3]`` rows of vertices, counter-clockwise seen from outside; those seen from
             inside are drawn darker.
+        colours: ``[V, 3]`` of the vertices, linear in [0, 1].
+        camera: where it is taken from.
         width: pixels.
         height: pixels.
-        camera: by default an oblique bird's-eye view of the whole mesh.
-        colours: ``[V, 3]`` of the vertices, linear in [0, 1]; by default those of clay.
     """
     wide, high = width * _SUPERSAMPLING, height * _SUPERSAMPLING
     picture = _sky(wide, high)
     if len(faces):
         points = np.ascontiguousarray(vertices, np.float64)
         rows = np.ascontiguousarray(faces, np.int32)
-        camera = camera or birds_eye(points, width / height)
         raster = rasterise(camera.project(points, wide, high), rows, wide, high)
         light = _shade(points, rows, camera, raster, colours)
         covered = raster.faces >= 0
@@ -82,7 +129,7 @@ def _shade(
     faces: NDArray[np.int32],
     camera: Camera,
     raster: Raster,
-    colours: NDArray[np.floating] | None,
+    colours: NDArray[np.floating],
 ) -> NDArray[np.float64]:
     """Light ``[P, 3]`` that the covered pixels send, in the order of the picture's rows."""
     covered = raster.faces >= 0
@@ -95,7 +142,7 @@ def _shade(
     sun = np.maximum(normals @ _TOWARDS_SUN, 0.0) * _sunlit(points, faces, places, normals)
     up = (0.5 + 0.5 * normals[:, 2])[:, None]
     light: NDArray[np.float64] = sun[:, None] * _SUN + up * _SKY_LIGHT + (1.0 - up) * _GROUND_LIGHT
-    light *= _CLAY if colours is None else _blend(colours, owners, weights)
+    light *= _blend(colours, owners, weights)
     light[inside] *= _BACK
     return light
 

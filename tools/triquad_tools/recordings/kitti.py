@@ -24,22 +24,6 @@ DEFAULT_PERIOD_NS = 100_000_000  # between scans of a folder without times
 _POINT_BYTES = 16
 
 
-class ScanFolderError(ToolError):
-    """A folder of scans that is missing, incomplete or contradicts itself."""
-
-
-class ScanFileError(ToolError):
-    """A scan file that does not hold whole points."""
-
-
-class PoseError(ToolError):
-    """A pose or calibration that is not 12 finite numbers of a rigid motion."""
-
-
-class StampError(ToolError):
-    """A time stamp that is not a number of seconds, or that runs backwards."""
-
-
 @dataclass(frozen=True)
 class KittiFolder:
     """The scans of a folder with their poses and times; points are read when asked for."""
@@ -56,7 +40,7 @@ class KittiFolder:
         path = self.scan_paths[index]
         size = path.stat().st_size
         if size % _POINT_BYTES:
-            raise ScanFileError(f"{path}: {size} bytes are not whole points of {_POINT_BYTES}")
+            raise ToolError(f"{path}: {size} bytes are not whole points of {_POINT_BYTES}")
         return np.fromfile(path, "<f4").reshape(-1, 4)[:, :3].astype(np.float32)
 
 
@@ -64,14 +48,14 @@ def read_folder(folder: Path) -> KittiFolder:
     """The scans, poses and times of a folder.
 
     Raises:
-        ScanFolderError: the folder, its poses or its scans are missing, or their counts differ.
-        PoseError: a pose or the calibration is not a rigid motion.
-        StampError: a time is not a number, or times run backwards.
+        ToolError: the folder, its poses or its scans are missing, their counts differ, a
+            pose or the calibration is not a rigid motion, a time is not a number, or times run
+            backwards.
     """
     if not folder.is_dir():
-        raise ScanFolderError(f"{folder}: no such folder")
+        raise ToolError(f"{folder}: no such folder")
     if not (folder / "poses.txt").is_file():
-        raise ScanFolderError(f"{folder}: holds no poses.txt")
+        raise ToolError(f"{folder}: holds no poses.txt")
     scans = _scan_paths(folder)
     poses = _read_poses(folder / "poses.txt")
     _check_count(folder / "poses.txt", "poses", len(poses), len(scans))
@@ -92,12 +76,12 @@ def _scan_paths(folder: Path) -> tuple[Path, ...]:
         paths = tuple(sorted((folder / name).glob("*.bin")))
         if paths:
             return paths
-    raise ScanFolderError(f"{folder}: holds no *.bin in any of {', '.join(SCAN_FOLDERS)}")
+    raise ToolError(f"{folder}: holds no *.bin in any of {', '.join(SCAN_FOLDERS)}")
 
 
 def _check_count(path: Path, what: str, count: int, scans: int) -> None:
     if count != scans:
-        raise ScanFolderError(f"{path}: {count} {what} for {scans} scans")
+        raise ToolError(f"{path}: {count} {what} for {scans} scans")
 
 
 def _lines(path: Path) -> list[tuple[str, str]]:
@@ -116,20 +100,20 @@ def _read_calibration(path: Path) -> NDArray[np.float64]:
         name, _, numbers = line.partition(":")
         if name.strip() == "Tr":
             return _parse_pose(place, numbers)
-    raise PoseError(f"{path}: has no line 'Tr:'")
+    raise ToolError(f"{path}: has no line 'Tr:'")
 
 
 def _parse_pose(place: str, line: str) -> NDArray[np.float64]:
     """The rigid pose ``[4, 4]`` of 12 numbers, its rotation made orthonormal."""
     words = line.split()
     if len(words) != 12:
-        raise PoseError(f"{place}: {len(words)} numbers where a pose has 12")
+        raise ToolError(f"{place}: {len(words)} numbers where a pose has 12")
     pose = np.eye(4)
     for i, word in enumerate(words):
         pose[i // 4, i % 4] = _parse_number(place, word)
     rotation = pose[:3, :3]
     if not is_rotation(pose):
-        raise PoseError(
+        raise ToolError(
             f"{place}: not a rotation: off orthonormal by {rotation_error(pose):.3g}, "
             f"determinant {np.linalg.det(rotation):.3g}"
         )
@@ -140,9 +124,9 @@ def _parse_number(place: str, word: str) -> float:
     try:
         number = float(word)
     except ValueError:
-        raise PoseError(f"{place}: {word!r} is not a number") from None
+        raise ToolError(f"{place}: {word!r} is not a number") from None
     if not math.isfinite(number):
-        raise PoseError(f"{place}: {word!r} is not finite")
+        raise ToolError(f"{place}: {word!r} is not finite")
     return number
 
 
@@ -153,10 +137,10 @@ def _read_stamps(path: Path) -> NDArray[np.int64]:
         try:
             stamp = int(Decimal(line.strip()) * 10**9)
         except (InvalidOperation, ValueError, OverflowError):
-            raise StampError(f"{place}: {line.strip()!r} is not a number of seconds") from None
+            raise ToolError(f"{place}: {line.strip()!r} is not a number of seconds") from None
         if not 0 <= stamp < 2**63:
-            raise StampError(f"{place}: {line.strip()} s is out of range")
+            raise ToolError(f"{place}: {line.strip()} s is out of range")
         if stamps and stamp < stamps[-1]:
-            raise StampError(f"{place}: {line.strip()} s is before the line above")
+            raise ToolError(f"{place}: {line.strip()} s is before the line above")
         stamps.append(stamp)
     return np.array(stamps, np.int64)

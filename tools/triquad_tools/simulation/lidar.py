@@ -7,8 +7,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from triquad_tools.recordings.cloud import merged
+from triquad_tools.recordings.cloud import PosedScan, merged
 from triquad_tools.simulation.scene import Scene
 
 _SENSOR_HEIGHT_M = 1.8
@@ -18,12 +19,10 @@ _TILT_RAD = math.radians(1.0)  # of the gentle roll and pitch
 
 
 @dataclass(frozen=True)
-class SimulatedScan:
-    """What the sensor measured, and the truth behind it; row ``i`` of both is the same ray."""
+class SimulatedScan(PosedScan):
+    """What the sensor measured: returns with range noise, and the truth behind each."""
 
-    points: NDArray[np.float32]  # [N, 3] metres, sensor frame, with range noise; returns only
     true_hits: NDArray[np.float64]  # [N, 3] metres, world frame, exactly on the surface
-    world_from_sensor: NDArray[np.float64]  # [4, 4]
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,9 @@ def drive(scene: Scene, n_scans: int, step_m: float) -> NDArray[np.float64]:
     roll = _TILT_RAD * np.sin(travelled * 0.31)
     pitch = _TILT_RAD * np.sin(travelled * 0.23 + 1.0)
     poses = np.tile(np.eye(4), (n_scans, 1, 1))
-    poses[:, :3, :3] = _rotations(roll, pitch, yaw)
+    # Roll about x, then pitch about y, then yaw about z.
+    angles = np.column_stack([roll, pitch, yaw])
+    poses[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
     poses[:, :3, 3] = positions
     return poses
 
@@ -138,18 +139,3 @@ def _positions(travelled: NDArray[np.float64], length_m: float) -> NDArray[np.fl
             np.full(len(travelled), _SENSOR_HEIGHT_M),
         ]
     )
-
-
-def _rotations(
-    roll: NDArray[np.float64], pitch: NDArray[np.float64], yaw: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Rotations ``[n, 3, 3]``: roll about x, then pitch about y, then yaw about z."""
-    about = np.tile(np.eye(3), (3, len(roll), 1, 1))
-    for matrices, angle, (i, j) in zip(
-        about, (roll, pitch, yaw), ((1, 2), (2, 0), (0, 1)), strict=True
-    ):
-        matrices[:, i, i] = matrices[:, j, j] = np.cos(angle)
-        matrices[:, j, i] = np.sin(angle)
-        matrices[:, i, j] = -np.sin(angle)
-    rotations: NDArray[np.float64] = about[2] @ about[1] @ about[0]
-    return rotations

@@ -1,16 +1,21 @@
-"""An exact world: a union of convex solids that answers signed distances without error."""
+"""An exact world: a union of convex solids that answers signed distances and rays without error."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_map.compiled.kernel import kernel
 
-from triquad_tools.simulation.nearest import CandidateGrid, Nearest, candidate_grid, nearest
-from triquad_tools.simulation.rays import cast_rays
-from triquad_tools.simulation.solids import Label, Solid, solid_table
+from triquad_tools.simulation.solids import BOUND, Solid, X, Y, Z, distance_to, solid_table
+
+CELL_M = 2.5
 
 _ON_SURFACE_M = 1e-7
+_NEWTON_STEPS = 64
+_HIT_M = 1e-8  # a ray this close to a surface has hit it
 
 
 @dataclass(frozen=True)
@@ -26,14 +31,15 @@ class Scene:
     solids: tuple[Solid, ...]
     bounds: NDArray[np.float64]  # [2, 3] lower and upper corner of the part of interest, metres
     drive_length_m: float = 0.0  # of the road along x, from the origin
+    houses: tuple[Solid, ...] = ()  # those of the solids that are part of a house
 
     def sdf(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distances ``[N]`` in metres at points ``[N, 3]`` of the world."""
-        return self._nearest(points).distances
+        return self._nearest(points)[0]
 
     def gradient(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit gradients ``[N, 3]`` of the signed distance at points ``[N, 3]`` of the world."""
-        return self._nearest(points).gradients
+        return self._nearest(points)[1]
 
     def is_exact(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether the signed distance is exact, ``[N]``, at points ``[N, 3]`` of the world.
@@ -41,9 +47,9 @@ class Scene:
         No part of the surface is nearer than the distance says; it is exact where the closest
         point that it tells of really lies on the surface.
         """
-        found = self._nearest(points)
-        closest = points - found.distances[:, None] * found.gradients
-        return (found.distances >= 0.0) | (np.abs(self.sdf(closest)) < _ON_SURFACE_M)
+        distances, gradients = self._nearest(points)
+        closest = points - distances[:, None] * gradients
+        return (distances >= 0.0) | (np.abs(self.sdf(closest)) < _ON_SURFACE_M)
 
     def is_inside_house(
         self, points: NDArray[np.float64], margin_m: float = 0.5
@@ -52,10 +58,7 @@ class Scene:
         return self._houses.sdf(points) < -margin_m
 
     def cast(
-        self,
-        origin: NDArray[np.float64],
-        directions: NDArray[np.float64],
-        range_max_m: float,
+        self, origin: NDArray[np.float64], directions: NDArray[np.float64], range_max_m: float
     ) -> NDArray[np.float64]:
         """Ranges ``[N]`` in metres at which rays first hit a solid; infinite where none does.
 
@@ -65,23 +68,31 @@ class Scene:
             range_max_m: rays end here.
         """
         start = np.ascontiguousarray(origin, np.float64)
-        return cast_rays(self._table, start, _rows(directions), range_max_m)
+        offsets = self._table[:, [X, Y, Z]] - start
+        gaps = np.linalg.norm(offsets, axis=1) - self._table[:, BOUND]
+        order = np.argsort(gaps, kind="stable")  # nearest first: the first hits rule out the rest
+        order = order[gaps[order] < range_max_m]
+        ordered = np.ascontiguousarray(self._table[order])
+        rays = _rows(directions)
+        return _cast(ordered, offsets[order], gaps[order], start, rays, range_max_m)
 
     @cached_property
     def _table(self) -> NDArray[np.float64]:
         return solid_table(self.solids)
 
     @cached_property
-    def _grid(self) -> CandidateGrid:
-        return candidate_grid(self._table, self.bounds)
+    def _grid(self) -> "_CandidateGrid":
+        return _candidate_grid(self._table, self.bounds)
 
     @cached_property
     def _houses(self) -> "Scene":
-        houses = tuple(solid for solid in self.solids if solid.label == Label.HOUSE)
-        return Scene(houses, self.bounds)
+        return Scene(self.houses, self.bounds)
 
-    def _nearest(self, points: NDArray[np.float64]) -> Nearest:
-        return nearest(self._table, self._grid, _rows(points))
+    def _nearest(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distances [N] to the nearest solids, and their gradients [N, 3]."""
+        return _nearest(self._table, *self._grid, _rows(points))
 
 
 def _rows(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -90,3 +101,138 @@ def _rows(points: NDArray[np.float64]) -> NDArray[np.float64]:
     if rows.ndim != 2 or rows.shape[1] != 3:
         raise ValueError(f"expected points [N, 3], got an array {list(rows.shape)}")
     return rows
+
+
+class _CandidateGrid(NamedTuple):
+    """Per cube of a grid, the solids that are nearest to some point of that cube.
+
+    The last list, for points beside the grid, names all solids.
+    """
+
+    origin: NDArray[np.float64]  # [3] metres, lower corner
+    shape: NDArray[np.int64]  # [3] cells
+    starts: NDArray[np.int64]  # [cells + 2] into members
+    members: NDArray[np.int64]  # rows of the table of solids
+
+
+def _candidate_grid(solids: NDArray[np.float64], bounds: NDArray[np.float64]) -> _CandidateGrid:
+    """The grid over ``bounds [2, 3]`` for a table of solids ``[S, 11]``."""
+    shape = np.ceil((bounds[1] - bounds[0]) / CELL_M).astype(np.int64)
+    cells = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
+    centres = bounds[0] + (cells.reshape(-1, 3) + 0.5) * CELL_M
+    distances = _all_distances(solids, centres)
+    # A distance changes by at most half a diagonal between a cell's centre and its corners.
+    reach = distances.min(axis=1, keepdims=True) + np.sqrt(3.0) * CELL_M
+    candidates = np.vstack([distances <= reach, np.ones(len(solids), np.bool_)])
+    return _CandidateGrid(
+        origin=np.ascontiguousarray(bounds[0], np.float64),
+        shape=shape,
+        starts=np.concatenate([[0], np.cumsum(candidates.sum(axis=1))]),
+        members=np.nonzero(candidates)[1],
+    )
+
+
+@kernel()
+def _all_distances(solids: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    distances = np.empty((points.shape[0], solids.shape[0]))
+    for i in range(points.shape[0]):
+        for s in range(solids.shape[0]):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            distances[i, s] = distance_to(solids[s], x, y, z)[0]
+    return distances
+
+
+@kernel()
+def _cell(origin: NDArray[np.float64], shape: NDArray[np.int64], point: NDArray[np.float64]) -> int:
+    """The flat index of a point's cell; one past the last for a point beside the grid."""
+    flat = np.int64(0)
+    for axis in range(3):
+        cell = np.floor((point[axis] - origin[axis]) / CELL_M)
+        if not 0 <= cell < shape[axis]:
+            return int(shape[0] * shape[1] * shape[2])
+        flat = flat * shape[axis] + int(cell)
+    return int(flat)
+
+
+@kernel()
+def _nearest(
+    solids: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    shape: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    members: NDArray[np.int64],
+    points: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    count = points.shape[0]
+    distances = np.full(count, np.inf)
+    gradients = np.zeros((count, 3))
+    for i in range(count):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        cell = _cell(origin, shape, points[i])
+        for k in range(starts[cell], starts[cell + 1]):
+            row = solids[members[k]]
+            distance, gx, gy, gz = distance_to(row, x, y, z)
+            if distance < distances[i]:
+                distances[i] = distance
+                gradients[i, 0], gradients[i, 1], gradients[i, 2] = gx, gy, gz
+    return distances, gradients
+
+
+@kernel()
+def _cast(
+    solids: NDArray[np.float64],
+    offsets: NDArray[np.float64],
+    gaps: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    range_max_m: float,
+) -> NDArray[np.float64]:
+    # Every solid is convex, so its signed distance is a convex function along any ray: Newton's
+    # method started outside never steps past the first hit.
+    outside = np.empty(solids.shape[0])  # squared distance to the centre less squared radius
+    for s in range(solids.shape[0]):
+        centre = offsets[s]
+        outside[s] = np.sum(centre * centre) - solids[s, BOUND] ** 2
+    ranges = np.empty(directions.shape[0])
+    for i in range(directions.shape[0]):
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        best = range_max_m
+        for s in range(solids.shape[0]):
+            if gaps[s] >= best:
+                break
+            start = 0.0
+            if outside[s] > 0.0:
+                middle = offsets[s, 0] * dx + offsets[s, 1] * dy + offsets[s, 2] * dz
+                half2 = middle * middle - outside[s]
+                if middle <= 0.0 or half2 < 0.0:
+                    continue
+                start = middle - math.sqrt(half2)
+            if start < best:
+                best = _hit(solids[s], origin, directions[i], start, best)
+        ranges[i] = best if best < range_max_m else np.inf
+    return ranges
+
+
+@kernel()
+def _hit(
+    row: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    start: float,
+    limit: float,
+) -> float:
+    """Range from ``start`` on at which a ray hits one solid; ``limit`` if that is nearer."""
+    dx, dy, dz = direction[0], direction[1], direction[2]
+    t = start
+    for _ in range(_NEWTON_STEPS):
+        if t >= limit:
+            return limit
+        x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
+        distance, gx, gy, gz = distance_to(row, x, y, z)
+        if distance < _HIT_M:
+            return t
+        slope = gx * dx + gy * dy + gz * dz
+        if slope >= 0.0:  # convex along the ray: from here on it only moves away
+            return limit
+        t -= distance / slope
+    return t

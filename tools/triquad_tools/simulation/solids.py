@@ -5,7 +5,6 @@ Distances are metres, positive outside a solid and negative inside.
 
 import math
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,23 +18,11 @@ _KIND, X, Y, Z, _COS, _SIN, _A, _B, _C, _D, BOUND = range(_COLUMNS)
 HALF_SPACE, BOX, CYLINDER, GABLE = range(4)
 
 
-class Label(IntEnum):
-    """What a solid is part of."""
-
-    GROUND = 0
-    PAVEMENT = 1
-    HOUSE = 2
-    CAR = 3
-    POLE = 4
-    TREE = 5
-
-
 @dataclass(frozen=True)
 class Solid:
     """One convex solid; made by the functions below."""
 
     kind: int
-    label: Label
     centre: Vector  # metres, world frame; of the bounding sphere
     yaw: float  # radians, about z
     size: tuple[float, float, float, float]  # metres; the meaning depends on the kind
@@ -48,31 +35,31 @@ class Solid:
         return (float(self.kind), *self.centre, *turn, *self.size, self.bound_m)
 
 
-def half_space(height_m: float, label: Label = Label.GROUND) -> Solid:
+def half_space(height_m: float) -> Solid:
     """All that lies below ``z = height_m``."""
-    return Solid(HALF_SPACE, label, (0.0, 0.0, height_m), 0.0, (0.0,) * 4, math.inf)
+    return Solid(HALF_SPACE, (0.0, 0.0, height_m), 0.0, (0.0,) * 4, math.inf)
 
 
-def box(label: Label, centre: Vector, half: Vector, yaw: float = 0.0, radius: float = 0.0) -> Solid:
+def box(centre: Vector, half: Vector, yaw: float = 0.0, radius: float = 0.0) -> Solid:
     """A box with half sides ``half``, its edges rounded with ``radius`` within these sides."""
     if not 0.0 <= radius <= min(half):
         raise ValueError(f"radius {radius!r} does not fit a box of half sides {half!r}")
     core = (half[0] - radius, half[1] - radius, half[2] - radius)
-    return Solid(BOX, label, centre, yaw, (*core, radius), math.hypot(*core) + radius)
+    return Solid(BOX, centre, yaw, (*core, radius), math.hypot(*core) + radius)
 
 
-def sphere(label: Label, centre: Vector, radius: float) -> Solid:
+def sphere(centre: Vector, radius: float) -> Solid:
     """A ball: a box that is nothing but rounding."""
-    return box(label, centre, (radius, radius, radius), 0.0, radius)
+    return box(centre, (radius, radius, radius), 0.0, radius)
 
 
-def cylinder(label: Label, centre: Vector, radius: float, half_height: float) -> Solid:
+def cylinder(centre: Vector, radius: float, half_height: float) -> Solid:
     """A vertical cylinder with flat caps."""
     size = (radius, half_height, 0.0, 0.0)
-    return Solid(CYLINDER, label, centre, 0.0, size, math.hypot(radius, half_height))
+    return Solid(CYLINDER, centre, 0.0, size, math.hypot(radius, half_height))
 
 
-def gable(label: Label, centre: Vector, half: Vector, eave: float, yaw: float = 0.0) -> Solid:
+def gable(centre: Vector, half: Vector, eave: float, yaw: float = 0.0) -> Solid:
     """A house with a pitched roof: a box of half sides ``half`` cut by two slopes.
 
     The ridge runs along the local x axis at the top of the box; the slopes begin at height
@@ -80,7 +67,7 @@ def gable(label: Label, centre: Vector, half: Vector, eave: float, yaw: float = 
     """
     if not 0.0 < eave < 2.0 * half[2]:
         raise ValueError(f"eave {eave!r} is not between 0 and the full height {2 * half[2]!r}")
-    return Solid(GABLE, label, centre, yaw, (*half, eave), math.hypot(*half))
+    return Solid(GABLE, centre, yaw, (*half, eave), math.hypot(*half))
 
 
 def solid_table(solids: tuple[Solid, ...]) -> NDArray[np.float64]:

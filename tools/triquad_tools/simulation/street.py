@@ -6,16 +6,7 @@ import numpy as np
 
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.solids import (
-    Label,
-    Solid,
-    Vector,
-    box,
-    cylinder,
-    gable,
-    half_space,
-    sphere,
-)
+from triquad_tools.simulation.solids import Solid, Vector, box, cylinder, gable, half_space, sphere
 
 ROAD_HALF_WIDTH_M = 5.0
 _PAVEMENT_M = 2.6  # width
@@ -32,13 +23,16 @@ def street(seed: int, length_m: float = 100.0) -> Scene:
     """
     rng = np.random.default_rng(seed)
     parts: list[Solid] = [half_space(0.0)]
+    houses: list[Solid] = []
     for side in (-1.0, 1.0):
         parts.append(_pavement(side, length_m))
-        parts += _houses(rng, side, length_m)
+        of_side = _houses(rng, side, length_m)
+        houses += of_side
+        parts += of_side
         parts += _cars(rng, side, length_m)
         parts += _poles_and_trees(rng, side, length_m)
     bounds = np.array([[-_MARGIN_M, -24.0, -0.5], [length_m + _MARGIN_M, 24.0, _TOP_M]])
-    return Scene(tuple(parts), bounds, length_m)
+    return Scene(tuple(parts), bounds, length_m, tuple(houses))
 
 
 def street_drive(seed: int, scans: int, step_m: float = 1.0) -> SimulatedDrive:
@@ -47,19 +41,17 @@ def street_drive(seed: int, scans: int, step_m: float = 1.0) -> SimulatedDrive:
     return SimulatedDrive(scene, Lidar(), drive(scene, scans, step_m), seed)
 
 
-def _standing(
-    label: Label, foot: Vector, half_x: float, half_y: float, height: float, yaw: float = 0.0
-) -> Solid:
+def _standing(foot: Vector, half_x: float, half_y: float, height: float, yaw: float = 0.0) -> Solid:
     """A box that stands at ``foot`` and is buried below it."""
     half_z = 0.5 * (height + _BURIED_M)
     centre = (foot[0], foot[1], foot[2] + height - half_z)
-    return box(label, centre, (half_x, half_y, half_z), yaw)
+    return box(centre, (half_x, half_y, half_z), yaw)
 
 
 def _pavement(side: float, length_m: float) -> Solid:
     foot = (0.5 * length_m, side * (ROAD_HALF_WIDTH_M + 0.5 * _PAVEMENT_M), 0.0)
     half_x = 0.5 * length_m + _MARGIN_M
-    return _standing(Label.PAVEMENT, foot, half_x, 0.5 * _PAVEMENT_M, _KERB_M)
+    return _standing(foot, half_x, 0.5 * _PAVEMENT_M, _KERB_M)
 
 
 def _houses(rng: np.random.Generator, side: float, length_m: float) -> list[Solid]:
@@ -85,14 +77,13 @@ def _flat_house(
     ledge_z, over = height - rng.uniform(0.4, 0.8), rng.uniform(0.25, 0.5)
     attic = (foot[0] + rng.uniform(-1.0, 1.0), foot[1], height + 0.2)
     return [
-        _standing(Label.HOUSE, foot, half_x, half_y, height, yaw),
+        _standing(foot, half_x, half_y, height, yaw),
         box(
-            Label.HOUSE,
             (foot[0], foot[1], ledge_z),
             (half_x + over, half_y + over, rng.uniform(0.12, 0.25)),
             yaw,
         ),
-        box(Label.HOUSE, attic, (0.45 * half_x, 0.5 * half_y, rng.uniform(1.0, 1.6)), yaw),
+        box(attic, (0.45 * half_x, 0.5 * half_y, rng.uniform(1.0, 1.6)), yaw),
     ]
 
 
@@ -113,8 +104,8 @@ def _gabled_house(
         eave + rise - 0.3,
     )
     return [
-        gable(Label.HOUSE, centre, (*half, half_z), eave + _BURIED_M, yaw),
-        box(Label.HOUSE, chimney, (0.3, 0.35, rng.uniform(1.0, 1.3)), yaw),
+        gable(centre, (*half, half_z), eave + _BURIED_M, yaw),
+        box(chimney, (0.3, 0.35, rng.uniform(1.0, 1.3)), yaw),
     ]
 
 
@@ -123,16 +114,16 @@ def _front(
 ) -> list[Solid]:
     """What a house has towards the street: a doorstep and perhaps a bay window or a balcony."""
     door = foot[0] + rng.uniform(-0.7, 0.7) * half_x
-    step = _standing(Label.HOUSE, (door, side * front, 0.0), 0.8, 0.55, rng.uniform(0.3, 0.5))
+    step = _standing((door, side * front, 0.0), 0.8, 0.55, rng.uniform(0.3, 0.5))
     x = foot[0] + rng.uniform(-0.5, 0.5) * half_x
     choice = rng.integers(3)
     if choice == 0:
         bay = (x, side * (front + 0.3), 0.0)
         half_width, height = rng.uniform(0.9, 1.6), rng.uniform(2.6, 3.2)
-        return [step, _standing(Label.HOUSE, bay, half_width, 1.0, height)]
+        return [step, _standing(bay, half_width, 1.0, height)]
     if choice == 1:
         floor = (x, side * (front + 0.1), rng.uniform(2.6, 3.1))
-        return [step, box(Label.HOUSE, floor, (rng.uniform(1.0, 1.8), 1.1, 0.11))]
+        return [step, box(floor, (rng.uniform(1.0, 1.8), 1.1, 0.11))]
     return [step]
 
 
@@ -161,9 +152,8 @@ def _car(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
 
     cabin_half_z = 0.5 * (top - 0.5)
     parts = [
-        box(Label.CAR, at(0.0, 0.0, body_z), (half_x, half_y, body_half), yaw, 0.12),
+        box(at(0.0, 0.0, body_z), (half_x, half_y, body_half), yaw, 0.12),
         box(
-            Label.CAR,
             at(cabin_x, 0.0, top - cabin_half_z),
             (cabin_half, half_y - 0.1, cabin_half_z),
             yaw,
@@ -172,7 +162,7 @@ def _car(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
     ]
     for along in (-0.62 * half_x, 0.62 * half_x):
         for across in (0.12 - half_y, half_y - 0.12):
-            parts.append(box(Label.CAR, at(along, across, 0.3), (0.31, 0.11, 0.31), yaw, 0.1))
+            parts.append(box(at(along, across, 0.3), (0.31, 0.11, 0.31), yaw, 0.1))
     return parts
 
 
@@ -192,12 +182,12 @@ def _pole(rng: np.random.Generator, x: float, y: float, side: float) -> list[Sol
     lamp = rng.uniform() < 0.6
     height = rng.uniform(5.0, 7.0) if lamp else rng.uniform(2.3, 2.9)
     half_z = 0.5 * (height + _BURIED_M)
-    post = cylinder(Label.POLE, (x, y, height - half_z), radius, half_z)
+    post = cylinder((x, y, height - half_z), radius, half_z)
     if lamp:
         arm = (x, y - side * 0.7, height - 0.12)
-        return [post, box(Label.POLE, arm, (0.12, 0.8, 0.07), 0.0, 0.06)]
+        return [post, box(arm, (0.12, 0.8, 0.07), 0.0, 0.06)]
     plate = (x, y, height - 0.45)
-    return [post, box(Label.POLE, plate, (radius + 0.03, 0.33, 0.33), 0.0, 0.02)]
+    return [post, box(plate, (radius + 0.03, 0.33, 0.33), 0.0, 0.02)]
 
 
 def _tree(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
@@ -206,16 +196,11 @@ def _tree(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
     half_z = 0.5 * (trunk + 0.6 * crown + _BURIED_M)
     top = trunk + 0.8 * crown
     parts = [
-        cylinder(
-            Label.TREE,
-            (x, y, trunk + 0.6 * crown - half_z),
-            rng.uniform(0.12, 0.28),
-            half_z,
-        ),
-        sphere(Label.TREE, (x, y, top), crown),
+        cylinder((x, y, trunk + 0.6 * crown - half_z), rng.uniform(0.12, 0.28), half_z),
+        sphere((x, y, top), crown),
     ]
     for angle in rng.uniform(0.0, 2.0 * math.pi) + np.arange(4) * 0.5 * math.pi:
         out, up = 0.75 * crown, rng.uniform(-0.3, 0.6) * crown
         centre = (x + out * math.cos(angle), y + out * math.sin(angle), top + up)
-        parts.append(sphere(Label.TREE, centre, rng.uniform(0.5, 0.75) * crown))
+        parts.append(sphere(centre, rng.uniform(0.5, 0.75) * crown))
     return parts
