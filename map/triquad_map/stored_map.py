@@ -7,10 +7,9 @@ from types import TracebackType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_format.mapfile.file_errors import named
+from triquad_format.mapfile.files import FileBytes, RandomAccess, named
 from triquad_format.mapfile.index import MapIndex, OpenFile, files_in
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.mcap.random_access import FileBytes, RandomAccess
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     FIELD_TOPICS,
@@ -27,8 +26,8 @@ from triquad_format.mapfile.parts.part import (
 from triquad_format.mapfile.parts.region_parts import RegionParts
 from triquad_format.mapfile.reader import assemble
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.crop import SLACK_LEAVES, LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.leaf_box import SLACK_LEAVES, LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.record_check import check_record, check_region
 from triquad_format.records.region import (
     AXES,

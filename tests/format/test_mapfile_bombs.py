@@ -29,7 +29,7 @@ from support.mapfile_edit import (
 )
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.manifest import FileRef
-from triquad_format.mapfile.mcap.chunks import MAX_CHUNK_BYTES
+from triquad_format.mapfile.mcap.records import MAX_CHUNK_BYTES
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, VERTICES, PartKey
 from triquad_format.records.region import MapRecord
 

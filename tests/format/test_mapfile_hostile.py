@@ -112,7 +112,7 @@ HOSTILE = {
     "training: samples": (TRAINING, set_field("samples", 2**62)),
     "training: fewer samples": (TRAINING, set_field("samples", 1)),
     "training: steps": (TRAINING, set_field("mlp_steps", -1)),
-    "training: visits": (TRAINING, set_field("visits_owed", 2**64 - 1)),
+    "training: budget": (TRAINING, set_field("training_budget", 2**64 - 1)),
     "moments: steps": (MOMENTS, first_level(set_array("steps", np.zeros((4, 1), np.uint8)))),
     "moments: a row less": (MOMENTS, first_level(shorten("steps", 1))),
     "moments: negative variance": (

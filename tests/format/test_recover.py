@@ -26,8 +26,7 @@ from triquad_format.mapfile.parts.part import (
 )
 from triquad_format.records import morton
 from triquad_format.records.crop import without_training
-from triquad_format.records.evidence_voxels import seen_voxels
-from triquad_format.records.region import region_centre, region_corner
+from triquad_format.records.region import region_centre, region_corner, seen_voxels
 from triquad_format.records.status import Status
 from triquad_format.recovery.recovered_map import recover
 from triquad_map.reference.evaluator import MapEvaluator

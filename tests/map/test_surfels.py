@@ -5,10 +5,8 @@ import pytest
 from support import small_world
 from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
-from triquad_map.composition.field_samples import field_samples
-from triquad_map.composition.split import in_one
-from triquad_map.nearest import NearestSurfels, no_surfels
-from triquad_map.surface.surfels import FieldSample, SurfelKind, fit_surfels
+from triquad_map.composition.region import NearestSurfels, field_samples, in_one, no_surfels
+from triquad_map.surface import FieldSample, SurfelKind, fit_surfels
 from triquad_server.epochs import FrozenRegion
 from triquad_server.mapping.mapper import Mapper
 

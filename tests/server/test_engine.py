@@ -5,8 +5,7 @@ import pytest
 import torch
 from support import small_world
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.batch import load, new_batch
-from triquad_map.compiled.field.encoding import locate
+from triquad_map.compiled.field.encoding import load, locate, new_batch
 from triquad_map.compiled.field.field import make_field
 from triquad_server.engine.adam import Parameter, Rates, step_rows, step_where
 from triquad_server.engine.live_field import LiveField, initial_field

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.parts.body import repack_part
-from triquad_format.mapfile.parts.part import PartKey
+from triquad_format.mapfile.parts.part import Part, PartKey
 from triquad_format.mapfile.reader import assemble
 from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.record_check import check_record
@@ -143,7 +142,7 @@ def _kept(path: Path, wanted: Sequence[Entry]) -> dict[PartKey, bytes]:
 def _write(path: Path, manifest: Manifest, payloads: Mapping[PartKey, bytes]) -> None:
     """Replace the file at ``path`` by one of these parts, all of it or nothing."""
     own = {entry.key: dataclasses.replace(entry, file=None) for entry in manifest.entries}
-    parts = (repack_part(key, payloads[key]) for key in own)
+    parts = (Part(key, payloads[key]) for key in own)
     write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns or None, known=own)
 
 

@@ -10,10 +10,9 @@ from datetime import datetime
 from pathlib import Path
 
 from triquad_format.errors import MapFileError
-from triquad_format.mapfile.file_errors import named
+from triquad_format.mapfile.files import FileBytes, named
 from triquad_format.mapfile.index import DAMAGED_SUFFIX, MapIndex, files_in
 from triquad_format.mapfile.manifest import Manifest
-from triquad_format.mapfile.mcap.random_access import FileBytes
 
 _NAME = re.compile(r"epoch-([0-9]{9,19})(\.delta)?\.triquad")
 

@@ -10,9 +10,9 @@ from triquad_format.errors import (
     MapFileError,
     NoIndexError,
 )
+from triquad_format.mapfile.files import FileBytes, RandomAccess
 from triquad_format.mapfile.manifest import Entry, FileRef, unpack_manifest
-from triquad_format.mapfile.mcap.index import McapIndex
-from triquad_format.mapfile.mcap.random_access import FileBytes, RandomAccess
+from triquad_format.mapfile.mcap.reader import McapIndex
 from triquad_format.mapfile.metadata import (
     METADATA_NAME,
     check_agreement,
@@ -77,7 +77,10 @@ class OtherFiles:
         try:
             source = self._open_file(file)
             try:
-                return _index_of(file, source)
+                index = MapIndex(source)
+                if index.manifest_sha256 != file.manifest_sha256:
+                    raise DamagedMapFileError("it is not the file that the map was made with")
+                return index
             except BaseException:
                 source.close()
                 raise
@@ -154,10 +157,3 @@ class MapIndex:
         if own is None or own.sha256 != entry.sha256:
             raise DamagedMapFileError(f"it does not hold {entry.key}")
         return own
-
-
-def _index_of(file: FileRef, source: RandomAccess) -> MapIndex:
-    index = MapIndex(source)
-    if index.manifest_sha256 != file.manifest_sha256:
-        raise DamagedMapFileError("it is not the file that the map was made with")
-    return index

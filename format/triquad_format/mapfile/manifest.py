@@ -124,14 +124,12 @@ def pack_manifest(manifest: Manifest) -> Part:
         "created_ns": manifest.stamp_ns,
         "files": [{"name": file.name, "manifest": file.manifest_sha256} for file in files],
         "topics": topics,
-        "parts": {name: _packed(name, values) for name, values in columns.items()},
+        "parts": {
+            name: pack_array(np.array(columns[name], dtype).reshape(-1, *row))
+            for name, (dtype, row) in _COLUMNS.items()
+        },
     }
     return pack_part(PartKey(MANIFEST), body)
-
-
-def _packed(name: str, values: Iterable[Any]) -> dict[str, object]:
-    dtype, row = _COLUMNS[name]
-    return pack_array(np.array(values, dtype).reshape(-1, *row))
 
 
 def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
@@ -207,20 +205,15 @@ def _check_keys(keys: list[PartKey]) -> None:
 def _entries(
     columns: Mapping[str, NDArray[Any]], topics: list[str], files: list[FileRef | None]
 ) -> Iterable[Entry]:
-    listed = {name: columns[name].tolist() for name in columns if name != "sha256"}
-    for i in range(len(columns["topic"])):
-        x, y, z = listed["region"][i]
-        key = PartKey(
-            topics[listed["topic"][i]],
-            (x, y, z),
-            plane=listed["plane"][i],
-            cell=listed["cell"][i],
-        )
+    digests = [digest.tobytes() for digest in columns["sha256"]]
+    others = [columns[name].tolist() for name in _COLUMNS if name != "sha256"]
+    for digest, row in zip(digests, zip(*others, strict=True), strict=True):
+        topic, region, plane, cell, size, epoch, stamp_ns, file = row
         yield Entry(
-            key,
-            size=listed["bytes"][i],
-            sha256=columns["sha256"][i].tobytes(),
-            epoch=listed["epoch"][i],
-            stamp_ns=listed["stamp_ns"][i],
-            file=files[listed["file"][i]],
+            PartKey(topics[topic], tuple(region), plane=plane, cell=cell),
+            size=size,
+            sha256=digest,
+            epoch=epoch,
+            stamp_ns=stamp_ns,
+            file=files[file],
         )

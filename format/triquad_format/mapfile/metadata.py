@@ -13,8 +13,8 @@ from typing import Any
 
 from triquad_format import __version__
 from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
-from triquad_format.mapfile.parts.body import PartBody, pack_part, unpack_body
-from triquad_format.mapfile.parts.part import MANIFEST, MAP, Part, PartKey
+from triquad_format.mapfile.parts.body import PartBody, unpack_body
+from triquad_format.mapfile.parts.part import MANIFEST, MAP
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
@@ -24,9 +24,6 @@ MIN_READER_VERSION = 1
 
 BASE_FILES = "base-files"
 """The required feature of a file whose parts lie in other files, too."""
-
-KNOWN_FEATURES: frozenset[str] = frozenset({BASE_FILES})
-"""The ``required_features`` that this reader understands."""
 
 FRAME_ID = "map"
 UNITS = "m"
@@ -55,11 +52,6 @@ def pack_facts(facts: MapFacts) -> dict[str, object]:
         "units": UNITS,
         "settings": {name: type(defaults[name])(value) for name, value in settings.items()},
     }
-
-
-def pack_map_part(facts: MapFacts) -> Part:
-    """The facts as the first part of a file."""
-    return pack_part(PartKey(MAP), pack_facts(facts))
 
 
 def unpack_facts(body: PartBody) -> MapFacts:
@@ -110,15 +102,21 @@ def pack_metadata(
         "min_reader_version": str(MIN_READER_VERSION),
         "required_features": BASE_FILES if needs_other_files else "",
         "producer": f"triquad {__version__}",
-        "map": facts.name,
-        "epoch": str(facts.epoch),
-        "frame_id": FRAME_ID,
-        "units": UNITS,
+        **_facts_in_metadata(facts),
     }
     if stamp_ns is not None:
         created = datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc)
         entries["created"] = created.strftime("%Y-%m-%dT%H:%M:%SZ")
     return entries
+
+
+def _facts_in_metadata(facts: MapFacts) -> dict[str, str]:
+    return {
+        "map": facts.name,
+        "epoch": str(facts.epoch),
+        "frame_id": FRAME_ID,
+        "units": UNITS,
+    }
 
 
 def readable_metadata(found: list[dict[str, str]]) -> dict[str, str]:
@@ -158,7 +156,7 @@ def check_readable(metadata: dict[str, str]) -> None:
         )
     if "required_features" not in metadata:
         raise DamagedMapFileError("the metadata 'triquad' does not name its required_features")
-    missing = _required(metadata) - KNOWN_FEATURES
+    missing = _required(metadata) - {BASE_FILES}
     if missing:
         unknown = ", ".join(sorted(missing))
         raise UnsupportedMapFileError(
@@ -178,13 +176,7 @@ def check_agreement(metadata: dict[str, str], facts: MapFacts, *, needs_other_fi
         facts: what its parts tell of the map.
         needs_other_files: whether its manifest lists parts that lie in other files.
     """
-    wanted = {
-        "map": facts.name,
-        "epoch": str(facts.epoch),
-        "frame_id": FRAME_ID,
-        "units": UNITS,
-    }
-    for key, value in wanted.items():
+    for key, value in _facts_in_metadata(facts).items():
         if metadata.get(key) != value:
             raise DamagedMapFileError(
                 f"its metadata says {key} = {metadata.get(key)!r:.80}, its parts say {value!r}",

@@ -1,25 +1,30 @@
 """Writing map files: the same record gives the same bytes, and a path gets all of them or none."""
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO
 
+from mcap.records import Channel, Schema
+
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
-from triquad_format.mapfile.mcap.chunks import total_limit
-from triquad_format.mapfile.mcap.writer import ChannelSpec, McapWriter, SchemaSpec
+from triquad_format.mapfile.mcap.records import total_limit
+from triquad_format.mapfile.mcap.writer import McapWriter
 from triquad_format.mapfile.metadata import (
     MAX_MAP_BYTES,
     METADATA_NAME,
     MapFacts,
-    pack_map_part,
+    pack_facts,
     pack_metadata,
 )
-from triquad_format.mapfile.parts.pack import FEATURE_DTYPES, pack_record
+from triquad_format.mapfile.parts.body import pack_part, seams
+from triquad_format.mapfile.parts.columns import FLOATS
+from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import (
     ENCODINGS,
     EVIDENCE,
@@ -53,13 +58,14 @@ _LEVELS = {
     PREVIEW: 19,
     MANIFEST: 3,
 }
+_PREVIEW_SCHEMA_ID = 1
 _CHANNELS = tuple(
-    ChannelSpec(
-        number,
-        topic,
-        encoding=encoding,
-        level=_LEVELS[topic],
-        schema=PREVIEW_SCHEMA if topic == PREVIEW else "",
+    Channel(
+        id=number,
+        topic=topic,
+        message_encoding=encoding,
+        metadata={},
+        schema_id=_PREVIEW_SCHEMA_ID if topic == PREVIEW else 0,
     )
     for number, (topic, encoding) in enumerate(ENCODINGS.items(), start=1)
 )
@@ -115,8 +121,8 @@ def write_map(
         FormatError: the record is not valid, or exceeds a limit of the format.
         OSError: the file cannot be written.
     """
-    if feature_dtype not in FEATURE_DTYPES:
-        raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FEATURE_DTYPES}")
+    if feature_dtype not in FLOATS:
+        raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FLOATS}")
     if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
         raise FormatError(f"stamp_ns = {stamp_ns} is out of range: use 0 to 2**63 - 1")
     check_record(record)
@@ -151,23 +157,23 @@ def write_parts(
         FormatError: a limit of the format is exceeded, or there are previews without their schema.
         OSError: the file cannot be written.
     """
-    if isinstance(file, (str, Path)):
-        with replacing(Path(file)) as stream:
-            return write_parts(
-                stream,
-                facts,
-                parts,
-                stamp_ns=stamp_ns,
-                known=known,
-                preview_schema=preview_schema,
-            )
     # Where parts of other files are known, some of them are nearly always needed.
     needs_others = any(entry.file is not None for entry in known.values())
     metadata = pack_metadata(facts, stamp_ns=stamp_ns, needs_other_files=needs_others)
-    schemas, channels = _described(preview_schema)
-    mcap = McapWriter(file, metadata["producer"], schemas=schemas, channels=channels)
-    mcap.add_metadata(METADATA_NAME, metadata)
-    return _PartsWriter(mcap, facts, stamp_ns=stamp_ns, known=known).write(parts)
+    opened = replacing(Path(file)) if isinstance(file, (str, Path)) else nullcontext(file)
+    with opened as stream:
+        mcap = _mcap_writer(stream, metadata["producer"], preview_schema)
+        mcap.add_metadata(METADATA_NAME, metadata)
+        return _PartsWriter(mcap, facts, stamp_ns=stamp_ns, known=known).write(parts)
+
+
+def _mcap_writer(file: BinaryIO, producer: str, preview_schema: bytes | None) -> McapWriter:
+    """A writer for a file's messages: previews are described only where there are any."""
+    if preview_schema is None:
+        channels = [channel for channel in _CHANNELS if channel.topic != PREVIEW]
+        return McapWriter(file, producer, schemas=[], channels=channels)
+    schema = Schema(_PREVIEW_SCHEMA_ID, preview_schema, PREVIEW_ENCODING, PREVIEW_SCHEMA)
+    return McapWriter(file, producer, schemas=[schema], channels=_CHANNELS)
 
 
 class _PartsWriter:
@@ -189,7 +195,7 @@ class _PartsWriter:
         self._total = 0
 
     def write(self, parts: Iterable[Part | Entry]) -> WrittenMap:
-        whole = pack_map_part(self._facts)
+        whole = pack_part(PartKey(MAP), pack_facts(self._facts))
         self._put(whole, self._stamp_ns)
         self._entries.append(self._changed(whole))
         for part in parts:
@@ -222,37 +228,30 @@ class _PartsWriter:
 
     def _changed(self, part: Part) -> Entry:
         """The entry of a part that this epoch changed."""
-        digest = hashlib.sha256(part.payload).digest()
         return Entry(
             part.key,
             size=len(part.payload),
-            sha256=digest,
+            sha256=hashlib.sha256(part.payload).digest(),
             epoch=self._facts.epoch,
             stamp_ns=self._stamp_ns,
         )
 
     def _put(self, part: Part, stamp_ns: int) -> None:
-        if part.key.topic not in self._mcap.topics:
+        topic = part.key.topic
+        if topic not in self._mcap.topics:
             raise FormatError(
                 f"the file has no channel for {part.key}; for previews give preview_schema as well"
             )
         if len(part.payload) > MAX_PART_BYTES:
             raise FormatError(
-                f"the part {part.key.topic} has {len(part.payload)} bytes; "
+                f"the part {topic} has {len(part.payload)} bytes; "
                 f"a map file holds parts of at most {MAX_PART_BYTES}",
             )
         self._total += len(part.payload)
         _check_total(self._total)
-        self._mcap.add_message(part.key.topic, part.payload, time_ns=stamp_ns, seams=part.seams)
-
-
-def _described(
-    preview_schema: bytes | None,
-) -> tuple[Sequence[SchemaSpec], Sequence[ChannelSpec]]:
-    """What describes the messages of a file: of previews only where there are any."""
-    if preview_schema is None:
-        return [], [channel for channel in _CHANNELS if channel.topic != PREVIEW]
-    return [SchemaSpec(PREVIEW_SCHEMA, PREVIEW_ENCODING, preview_schema)], _CHANNELS
+        self._mcap.add_message(
+            topic, part.payload, time_ns=stamp_ns, level=_LEVELS[topic], seams=seams(part)
+        )
 
 
 def _check_total(size: int) -> None:

@@ -1,22 +1,78 @@
-"""A map cut down to a box, or freed of what only training needs."""
+"""Boxes of a map: what lies in one, and a map cut down to one or freed of training state."""
 
 import dataclasses
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from triquad_format.errors import FormatError
 from triquad_format.records import morton
-from triquad_format.records.evidence_voxels import masked, status_voxels
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.leaf_box import LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.region import (
     AXES,
+    BLOCK_VOXELS,
+    Evidence,
     MapRecord,
     Region,
+    RegionIndex,
     TrainingState,
     VertexTable,
     leaf_coordinates,
+    masked,
+    region_centre,
 )
+
+SLACK_LEAVES = 1 / 16
+"""Kept around a box: points are rounded to float32, at depth 15 by up to 1/128 of a leaf."""
+
+_Number = TypeVar("_Number", bound=np.number)
+
+_REACH_VOXELS = 0.5
+"""A point is near a surface where one was seen this far away."""
+
+
+@dataclass(frozen=True)
+class LeafBox:
+    """A box in the leaf coordinates of one region."""
+
+    low: NDArray[np.floating]  # [3]
+    high: NDArray[np.floating]  # [3]
+
+    def meets(self, other: "LeafBox", slack: float = 0.0) -> bool:
+        """Whether the two come as near as ``slack`` leaves on every axis."""
+        near = (self.low <= other.high + slack) & (self.high >= other.low - slack)
+        return bool(near.all())
+
+
+def whole_region(settings: FieldSettings) -> LeafBox:
+    """The region's cube."""
+    return LeafBox(np.zeros(3), np.full(3, float(1 << settings.depth)))
+
+
+def leaf_box(
+    settings: FieldSettings,
+    index: RegionIndex,
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+) -> LeafBox:
+    """The box between two corners [3] of the map frame, grown by what rounding may need."""
+    centre = region_centre(settings, index)
+    return LeafBox(
+        leaf_coordinates(settings, low - centre) - SLACK_LEAVES,
+        leaf_coordinates(settings, high - centre) + SLACK_LEAVES,
+    )
+
+
+def check_box(
+    minimum: ArrayLike, maximum: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The corners [3] of a box; a :class:`FormatError` where they are not finite or in order."""
+    low, high = np.asarray(minimum, np.float64), np.asarray(maximum, np.float64)
+    if not (np.isfinite([low, high]).all() and (low < high).all()):
+        raise FormatError(f"a box from {low.tolist()} to {high.tolist()} holds nothing")
+    return low, high
 
 
 def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
@@ -84,9 +140,7 @@ def _crop_training(
         training,
         table_means=_rows(training.table_means, kept),
         table_variances=_rows(training.table_variances, kept),
-        table_steps=tuple(
-            steps[rows] for steps, rows in zip(training.table_steps, kept, strict=True)
-        ),
+        table_steps=_rows(training.table_steps, kept),
         sample_points=training.sample_points[inside],
         sample_labels=training.sample_labels[inside],
         budget_samples=-(-owed // max(len(leaves), 1)),
@@ -94,6 +148,18 @@ def _crop_training(
 
 
 def _rows(
-    columns: tuple[NDArray[np.floating], ...], kept: list[NDArray[np.intp]]
-) -> tuple[NDArray[np.floating], ...]:
+    columns: tuple[NDArray[_Number], ...], kept: list[NDArray[np.intp]]
+) -> tuple[NDArray[_Number], ...]:
     return tuple(column[rows] for column, rows in zip(columns, kept, strict=True))
+
+
+def status_voxels(evidence: Evidence, box: LeafBox) -> NDArray[np.uint8]:
+    """Bits [B, BLOCK_BYTES] of the voxels that decide the status in a box."""
+    first = morton.decode(evidence.codes, 3) * BLOCK_VOXELS
+    voxels = first[:, :, None] + np.arange(BLOCK_VOXELS)  # [B, 3, 8]
+    low, high = box.low - _REACH_VOXELS, box.high + _REACH_VOXELS
+    inside = (voxels + 1 >= low[:, None]) & (voxels <= high[:, None])
+    columns = inside[:, 0, :, None] & inside[:, 1, None, :]  # [B, x, y]
+    heights = np.packbits(inside[:, 2], axis=1, bitorder="little")  # [B, 1]
+    mask = np.where(columns.reshape(len(columns), BLOCK_VOXELS**2), heights, 0)
+    return mask.astype(np.uint8)

@@ -1,6 +1,5 @@
 """What a map record must hold to be valid: checked before it is written and after it is read."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,7 +7,6 @@ from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError
 from triquad_format.records import morton
-from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
     AXES,
@@ -20,10 +18,10 @@ from triquad_format.records.region import (
     MLP_LAYERS,
     Evidence,
     MapRecord,
-    Mlp,
     Region,
     TrainingState,
     VertexTable,
+    surface_counts,
 )
 from triquad_format.wire.codec import ArraySpec
 from triquad_format.wire.keys import check_name
@@ -43,7 +41,7 @@ def check_record(record: MapRecord) -> None:
 
 
 def check_region(settings: FieldSettings, region: Region) -> None:
-    """Raise :class:`FormatError`, naming region and field, unless ``region`` is sound."""
+    """Raise :class:`FormatError`, naming region and field, unless ``region`` is valid."""
     try:
         _check_region(settings, region)
     except FormatError as error:
@@ -54,7 +52,9 @@ def _check_region(settings: FieldSettings, region: Region) -> None:
     if len(region.index) != 3 or any(not -(2**31) < number < 2**31 for number in region.index):
         raise FormatError("the index is out of range")
     _check_floats("frequencies", region.frequencies, (settings.frequencies,))
-    _check_mlp(settings, region.mlp)
+    shapes = _mlp_shapes(settings)
+    _check_arrays("mlp weights", region.mlp.weights, shapes[:MLP_LAYERS])
+    _check_arrays("mlp biases", region.mlp.biases, shapes[MLP_LAYERS:])
     places = [(plane, level) for plane in range(len(AXES)) for level in settings.levels]
     if [(table.plane, table.level) for table in region.tables] != places:
         raise FormatError("the vertex tables are not those of the settings")
@@ -74,12 +74,6 @@ def _mlp_shapes(settings: FieldSettings) -> list[tuple[int, ...]]:
     return [*weights, (hidden,), (hidden,), (1,)]
 
 
-def _check_mlp(settings: FieldSettings, mlp: Mlp) -> None:
-    if len(mlp.weights) != MLP_LAYERS or len(mlp.biases) != MLP_LAYERS:
-        raise FormatError(f"the MLP does not have {MLP_LAYERS} layers")
-    _check_arrays("mlp", [*mlp.weights, *mlp.biases], _mlp_shapes(settings))
-
-
 def _check_table(settings: FieldSettings, table: VertexTable) -> None:
     name = f"plane {table.plane}, level {table.level}"
     _check_codes(f"{name} codes", table.codes)
@@ -90,17 +84,13 @@ def _check_table(settings: FieldSettings, table: VertexTable) -> None:
         _check_floats(f"{name} features", table.features, shape, dtypes=_FLOATS)
         return
     ArraySpec("<i2", shape).check(f"{name} features", table.features)
-    if not (math.isfinite(table.scale) and table.scale > 0 and _is_single(table.scale)):
+    in_range = 0 < table.scale <= float(np.finfo(np.float32).max)
+    if not in_range or float(np.float32(table.scale)) != table.scale:
         raise FormatError(
             f"{name}: a scale of {table.scale} is not a positive number of single precision"
         )
     if np.abs(table.features.astype(np.int32)).max(initial=0) > MAX_INTEGER:
         raise FormatError(f"{name}: an integer exceeds {MAX_INTEGER}")
-
-
-def _is_single(value: float) -> bool:
-    with np.errstate(over="ignore"):
-        return float(np.float32(value)) == value
 
 
 def _check_evidence(settings: FieldSettings, evidence: Evidence) -> None:

@@ -41,6 +41,8 @@ MLP_LAYERS = 3
 
 RegionIndex = tuple[int, int, int]
 
+_BITS_SET = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype="u1")
+
 _Float = TypeVar("_Float", bound=np.floating)
 
 
@@ -87,7 +89,7 @@ class Evidence:
     levels: NDArray[np.uint8] | None = None
     """[S] How well each surface voxel is supported, from 0 to ``MAX_LEVEL``; ``None``: not known.
 
-    In the order of :func:`~triquad_format.records.evidence_voxels.seen_voxels`. What a level
+    In the order of :func:`seen_voxels`. What a level
     stands for is up to those who set and read it; a higher one is better supported.
     """
     seen_s: NDArray[np.int64] | None = None
@@ -170,3 +172,34 @@ def region_corner(settings: FieldSettings, index: RegionIndex) -> NDArray[np.flo
 def leaf_coordinates(settings: FieldSettings, offset: NDArray[_Float]) -> NDArray[_Float]:
     """Leaf coordinates [N, 3] at ``offset`` [N, 3] from a region's centre, metres."""
     return np.asarray(offset / settings.leaf_m + (1 << (settings.depth - 1)), offset.dtype)
+
+
+def seen_voxels(evidence: Evidence, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Voxels [N, 3] of a region whose bit is set in ``masks`` [B, BLOCK_BYTES] of its evidence."""
+    bits = np.unpackbits(masks, axis=1, bitorder="little")
+    rows, voxel = np.nonzero(bits)
+    inner = np.stack(np.unravel_index(voxel, (BLOCK_VOXELS,) * 3), axis=1)
+    blocks: NDArray[np.int64] = morton.decode(evidence.codes, 3)[rows] * BLOCK_VOXELS
+    return blocks + inner
+
+
+def surface_counts(surface: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Numbers [B] of surface voxels in blocks with these masks [B, BLOCK_BYTES]."""
+    counts: NDArray[np.int64] = _BITS_SET[surface].sum(axis=1, dtype=np.int64)
+    return counts
+
+
+def masked(evidence: Evidence, mask: NDArray[np.uint8]) -> Evidence:
+    """The evidence of the voxels whose bit is set in ``mask`` [B, BLOCK_BYTES]."""
+    surface, free = evidence.surface & mask, evidence.free & mask
+    rows = np.flatnonzero((surface | free).any(axis=1))
+    levels, seen_s = evidence.levels, evidence.seen_s
+    if levels is not None:
+        before, after = (
+            np.unpackbits(bits, bitorder="little").astype(bool)
+            for bits in (evidence.surface, surface)
+        )
+        levels = levels[after[before]]
+    if seen_s is not None:
+        seen_s = np.where(surface.any(axis=1), seen_s, 0)[rows]
+    return Evidence(evidence.codes[rows], surface[rows], free[rows], levels=levels, seen_s=seen_s)

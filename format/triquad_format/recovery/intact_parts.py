@@ -1,10 +1,17 @@
-"""The intact parts of a damaged map file, and of the other files that it needs."""
+"""The intact parts of a damaged map file, and of the other files that it needs.
 
+Nothing in a file tells where a chunk is: each is found by how it begins, and told from chance by
+its checksum. So nothing that is damaged hides what lies behind it.
+"""
+
+import contextlib
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from triquad_format.errors import (
     FormatError,
@@ -12,14 +19,21 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
+from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.index import file_in
 from triquad_format.mapfile.manifest import Manifest, unpack_manifest
-from triquad_format.mapfile.mcap.chunks import total_limit
-from triquad_format.mapfile.mcap.random_access import FileBytes
-from triquad_format.mapfile.mcap.records import Message
-from triquad_format.mapfile.metadata import MapFacts, check_readable, unpack_facts
+from triquad_format.mapfile.mcap.records import (
+    Channel,
+    Message,
+    Record,
+    metadata_entries,
+    read_chunk,
+    total_limit,
+)
+from triquad_format.mapfile.metadata import METADATA_NAME, MapFacts, check_readable, unpack_facts
 from triquad_format.mapfile.parts.body import unpack_body
 from triquad_format.mapfile.parts.part import (
+    ENCODINGS,
     MANIFEST,
     MAP,
     REGION,
@@ -28,7 +42,18 @@ from triquad_format.mapfile.parts.part import (
     PartKey,
 )
 from triquad_format.records.region import RegionIndex
-from triquad_format.recovery.intact_chunks import found_metadata, intact_messages
+
+_Content = TypeVar("_Content")
+
+_HEAD_BYTES = 9  # of a record: opcode and length
+
+_LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
+"""Bytes of all places that are tried: a constant, and a multiple of the file's size."""
+
+# A record below 4 GiB; in a chunk then times, size and checksum, and the name of its compression.
+_CHUNK = re.compile(rb"\x06.{4}\x00{4}.{28}(?:\x04\x00{3}zstd|\x00{4})", re.DOTALL)
+_METADATA = re.compile(rb"\x0c.{4}\x00{4}\x07\x00{3}" + METADATA_NAME.encode(), re.DOTALL)
+_CHANNEL = re.compile(rb"\x04.{4}\x00{4}(..)...\x00{3}(/[a-z/]+).\x00{3}([a-z]+)\x00{4}", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -69,10 +94,11 @@ def intact_parts(path: Path, max_bytes: int) -> IntactParts:
         OSError: it cannot be read.
     """
     messages = list(_messages(path, max_bytes))
-    manifest = _manifest(messages, path.stat().st_size)
+    size = path.stat().st_size
+    manifest = _first(messages, MANIFEST, lambda data: unpack_manifest(data, size))
     if manifest is not None:
         return _listed_parts(manifest, messages, path.parent, max_bytes=max_bytes)
-    facts = _facts(messages)
+    facts = _first(messages, MAP, lambda data: unpack_facts(unpack_body(MAP, data)))
     if facts is None:
         raise MapFileError("nothing can be saved: neither its first part nor its last is intact")
     keyed = ((_own_key(message), message.data) for message in messages)
@@ -105,23 +131,15 @@ def _refuse_newer(metadata: dict[str, str]) -> None:
         return  # damaged, too: the parts will tell
 
 
-def _manifest(messages: Iterable[Message], file_bytes: int) -> Manifest | None:
+def _first(
+    messages: Iterable[Message], topic: str, read: Callable[[bytes], _Content]
+) -> _Content | None:
+    """What the first part of a topic holds; ``None``: there is none, or it is malformed."""
     for message in messages:
-        if message.channel.topic == MANIFEST:
-            try:
-                return unpack_manifest(message.data, file_bytes)
-            except FormatError:
-                return None
-    return None
-
-
-def _facts(messages: Iterable[Message]) -> MapFacts | None:
-    for message in messages:
-        if message.channel.topic == MAP:
-            try:
-                return unpack_facts(unpack_body(MAP, message.data))
-            except FormatError:
-                return None
+        if message.channel.topic == topic:
+            with contextlib.suppress(FormatError):
+                return read(message.data)
+            break
     return None
 
 
@@ -165,3 +183,67 @@ def _own_key(message: Message) -> PartKey | None:
         return PartKey(topic, body.index(), plane=body.count("plane"), cell=body.count("cell"))
     except FormatError:
         return None
+
+
+def intact_messages(data: bytes, max_bytes: int) -> Iterator[Message]:
+    """The messages of all intact chunks, in the order of the file.
+
+    Args:
+        data: what there is of the file.
+        max_bytes: limit on all decompressed chunks together.
+
+    Raises:
+        TooLargeMapFileError: there is more.
+    """
+    channels = _channels(data)
+    budget = _LEAST_BUDGET + _BUDGET_RATIO * len(data)
+    at = 0
+    while match := _CHUNK.search(data, at):
+        at = match.start() + 1
+        record = _record(data, match.start())
+        if record is None or len(record.content) > budget:
+            continue
+        budget -= len(record.content)
+        try:
+            chunk = read_chunk(record)
+            messages = list(chunk.messages(dict(channels)))
+        except FormatError:
+            continue
+        max_bytes -= chunk.size
+        if max_bytes < 0:
+            raise TooLargeMapFileError("its intact chunks exceed the limit given for its size")
+        yield from messages
+        at = record.end
+
+
+def found_metadata(data: bytes) -> dict[str, str]:
+    """The entries of the first metadata record ``triquad`` that can be read; empty: of none."""
+    for match in _METADATA.finditer(data):
+        record = _record(data, match.start())
+        with contextlib.suppress(FormatError):
+            if record is not None:
+                return metadata_entries(record)[1]
+    return {}
+
+
+def _record(data: bytes, start: int) -> Record | None:
+    """The record that begins at ``start``, if the file has all of it."""
+    first = start + _HEAD_BYTES
+    length = int.from_bytes(data[start + 1 : first], "little")
+    if first + length > len(data):
+        return None
+    return Record(data[start], start, memoryview(data)[first : first + length])
+
+
+def _channels(data: bytes) -> dict[int, Channel]:
+    """Channels by number: as records in the file say, else as files are written.
+
+    The records stand twice in a file, and have no checksum of their own.
+    """
+    usual = [Channel(topic, encoding) for topic, encoding in ENCODINGS.items()]
+    channels = dict(enumerate(usual, start=1))
+    for match in _CHANNEL.finditer(data):
+        channel = Channel(match[2].decode(), match[3].decode())
+        if channel in usual:
+            channels[int.from_bytes(match[1], "little")] = channel
+    return channels

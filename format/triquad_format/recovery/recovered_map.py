@@ -1,7 +1,6 @@
-"""What is intact in a damaged map file, as a valid map.
+"""What is intact in a damaged map file, as a valid map; and what is lost, and where.
 
-Every chunk is searched for on its own (:mod:`triquad_format.recovery.intact_chunks`). Where the
-manifest is intact, it tells what each part is and what is missing; else the parts tell of
+Where the manifest is intact, it tells what each part is and what is missing; else the parts tell of
 themselves.
 """
 
@@ -11,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.file_errors import named
+from triquad_format.mapfile.files import named
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
@@ -24,11 +24,12 @@ from triquad_format.mapfile.parts.part import (
     VERTICES,
     PartKey,
     cells_at,
+    extent,
+    vertex_reach,
 )
 from triquad_format.mapfile.parts.region_parts import RegionParts
-from triquad_format.records.evidence_voxels import masked, seen_voxels, status_voxels
+from triquad_format.records.crop import LeafBox, status_voxels
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.leaf_box import LeafBox
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import (
     AXES,
@@ -36,10 +37,35 @@ from triquad_format.records.region import (
     Region,
     RegionIndex,
     leaf_coordinates,
+    masked,
     region_centre,
+    region_corner,
+    seen_voxels,
 )
 from triquad_format.recovery.intact_parts import IntactParts, intact_parts
-from triquad_format.recovery.loss import Loss, effect_box, loss_of
+
+STATUS_REACH_LEAVES = 2
+"""How far beyond lost vertices a status may change: voxels that have an effect there are dropped
+whole, and had an effect half a leaf beyond."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A part that is lost, and the box in which the map has lost something by it.
+
+    Without a part ``/triquad/region`` all of the region is lost; without vertices the distances
+    in a square column; without evidence the status in a cube. One part ``/triquad/training``
+    stands for all of a region's training state.
+    """
+
+    key: PartKey
+    minimum: NDArray[np.float64]  # [3] metres, map frame
+    maximum: NDArray[np.float64]  # [3]
+
+    def meets(self, centre: NDArray[np.float64], side_m: float) -> bool:
+        """Whether the box meets a cube around ``centre`` [3], metres, map frame."""
+        low, high = centre - side_m / 2, centre + side_m / 2
+        return bool(((self.minimum <= high) & (self.maximum >= low)).all())
 
 
 @dataclass(frozen=True)
@@ -167,3 +193,21 @@ def _masked_where_lost(settings: FieldSettings, region: Region, losses: Iterable
             box = LeafBox(*leaf_coordinates(settings, corners - centre))
             evidence = masked(evidence, ~status_voxels(evidence, box))
     return dataclasses.replace(region, evidence=evidence)
+
+
+def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
+    """The loss of a part."""
+    low, high = effect_box(key, settings)
+    reach_m = STATUS_REACH_LEAVES * settings.leaf_m
+    return Loss(key, low - reach_m, high + reach_m)
+
+
+def effect_box(key: PartKey, settings: FieldSettings) -> NDArray[np.float64]:
+    """Corners [2, 3] of the box in which a part has an effect itself, metres, map frame."""
+    box = extent(settings, key)
+    if key.topic == VERTICES:
+        # A vertex has an effect as far as the side of its level's nodes; those at the upper border
+        # of a square belong to the next.
+        box.low[list(AXES[key.plane])] -= vertex_reach(settings)
+    corner = region_corner(settings, key.region)
+    return corner + np.stack([box.low, box.high]) * settings.leaf_m

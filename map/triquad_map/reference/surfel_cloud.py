@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
-from triquad_format.records.evidence_voxels import seen_voxels, surface_counts
-from triquad_format.records.region import BLOCK_VOXELS, Evidence
+from triquad_format.records.region import BLOCK_VOXELS, Evidence, seen_voxels, surface_counts
 
 from triquad_map.composition.region import NearestSurfels
 from triquad_map.reference.seen_blocks import SeenBlocks

@@ -16,9 +16,8 @@ from triquad_format.mapfile.parts.part import PREVIEW, Part, PartKey
 from triquad_format.mapfile.writer import Previews
 from triquad_format.records import morton
 from triquad_format.records.arrays import Doubles, Longs
-from triquad_format.records.evidence_voxels import seen_voxels
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord, Region, region_corner
+from triquad_format.records.region import MapRecord, Region, region_corner, seen_voxels
 from triquad_map.reference.evaluator import MapEvaluator
 
 _STEP_M = 2.0**-5

@@ -8,7 +8,6 @@ from triquad_format.errors import MapFileError
 from triquad_format.mapfile.index import OtherFiles
 from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
 from triquad_format.mapfile.metadata import MapFacts
-from triquad_format.mapfile.parts.body import repack_part
 from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.mapfile.parts.part import MAP, Part, PartKey
 from triquad_format.records.region import RegionIndex
@@ -113,10 +112,10 @@ def copied_parts(entries: Iterable[Entry], others: OtherFiles) -> Iterator[Part]
             payload = others.payload(entry)
         except OSError as error:  # of reading: the file that is written is another
             raise MapFileError(f"a file that holds parts cannot be read: {error}") from error
-        yield repack_part(entry.key, payload)
+        yield Part(entry.key, payload)
 
 
-def unless(stopping: Callable[[], bool], parts: Iterator[Part]) -> Iterator[Part]:
+def abortable(stopping: Callable[[], bool], parts: Iterator[Part]) -> Iterator[Part]:
     """The parts, until ``stopping()``.
 
     Raises:

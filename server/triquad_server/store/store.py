@@ -26,11 +26,11 @@ from triquad_server.store.checkpoint_folder import CheckpointFolder
 from triquad_server.store.checkpoint_parts import (
     KnownParts,
     StoppedError,
+    abortable,
     checkpoint_parts,
     copied_parts,
     known_parts,
     own_bytes,
-    unless,
 )
 from triquad_server.store.restore import ValidCheckpoint, newest_valid
 
@@ -120,7 +120,7 @@ class Store:
         path = self.folder / checkpoint_name(known.facts.epoch, complete=True)
         try:
             with self._writing(f"{path} cannot be folded") as others:
-                parts = unless(stopping, copied_parts(known.entries.values(), others))
+                parts = abortable(stopping, copied_parts(known.entries.values(), others))
                 written = write_parts(
                     path,
                     known.facts,

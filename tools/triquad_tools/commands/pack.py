@@ -11,8 +11,7 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
 from triquad_format.records.field_settings import check_range
-from triquad_format.recovery.loss import Loss
-from triquad_format.recovery.recovered_map import RecoveredMap, recover
+from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 
 from triquad_tools.console.arguments import error_limit, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.evidence_voxels import seen_voxels
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord, Region, region_centre
+from triquad_format.records.region import MapRecord, Region, region_centre, seen_voxels
 from triquad_map.reference.evaluator import MapEvaluator
 
 QUANTILE = 0.99

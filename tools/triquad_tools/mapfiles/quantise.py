@@ -18,9 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import FormatError
-from triquad_format.records.evidence_voxels import masked
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MAX_INTEGER, MapRecord, Region, VertexTable
+from triquad_format.records.region import MAX_INTEGER, MapRecord, Region, VertexTable, masked
 from triquad_map.record_view import open_view
 
 from triquad_tools.mapfiles.field_change import FieldChange, draw_probes, field_change

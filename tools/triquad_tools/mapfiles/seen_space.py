@@ -5,15 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
-from triquad_format.records.evidence_voxels import masked, seen_voxels
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
     BLOCK_VOXELS,
     Evidence,
     MapRecord,
     Region,
+    masked,
     owned_blocks,
     region_corner,
+    seen_voxels,
 )
 
 

@@ -11,9 +11,9 @@ from triquad_format.mapfile.checkpoint_folder import (
     map_folder,
     set_aside,
 )
+from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import FileRef, Manifest
-from triquad_format.mapfile.mcap.random_access import FileBytes
 from triquad_format.mapfile.parts.part import REGION_TOPICS
 from triquad_format.records.region import RegionIndex
 

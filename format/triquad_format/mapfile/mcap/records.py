@@ -1,4 +1,7 @@
-"""The records of MCAP files: what each holds, read no further than there are bytes."""
+"""The records of MCAP files, read no further than there are bytes.
+
+The size of a chunk is bounded before it is decompressed.
+"""
 
 import struct
 import zlib
@@ -6,7 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from triquad_format.errors import DamagedMapFileError
+import zstandard
+
+from triquad_format.errors import DamagedMapFileError, UnsupportedMapFileError
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -15,6 +20,24 @@ CHUNK, CHUNK_INDEX, METADATA, METADATA_INDEX, DATA_END = 0x06, 0x08, 0x0C, 0x0D,
 _RECORD = struct.Struct("<BQ")
 
 FOOTER_BYTES = _RECORD.size + 20
+
+MAX_CHUNK_BYTES = 256 * 2**20
+"""Decompressed size of the largest chunk."""
+
+FREE_CHUNK_BYTES = 12 * 2**20
+MAX_CHUNK_RATIO = 16
+"""A chunk above ``FREE_CHUNK_BYTES`` has at most so many times its compressed size."""
+
+_FREE_TOTAL_BYTES = 32 * 2**20
+_MAX_TOTAL_RATIO = 32
+"""All chunks together, decompressed, have at most so many times the file's size, and that more."""
+
+MAX_WINDOW_BYTES = 8 * 2**20
+"""Memory that zstd may ask for beside its output; RFC 8878 has every decoder support it."""
+
+_MAX_BLOCK_BYTES = 2**17  # of a zstd block, decompressed
+_RLE_BLOCK, _COMPRESSED_BLOCK = 1, 2
+_CHECKSUM_BYTES = 4
 
 
 @dataclass(frozen=True)
@@ -77,10 +100,6 @@ class Fields:
             raise DamagedMapFileError(
                 f"the record at byte {self._record.start} holds a text that is not UTF-8",
             ) from error
-
-    def rest(self) -> memoryview:
-        """All that follows."""
-        return self._record.content[self._offset :]
 
     @property
     def left(self) -> int:
@@ -177,4 +196,104 @@ def record_messages(
         if number not in channels:
             raise DamagedMapFileError(f"a message is of channel {number}, which nothing describes")
         stored = round(len(record.content) * stored_share)
-        yield Message(channels[number], bytes(fields.rest()), stored)
+        yield Message(channels[number], bytes(fields.take(fields.left)), stored)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A chunk as it lies in the file; nothing is decompressed before its messages are read."""
+
+    record: Record
+    size: int  # bytes of its records, as it says
+    crc: int  # of its records; 0 where its writer computed none
+    compression: str
+    stored: memoryview
+
+    def messages(self, channels: dict[int, Channel]) -> Iterator[Message]:
+        """Its messages; ``channels`` gets those that are described in it.
+
+        Raises:
+            MapFileError: the chunk or a message is malformed, too large or fails its checksum.
+        """
+        data = self._decompressed()
+        stored_share = len(self.record.content) / max(len(data), 1)
+        for inner in walk(data, 0):
+            yield from record_messages(inner, channels, stored_share)
+
+    def _decompressed(self) -> memoryview:
+        where, size, stored = f"the chunk at byte {self.record.start}", self.size, self.stored
+        if size > MAX_CHUNK_BYTES:
+            raise DamagedMapFileError(
+                f"{where} declares {size} bytes; the limit is {MAX_CHUNK_BYTES}"
+            )
+        if size > chunk_limit(len(stored)):
+            raise DamagedMapFileError(f"{where} declares {size} bytes, but stores {len(stored)}")
+        if self.compression not in ("", "zstd"):
+            raise UnsupportedMapFileError(
+                f"{where} is compressed with {self.compression!r}; use zstd"
+            )
+        data = _decompress_zstd(where, stored, size) if self.compression else stored
+        if len(data) != size:
+            raise DamagedMapFileError(f"{where} holds {len(data)} bytes, but declares {size}")
+        check_crc(where, data, self.crc)
+        return data
+
+
+def read_chunk(record: Record) -> Chunk:
+    """The chunk in a record of the opcode ``CHUNK``.
+
+    Raises:
+        DamagedMapFileError: its fields do not fill the record.
+    """
+    fields = Fields(record)
+    fields.take(16)  # times of the first and last message
+    size, crc, compression = fields.number(8), fields.number(4), fields.text()
+    stored = fields.take(fields.number(8))
+    if fields.left:
+        raise DamagedMapFileError(f"the chunk at byte {record.start} does not fill its record")
+    return Chunk(record, size, crc, compression, stored)
+
+
+def chunk_limit(stored_size: int) -> int:
+    """Bytes to which a chunk of ``stored_size`` bytes may decompress."""
+    return max(FREE_CHUNK_BYTES, MAX_CHUNK_RATIO * stored_size)
+
+
+def total_limit(file_size: int) -> int:
+    """Bytes to which all chunks of a file may decompress together."""
+    return _FREE_TOTAL_BYTES + _MAX_TOTAL_RATIO * file_size
+
+
+def _decompress_zstd(where: str, stored: memoryview, size: int) -> memoryview:
+    """At most ``size`` bytes: the blocks are counted before memory is taken for them."""
+    try:
+        if zstandard.frame_content_size(stored) not in (-1, size):
+            raise DamagedMapFileError(f"{where} contradicts the size in its zstd frame")
+        if _most_decompressed(where, stored) < size:
+            raise DamagedMapFileError(f"{where} declares {size} bytes, but is shorter")
+        decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES)
+        return memoryview(
+            decompressor.decompress(stored, max_output_size=size, allow_extra_data=False)
+        )
+    except zstandard.ZstdError as error:
+        raise DamagedMapFileError(f"{where} cannot be decompressed: {error}") from error
+
+
+def _most_decompressed(where: str, stored: memoryview) -> int:
+    """How many bytes the blocks of a zstd frame can give at most (RFC 8878, section 3.1.1.2)."""
+    at = zstandard.frame_header_size(stored)
+    most, last = 0, False
+    while not last:
+        header = int.from_bytes(stored[at : at + 3], "little")
+        if at + 3 > len(stored):
+            raise DamagedMapFileError(f"{where} ends within its zstd frame")
+        last, kind, length = bool(header & 1), header >> 1 & 3, header >> 3
+        if kind > _COMPRESSED_BLOCK:
+            raise DamagedMapFileError(f"{where} holds a zstd block of an unknown kind")
+        most += _MAX_BLOCK_BYTES if kind == _COMPRESSED_BLOCK else length
+        at += 3 + (1 if kind == _RLE_BLOCK else length)
+    if zstandard.get_frame_parameters(stored).has_checksum:
+        at += _CHECKSUM_BYTES
+    if at != len(stored):
+        raise DamagedMapFileError(f"{where} does not end with its zstd frame")
+    return most

@@ -6,8 +6,8 @@ The specification is at https://mcap.dev/spec.
 
 import hashlib
 import zlib
+from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
 from typing import BinaryIO
 
 import zstandard
@@ -30,37 +30,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from triquad_format.mapfile.mcap.chunks import chunk_limit
-from triquad_format.mapfile.mcap.records import MAGIC
-
-
-@dataclass(frozen=True)
-class ChannelSpec:
-    """A channel, and how the chunks of its messages are compressed."""
-
-    number: int
-    topic: str
-    encoding: str
-    level: int  # of zstd
-    schema: str = ""  # name of its schema, if it has one
-
-
-@dataclass(frozen=True)
-class SchemaSpec:
-    """A schema of messages."""
-
-    name: str
-    encoding: str
-    data: bytes
-
-
-@dataclass
-class _Summary:
-    """What the summary section tells of what was written."""
-
-    chunks: list[ChunkIndex] = field(default_factory=list)
-    metadata: list[MetadataIndex] = field(default_factory=list)
-    counts: dict[int, int] = field(default_factory=dict)
+from triquad_format.mapfile.mcap.records import MAGIC, chunk_limit
 
 
 class McapWriter:
@@ -71,27 +41,27 @@ class McapWriter:
         stream: BinaryIO,
         library: str,
         *,
-        schemas: Sequence[SchemaSpec],
-        channels: Sequence[ChannelSpec],
+        schemas: Sequence[Schema],
+        channels: Sequence[Channel],
     ) -> None:
         """Write what begins the file; ``library`` names the program that writes it."""
         self._stream = stream
         self._digest = hashlib.sha256()
         self._crc = 0
         self.size = 0
-        self._summary = _Summary()
-        self._schemas = _schema_records(schemas)
-        self._channels = _channel_records(channels, self._schemas)
-        self._specs = {spec.topic: spec for spec in channels}
+        self._schemas = schemas
+        self._channels = channels
+        self._numbers = {channel.topic: channel.id for channel in channels}
+        self._chunks: list[ChunkIndex] = []
+        self._metadata: list[MetadataIndex] = []
         self._write(MAGIC)
-        self._record(Header("", library))
-        for record in (*self._schemas, *self._channels):
+        for record in (Header("", library), *schemas, *channels):
             self._record(record)
 
     @property
     def topics(self) -> Collection[str]:
         """The topics of its channels."""
-        return self._specs.keys()
+        return self._numbers.keys()
 
     @property
     def sha256(self) -> str:
@@ -102,10 +72,10 @@ class McapWriter:
         """Write a metadata record."""
         start = self.size
         self._record(Metadata(metadata=entries, name=name))
-        self._summary.metadata.append(MetadataIndex(start, self.size - start, name))
+        self._metadata.append(MetadataIndex(start, self.size - start, name))
 
     def add_message(
-        self, topic: str, payload: bytes, *, time_ns: int, seams: Sequence[int]
+        self, topic: str, payload: bytes, *, time_ns: int, level: int, seams: Sequence[int]
     ) -> None:
         """Write a message in a chunk of its own.
 
@@ -113,20 +83,43 @@ class McapWriter:
             topic: of one of the channels.
             payload: what the message holds.
             time_ns: of the message, nanoseconds since 1970.
+            level: of zstd.
             seams: offsets in the payload where bytes of another kind begin.
 
         Raises:
             OSError: the stream cannot be written.
         """
-        spec = self._specs[topic]
-        number = spec.number
-        chunk = _chunk(spec, payload, time_ns=time_ns, seams=seams)
+        number = self._numbers[topic]
+        message = _packed(
+            Message(
+                channel_id=number,
+                log_time=time_ns,
+                data=payload,
+                publish_time=time_ns,
+                sequence=0,
+            )
+        )
+        shift = len(message) - len(payload)
+        chunk = _chunk(
+            message, _compress(message, [shift + seam for seam in seams], level), time_ns
+        )
         start = self.size
         self._record(chunk)
         index_start = self.size
         self._record(MessageIndex(number, [(time_ns, 0)]))
-        self._summary.chunks.append(_chunk_index(chunk, number, (start, index_start, self.size)))
-        self._summary.counts[number] = self._summary.counts.get(number, 0) + 1
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=index_start - start,
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=time_ns,
+                message_index_length=self.size - index_start,
+                message_index_offsets={number: index_start},
+                message_start_time=time_ns,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        )
 
     def finish(self) -> None:
         """Write the summary and what ends the file; the stream stays open."""
@@ -138,8 +131,8 @@ class McapWriter:
             (Opcode.SCHEMA, self._schemas),
             (Opcode.CHANNEL, self._channels),
             (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._summary.chunks),
-            (Opcode.METADATA_INDEX, self._summary.metadata),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.METADATA_INDEX, self._metadata),
         ]
         for opcode, records in groups:
             group_start = summary.count
@@ -159,16 +152,18 @@ class McapWriter:
         self._write(MAGIC)
 
     def _statistics(self) -> Statistics:
-        times = [chunk.message_start_time for chunk in self._summary.chunks]
+        times = [chunk.message_start_time for chunk in self._chunks]
+        # Each chunk holds one message, and its index names the channel.
+        counts = Counter(number for c in self._chunks for number in c.message_index_offsets)
         return Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
-            channel_message_counts=self._summary.counts,
-            chunk_count=len(self._summary.chunks),
-            message_count=len(self._summary.chunks),
+            channel_message_counts=counts,
+            chunk_count=len(self._chunks),
+            message_count=len(self._chunks),
             message_end_time=max(times, default=0),
             message_start_time=min(times, default=0),
-            metadata_count=len(self._summary.metadata),
+            metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
 
@@ -182,65 +177,17 @@ class McapWriter:
         self.size += len(data)
 
 
-def _schema_records(specs: Sequence[SchemaSpec]) -> list[Schema]:
-    return [
-        Schema(id=number, data=spec.data, encoding=spec.encoding, name=spec.name)
-        for number, spec in enumerate(specs, start=1)
-    ]
-
-
-def _channel_records(specs: Sequence[ChannelSpec], schemas: Sequence[Schema]) -> list[Channel]:
-    numbers = {schema.name: schema.id for schema in schemas}
-    return [
-        Channel(
-            id=spec.number,
-            topic=spec.topic,
-            message_encoding=spec.encoding,
-            metadata={},
-            schema_id=numbers.get(spec.schema, 0),
-        )
-        for spec in specs
-    ]
-
-
-def _chunk(spec: ChannelSpec, payload: bytes, *, time_ns: int, seams: Sequence[int]) -> Chunk:
+def _chunk(message: bytes, compressed: bytes, time_ns: int) -> Chunk:
     """A chunk of one message."""
-    message = _packed(
-        Message(
-            channel_id=spec.number,
-            log_time=time_ns,
-            data=payload,
-            publish_time=time_ns,
-            sequence=0,
-        )
-    )
-    shift = len(message) - len(payload)
-    stored = _compress(message, [shift + seam for seam in seams], spec.level)
     # What shrinks by more than readers believe is not compressed.
-    shrinks = len(stored) < len(message) <= chunk_limit(len(stored))
+    shrinks = len(compressed) < len(message) <= chunk_limit(len(compressed))
     return Chunk(
         compression="zstd" if shrinks else "",
-        data=stored if shrinks else message,
+        data=compressed if shrinks else message,
         message_end_time=time_ns,
         message_start_time=time_ns,
         uncompressed_crc=zlib.crc32(message),
         uncompressed_size=len(message),
-    )
-
-
-def _chunk_index(chunk: Chunk, channel: int, places: tuple[int, int, int]) -> ChunkIndex:
-    """What the summary tells of a chunk; ``places`` are where it, its index and the next begin."""
-    start, index_start, end = places
-    return ChunkIndex(
-        chunk_length=index_start - start,
-        chunk_start_offset=start,
-        compression=chunk.compression,
-        compressed_size=len(chunk.data),
-        message_end_time=chunk.message_end_time,
-        message_index_length=end - index_start,
-        message_index_offsets={channel: index_start},
-        message_start_time=chunk.message_start_time,
-        uncompressed_size=chunk.uncompressed_size,
     )
 
 

@@ -1,8 +1,8 @@
-"""The msgpack map of a part: packed with its seams, and read back with every field checked."""
+"""The msgpack map of a part: packed, and read back with every field checked."""
 
 import reprlib
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgpack
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from triquad_format.errors import DamagedMapFileError, WireError
 from triquad_format.mapfile.parts.columns import (
     MAX_CODE_BYTES,
+    Column,
     join_integers,
     unshuffle,
     unshuffle_codes,
@@ -21,56 +22,46 @@ from triquad_format.records.region import RegionIndex
 from triquad_format.wire.codec import ArraySpec, unpack_array
 from triquad_format.wire.structure import MAX_OBJECTS, binary_offsets, check_structure
 
-MAX_REGION_INDEX = 2**31 - 1
-MAX_ITEMS = 64
+_MAX_REGION_INDEX = 2**31 - 1
+_MAX_ITEMS = 64
 _OBJECTS_PER_ITEM = 8  # of a manifest's longest list
 _MAX_STRING_BYTES = 4096
 _MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
 
 def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
-    """A part of this body: numbers, strings, lists, maps and packed arrays.
-
-    Its seams lie between the byte planes of its arrays.
-    """
-    payload = typing.cast(bytes, msgpack.packb(body))
-    return Part(key, payload, _seams(payload, body))
+    """A part of this body: numbers, strings, lists, maps and packed arrays."""
+    return Part(key, typing.cast(bytes, msgpack.packb(body)))
 
 
-def repack_part(key: PartKey, payload: bytes) -> Part:
-    """A part that was read and checked, to be written again."""
-    if not key.topic.startswith(PREFIX):
-        return Part(key, payload)
-    body = msgpack.unpackb(payload, max_map_len=MAX_ITEMS, max_ext_len=0)
-    return Part(key, payload, _seams(payload, body))
-
-
-def _seams(payload: bytes, body: Mapping[str, object]) -> tuple[int, ...]:
-    """Where byte planes begin and end in a payload."""
-    seams: list[int] = []
-    for place, planes in zip(binary_offsets(payload), _plane_counts(body), strict=True):
-        size = len(place)
+def seams(part: Part) -> list[int]:
+    """Offsets in a valid part's payload at which byte planes of its arrays begin and end."""
+    if not part.key.topic.startswith(PREFIX):
+        return []
+    binaries = list(_binaries(msgpack.unpackb(part.payload, max_ext_len=0)))
+    if all(size < _MIN_SEAM_BYTES for size, _ in binaries):
+        return []
+    offsets: list[int] = []
+    for place, (size, planes) in zip(binary_offsets(part.payload), binaries, strict=True):
         if size >= _MIN_SEAM_BYTES:
             step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
-            seams.extend(range(place.start, place.stop + 1, step))
-    return tuple(seams)
+            offsets.extend(range(place.start, place.stop + 1, step))
+    return offsets
 
 
-def _plane_counts(value: object) -> Iterator[int]:
-    """Byte planes of each binary in a body, in the order of the payload."""
+def _binaries(value: object) -> Iterator[tuple[int, int]]:
+    """Size and number of byte planes of each binary in a body, in the order of the payload."""
     if isinstance(value, bytes):
-        yield 1
-    elif isinstance(value, Mapping) and isinstance(value.get("data"), bytes):
-        yield value["shape"][0] if value["dtype"] in ("|u1", "|i1") and value["shape"] else 1
-    elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from _plane_counts(item)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _plane_counts(item)
+        yield len(value), 1
+    elif isinstance(value, dict) and isinstance(value.get("data"), bytes):
+        shuffled = value["dtype"] in ("|u1", "|i1") and value["shape"]
+        yield len(value["data"]), value["shape"][0] if shuffled else 1
+    elif isinstance(value, (dict, list)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _binaries(item)
 
 
-def unpack_body(topic: str, payload: bytes, max_items: int = MAX_ITEMS) -> "PartBody":
+def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "PartBody":
     """The body of a part.
 
     Args:
@@ -87,7 +78,7 @@ def unpack_body(topic: str, payload: bytes, max_items: int = MAX_ITEMS) -> "Part
             payload,
             max_str_len=_MAX_STRING_BYTES,
             max_array_len=max_items,
-            max_map_len=MAX_ITEMS,
+            max_map_len=_MAX_ITEMS,
             max_ext_len=0,
         )
     except (WireError, ValueError, msgpack.exceptions.UnpackException) as error:
@@ -142,7 +133,7 @@ class PartBody:
         """The index of the region to which the part belongs."""
         value = self.value("region", list)
         if len(value) != 3 or not all(
-            type(number) is int and abs(number) <= MAX_REGION_INDEX for number in value
+            type(number) is int and abs(number) <= _MAX_REGION_INDEX for number in value
         ):
             raise DamagedMapFileError(
                 f"{self.topic}: region = {reprlib.repr(value)} is not an index"
@@ -166,6 +157,11 @@ class PartBody:
             arrays.append(array)
         return tuple(arrays)
 
+    def mapping(self, key: str) -> Mapping[str, object]:
+        """A nested map."""
+        value: Mapping[str, object] = self.value(key, dict)
+        return value
+
     def maps(self, key: str, count: int) -> tuple["PartBody", ...]:
         """``count`` nested maps."""
         return tuple(PartBody(self.topic, item) for item in self._items(key, count))
@@ -173,17 +169,24 @@ class PartBody:
     def codes(self, key: str, most: int) -> NDArray[np.int64]:
         """Morton codes [V], of which no more than ``most`` are decoded: each takes eight bytes."""
         planes = self.array(key, "|u1", (None, None))
-        self.limit(key, planes.shape[1], most)
+        self._limit(key, planes.shape[1], most)
         if not 1 <= len(planes) <= MAX_CODE_BYTES:
             raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per code")
         return unshuffle_codes(planes)
 
-    def floats(self, key: str, *shape: int | None) -> NDArray[Any]:
-        """A shuffled array of ``<f2`` or ``<f4``."""
-        planes = self.array(key, "|u1", (None, *shape))
-        if len(planes) not in (2, 4):
-            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
-        return unshuffle(planes, f"<f{len(planes)}")
+    def column(self, column: Column, count: int | None) -> NDArray[Any]:
+        """A shuffled column of ``count`` rows; ``None``: of any number."""
+        planes = self.array(column.name, "|u1", (None, count, *column.row))
+        for dtype in column.dtypes:
+            if np.dtype(dtype).itemsize == len(planes):
+                return unshuffle(planes, dtype)
+        raise DamagedMapFileError(f"{self.topic}: {column.name} has {len(planes)} bytes per value")
+
+    def columns(self, columns: Sequence[Column], most: int) -> tuple[NDArray[Any], ...]:
+        """Shuffled columns of equal length, which is at most ``most``."""
+        first = self.column(columns[0], None)
+        self._limit(columns[0].name, len(first), most)
+        return (first, *(self.column(column, len(first)) for column in columns[1:]))
 
     def integers(self, key: str, count: int, size: int) -> NDArray[np.int16]:
         """Integers [count, size] of one or two bytes."""
@@ -192,22 +195,17 @@ class PartBody:
             raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
         return join_integers(planes)
 
-    def limit(self, key: str, count: int, most: int) -> None:
-        """Refuse a field of more than ``most`` rows."""
-        if count > most:
-            raise DamagedMapFileError(f"{self.topic}: {key} has {count} rows, above {most}")
-
     def has(self, key: str) -> bool:
         """Whether there is a field ``key``."""
         return key in self._body
-
-    def mapping(self, key: str) -> Mapping[str, object]:
-        """A nested map."""
-        value: Mapping[str, object] = self.value(key, dict)
-        return value
 
     def _items(self, key: str, count: int) -> list[Any]:
         items: list[Any] = self.value(key, list)
         if len(items) != count:
             raise DamagedMapFileError(f"{self.topic}: {key} holds {len(items)} items, not {count}")
         return items
+
+    def _limit(self, key: str, count: int, most: int) -> None:
+        """Refuse a field of more than ``most`` rows."""
+        if count > most:
+            raise DamagedMapFileError(f"{self.topic}: {key} has {count} rows, above {most}")

@@ -1,15 +1,44 @@
 """Columns of numbers as bytes that compress well: byte planes, bit planes, differences of codes."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_LEVEL
+
+FLOATS = ("<f2", "<f4")
+"""Precisions in which long columns of floats are stored."""
 
 LEVEL_BITS = MAX_LEVEL.bit_length()
 """Planes of bits that hold levels of evidence."""
 
 MAX_CODE_BYTES = 6
 """Bytes of the widest difference between two neighbouring Morton codes."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A shuffled column ``[N, *row]`` of a part, in one of several dtypes."""
+
+    name: str
+    dtypes: tuple[str, ...]  # of different sizes; where there are no rows, the first
+    row: tuple[int, ...] = ()
+
+
+SAMPLE_COLUMNS = (Column("points", ("<f4",), (3,)), Column("labels", FLOATS))
+
+
+def feature_column(settings: FieldSettings) -> Column:
+    """Feature vectors of vertices that are not integers."""
+    return Column("features", FLOATS, (settings.feature_size,))
+
+
+def moment_columns(settings: FieldSettings) -> tuple[Column, ...]:
+    """Adam's state of vertices: first and second moments, and steps."""
+    floats, row = ("<f4", "<f2"), (settings.feature_size,)
+    return Column("means", floats, row), Column("variances", floats, row), Column("steps", ("<i4",))
 
 
 def shuffle(array: NDArray[np.generic]) -> NDArray[np.uint8]:

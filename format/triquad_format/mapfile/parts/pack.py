@@ -1,10 +1,9 @@
-"""A map record as the parts of a map file, each a msgpack map.
+"""A map record as the parts of a map file, each a msgpack map, as ``docs/map-file.md`` says.
 
-``docs/map-file.md`` is the specification; :mod:`triquad_format.mapfile.parts.unpack` is the way
-back.
+:mod:`triquad_format.mapfile.parts.region_parts` is the way back.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,10 @@ from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.parts.body import pack_part
 from triquad_format.mapfile.parts.columns import (
+    SAMPLE_COLUMNS,
+    Column,
+    feature_column,
+    moment_columns,
     shuffle,
     shuffle_codes,
     shuffle_counts,
@@ -30,7 +33,6 @@ from triquad_format.mapfile.parts.part import (
     cube_shift,
     square_shift,
 )
-from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
     AXES,
@@ -39,13 +41,11 @@ from triquad_format.records.region import (
     RegionIndex,
     TrainingState,
     VertexTable,
+    surface_counts,
 )
 from triquad_format.wire.codec import pack_array
 
 SAMPLES_PER_PART = 1 << 17
-
-FEATURE_DTYPES = ("<f2", "<f4")
-"""Precisions of features in a file."""
 
 
 def pack_record(
@@ -54,7 +54,7 @@ def pack_record(
     """The parts of all regions of a checked record, each region's preview after them.
 
     Raises:
-        FormatError: features do not fit ``feature_dtype``, one of ``FEATURE_DTYPES``.
+        FormatError: features do not fit ``feature_dtype``, one of ``FLOATS``.
     """
     for region in record.regions:
         yield from pack_region(region, record.settings, feature_dtype)
@@ -68,14 +68,13 @@ def pack_region(region: Region, settings: FieldSettings, feature_dtype: str) -> 
     Args:
         region: as :func:`triquad_format.records.record_check.check_record` accepts it.
         settings: of its map.
-        feature_dtype: one of ``FEATURE_DTYPES``, for features that are not integers.
+        feature_dtype: one of ``FLOATS``, for features that are not integers.
 
     Raises:
         FormatError: features do not fit ``feature_dtype``; the text names the region.
     """
     yield _pack_head(region)
-    for plane in range(len(AXES)):
-        yield from _pack_vertices(region, plane, settings, feature_dtype=feature_dtype)
+    yield from _pack_vertices(region, settings, feature_dtype)
     yield from _pack_evidence(region)
     if region.training is not None:
         yield from _pack_training(region, region.training, settings)
@@ -89,6 +88,15 @@ def _pack_part(key: PartKey, fields: Mapping[str, object]) -> Part:
     return pack_part(key, {**place, **fields})
 
 
+def _pack_columns(
+    columns: Sequence[Column], values: Sequence[NDArray[np.generic]]
+) -> dict[str, object]:
+    return {
+        column.name: pack_array(shuffle(array))
+        for column, array in zip(columns, values, strict=True)
+    }
+
+
 def _pack_head(region: Region) -> Part:
     scales = [table.scale for table in region.tables]
     body = {
@@ -100,32 +108,26 @@ def _pack_head(region: Region) -> Part:
     return _pack_part(PartKey(REGION, region.index), body)
 
 
-def _pack_vertices(
-    region: Region, plane: int, settings: FieldSettings, *, feature_dtype: str
+def _pack_squares(
+    topic: str,
+    region: Region,
+    settings: FieldSettings,
+    fields_of: Callable[[int, slice], Mapping[str, object]],
 ) -> Iterator[Part]:
-    tables = [table for table in region.tables if table.plane == plane]
-    for cell, rows in _squares(tables, settings):
-        levels = []
-        for table, of_level in zip(tables, rows, strict=True):
-            first_code = cell << square_shift(settings, table.level)
-            codes = shuffle_codes(table.codes[of_level] - first_code)
-            try:
-                features = _pack_features(table, of_level, feature_dtype)
-            except FormatError as error:
-                raise FormatError(f"region {region.index}: {error}") from error
-            levels.append({"codes": pack_array(codes), **features})
-        yield _pack_part(
-            PartKey(VERTICES, region.index, plane=plane, cell=cell), {"levels": levels}
-        )
+    """A part for each square that holds vertices.
 
-
-def _squares(
-    tables: list[VertexTable], settings: FieldSettings
-) -> Iterator[tuple[int, list[slice]]]:
-    """The squares that hold vertices of a plane, with the rows of each table."""
-    cells = [table.codes >> square_shift(settings, table.level) for table in tables]
-    for cell in np.unique(np.concatenate(cells)).tolist():
-        yield cell, [_rows_of(column, cell) for column in cells]
+    ``fields_of`` gives what a part holds of some rows of a table, which it gets by its number.
+    """
+    for plane in range(len(AXES)):
+        cells = {
+            number: table.codes >> square_shift(settings, table.level)
+            for number, table in enumerate(region.tables)
+            if table.plane == plane
+        }
+        for cell in np.unique(np.concatenate(list(cells.values()))).tolist():
+            levels = [fields_of(number, _rows_of(of, cell)) for number, of in cells.items()]
+            key = PartKey(topic, region.index, plane=plane, cell=cell)
+            yield _pack_part(key, {"levels": levels})
 
 
 def _rows_of(cells: NDArray[np.int64], cell: int) -> slice:
@@ -133,7 +135,22 @@ def _rows_of(cells: NDArray[np.int64], cell: int) -> slice:
     return slice(int(first), int(last))
 
 
-def _pack_features(table: VertexTable, rows: slice, dtype: str) -> dict[str, object]:
+def _pack_vertices(region: Region, settings: FieldSettings, dtype: str) -> Iterator[Part]:
+    def fields_of(number: int, rows: slice) -> Mapping[str, object]:
+        table = region.tables[number]
+        within = (1 << square_shift(settings, table.level)) - 1
+        codes = pack_array(shuffle_codes(table.codes[rows] & within))
+        try:
+            return {"codes": codes, **_pack_features(table, rows, dtype, settings)}
+        except FormatError as error:
+            raise FormatError(f"region {region.index}: {error}") from error
+
+    return _pack_squares(VERTICES, region, settings, fields_of)
+
+
+def _pack_features(
+    table: VertexTable, rows: slice, dtype: str, settings: FieldSettings
+) -> dict[str, object]:
     features = table.features[rows]
     if table.scale is not None:
         return {"integers": pack_array(split_integers(features.astype(np.int16)))}
@@ -144,7 +161,7 @@ def _pack_features(table: VertexTable, rows: slice, dtype: str) -> dict[str, obj
             f"features of plane {table.plane}, level {table.level} reach "
             f"{np.abs(table.features).max()}, which {dtype} does not hold; use '<f4'",
         )
-    return {"features": pack_array(shuffle(features))}
+    return _pack_columns([feature_column(settings)], [features])
 
 
 def _pack_evidence(region: Region) -> Iterator[Part]:
@@ -182,35 +199,20 @@ def _pack_training(
         "mlp_means": [pack_array(mean) for mean in training.mlp_means],
         "mlp_variances": [pack_array(variance) for variance in training.mlp_variances],
         "mlp_steps": training.mlp_steps,
-        "visits_owed": training.budget_samples,
+        "training_budget": training.budget_samples,
         "samples": len(training.sample_points),
     }
     yield _pack_part(PartKey(TRAINING, region.index), fields)
-    yield from _pack_moments(region, training, settings)
+    moments = (training.table_means, training.table_variances, training.table_steps)
+    columns = moment_columns(settings)
+    yield from _pack_squares(
+        MOMENTS,
+        region,
+        settings,
+        lambda number, rows: _pack_columns(columns, [moment[number][rows] for moment in moments]),
+    )
     for number, first in enumerate(range(0, len(training.sample_points), SAMPLES_PER_PART)):
         rows = slice(first, first + SAMPLES_PER_PART)
-        samples = {
-            "points": pack_array(shuffle(training.sample_points[rows])),
-            "labels": pack_array(shuffle(training.sample_labels[rows])),
-        }
-        yield _pack_part(PartKey(SAMPLES, region.index, cell=number), samples)
-
-
-def _pack_moments(
-    region: Region, training: TrainingState, settings: FieldSettings
-) -> Iterator[Part]:
-    for plane in range(len(AXES)):
-        numbers = [i for i, table in enumerate(region.tables) if table.plane == plane]
-        tables = [region.tables[i] for i in numbers]
-        for cell, rows in _squares(tables, settings):
-            levels = [
-                {
-                    "means": pack_array(shuffle(training.table_means[i][of_level])),
-                    "variances": pack_array(shuffle(training.table_variances[i][of_level])),
-                    "steps": pack_array(shuffle(training.table_steps[i][of_level])),
-                }
-                for i, of_level in zip(numbers, rows, strict=True)
-            ]
-            yield _pack_part(
-                PartKey(MOMENTS, region.index, plane=plane, cell=cell), {"levels": levels}
-            )
+        samples = [training.sample_points[rows], training.sample_labels[rows]]
+        key = PartKey(SAMPLES, region.index, cell=number)
+        yield _pack_part(key, _pack_columns(SAMPLE_COLUMNS, samples))

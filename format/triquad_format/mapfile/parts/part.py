@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.records import morton
+from triquad_format.records.crop import LeafBox, whole_region
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.leaf_box import LeafBox, whole_region
 from triquad_format.records.region import AXES, BLOCK_VOXELS, RegionIndex
 
 PREFIX = "/triquad/"
@@ -67,7 +67,6 @@ class Part:
 
     key: PartKey
     payload: bytes
-    seams: tuple[int, ...] = ()  # offsets in the payload where bytes of another kind begin
 
 
 def square_shift(settings: FieldSettings, level: int) -> int:

@@ -1,13 +1,26 @@
-"""A region from its parts."""
+"""A region from its parts; every field is checked as it is read.
 
-from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+Sizes are checked before anything is decoded, which takes more memory than a part has bytes.
+"""
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.mapfile.parts.body import unpack_body
+from triquad_format.mapfile.parts.body import PartBody, unpack_body
+from triquad_format.mapfile.parts.columns import (
+    LEVEL_BITS,
+    SAMPLE_COLUMNS,
+    Column,
+    feature_column,
+    join_levels,
+    moment_columns,
+    unshuffle_counts,
+)
+from triquad_format.mapfile.parts.pack import SAMPLES_PER_PART
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     MOMENTS,
@@ -16,30 +29,28 @@ from triquad_format.mapfile.parts.part import (
     TRAINING,
     VERTICES,
     PartKey,
+    cube_shift,
+    square_shift,
 )
-from triquad_format.mapfile.parts.unpack import (
-    COLUMN_TOPICS,
-    Columns,
-    RegionHead,
-    TrainingHead,
-    read_columns,
-    read_evidence,
-    read_head,
-    read_training_head,
-)
-from triquad_format.records.evidence_voxels import surface_counts
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
+    MAX_SEEN_S,
+    MLP_LAYERS,
     Evidence,
+    Mlp,
     Region,
     RegionIndex,
     TrainingState,
     VertexTable,
+    surface_counts,
 )
 
-_Integer = TypeVar("_Integer", bound=np.integer)
+_MAX_SEEN_BYTES = (MAX_SEEN_S.bit_length() + 7) // 8
+
+_Columns = tuple[NDArray[Any], ...]
+"""Columns of equal length: some rows of a table."""
 
 
 class RegionParts:
@@ -48,10 +59,9 @@ class RegionParts:
     def __init__(self, index: RegionIndex, settings: FieldSettings) -> None:
         self._index = index
         self._settings = settings
-        self._head: RegionHead | None = None
-        self._training: TrainingHead | None = None
+        self._heads: dict[str, PartBody] = {}  # by topic, REGION and TRAINING
         self._cubes: dict[int, Evidence] = {}
-        self._columns: dict[PartKey, tuple[Columns, ...]] = {}
+        self._rows: dict[PartKey, tuple[_Columns, ...]] = {}  # of each level; of samples, just one
 
     def add(self, key: PartKey, payload: bytes) -> None:
         """Read a part.
@@ -62,99 +72,159 @@ class RegionParts:
         body = unpack_body(key.topic, payload)
         if body.index() != key.region:
             raise DamagedMapFileError(f"{key.topic}: of region {body.index()}, not {key.region}")
-        if key.topic == REGION:
-            self._head = read_head(body)
-        elif key.topic == TRAINING:
-            self._training = read_training_head(body)
-        elif key.topic == EVIDENCE:
-            self._cubes[key.cell] = read_evidence(body, key)
-        elif key.topic in COLUMN_TOPICS:
-            self._columns[key] = read_columns(body, key, self._settings)
+        if key.topic in (REGION, TRAINING):
+            self._heads[key.topic] = body
+            return
+        body.expect("plane", key.plane)
+        body.expect("cell", key.cell)
+        if key.topic == EVIDENCE:
+            self._cubes[key.cell] = _read_evidence(body, key)
+        elif key.topic == SAMPLES:
+            self._rows[key] = (body.columns(SAMPLE_COLUMNS, SAMPLES_PER_PART),)
+        elif key.topic in (VERTICES, MOMENTS):
+            self._rows[key] = self._read_levels(body, key)
 
     def region(self) -> Region:
         """The region; the caller has checked by the manifest that all parts are there.
 
         Raises:
-            FormatError: parts do not fit together.
+            FormatError: a field of a head is missing or malformed, or parts do not fit together.
         """
-        if self._head is None:
+        head = self._heads.get(REGION)
+        if head is None:
             raise DamagedMapFileError(f"the part {REGION} of region {self._index} is missing")
-        tables = [columns for plane in range(len(AXES)) for columns in self._tables(plane)]
-        places = [(plane, level) for plane in range(len(AXES)) for level in self._settings.levels]
-        scales: list[Any] = self._head.scales or [None] * len(places)
-        if len(scales) != len(places):
-            raise DamagedMapFileError(f"{REGION}: {len(scales)} scales for {len(places)} tables")
-        vertices = tuple(
-            _vertex_table(place, columns, scale)
-            for place, columns, scale in zip(places, tables, scales, strict=True)
-        )
         return Region(
             index=self._index,
-            frequencies=self._head.frequencies,
-            mlp=self._head.mlp,
-            tables=vertices,
+            frequencies=head.array("frequencies", "<f4", (None,)),
+            mlp=Mlp(head.arrays("weights", MLP_LAYERS), head.arrays("biases", MLP_LAYERS)),
+            tables=self._tables(head.array("scales", "<f4", (None,)).tolist()),
             evidence=_joined_evidence([self._cubes[cell] for cell in sorted(self._cubes)]),
-            training=self._training_state(),
+            training=self._training(),
         )
 
-    def _of(self, topic: str, plane: int = 0) -> list[tuple[Columns, ...]]:
-        """Parts of a topic in the order of their cells."""
-        keys = sorted(k for k in self._columns if k.topic == topic and k.plane == plane)
-        return [self._columns[key] for key in keys]
+    def _read_levels(self, body: PartBody, key: PartKey) -> tuple[_Columns, ...]:
+        """The rows of each level in a square of vertices, or of their moments."""
+        settings = self._settings
+        levels = []
+        for level, rows in zip(
+            settings.levels, body.maps("levels", settings.feature_levels), strict=True
+        ):
+            shift = square_shift(settings, level)
+            if key.topic == MOMENTS:
+                levels.append(rows.columns(moment_columns(settings), 1 << shift))
+                continue
+            codes = _read_codes(rows, key, shift)
+            if rows.has("integers"):
+                features = rows.integers("integers", len(codes), settings.feature_size)
+            else:
+                features = rows.column(feature_column(settings), len(codes))
+            levels.append((codes, features))
+        return tuple(levels)
 
-    def _tables(self, plane: int) -> list[Columns]:
-        """Codes and features of a plane, level by level."""
-        size = self._settings.feature_size
-        empty = (np.zeros(0, np.int64), np.zeros((0, size), np.float16))
-        return self._levels(VERTICES, plane, empty)
+    def _tables(self, scales: Sequence[float]) -> tuple[VertexTable, ...]:
+        """The vertex tables, with their scales where there are any."""
+        places = [(plane, level) for plane in range(len(AXES)) for level in self._settings.levels]
+        if len(scales) not in (0, len(places)):
+            raise DamagedMapFileError(f"{REGION}: {len(scales)} scales for {len(places)} tables")
+        no_features = _no_rows([feature_column(self._settings)])
+        rows = self._levels(VERTICES, (np.zeros(0, np.int64), *no_features))
+        tables = []
+        for number, ((plane, level), (codes, features)) in enumerate(
+            zip(places, rows, strict=True)
+        ):
+            scale = scales[number] if scales else None
+            if scale is not None and not len(codes):
+                features = features.astype(np.int16)  # no part tells of what dtype no rows are
+            tables.append(VertexTable(plane, level, codes, features, scale))
+        return tuple(tables)
 
-    def _levels(self, topic: str, plane: int, empty: Columns) -> list[Columns]:
-        squares = self._of(topic, plane)
+    def _levels(self, topic: str, empty: _Columns) -> list[_Columns]:
+        """The rows of each plane's levels, those of all squares together."""
+        planes = [self._of(topic, plane) for plane in range(len(AXES))]
         return [
-            _joined(topic, [square[h] for square in squares], empty)
-            for h in range(self._settings.feature_levels)
+            _joined(topic, [square[level] for square in squares], empty)
+            for squares in planes
+            for level in range(self._settings.feature_levels)
         ]
 
-    def _training_state(self) -> TrainingState | None:
-        head = self._training
+    def _of(self, topic: str, plane: int = 0) -> list[tuple[_Columns, ...]]:
+        """The rows in the parts of a topic, in the order of their cells."""
+        keys = sorted(key for key in self._rows if key.topic == topic and key.plane == plane)
+        return [self._rows[key] for key in keys]
+
+    def _training(self) -> TrainingState | None:
+        head = self._heads.get(TRAINING)
         if head is None:
             return None
-        size = self._settings.feature_size
-        rows = np.zeros((0, size), np.float32)
-        moments = [
-            columns
-            for plane in range(len(AXES))
-            for columns in self._levels(MOMENTS, plane, (rows, rows, np.zeros(0, np.int32)))
-        ]
-        empty = (np.zeros((0, 3), np.float32), np.zeros(0, np.float16))
-        points, labels = _joined(SAMPLES, [part[0] for part in self._of(SAMPLES)], empty)
-        if len(points) != head.samples:
-            raise DamagedMapFileError(f"{SAMPLES}: {len(points)} samples, not {head.samples}")
+        moments = self._levels(MOMENTS, _no_rows(moment_columns(self._settings)))
+        means, variances, steps = zip(*moments, strict=True)
+        samples = [portion for (portion,) in self._of(SAMPLES)]
+        points, labels = _joined(SAMPLES, samples, _no_rows(SAMPLE_COLUMNS))
+        if len(points) != head.count("samples"):
+            raise DamagedMapFileError(
+                f"{SAMPLES}: {len(points)} samples, not {head.count('samples')}"
+            )
         return TrainingState(
-            table_means=tuple(columns[0] for columns in moments),
-            table_variances=tuple(columns[1] for columns in moments),
-            table_steps=tuple(columns[2] for columns in moments),
-            mlp_means=head.mlp_means,
-            mlp_variances=head.mlp_variances,
-            mlp_steps=head.mlp_steps,
+            table_means=means,
+            table_variances=variances,
+            table_steps=steps,
+            mlp_means=head.arrays("mlp_means", 2 * MLP_LAYERS),
+            mlp_variances=head.arrays("mlp_variances", 2 * MLP_LAYERS),
+            mlp_steps=head.count("mlp_steps"),
             sample_points=points,
             sample_labels=labels,
-            budget_samples=head.budget_samples,
+            budget_samples=head.count("training_budget"),
         )
 
 
-def _vertex_table(place: tuple[int, int], columns: Columns, scale: float | None) -> VertexTable:
-    codes, features = columns
-    if scale is not None and not len(codes):
-        features = features.astype(np.int16)  # no part tells of what dtype no rows are
-    return VertexTable(*place, codes, features, scale)
+def _read_codes(body: PartBody, key: PartKey, shift: int) -> NDArray[np.int64]:
+    """Codes [V] within the region of those within a square or cube."""
+    codes = body.codes("codes", 1 << shift)
+    if len(codes) and not 0 <= codes.max() < 1 << shift:
+        raise DamagedMapFileError(f"{key.topic}: a code lies outside of cell {key.cell}")
+    if key.cell >= 1 << 60 - shift:
+        raise DamagedMapFileError(f"{key.topic}: cell {key.cell} is out of range")
+    return codes + (key.cell << shift)
 
 
-def _joined(topic: str, portions: Iterable[Columns], empty: Columns) -> Columns:
+def _read_evidence(body: PartBody, key: PartKey) -> Evidence:
+    """The evidence of a cube; its optional fields are ``None`` where the part has none."""
+    codes = _read_codes(body, key, cube_shift())
+    surface, free = (
+        body.array(name, "|u1", (len(codes), BLOCK_BYTES)) for name in ("surface", "free")
+    )
+    levels = None
+    if body.has("levels"):
+        count = int(surface_counts(surface).sum())
+        planes = body.array("levels", "|u1", (LEVEL_BITS, (count + 7) // 8))
+        levels = join_levels(planes, count)
+    seen_s = _read_seen(body, surface) if body.has("seen_s") else None
+    return Evidence(codes, surface, free, levels=levels, seen_s=seen_s)
+
+
+def _read_seen(body: PartBody, surface: NDArray[np.uint8]) -> NDArray[np.int64]:
+    touched = surface.any(axis=1)
+    planes = body.array("seen_s", "|u1", (None, int(touched.sum())))
+    if not 1 <= len(planes) <= _MAX_SEEN_BYTES:
+        raise DamagedMapFileError(f"{body.topic}: seen_s has {len(planes)} bytes per time")
+    start = body.count("seen_from_s")
+    if start > MAX_SEEN_S:
+        raise DamagedMapFileError(f"{body.topic}: seen_from_s = {start} is above {MAX_SEEN_S}")
+    since = unshuffle_counts(planes)
+    seen_s = np.zeros(len(surface), np.int64)
+    seen_s[touched] = np.where(since > 0, start + since, 0)
+    return seen_s
+
+
+def _no_rows(columns: Sequence[Column]) -> _Columns:
+    """These columns without rows."""
+    return tuple(np.zeros((0, *column.row), column.dtypes[0]) for column in columns)
+
+
+def _joined(topic: str, portions: Sequence[_Columns], empty: _Columns) -> _Columns:
     """The rows of all portions, column by column."""
-    kept = list(portions)
-    # The portion without rows gives dtypes where there is no other.
-    kept = [portion for portion in kept if len(portion[0])] or kept[:1] or [empty]
+    # A portion without rows gives dtypes where there is no other.
+    kept = [portion for portion in portions if len(portion[0])] or [*portions[:1], empty][:1]
     kinds = [(column.dtype, column.shape[1:]) for column in kept[0]]
     for portion in kept[1:]:
         if [(column.dtype, column.shape[1:]) for column in portion] != kinds:
@@ -171,28 +241,23 @@ def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
     """
     if len(portions) == 1:
         return portions[0]
-    masks = np.zeros((0, BLOCK_BYTES), np.uint8)
-    levels = [portion.levels for portion in portions]
-    seen_s = [portion.seen_s for portion in portions]
-    counts = [int(surface_counts(portion.surface).sum()) for portion in portions]
+    codes, masks = np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8)
+    levels = [_levels_of(portion) for portion in portions]
+    seen_s = [_seen_of(portion) for portion in portions]
     return Evidence(
-        np.concatenate([np.zeros(0, np.int64), *(portion.codes for portion in portions)]),
+        np.concatenate([codes, *(portion.codes for portion in portions)]),
         np.concatenate([masks, *(portion.surface for portion in portions)]),
         np.concatenate([masks, *(portion.free for portion in portions)]),
-        levels=_filled(levels, counts, np.uint8),
-        seen_s=_filled(seen_s, [len(portion.codes) for portion in portions], np.int64),
+        levels=np.concatenate(levels) if any(p.levels is not None for p in portions) else None,
+        seen_s=np.concatenate(seen_s) if any(p.seen_s is not None for p in portions) else None,
     )
 
 
-def _filled(
-    columns: Sequence[NDArray[_Integer] | None], counts: Sequence[int], kind: type[_Integer]
-) -> NDArray[_Integer] | None:
-    """The columns in one, with zeros in place of those that are missing."""
-    if all(column is None for column in columns):
-        return None
-    return np.concatenate(
-        [
-            np.zeros(count, kind) if column is None else column
-            for column, count in zip(columns, counts, strict=True)
-        ]
-    )
+def _levels_of(evidence: Evidence) -> NDArray[np.uint8]:
+    if evidence.levels is not None:
+        return evidence.levels
+    return np.zeros(int(surface_counts(evidence.surface).sum()), np.uint8)
+
+
+def _seen_of(evidence: Evidence) -> NDArray[np.int64]:
+    return np.zeros(len(evidence.codes), np.int64) if evidence.seen_s is None else evidence.seen_s

@@ -1,12 +1,22 @@
-"""Bytes that can be read from any place: of a file here, or elsewhere."""
+"""Files of maps: read from any place, replaced as a whole, and named in errors."""
 
+import contextlib
 import io
 import os
+import secrets
 import stat
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
-from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.errors import (
+    DamagedMapFileError,
+    FormatError,
+    MapFileError,
+    TooLargeMapFileError,
+)
+
+_REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be intact"
 
 
 class RandomAccess(Protocol):
@@ -75,3 +85,43 @@ def check_range(offset: int, length: int, size: int) -> None:
         raise DamagedMapFileError(
             f"bytes {offset} to {offset + length} are needed, but it has {size}: it is incomplete"
         )
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A stream whose bytes replace the file at ``path``, durably, where nothing is raised."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("xb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make renames in a folder durable, where the system lets folders be synced."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def named(name: str) -> Iterator[None]:
+    """Put the file's name and, for damage, the remedy into what is raised."""
+    try:
+        yield
+    except FormatError as error:
+        if isinstance(error, MapFileError) and not isinstance(error, DamagedMapFileError):
+            raise type(error)(f"{name}: {error}") from error
+        raise DamagedMapFileError(f"{name} is damaged: {error}; {_REMEDY}") from error
+    except MemoryError as error:
+        raise TooLargeMapFileError(f"{name}: the map does not fit into memory") from error
