@@ -14,7 +14,6 @@ from support.operations import OPERATIONS
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ResetRequest,
-    Scan,
     SdfRequest,
     StatusRequest,
     TileListRequest,
@@ -26,13 +25,13 @@ ORIGIN = np.zeros(3)
 ONE_POINT = np.zeros((1, 3), np.float32)
 
 
-def segments(count: int, length_m: float) -> SegmentsRequest:
+def segments(count, length_m):
     starts = np.zeros((count, 3), np.float32)
     ends = starts + np.array([length_m, 0, 0], np.float32)
     return SegmentsRequest(ORIGIN, starts, ends, 0.1, 5.0, 0)
 
 
-def rays(count: int, range_m: float) -> RaysRequest:
+def rays(count, range_m):
     ways = np.tile(np.array([1, 0, 0], np.float32), (count, 1))
     return RaysRequest(ORIGIN, np.zeros_like(ways), ways, range_m, False, 0)
 
@@ -64,21 +63,21 @@ def scan(request):
     session = zlib.crc32(request.node.name.encode())
     source = f"lidar{session}"
 
-    def make(sequence: int = 0, **changes: object) -> Scan:
+    def make(sequence=0, **changes):
         return servers.scan(sequence, **({"session": session, "source": source} | changes))
 
     return make
 
 
-def changed(message: codec.Message, **changes: object) -> bytes:
+def changed(message, **changes):
     return msgpack.packb(msgpack.unpackb(codec.encode(message)) | changes)
 
 
-def packed(array: np.ndarray) -> dict[str, object]:
+def packed(array):
     return {"dtype": array.dtype.str, "shape": list(array.shape), "data": array.tobytes()}
 
 
-def added(before: dict[str, int], after: dict[str, int]) -> dict[str, int]:
+def added(before, after):
     """The counts that rose, and by how much."""
     rises = {reason: count - before.get(reason, 0) for reason, count in after.items()}
     return {reason: rise for reason, rise in rises.items() if rise}

@@ -73,11 +73,11 @@ def imported(folder: str) -> set[str]:
         ),
     ],
 )
-def test_what_is_imported_is_declared(folder, extras):
+def test_what_is_imported_is_declared(folder: str, extras: tuple[str, ...]) -> None:
     assert imported(folder) <= declared(*extras)
 
 
-def test_what_is_declared_is_imported():
+def test_what_is_declared_is_imported() -> None:
     folders = ("format", "map", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
     assert declared("fast", "mesh", "preview", "server", "tools") <= used | USED_BY_OTHERS

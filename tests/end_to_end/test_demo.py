@@ -2,6 +2,7 @@ import dataclasses
 import json
 import signal
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,7 +41,9 @@ GOOD = DemoResults(
 QUALITY = ("SDF error", "gradient angle", "mesh F-score", "houses UNKNOWN")
 
 
-def test_a_few_scans_leave_all_results(tmp_path, capsys, monkeypatch) -> None:
+def test_a_few_scans_leave_all_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(steps, "_SETTLE_LIMIT_S", 3.0)
     monkeypatch.setattr(steps, "_MESH_SAMPLES", 100_000)
     out = tmp_path / "out"
@@ -95,7 +98,9 @@ def test_results_as_promised_break_nothing() -> None:
         ("queries", {"epochs_backwards": 1}, "answers from an older epoch is 1"),
     ],
 )
-def test_a_broken_promise_is_named_with_its_value(part, changes, words) -> None:
+def test_a_broken_promise_is_named_with_its_value(
+    part: str, changes: dict[str, object], words: str
+) -> None:
     changed = dataclasses.replace(getattr(GOOD, part), **changes)
     broken = broken_promises(dataclasses.replace(GOOD, **{part: changed}))
     assert len(broken) == 1
@@ -114,7 +119,7 @@ def test_a_map_that_still_learns_may_change_over_a_restart() -> None:
     assert "went on learning" in notes["after a restart"]
 
 
-def test_a_server_that_cannot_start_is_reported_with_its_last_line(tmp_path) -> None:
+def test_a_server_that_cannot_start_is_reported_with_its_last_line(tmp_path: Path) -> None:
     (tmp_path / "store").write_text("a file")
     log = tmp_path / "server.log"
     with pytest.raises(ToolError, match="the server did not start: .*store") as caught:
@@ -159,7 +164,7 @@ def test_queries_without_a_server_fail() -> None:
 
 
 @pytest.mark.parametrize("arguments", [("--scans", "0"), ("--seed", "x"), ("street",)])
-def test_wrong_usage_ends_with_code_2(arguments) -> None:
+def test_wrong_usage_ends_with_code_2(arguments: tuple[str, ...]) -> None:
     with pytest.raises(SystemExit) as caught:
         demo.main(arguments)
     assert caught.value.code == 2

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import SdfResult
 from triquad_format.mapfile.reader import read_map
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
@@ -15,22 +14,22 @@ POSE = np.eye(4)
 
 
 @pytest.fixture
-def settings(tmp_path) -> Path:
+def settings(tmp_path):
     path = tmp_path / "server.toml"
     path.write_text(servers.SMALL_TOML)
     return path
 
 
 @pytest.fixture
-def arguments(tmp_path, settings) -> list[str | Path]:
+def arguments(tmp_path, settings):
     return ["--settings", settings, "--store", tmp_path / "store"]
 
 
-def checkpoints(tmp_path: Path) -> list[Path]:
+def checkpoints(tmp_path):
     return sorted((tmp_path / "store" / servers.MAP).glob("*.triquad"))
 
 
-def learn(endpoint: str) -> SdfResult:
+def learn(endpoint):
     with triquad_client.connect(endpoint) as client:
         for _ in range(2):
             client.publish_scan(servers.sphere(), POSE)
@@ -39,18 +38,18 @@ def learn(endpoint: str) -> SdfResult:
         return client.query_sdf(PROBES, gradient=True)
 
 
-def ask(endpoint: str) -> SdfResult:
+def ask(endpoint):
     with triquad_client.connect(endpoint) as client:
         return client.query_sdf(PROBES, gradient=True)
 
 
-def assert_same_map(before: SdfResult, after: SdfResult) -> None:
+def assert_same_map(before, after):
     assert after.epoch >= before.epoch
     assert np.array_equal(after.status, before.status)
     assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features in half precision
 
 
-def run(arguments: list[str | Path], endpoint: str | None = None) -> servers.ServerProcess:
+def run(arguments, endpoint=None):
     """A server that ends by itself."""
     with servers.server_process(arguments, endpoint, ready=False) as server:
         server.wait()

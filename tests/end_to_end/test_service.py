@@ -120,7 +120,7 @@ def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client,
     probes = np.tile(PROBES, (1500, 1))  # 300 000 points: several requests
     stop = threading.Event()
 
-    def publish() -> None:
+    def publish():
         with triquad_client.connect(endpoint) as publisher:
             while not stop.is_set():
                 learn(publisher, 1)

@@ -15,7 +15,7 @@ PASSAGES = re.split(r"^(?:#{2,3} |(?=`[A-Z]\w+`))", PAGE, flags=re.MULTILINE)
 """From each heading, and from each line that begins with the name of a message."""
 
 
-def all_messages() -> list[type[Message]]:
+def all_messages():
     kinds = {
         kind
         for module in (messages, query_messages)

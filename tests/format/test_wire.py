@@ -61,7 +61,7 @@ EXAMPLES = [
 ]
 
 
-def all_messages() -> list[type[Message]]:
+def all_messages():
     return [
         kind
         for kind in vars(messages).values()
@@ -69,7 +69,7 @@ def all_messages() -> list[type[Message]]:
     ]
 
 
-def same(left: object, right: object) -> bool:
+def same(left, right):
     if isinstance(left, np.ndarray):
         return left.dtype == right.dtype and np.array_equal(left, right, equal_nan=True)
     return left == right
@@ -126,11 +126,11 @@ def test_fields_with_a_default_may_be_missing():
         codec.decode(TileRequest, msgpack.packb(body))
 
 
-def changed(message: Message, **changes: object) -> bytes:
+def changed(message, **changes):
     return msgpack.packb(msgpack.unpackb(codec.encode(message)) | changes)
 
 
-def array(dtype: object = "<f4", shape: object = (2, 3), data: object = bytes(24)) -> object:
+def array(dtype="<f4", shape=(2, 3), data=bytes(24)):
     return {"dtype": dtype, "shape": list(shape) if isinstance(shape, tuple) else shape} | {
         "data": data
     }

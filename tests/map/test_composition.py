@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from support.map_records import random_record, with_levels
 from triquad_format.records import morton
-from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord, region_corner
+from triquad_format.records.region import (
+    BLOCK_BYTES,
+    Evidence,
+    MapRecord,
+    RegionIndex,
+    region_corner,
+)
 from triquad_map.composition.region import no_surfels
 from triquad_map.reference.evaluator import MapEvaluator
 
@@ -67,7 +73,7 @@ def across_the_border(record: MapRecord, count: int, spread_m: float) -> np.ndar
 
 
 @pytest.mark.parametrize("spread_m", [1.0, 5.0])
-def test_the_nearest_unknown_space_may_lie_in_another_region(spread_m):
+def test_the_nearest_unknown_space_may_lie_in_another_region(spread_m: float) -> None:
     record = widely_seen(random_record(3, indices=TWO, training=False))
     points = across_the_border(record, 40, spread_m)
     found = MapEvaluator(record).nearest_unknown(points, 1.2)
@@ -81,7 +87,9 @@ def test_the_nearest_unknown_space_may_lie_in_another_region(spread_m):
 
 
 @pytest.mark.parametrize("indices", [TWO, APART])
-def test_the_nearest_surface_is_that_of_the_region_where_it_is_nearest(indices):
+def test_the_nearest_surface_is_that_of_the_region_where_it_is_nearest(
+    indices: tuple[RegionIndex, ...],
+) -> None:
     record = with_levels(random_record(4, indices=indices, points=60, training=False))
     leaf_m = record.settings.leaf_m
     points = np.random.default_rng(5).uniform(-20, 30, (200, 3))
@@ -99,7 +107,7 @@ def test_the_nearest_surface_is_that_of_the_region_where_it_is_nearest(indices):
     np.testing.assert_allclose(gaps[found.found], best[found.found], atol=1e-9)
 
 
-def test_confidence_fades_with_the_age_since_anything_was_seen_anywhere():
+def test_confidence_fades_with_the_age_since_anything_was_seen_anywhere() -> None:
     record = with_levels(random_record(4, indices=TWO, points=60, training=False))
     old, new = record.regions
     seen_s = [

@@ -110,10 +110,10 @@ def test_what_is_frozen_does_not_change() -> None:
     assert frozen.status(voxel(1.5, 1.5, 1.5))[0] == Status.SURFACE
 
 
-def test_support_rises_with_each_look_from_near_and_from_other_sides():
+def test_support_rises_with_each_look_from_near_and_from_other_sides() -> None:
     ends = np.array([[20.5, 20.5, 20.5], [60.5, 20.5, 20.5]])
 
-    def level_after(*origins):
+    def level_after(*origins: tuple[float, ...]) -> int:
         evidence = LiveEvidence(SIDE)
         for origin in origins:
             evidence.mark_surface(ends[:1], Sighting(np.array(origin), 0.2, 1_000))
@@ -127,7 +127,7 @@ def test_support_rises_with_each_look_from_near_and_from_other_sides():
     assert level_after(*[near, other_side] * 100) == LEVELS - 1
 
 
-def test_levels_and_times_survive_a_record():
+def test_levels_and_times_survive_a_record() -> None:
     evidence = LiveEvidence(SIDE)
     origins = [np.array([64.0, 64, 64]), np.array([10.0, 64, 64])]
     rng = np.random.default_rng(5)
@@ -145,7 +145,7 @@ def test_levels_and_times_survive_a_record():
     np.testing.assert_array_equal(frozen.record().seen_s, record.seen_s)
 
 
-def test_what_is_forgotten_has_no_support():
+def test_what_is_forgotten_has_no_support() -> None:
     evidence = LiveEvidence(SIDE)
     end = np.array([[20.5, 20.5, 20.5]])
     for _ in range(50):

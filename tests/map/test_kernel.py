@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -29,7 +28,7 @@ def callee(x):
 
 
 @pytest.fixture
-def package(tmp_path: Path) -> Path:
+def package(tmp_path):
     folder = tmp_path / "source" / "triquad_toy"
     folder.mkdir(parents=True)
     sources = {"__init__": "", "caller": CALLER, "callee": CALLEE, "constants": "ADDED = 3"}
@@ -38,7 +37,7 @@ def package(tmp_path: Path) -> Path:
     return folder
 
 
-def run(package: Path, **variables: str) -> tuple[int, int]:
+def run(package, **variables):
     """The result of the caller in a process of its own, and what it found compiled."""
     unset = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
     environment = {name: value for name, value in os.environ.items() if name not in unset}
@@ -56,7 +55,7 @@ def run(package: Path, **variables: str) -> tuple[int, int]:
     return int(result), int(found)
 
 
-def edit(package: Path, module: str, old: str, new: str) -> None:
+def edit(package, module, old, new):
     file = package / f"{module}.py"
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))

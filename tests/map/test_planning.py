@@ -1,19 +1,17 @@
 """Questions of planners, asked of a real server through the network."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import Client, InvalidInputError, Status, Unknown, UnknownSpaceError
+from triquad_client import InvalidInputError, Status, Unknown, UnknownSpaceError
 
 RADIUS_M = servers.RADIUS_M
 POSE = np.eye(4)
 
 
 @pytest.fixture(scope="module")
-def client() -> Iterator[Client]:
+def client():
     """Of a server that has seen a sphere from its middle, and learnt all of it."""
     with servers.service_and_client() as client:
         for turn in range(3):
@@ -23,7 +21,7 @@ def client() -> Iterator[Client]:
         yield client
 
 
-def even_sphere(count: int, turn: float) -> np.ndarray:
+def even_sphere(count, turn):
     """Points [count, 3] that leave no gaps on the sphere around the sensor."""
     height = 1 - (np.arange(count) + 0.5) * 2 / count
     angle = np.pi * (1 + np.sqrt(5)) * np.arange(count) + turn
@@ -32,7 +30,7 @@ def even_sphere(count: int, turn: float) -> np.ndarray:
     return (RADIUS_M * ball).astype(np.float32)
 
 
-def directions(count: int = 500) -> np.ndarray:
+def directions(count=500):
     ways = np.random.default_rng(4).normal(size=(count, 3))
     return ways / np.linalg.norm(ways, axis=1, keepdims=True)
 

@@ -13,7 +13,6 @@ from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.recorded_view import RecordedView
 from triquad_map.compiled.surfels.surfel_map import surfel_index, surfel_places
 from triquad_map.compiled.surfels.surfel_search import find_nearest
-from triquad_map.composition.composed_view import ComposedView
 from triquad_map.composition.region import no_surfels
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
@@ -30,11 +29,11 @@ APART = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (-4, 2, 1))
 """Neighbours by a face and by an edge, and one far away."""
 
 
-def both(record: MapRecord) -> tuple[ComposedView, MapEvaluator]:
+def both(record):
     return RecordedView(record), MapEvaluator(record)
 
 
-def around(record: MapRecord, count: int, seed: int) -> np.ndarray:
+def around(record, count, seed):
     """Points in and between the regions of a map, and outside of all."""
     rng = np.random.default_rng(seed)
     centres = np.array([region.index for region in record.regions]) * record.settings.region_pitch_m
@@ -85,7 +84,7 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
     np.testing.assert_allclose(fast.means[hit], slow.means[hit], atol=1e-3)
 
 
-def random_surfels(rng: np.random.Generator, count: int) -> Surfels:
+def random_surfels(rng, count):
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Surfels(
@@ -96,12 +95,12 @@ def random_surfels(rng: np.random.Generator, count: int) -> Surfels:
 
 
 @pytest.fixture(scope="module", params=["flat", "table"])
-def ground(request) -> tuple[ComposedView, MapEvaluator]:
+def ground(request):
     """The views of a ground whose field is exact."""
     return both(exact_map(flat(0.07) if request.param == "flat" else table(0.0, 1.3)))
 
 
-def places(count: int, seed: int = 0) -> np.ndarray:
+def places(count, seed=0):
     return np.random.default_rng(seed).uniform([-14, -14, -2], [14, 14, 6], (count, 3))
 
 

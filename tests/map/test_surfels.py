@@ -4,19 +4,18 @@ import numpy as np
 import pytest
 from support import small_world
 from triquad_map.compiled.evidence.evidence import LiveEvidence
-from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
-from triquad_map.composition.region import NearestSurfels, field_samples, in_one, no_surfels
+from triquad_map.compiled.surfels.surfel_map import first_surfels
+from triquad_map.composition.region import field_samples, in_one, no_surfels
 from triquad_map.surface import FieldSample, SurfelKind, fit_surfels
-from triquad_server.epochs import FrozenRegion
 from triquad_server.mapping.mapper import Mapper
 
 SIDE = 64
 
 
-def plane(normal: np.ndarray, height: float):
+def plane(normal, height):
     """The exact field of a half space, in voxels."""
 
-    def sample(points: np.ndarray) -> FieldSample:
+    def sample(points):
         values = points @ normal - height
         return FieldSample(values.astype(np.float32), np.tile(normal, (len(points), 1)))
 
@@ -40,7 +39,7 @@ def test_of_two_voxels_on_one_surface_one_counts():
     voxels = np.array([[30, 30, 30], [30, 30, 31]])
     seen = {tuple(voxel) for voxel in voxels.tolist()}
 
-    def ended_in(asked: np.ndarray) -> np.ndarray:
+    def ended_in(asked):
         return np.array([tuple(voxel) in seen for voxel in asked.tolist()], bool)
 
     surfels = fit_surfels(voxels, field, ended_in)
@@ -48,7 +47,7 @@ def test_of_two_voxels_on_one_surface_one_counts():
 
 
 def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
-    def flat(points: np.ndarray) -> FieldSample:
+    def flat(points):
         return FieldSample(np.full(len(points), 2.0, np.float32), np.zeros((len(points), 3)))
 
     surfels = fit_surfels(np.array([[5, 6, 7]]), flat, lambda asked: np.zeros(len(asked), bool))
@@ -56,13 +55,13 @@ def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
     np.testing.assert_array_equal(surfels.offsets[0], 0)
 
 
-def nearest(surfels: SurfelMap, points: np.ndarray) -> NearestSurfels:
+def nearest(surfels, points):
     found = no_surfels(np.full(len(points), 40.0))
     surfels.find_nearest(points, found)
     return found
 
 
-def random_evidence(rng: np.random.Generator, count: int) -> LiveEvidence:
+def random_evidence(rng, count):
     evidence = LiveEvidence(SIDE)
     evidence.mark_surface(rng.uniform((0, 0, 28), (SIDE, SIDE, 33), (count, 3)))
     return evidence
@@ -101,7 +100,7 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
     assert rounds > 1
 
 
-def surfels_of(region: FrozenRegion, mapper_settings: object) -> SurfelMap:
+def surfels_of(region, mapper_settings):
     samples = field_samples(region.engine, mapper_settings, in_one)  # type: ignore[arg-type]
     return first_surfels(region.evidence, samples, 1)
 

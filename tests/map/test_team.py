@@ -16,7 +16,7 @@ def team():
 def test_each_place_is_worked_on_once(team, count):
     done = np.zeros(count, int)
 
-    def work(first: int, last: int) -> None:
+    def work(first, last):
         done[first:last] += 1
 
     team.split(count, work)
@@ -28,7 +28,7 @@ def test_each_place_is_worked_on_once(team, count):
 def test_an_error_of_one_part_is_raised_when_all_have_ended(team):
     ended = []
 
-    def work(part: int) -> None:
+    def work(part):
         ended.append(part)
         if part == THREADS - 1:
             raise ValueError("the last part")

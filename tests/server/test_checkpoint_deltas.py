@@ -10,7 +10,7 @@ from support.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files
 from triquad_format.mapfile.reader import read_map, read_map_file
-from triquad_format.records.region import MapRecord, RegionIndex
+from triquad_format.records.region import RegionIndex
 from triquad_format.recovery.recovered_map import recover
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges, Mapper
@@ -20,7 +20,7 @@ from triquad_server.store.store import Store
 ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(10))
 
 
-def grown(seed: int, epoch: int, before: MapRecord | None = None, only=ROW) -> MapRecord:
+def grown(seed, epoch, before=None, only=ROW):
     """A map of ten regions; those not in ``only`` are as in ``before``."""
     fresh = random_record(seed, indices=ROW, name="lab", epoch=epoch, points=60)
     if before is None:
@@ -30,7 +30,7 @@ def grown(seed: int, epoch: int, before: MapRecord | None = None, only=ROW) -> M
     return dataclasses.replace(fresh, regions=regions)
 
 
-def changes(record: MapRecord, only=ROW) -> MapChanges:
+def changes(record, only=ROW):
     """What the mapper hands over where the regions ``only`` changed."""
     changed = tuple(region for region in record.regions if region.index in only)
     epoch = Mapper("lab", Settings(field=record.settings), "cpu", record).publish()
@@ -47,7 +47,7 @@ def store(tmp_path):
         yield store
 
 
-def drive(store: Store, epochs: int, rows=ROW) -> dict[int, MapRecord]:
+def drive(store, epochs, rows=ROW):
     """Epochs of which each changes the next one of the regions ``rows``; the first is complete."""
     records = {1: grown(1, 1)}
     store.write(changes(records[1]))
@@ -59,7 +59,7 @@ def drive(store: Store, epochs: int, rows=ROW) -> dict[int, MapRecord]:
     return records
 
 
-def paths(store: Store) -> dict[int, Path]:
+def paths(store):
     return {file.epoch: file.path for file in reversed(checkpoint_files(store.folder))}
 
 

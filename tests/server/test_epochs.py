@@ -13,21 +13,19 @@ from triquad_server.epochs import Epoch, EpochHistory, EpochLimits
 class Clock:
     now: float = 0.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 
-def epoch(number: int) -> Epoch:
+def epoch(number):
     return Epoch("lab", number, FieldSettings(), (), in_one)
 
 
-def history(
-    kept: int, pinned: int = 0, pin_s: float = 30.0, clock: Clock | None = None
-) -> EpochHistory:
+def history(kept, pinned=0, pin_s=30.0, clock=None):
     return EpochHistory(epoch(1), EpochLimits(kept, pinned, pin_s), clock or Clock())
 
 
-def is_gone(epochs: EpochHistory, number: int) -> bool:
+def is_gone(epochs, number):
     try:
         found = epochs.get(number)
     except RefusedError as error:

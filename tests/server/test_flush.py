@@ -15,20 +15,20 @@ from triquad_server.intake.sources import SourceLedger
 class PendingRequest:
     """Stands for a Zenoh query; keeps its one answer."""
 
-    def __init__(self, defect: Exception | None = None) -> None:
+    def __init__(self, defect=None):
         self._defect = defect
         self._replies: queue.SimpleQueue[object] = queue.SimpleQueue()
 
-    def answer(self, message: object) -> None:
+    def answer(self, message):
         if self._defect:
             raise self._defect
         self._replies.put(message)
 
-    def refuse(self, code: str, text: str) -> None:
+    def refuse(self, code, text):
         self._replies.put(code)
 
     @property
-    def reply(self) -> object:
+    def reply(self):
         return self._replies.get(timeout=servers.WAIT_S)
 
 
@@ -44,7 +44,7 @@ def handler(ledger, monkeypatch):
         yield handler
 
 
-def asks(sequence: int = 0, **changes: object) -> FlushRequest:
+def asks(sequence=0, **changes):
     return FlushRequest(
         **({"source": "lidar", "session": 7, "timeout_s": 60.0} | changes), sequence=sequence
     )

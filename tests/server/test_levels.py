@@ -30,27 +30,27 @@ CUBES = dataclasses.replace(SMALL, depth=9)
 RECORD = with_levels(random_record(21, settings=CUBES, indices=((0, 0, 0), (1, 0, 0)), points=500))
 
 
-def level_of(evidence: Evidence) -> dict[tuple[int, ...], int]:
+def level_of(evidence):
     """The level of each surface voxel."""
     voxels = seen_voxels(evidence, evidence.surface).tolist()
     return dict(zip(map(tuple, voxels), evidence.levels.tolist(), strict=True))
 
 
-def time_of(evidence: Evidence) -> dict[int, int]:
+def time_of(evidence):
     """The time of each block that holds surface."""
     times = zip(evidence.codes.tolist(), evidence.seen_s.tolist(), strict=True)
     touched = evidence.surface.any(axis=1)
     return {code: s for (code, s), seen in zip(times, touched, strict=True) if seen}
 
 
-def assert_part_of(some: Evidence, whole: Evidence) -> None:
+def assert_part_of(some, whole):
     """Voxels and blocks kept what they had; blocks without surface have no time."""
     assert level_of(some).items() <= level_of(whole).items()
     assert time_of(some).items() <= time_of(whole).items()
     assert not some.seen_s[~some.surface.any(axis=1)].any()
 
 
-def blocks(seed: int, count: int) -> Evidence:
+def blocks(seed, count):
     """Blocks with many voxels each, some without surface, all in one cube."""
     rng = np.random.default_rng(seed)
     surface, free = rng.integers(0, 256, (2, count, 64)).astype(np.uint8)
@@ -58,7 +58,7 @@ def blocks(seed: int, count: int) -> Evidence:
     return Evidence(np.sort(rng.permutation(200)[:count]).astype(np.int64), surface, free)
 
 
-def record_of(evidence: Evidence):
+def record_of(evidence):
     record = random_record(3, training=False)
     region = dataclasses.replace(record.regions[0], evidence=evidence)
     return dataclasses.replace(record, regions=(region,))

@@ -9,7 +9,7 @@ SCAN = servers.scan()
 SOURCE = (SCAN.source, SCAN.session)
 
 
-def arrive_and_take(ledger: SourceLedger, sequence: int) -> None:
+def arrive_and_take(ledger, sequence):
     assert ledger.arrive(servers.scan(sequence)) is None
     ledger.take(servers.scan(sequence))
 
@@ -131,7 +131,7 @@ def test_waiting_for_an_outcome_ends_with_the_publication():
     publisher.join()
 
 
-def test_a_scan_turned_away_says_nothing_of_those_that_wait() -> None:
+def test_a_scan_turned_away_says_nothing_of_those_that_wait():
     ledger = SourceLedger()
     first, second = servers.scan(sequence=0), servers.scan(sequence=1)
     ledger.arrive(first)

@@ -17,7 +17,7 @@ from triquad_server.store.store import Store
 EMPTY = Mapper("lab", servers.SMALL, "cpu").publish()
 
 
-def record(epoch: int) -> MapChanges:
+def record(epoch):
     return MapChanges(MapRecord("lab", epoch, servers.SMALL.field, ()), (), EMPTY)
 
 
@@ -28,7 +28,7 @@ def store(tmp_path):
     store.close()
 
 
-def names(store: Store) -> list[str]:
+def names(store):
     return sorted(path.name for path in store.folder.iterdir() if path.name != "lock")
 
 

@@ -26,17 +26,17 @@ from triquad_server.mesh.preview import previews_of
 class MemoryBytes:
     """A map file's bytes in memory, read at random."""
 
-    def __init__(self, data: bytes | bytearray | memoryview, name: str = "map file") -> None:
+    def __init__(self, data, name="map file"):
         self.name = name
         self.size = len(data)
         self._data = memoryview(data)
 
-    def read(self, offset: int, length: int) -> bytes:
+    def read(self, offset, length):
         """As :meth:`RandomAccess.read`."""
         check_range(offset, length, self.size)
         return bytes(self._data[offset : offset + length])
 
-    def close(self) -> None:
+    def close(self):
         """Do nothing: there is no file."""
 
 

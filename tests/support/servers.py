@@ -11,6 +11,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import triquad_client
@@ -125,7 +126,11 @@ def answering(answers: dict[str, Callable[[zenoh.Query, str], None]]) -> Iterato
             queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(16))
             queryables.append(queryable)
 
-            def serve(queryable=queryable, key=key, answer=answer) -> None:
+            def serve(
+                queryable: "zenoh.Queryable[Any]" = queryable,
+                key: str = key,
+                answer: Callable[[zenoh.Query, str], None] = answer,
+            ) -> None:
                 for query in queryable:
                     answer(query, key)
 

@@ -1,5 +1,4 @@
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,26 +12,26 @@ SCANS = 9
 EVERY = 3  # withheld
 
 
-def _plate(path: Path, x: tuple[float, float], y: tuple[float, float], z: float) -> Path:
+def _plate(path, x, y, z):
     corners = [[x[0], y[0], z], [x[1], y[0], z], [x[1], y[1], z], [x[0], y[1], z]]
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     triquad_client.Mesh(np.array(corners, float), faces, 1).save(path)
     return path
 
 
-def _grid() -> np.ndarray:
+def _grid():
     """A level cloud of 2 cm spacing over 4 m x 2 m."""
     x, y = np.meshgrid(np.arange(0.01, 4.0, 0.02), np.arange(0.01, 2.0, 0.02))
     return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
 
 
-def _evaluate(capsys, *arguments: object) -> dict:
+def _evaluate(capsys, *arguments):
     assert evaluate.main([*map(str, arguments), "--json"]) == 0
     return json.loads(capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
-def test_a_plate_scores_its_distance_from_a_cloud(tmp_path, capsys, suffix) -> None:
+def test_a_plate_scores_its_distance_from_a_cloud(tmp_path, capsys, suffix):
     mesh = _plate(tmp_path / f"plate{suffix}", (0, 4), (0, 2), 0.05)
     cloud = tmp_path / "cloud.ply"
     triquad_client.Mesh(_grid(), np.empty((0, 3), np.int32), 1).save(cloud)
@@ -45,7 +44,7 @@ def test_a_plate_scores_its_distance_from_a_cloud(tmp_path, capsys, suffix) -> N
     assert scores["f_score"] == 0.0
 
 
-def test_a_plate_scores_its_distance_from_the_scans_of_a_folder(tmp_path, capsys) -> None:
+def test_a_plate_scores_its_distance_from_the_scans_of_a_folder(tmp_path, capsys):
     mesh = _plate(tmp_path / "plate.ply", (10, 14), (0, 2), 0.02)
     pose = np.eye(4)
     pose[0, 3] = 10.0
@@ -61,7 +60,7 @@ def test_a_plate_scores_its_distance_from_the_scans_of_a_folder(tmp_path, capsys
     assert scores["references"] < 200 * 100
 
 
-def test_a_plate_over_the_road_scores_its_height_on_the_street(tmp_path, capsys) -> None:
+def test_a_plate_over_the_road_scores_its_height_on_the_street(tmp_path, capsys):
     mesh = _plate(tmp_path / "plate.ply", (2, 6), (-2, 2), 0.03)
     assert evaluate.main(["mesh", str(mesh), "--street", "1", "--scans", "1"]) == 0
     output = capsys.readouterr().out
@@ -71,7 +70,7 @@ def test_a_plate_over_the_road_scores_its_height_on_the_street(tmp_path, capsys)
 
 
 @pytest.fixture(scope="module")
-def sphere_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sphere_folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("sphere")
     clouds = [servers.sphere(6000)] * SCANS
     write_folder(path, clouds, np.tile(np.eye(4), (SCANS, 1, 1)), range(SCANS))
@@ -79,7 +78,7 @@ def sphere_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(sphere_folder: Path):
+def server(sphere_folder):
     """A server that has learnt a sphere, but for the withheld scans."""
     with servers.running_service() as endpoint:
         arguments = ["--connect", endpoint, "--skip-every", str(EVERY), "--settle"]
@@ -87,7 +86,7 @@ def server(sphere_folder: Path):
         yield endpoint
 
 
-def test_a_map_is_scored_at_withheld_scans(server, sphere_folder, tmp_path, capsys) -> None:
+def test_a_map_is_scored_at_withheld_scans(server, sphere_folder, tmp_path, capsys):
     withheld = ("--withheld", sphere_folder, "--skip-every", EVERY, "--range-min", 2)
     of_server = _evaluate(capsys, "map", server, *withheld)["withheld"]
     assert of_server["points"] == SCANS // EVERY * 6000
@@ -106,7 +105,7 @@ def test_a_map_is_scored_at_withheld_scans(server, sphere_folder, tmp_path, caps
     assert none["sdf_median_m"] is None
 
 
-def test_a_map_of_a_street_is_scored_against_it(capsys, tmp_path, monkeypatch) -> None:
+def test_a_map_of_a_street_is_scored_against_it(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(evaluate, "_SERVER_SAMPLES_MAX", 100_000)
     drive = street_drive(1, 1)
     with servers.running_service() as endpoint:
@@ -127,8 +126,8 @@ def test_a_map_of_a_street_is_scored_against_it(capsys, tmp_path, monkeypatch) -
     assert "Mesh" not in output
 
 
-def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder) -> None:
-    def refusal(*arguments: object) -> str:
+def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder):
+    def refusal(*arguments):
         assert evaluate.main([str(argument) for argument in arguments]) == 2
         error = capsys.readouterr().err
         assert error.startswith("triquad-eval: ")
@@ -148,7 +147,7 @@ def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder) -
     assert f"--skip-every {SCANS + 1} withholds none of its {SCANS} scans" in refusal(*far_apart)
 
 
-def test_a_server_that_cannot_be_reached_is_a_failure(capsys, sphere_folder) -> None:
+def test_a_server_that_cannot_be_reached_is_a_failure(capsys, sphere_folder):
     endpoint = servers.free_endpoint()
     assert evaluate.main(["map", endpoint, "--withheld", str(sphere_folder)]) == 1
     assert f"triquad-eval: cannot connect to {endpoint}" in capsys.readouterr().err
@@ -167,7 +166,7 @@ def test_a_server_that_cannot_be_reached_is_a_failure(capsys, sphere_folder) -> 
         ("map", "x.triquad", "--withheld", "y", "--range-max", "inf"),
     ],
 )
-def test_wrong_usage_ends_with_code_2(arguments) -> None:
+def test_wrong_usage_ends_with_code_2(arguments):
     with pytest.raises(SystemExit) as caught:
         evaluate.main(arguments)
     assert caught.value.code == 2
