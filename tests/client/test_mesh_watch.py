@@ -71,8 +71,8 @@ def request(**changes: object) -> TileUpdatesRequest:
         level=0,
         server="",
         revision=0,
-        held=np.zeros((0, 3), np.int32),
-        held_versions=np.zeros(0, np.int64),
+        known=np.zeros((0, 3), np.int32),
+        known_versions=np.zeros(0, np.int64),
         max_bytes=1_000_000,
         timeout_s=0.0,
         client="test",
@@ -221,11 +221,11 @@ def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: 
         ({"timeout_s": np.nan}, "bad_request"),
         ({"client": ""}, "bad_request"),
         ({"client": "a/b"}, "bad_request"),
-        ({"held_versions": np.ones(3, np.int64)}, "bad_request"),
+        ({"known_versions": np.ones(3, np.int64)}, "bad_request"),
         (
             {
-                "held": np.zeros((100_001, 3), np.int32),
-                "held_versions": np.zeros(100_001, np.int64),
+                "known": np.zeros((100_001, 3), np.int32),
+                "known_versions": np.zeros(100_001, np.int64),
             },
             "too_large",
         ),
@@ -338,8 +338,8 @@ def test_the_protocol_by_hand(client: Client, endpoint: str) -> None:
                 max_bytes=1,
                 server=reply.server,
                 revision=reply.revision,
-                held=np.array(list(versions), np.int32).reshape(-1, 3),
-                held_versions=np.array(list(versions.values()), np.int64),
+                known=np.array(list(versions), np.int32).reshape(-1, 3),
+                known_versions=np.array(list(versions.values()), np.int64),
             )
         for x, y, z in reply.tiles.tolist():
             known[x, y, z] = reply.data

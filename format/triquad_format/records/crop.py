@@ -135,7 +135,7 @@ def _crop_training(
 ) -> TrainingState:
     leaves = leaf_coordinates(settings, training.sample_points)
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))
-    owed = training.budget_samples * len(inside)  # rounded up below, so that none is forgotten
+    samples = training.budget_samples * len(inside)  # rounded up below, so that none is forgotten
     return dataclasses.replace(
         training,
         table_means=_rows(training.table_means, kept),
@@ -143,7 +143,7 @@ def _crop_training(
         table_steps=_rows(training.table_steps, kept),
         sample_points=training.sample_points[inside],
         sample_labels=training.sample_labels[inside],
-        budget_samples=-(-owed // max(len(leaves), 1)),
+        budget_samples=-(-samples // max(len(leaves), 1)),
     )
 
 

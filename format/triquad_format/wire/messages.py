@@ -114,10 +114,10 @@ class TileUpdatesRequest(Message):
     minimum: Point
     maximum: Point  # of the box, map frame; an open side is infinite
     level: int  # of detail
-    server: str  # of the reply before, whose word revision and held are; empty at first
+    server: str  # of the reply before, to which revision and known belong; empty at first
     revision: int  # of the reply before: everything up to it is known; 0 at first
-    held: TileIndices  # [H, 3] tiles that are known whatever the revision
-    held_versions: Epochs  # [H]
+    known: TileIndices  # [H, 3] tiles that are known whatever the revision
+    known_versions: Epochs  # [H]
     max_bytes: int  # of the reply's tiles; a single tile may have more
     timeout_s: float
     client: str  # a name, on which max_bytes_per_s is counted
@@ -132,7 +132,7 @@ class TileUpdates(Message):
     revision: int  # for the next request
     epoch: int  # the tiles show this epoch, where complete
     complete: bool  # nothing more waits
-    restart: bool  # the request spoke of another server: tiles held from it are void
+    restart: bool  # the request spoke of another server: what was known of it is void
     tile_side_m: float
     cell_m: float
     tiles: TileIndices  # [T, 3] that changed

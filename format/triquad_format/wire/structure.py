@@ -1,4 +1,4 @@
-"""A look at the structure of a msgpack message before anything is built from it.
+"""A check of the structure of a msgpack message before anything is built from it.
 
 A message of a few megabytes can hold millions of tiny objects, or nest thousands deep; unpacking it
 would hold up everything else for seconds and take a hundred times its size. Reading the headers
@@ -49,7 +49,7 @@ def check_structure(payload: bytes, max_objects: int = MAX_OBJECTS) -> None:
 
 
 def binary_offsets(payload: bytes) -> Iterator[range]:
-    """Where the bytes of each binary lie in a sound msgpack object, in their order."""
+    """Where the bytes of each binary lie in a valid msgpack object, in their order."""
     at, objects = 0, 1
     while objects:
         code = payload[at]

@@ -48,7 +48,7 @@ class Follower:
     bytes_per_s: float
     restart: bool  # it knows tiles of another server: they are void
     known_to: int  # it knows everything up to this revision
-    held: dict[TileIndex, int]  # versions of tiles that it has whatever the revision
+    known: dict[TileIndex, int]  # versions of tiles that it has whatever the revision
     nothing_at: tuple[int, int] | None = None  # state of the cache that had nothing for it
 
 
@@ -60,7 +60,7 @@ def new_follower(
     ``server`` is the name that replies carry, ``epoch`` the newest.
     """
     restart = asks.server not in ("", server)
-    held = zip(asks.held.tolist(), asks.held_versions.tolist(), strict=True)
+    known = zip(asks.known.tolist(), asks.known_versions.tolist(), strict=True)
     limits = (settings.client_bytes_per_s, asks.max_bytes_per_s)
     return Follower(
         request=request,
@@ -70,7 +70,7 @@ def new_follower(
         bytes_per_s=min((limit for limit in limits if limit), default=math.inf),
         restart=restart,
         known_to=0 if restart else asks.revision,
-        held={} if restart else {(x, y, z): version for (x, y, z), version in held},
+        known={} if restart else {(x, y, z): version for (x, y, z), version in known},
     )
 
 
@@ -107,13 +107,13 @@ def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
 
 
 def _check_held(asks: TileUpdatesRequest) -> None:
-    if len(asks.held) != len(asks.held_versions):
+    if len(asks.known) != len(asks.known_versions):
         raise RefusedError(
-            "bad_request", f"{len(asks.held_versions)} versions of {len(asks.held)} held tiles"
+            "bad_request", f"{len(asks.known_versions)} versions of {len(asks.known)} known tiles"
         )
-    if len(asks.held) > MAX_KNOWN_TILES:
+    if len(asks.known) > MAX_KNOWN_TILES:
         raise RefusedError(
-            "too_large", f"{len(asks.held)} held tiles exceed the limit of {MAX_KNOWN_TILES}"
+            "too_large", f"{len(asks.known)} known tiles exceed the limit of {MAX_KNOWN_TILES}"
         )
 
 

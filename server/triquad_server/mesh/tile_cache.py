@@ -114,13 +114,13 @@ class _TileLevel:
         low: Doubles,
         high: Doubles,
         known_to: int,
-        held: Mapping[TileIndex, int],
+        known: Mapping[TileIndex, int],
         revision: int,
     ) -> TileDelta:
         """What is new in a box to somebody who knows everything up to the revision ``known_to``.
 
-        ``held`` are versions of tiles that are known whatever the revision; ``revision`` is that of
-        the newest tile of any level.
+        ``known`` are versions of tiles that are known whatever the revision; ``revision`` is that
+        of the newest tile of any level.
         """
         ready: list[CachedTile] = []
         to_make: list[TileIndex] = []
@@ -131,12 +131,12 @@ class _TileLevel:
             if tile is None:
                 to_make.append(index)
                 continue
-            unknown = tile.revision > known_to and held.get(index) != tile.version
-            if unknown and (not tile.empty or known_to or index in held):
+            unknown = tile.revision > known_to and known.get(index) != tile.version
+            if unknown and (not tile.empty or known_to or index in known):
                 ready.append(tile)
         ready.sort(key=lambda tile: tile.revision)
         to_make.sort(key=lambda index: (self.changed[index], index))
-        removed = [index for index in held if index not in self.changed]
+        removed = [index for index in known if index not in self.changed]
         return TileDelta(ready, removed, to_make, revision)
 
     def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
@@ -214,15 +214,15 @@ class TileCache:
         return np.array(epochs, np.int64)
 
     def delta(
-        self, level: int, low: Doubles, high: Doubles, known_to: int, held: Mapping[TileIndex, int]
+        self, level: int, low: Doubles, high: Doubles, known_to: int, known: Mapping[TileIndex, int]
     ) -> TileDelta:
         """What is new in a box to somebody who knows everything up to the revision ``known_to``.
 
-        ``held`` are versions of tiles that are known whatever the revision.
+        ``known`` are versions of tiles that are known whatever the revision.
         """
         with self._lock:
             return self._levels[level].delta(
-                low, high, known_to=known_to, held=held, revision=self.revision
+                low, high, known_to=known_to, known=known, revision=self.revision
             )
 
     def make(self, level: int, index: TileIndex) -> CachedTile:

@@ -150,7 +150,7 @@ class TileFeed:
             asks.minimum,
             asks.maximum,
             known_to=follower.known_to,
-            held=follower.held,
+            known=follower.known,
         )
         if delta.ready or (delta.removed and not delta.to_make):
             self._send(follower, self._filled(follower, delta))
