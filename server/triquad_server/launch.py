@@ -65,8 +65,8 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
             store = Store(options.store, options.map_name, options.settings.store)
             stack.enter_context(closing(store))
             restored = _restored(store, options)
-        _prepare(options.settings, device)
         teams = Teams()
+        _prepare(options.settings, device, teams)
         mapper = Mapper(
             options.map_name, options.settings, device, restored.record if restored else None, teams
         )
@@ -117,7 +117,7 @@ def choose_device(wanted: str) -> str:
     return wanted
 
 
-def _prepare(settings: Settings, device: str) -> None:
+def _prepare(settings: Settings, device: str, teams: Teams) -> None:
     """Have all kernels compiled; whoever waits for it is told how it goes."""
     _log.info("preparing compiled code")
     started = time.monotonic()
@@ -133,13 +133,16 @@ def _prepare(settings: Settings, device: str) -> None:
             _log.info("%.0f s so far; next: %s", seconds, stage)
 
     try:
-        warm_up(settings, device, report)
+        warm_up(settings, device, teams, report)
     finally:
         first_time.cancel()
 
 
 def warm_up(
-    settings: Settings, device: str, report: Callable[[str], None] = lambda _: None
+    settings: Settings,
+    device: str,
+    teams: Teams | None = None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Map and ask a made-up sphere, and forget it.
 
@@ -150,7 +153,7 @@ def warm_up(
     directions = np.random.default_rng(0).normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     radius = min(max(_WARM_UP_RADIUS_M, settings.scan.range_min_m), settings.scan.range_max_m)
-    teams = Teams()
+    teams = teams or Teams()
     mapper = Mapper("warm-up", settings, device, teams=teams)
     report("taking in scans")
     mapper.ingest((directions * radius).astype(np.float32), np.eye(4))

@@ -47,7 +47,7 @@ def test_neighbouring_tiles_meet_without_seams(
 ) -> None:
     """On their common face, both tiles have the same vertices."""
     side = settings().mesh.tile_side_m
-    twins = []
+    met = []
     for (x, y, z), tile in tiles.items():
         other = tiles.get((x + 1, y, z))
         if other is None:
@@ -57,10 +57,10 @@ def test_neighbouring_tiles_meet_without_seams(
         if len(mine) == 0 or len(theirs) == 0:
             continue
         gaps = np.abs(mine[:, None, 1:] - theirs[None, :, 1:]).max(axis=2)
-        twins.append(gaps.min(axis=1) < 1e-4)
-    # A vertex without a twin ends the mesh there: no surface was seen beyond.
-    assert np.concatenate(twins).sum() > 200
-    assert np.concatenate(twins).mean() > 0.8
+        met.append(gaps.min(axis=1) < 1e-4)
+    # A vertex that meets none ends the mesh there: no surface was seen beyond.
+    assert np.concatenate(met).sum() > 200
+    assert np.concatenate(met).mean() > 0.8
 
 
 def test_nothing_is_meshed_where_nothing_was_seen(epoch: Epoch) -> None:
