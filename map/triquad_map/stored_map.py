@@ -27,16 +27,9 @@ from triquad_format.mapfile.parts.region_parts import RegionParts
 from triquad_format.mapfile.reader import assemble
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import SLACK_LEAVES, LeafBox, check_box, leaf_box, whole_region
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.record_check import check_record, check_region
-from triquad_format.records.region import (
-    AXES,
-    MapRecord,
-    Region,
-    RegionIndex,
-    leaf_coordinates,
-    region_centre,
-)
+from triquad_format.records.region import AXES, MapRecord, Region
 
 from triquad_map.composition.field_view import FieldView
 from triquad_map.reference.evaluator import checked_points, in_chunks
@@ -173,12 +166,12 @@ class StoredMap:
         half = self._settings.region_side_m / 2
         reach = vertex_reach(self._settings) + SLACK_LEAVES
         for index in self._indices:
-            offset = points - region_centre(self._settings, index)
+            offset = points - self._settings.region_centre(index)
             offset = offset[(np.abs(offset) < half).all(axis=1)]
             if not len(offset):
                 continue
             needed.add(PartKey(REGION, index))
-            leaves = leaf_coordinates(self._settings, offset)
+            leaves = self._settings.leaf_coordinates(offset)
             for plane, axes in enumerate(AXES):
                 cells = cells_near(leaves[:, axes], reach)
                 needed |= {PartKey(VERTICES, index, plane, cell) for cell in cells}
@@ -213,7 +206,7 @@ class PartialRegion:
             FormatError: it is malformed.
         """
         self.index = index
-        self.centre = region_centre(settings, index)
+        self.centre = settings.region_centre(index)
         self._settings = settings
         self._head = head
         shifts = {level: square_shift(settings, level) for level in settings.levels}

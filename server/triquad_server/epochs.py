@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord, RegionIndex
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.region import MapRecord
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
 from triquad_map.composition.composed_view import ComposedView

@@ -11,8 +11,8 @@ from support.map_records import SMALL, random_record
 from support.mapfile_edit import RawPart, file_bytes, metadata_of, parts_of, read_bytes, rebuild
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.records import morton
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, Evidence
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
+from triquad_format.records.region import BLOCK_BYTES, Evidence
 from triquad_server.mesh.preview import CLUSTER_CELLS, NET_LEAVES
 
 SETTINGS = FieldSettings()

@@ -26,7 +26,7 @@ from triquad_format.mapfile.parts.part import (
 )
 from triquad_format.records import morton
 from triquad_format.records.crop import without_training
-from triquad_format.records.region import region_centre, region_corner, seen_voxels
+from triquad_format.records.region import seen_voxels
 from triquad_format.records.status import Status
 from triquad_format.recovery.recovered_map import recover
 from triquad_map.reference.evaluator import MapEvaluator
@@ -58,7 +58,7 @@ def places():
         evidence = region.evidence
         voxels = seen_voxels(evidence, evidence.surface | evidence.free)
         voxels = voxels[rng.integers(len(voxels), size=2000)] + rng.uniform(size=(2000, 3))
-        points.append(region_corner(SQUARES, region.index) + voxels * SQUARES.leaf_m)
+        points.append(SQUARES.region_corner(region.index) + voxels * SQUARES.leaf_m)
     return np.concatenate(points)
 
 
@@ -72,7 +72,7 @@ def in_lost_regions(points, recovery):
     kept = {region.index for region in recovery.record.regions}
     inside = np.zeros(len(points), bool)
     for index in set(INDICES) - kept:
-        offset = points - region_centre(SQUARES, index)
+        offset = points - SQUARES.region_centre(index)
         inside |= (np.abs(offset) <= SQUARES.region_side_m / 2).all(axis=1)
     return inside
 
@@ -142,7 +142,7 @@ def test_outside_of_the_boxes_that_are_told_nothing_changes(recovered):
     recovery = recovered(flipped(data, chunk.end - 20))
     (loss,) = recovery.losses
     blocks = morton.decode(seen.codes, 3)
-    corner = region_corner(SQUARES, region.index)
+    corner = SQUARES.region_corner(region.index)
     places = np.concatenate([blocks * 8.0, blocks * 8.0 + 7, leaves])
     points = np.concatenate(
         [corner + (places + rng.uniform(-1, 2, places.shape)) * SQUARES.leaf_m for _ in range(10)]

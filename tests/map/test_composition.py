@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 from support.map_records import random_record, with_levels
 from triquad_format.records import morton
-from triquad_format.records.region import (
-    BLOCK_BYTES,
-    Evidence,
-    MapRecord,
-    RegionIndex,
-    region_corner,
-)
+from triquad_format.records.field_settings import RegionIndex
+from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord
 from triquad_map.composition.region import no_surfels
 from triquad_map.reference.evaluator import MapEvaluator
 
@@ -38,7 +33,7 @@ class SlowSpace:
         """Whether a ray ended in a voxel or crossed it, by the region that owns it."""
         middle = (voxel + 0.5) * self.settings.leaf_m
         x, y, z = (math.floor(c / self.settings.region_pitch_m + 0.5) for c in middle)
-        corner = region_corner(self.settings, (x, y, z)) / self.settings.leaf_m
+        corner = self.settings.region_corner((x, y, z)) / self.settings.leaf_m
         inner = voxel - np.round(corner).astype(int)
         masks = self.blocks.get(((x, y, z), *(inner // 8).tolist()))
         a, b, c = (inner % 8).tolist()
@@ -97,7 +92,7 @@ def test_the_nearest_surface_is_that_of_the_region_where_it_is_nearest(
     best = np.full(len(points), 9.0)
     for region in record.regions:
         alone = MapEvaluator(dataclasses.replace(record, regions=(region,)))
-        corner = region_corner(record.settings, region.index)
+        corner = record.settings.region_corner(region.index)
         nearest = no_surfels(np.full(len(points), 1e4))
         alone.region_views[0].surfels.find_nearest((points - corner) / leaf_m, nearest)
         best = np.minimum(best, nearest.distances * leaf_m)

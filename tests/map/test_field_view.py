@@ -3,8 +3,7 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import RegionIndex, region_centre
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.status import Status
 from triquad_map.composition.field_view import FieldView
 from triquad_map.composition.region import FieldValues
@@ -19,7 +18,7 @@ class NumberedRegion:
 
     def __init__(self, number: int, index: RegionIndex) -> None:
         self.index = index
-        self.centre = region_centre(FIELD, index)
+        self.centre = FIELD.region_centre(index)
         self.engine = self.evidence = self
         self.number = number
 

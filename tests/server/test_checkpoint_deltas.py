@@ -10,7 +10,7 @@ from support.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files
 from triquad_format.mapfile.reader import read_map, read_map_file
-from triquad_format.records.region import RegionIndex
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.recovery.recovered_map import recover
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges, Mapper

@@ -5,10 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import (
     BLOCK_BYTES,
-    BLOCK_VOXELS,
     Evidence,
     MapRecord,
     Mlp,

@@ -6,16 +6,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
-    BLOCK_VOXELS,
     Evidence,
     MapRecord,
     Mlp,
     Region,
-    RegionIndex,
     TrainingState,
     VertexTable,
 )

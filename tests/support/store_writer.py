@@ -6,7 +6,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from support.map_records import random_record
-from triquad_format.records.region import MapRecord, Region, RegionIndex
+from triquad_format.records.field_settings import RegionIndex
+from triquad_format.records.region import MapRecord, Region
 from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.settings import Settings, StoreSettings
 from triquad_server.store.store import Store

@@ -31,8 +31,9 @@ from triquad_format.mapfile.parts.part import (
     TOPICS,
 )
 from triquad_format.mapfile.parts.region_parts import RegionParts
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord, RegionIndex
+from triquad_format.records.region import MapRecord
 
 _BLOCK_BYTES = 1 << 20
 

@@ -42,8 +42,9 @@ from triquad_format.mapfile.parts.part import (
     Part,
     PartKey,
 )
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord, RegionIndex
+from triquad_format.records.region import MapRecord
 
 # Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
 # good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.

@@ -9,19 +9,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from triquad_format.errors import FormatError
 from triquad_format.records import morton
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
-    BLOCK_VOXELS,
     Evidence,
     MapRecord,
     Region,
-    RegionIndex,
     TrainingState,
     VertexTable,
-    leaf_coordinates,
     masked,
-    region_centre,
 )
 
 SLACK_LEAVES = 1 / 16
@@ -58,10 +54,10 @@ def leaf_box(
     high: NDArray[np.float64],
 ) -> LeafBox:
     """The box between two corners [3] of the map frame, grown by what rounding may need."""
-    centre = region_centre(settings, index)
+    centre = settings.region_centre(index)
     return LeafBox(
-        leaf_coordinates(settings, low - centre) - SLACK_LEAVES,
-        leaf_coordinates(settings, high - centre) + SLACK_LEAVES,
+        settings.leaf_coordinates(low - centre) - SLACK_LEAVES,
+        settings.leaf_coordinates(high - centre) + SLACK_LEAVES,
     )
 
 
@@ -133,7 +129,7 @@ def _crop_training(
     kept: list[NDArray[np.intp]],
     box: LeafBox,
 ) -> TrainingState:
-    leaves = leaf_coordinates(settings, training.sample_points)
+    leaves = settings.leaf_coordinates(training.sample_points)
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))
     samples = training.budget_samples * len(inside)  # rounded up below, so that none is forgotten
     return dataclasses.replace(

@@ -1,9 +1,18 @@
-"""The settings that define a field: they travel with every map."""
+"""The settings that define a field, and the places of its regions: they travel with every map.
+
+A region is a cube of the world of side ``2**depth * leaf_m``. Region ``(i, j, k)`` is centred at
+``(i, j, k) * region_pitch_m`` of the map frame; neighbours overlap by ``overlap_m`` and are
+blended there (see :mod:`triquad_map.composition`). Inside a region,
+``u = (p - centre) / leaf_m + 2**(depth - 1)`` are leaf coordinates in ``[0, 2**depth]``.
+"""
 
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
+
+import numpy as np
+from numpy.typing import NDArray
 
 from triquad_format.errors import SettingsError
 
@@ -14,6 +23,13 @@ ENCODINGS: tuple[Encoding, ...] = get_args(Encoding)
 
 OVERLAP_LEAVES = 16
 """Leaf cells by which neighbouring regions overlap."""
+
+BLOCK_VOXELS = 8
+"""Leaves along the side of a block of evidence."""
+
+RegionIndex = tuple[int, int, int]
+
+_Float = TypeVar("_Float", bound=np.floating)
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:
@@ -91,8 +107,29 @@ class FieldSettings:
         return self.leaf_m * OVERLAP_LEAVES
 
     @property
+    def owned_blocks(self) -> range:
+        """Blocks of evidence, along each axis, in the space that a region alone answers for.
+
+        Neighbours meet in the middle of their overlap.
+        """
+        margin = OVERLAP_LEAVES // 2 // BLOCK_VOXELS
+        return range(margin, (1 << self.depth) // BLOCK_VOXELS - margin)
+
+    @property
     def input_size(self) -> int:
         """Length of the MLP's input vector."""
         features = self.feature_levels * self.feature_size if self.encoding != "fourier" else 0
         fourier = 6 * self.frequencies if self.encoding != "features" else 0
         return features + fourier
+
+    def region_centre(self, index: RegionIndex) -> NDArray[np.float64]:
+        """Centre [3] of a region in the map frame, metres."""
+        return np.asarray(index, np.float64) * self.region_pitch_m
+
+    def region_corner(self, index: RegionIndex) -> NDArray[np.float64]:
+        """Least corner [3] of a region's cube in the map frame, metres."""
+        return self.region_centre(index) - self.region_side_m / 2
+
+    def leaf_coordinates(self, offset: NDArray[_Float]) -> NDArray[_Float]:
+        """Leaf coordinates [N, 3] at ``offset`` [N, 3] from a region's centre, metres."""
+        return np.asarray(offset / self.leaf_m + (1 << (self.depth - 1)), offset.dtype)

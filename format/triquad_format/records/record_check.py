@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError
 from triquad_format.records import morton
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
-    BLOCK_VOXELS,
     MAX_INTEGER,
     MAX_LEVEL,
     MAX_SEEN_S,

@@ -1,29 +1,20 @@
 """A region as plain arrays: what the map file holds and what the evaluator reads.
 
-A region is a cube of the world of side ``2**depth * leaf_m``. Region ``(i, j, k)`` is centred at
-``(i, j, k) * region_pitch_m`` of the map frame; neighbours overlap by ``overlap_m`` and are
-blended there (see :mod:`triquad_map.reference.evaluator`).
-
-Inside a region, ``u = (p - centre) / leaf_m + 2**(depth - 1)`` are leaf coordinates in
-``[0, 2**depth]``. At level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a
-plane lies at ``(a, b) * 2**(depth - l)``. Evidence voxels have the side of a leaf; a block is a
-cube of 8 x 8 x 8 voxels.
+Where it lies and what its coordinates are, :mod:`triquad_format.records.field_settings` tells. At
+level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a plane lies at
+``(a, b) * 2**(depth - l)``. Evidence voxels have the side of a leaf.
 """
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.records import morton
-from triquad_format.records.field_settings import OVERLAP_LEAVES, FieldSettings
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 
 AXES = ((0, 1), (0, 2), (1, 2))
 """Coordinate axes of the planes XY, XZ and YZ."""
-
-BLOCK_VOXELS = 8
-"""Voxels along the side of an evidence block."""
 
 BLOCK_BYTES = BLOCK_VOXELS**3 // 8
 """Bytes of one bit mask of a block: voxel (x, y, z) is bit ``z`` of byte ``x * 8 + y``."""
@@ -39,11 +30,7 @@ MAX_INTEGER = 32_639
 
 MLP_LAYERS = 3
 
-RegionIndex = tuple[int, int, int]
-
 _BITS_SET = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype="u1")
-
-_Float = TypeVar("_Float", bound=np.floating)
 
 
 @dataclass(frozen=True)
@@ -60,15 +47,6 @@ class VertexTable:
         """The feature vectors [V, feature_size] themselves: integers count steps of ``scale``."""
         vectors = self.features.astype(np.float32)
         return vectors if self.scale is None else vectors * np.float32(self.scale)
-
-    def rows_of(self, vertices: NDArray[np.integer]) -> NDArray[np.intp]:
-        """Rows [N] of the vertices at integer coordinates [N, 2]; ``V`` where there is none."""
-        if not len(self.codes):
-            return np.zeros(len(vertices), np.intp)
-        wanted = morton.encode(vertices)
-        rows = np.searchsorted(self.codes, wanted)
-        found = self.codes[np.minimum(rows, len(self.codes) - 1)] == wanted
-        return np.where(found, rows, len(self.codes))
 
 
 @dataclass(frozen=True)
@@ -148,30 +126,6 @@ class MapRecord:
     def has_evidence(self) -> bool:
         """Whether rays have shown anything; without evidence all is ``UNKNOWN``."""
         return any(len(region.evidence.codes) for region in self.regions)
-
-
-def region_centre(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:
-    """Centre [3] of a region in the map frame, metres."""
-    return np.asarray(index, np.float64) * settings.region_pitch_m
-
-
-def owned_blocks(settings: FieldSettings) -> range:
-    """Blocks of evidence, along each axis, in the space that a region alone answers for.
-
-    Neighbours meet in the middle of their overlap.
-    """
-    margin = OVERLAP_LEAVES // 2 // BLOCK_VOXELS
-    return range(margin, (1 << settings.depth) // BLOCK_VOXELS - margin)
-
-
-def region_corner(settings: FieldSettings, index: RegionIndex) -> NDArray[np.float64]:
-    """Least corner [3] of a region's cube in the map frame, metres."""
-    return region_centre(settings, index) - settings.region_side_m / 2
-
-
-def leaf_coordinates(settings: FieldSettings, offset: NDArray[_Float]) -> NDArray[_Float]:
-    """Leaf coordinates [N, 3] at ``offset`` [N, 3] from a region's centre, metres."""
-    return np.asarray(offset / settings.leaf_m + (1 << (settings.depth - 1)), offset.dtype)
 
 
 def seen_voxels(evidence: Evidence, masks: NDArray[np.uint8]) -> NDArray[np.int64]:

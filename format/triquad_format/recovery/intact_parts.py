@@ -41,7 +41,7 @@ from triquad_format.mapfile.parts.part import (
     TRAINING,
     PartKey,
 )
-from triquad_format.records.region import RegionIndex
+from triquad_format.records.field_settings import RegionIndex
 
 _Content = TypeVar("_Content")
 

@@ -29,19 +29,9 @@ from triquad_format.mapfile.parts.part import (
 )
 from triquad_format.mapfile.parts.region_parts import RegionParts
 from triquad_format.records.crop import LeafBox, status_voxels
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import (
-    AXES,
-    MapRecord,
-    Region,
-    RegionIndex,
-    leaf_coordinates,
-    masked,
-    region_centre,
-    region_corner,
-    seen_voxels,
-)
+from triquad_format.records.region import AXES, MapRecord, Region, masked, seen_voxels
 from triquad_format.recovery.intact_parts import IntactParts, intact_parts
 
 STATUS_REACH_LEAVES = 2
@@ -186,11 +176,11 @@ def _missing_squares(
 def _masked_where_lost(settings: FieldSettings, region: Region, losses: Iterable[Loss]) -> Region:
     """The region without evidence where vertices are lost, be they its own or a neighbour's."""
     evidence = region.evidence
-    centre = region_centre(settings, region.index)
+    centre = settings.region_centre(region.index)
     for loss in losses:
         if loss.key.topic == VERTICES and loss.meets(centre, settings.region_side_m):
             corners = effect_box(loss.key, settings)
-            box = LeafBox(*leaf_coordinates(settings, corners - centre))
+            box = LeafBox(*settings.leaf_coordinates(corners - centre))
             evidence = masked(evidence, ~status_voxels(evidence, box))
     return dataclasses.replace(region, evidence=evidence)
 
@@ -209,5 +199,5 @@ def effect_box(key: PartKey, settings: FieldSettings) -> NDArray[np.float64]:
         # A vertex has an effect as far as the side of its level's nodes; those at the upper border
         # of a square belong to the next.
         box.low[list(AXES[key.plane])] -= vertex_reach(settings)
-    corner = region_corner(settings, key.region)
+    corner = settings.region_corner(key.region)
     return corner + np.stack([box.low, box.high]) * settings.leaf_m

@@ -5,8 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import RegionIndex, leaf_coordinates, owned_blocks
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.composition.field_view import FieldView
 from triquad_map.composition.region import MapRegion, Split, in_one, no_surfels
@@ -100,7 +99,7 @@ class ComposedView(FieldView):
             return
         found = no_surfels(limits[near] / leaf_m)
         surfels = region.surfels
-        surfels.find_nearest(leaf_coordinates(self._settings, offsets[near]), found)
+        surfels.find_nearest(self._settings.leaf_coordinates(offsets[near]), found)
         hits = np.flatnonzero(found.rows >= 0)
         rows, to = found.rows[hits], near[hits] + part.start
         corner = region.centre - half_m
@@ -163,11 +162,11 @@ class ComposedView(FieldView):
     def _search_region(self, found: NearestUnknown, points: Doubles, region: MapRegion) -> None:
         """Search what a region owns of the space around."""
         leaf_m = self._settings.leaf_m
-        voxels = leaf_coordinates(self._settings, points - region.centre)
+        voxels = self._settings.leaf_coordinates(points - region.centre)
         distances = found.distance / leaf_m
         before = distances.copy()
         nearest = np.empty((len(points), 3))
-        region.evidence.find_unknown(voxels, owned_blocks(self._settings), distances, nearest)
+        region.evidence.find_unknown(voxels, self._settings.owned_blocks, distances, nearest)
         nearer = distances < before
         found.distance[nearer] = distances[nearer] * leaf_m
         corner = region.centre - self._settings.region_side_m / 2

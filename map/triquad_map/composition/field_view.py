@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import leaf_coordinates
 from triquad_format.records.status import Status
 
 from triquad_map.composition.region import FieldRegion, FieldValues, Split, in_one
@@ -124,7 +123,7 @@ class FieldView:
         status = np.full(len(points), Status.UNKNOWN, np.uint8)
         for owned in owners.groups:
             offsets = points[owned.points] - owned.region.centre
-            voxels = leaf_coordinates(self._settings, offsets)
+            voxels = self._settings.leaf_coordinates(offsets)
             status[owned.points] = owned.region.evidence.status(voxels, reach)
         return status
 

@@ -7,8 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import RegionIndex, region_centre
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.surface import FieldSample, SampleField
 
@@ -162,7 +161,7 @@ class RecordedRegion:
     ) -> None:
         """``fit`` makes the surfels, which takes a while; it is called once at most."""
         self.index = index
-        self.centre = region_centre(settings, index)
+        self.centre = settings.region_centre(index)
         self.engine = engine
         self.evidence = evidence
         self._fit = fit

@@ -10,7 +10,7 @@ import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import AXES, Region, VertexTable, leaf_coordinates
+from triquad_format.records.region import AXES, Region, VertexTable
 
 from triquad_map.composition.region import FieldValues
 from triquad_map.reference.coded_rows import ONE_CELL, CodedRows
@@ -67,7 +67,7 @@ class RegionField:
         settings = self._settings
         size = settings.feature_size
         leaf = np.float32(settings.leaf_m)
-        u = leaf_coordinates(settings, local)
+        u = settings.leaf_coordinates(local)
         features = np.zeros((len(local), settings.feature_levels * size), np.float32)
         for (plane, level), vertices in self._features.items():
             axes = AXES[plane]

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, Evidence
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
+from triquad_format.records.region import BLOCK_BYTES, Evidence
 from triquad_format.records.status import Status
 
 from triquad_map.reference.coded_rows import ONE_CELL, CodedRows

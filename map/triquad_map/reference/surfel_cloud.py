@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
-from triquad_format.records.region import BLOCK_VOXELS, Evidence, seen_voxels, surface_counts
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import Evidence, seen_voxels, surface_counts
 
 from triquad_map.composition.region import NearestSurfels
 from triquad_map.reference.seen_blocks import SeenBlocks

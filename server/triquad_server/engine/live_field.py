@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.arrays import Longs
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import AXES, Mlp, Region, RegionIndex, TrainingState, VertexTable
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
 from triquad_map.compiled.field.quadtree import LiveQuadtree

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import Region, RegionIndex, leaf_coordinates, region_centre
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.region import Region
 from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.compiled.surfels.surfel_map import first_surfels
@@ -64,7 +64,7 @@ class LiveRegion:
         self, index: RegionIndex, setup: RegionSetup, field: LiveField, evidence: LiveEvidence
     ) -> None:
         self.index = index
-        self.centre = region_centre(setup.field, index)
+        self.centre = setup.field.region_centre(index)
         self.field = field
         self.evidence = evidence
         _, seed = setup.seeds(index)
@@ -165,7 +165,7 @@ class LiveRegion:
 
     def voxels(self, points: Doubles) -> Doubles:
         """Voxel coordinates [N, 3] of points."""
-        return leaf_coordinates(self._settings, points - self.centre)
+        return self._settings.leaf_coordinates(points - self.centre)
 
     def freeze(self, epoch: int, before: FrozenRegion | None) -> FrozenRegion:
         """The region as it is now, to be published with ``epoch``.

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_format.records.region import MapRecord, RegionIndex
+from triquad_format.records.field_settings import RegionIndex
+from triquad_format.records.region import MapRecord
 
 from triquad_server.engine.trainer import GradientSums
 from triquad_server.epochs import Epoch, FrozenRegion

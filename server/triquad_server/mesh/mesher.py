@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
-from triquad_format.records.region import BLOCK_VOXELS
+from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.status import Status
 from triquad_format.wire.tile_codec import STEPS, TileSurface
 from triquad_map.compiled.kernel import kernel

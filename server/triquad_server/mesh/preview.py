@@ -17,7 +17,7 @@ from triquad_format.mapfile.writer import Previews
 from triquad_format.records import morton
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord, Region, region_corner, seen_voxels
+from triquad_format.records.region import MapRecord, Region, seen_voxels
 from triquad_map.reference.evaluator import MapEvaluator
 
 _STEP_M = 2.0**-5
@@ -114,7 +114,7 @@ def coarse_mesh(
     seen = morton.encode(seen_voxels(region.evidence, region.evidence.surface) // NET_LEAVES)
     cells = morton.decode(np.unique(seen), 3)
     side_m = settings.leaf_m * NET_LEAVES
-    origin = region_corner(settings, region.index)
+    origin = settings.region_corner(region.index)
     corners = morton.encode(cells[:, None] + _CORNERS)  # [C, 8]
     codes, where = np.unique(corners, return_inverse=True)
     values = distances(morton.decode(codes, 3) * side_m + origin)

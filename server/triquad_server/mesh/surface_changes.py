@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import RegionIndex
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.compiled.team import Team
 

@@ -10,7 +10,7 @@ from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.mapfile.parts.part import MAP, Part, PartKey
-from triquad_format.records.region import RegionIndex
+from triquad_format.records.field_settings import RegionIndex
 
 from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mesh.preview import preview_part

@@ -9,7 +9,8 @@ from mcap.reader import make_reader
 from triquad_format.mapfile.parts.part import PREFIX, PREVIEW
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
-from triquad_format.records.region import BLOCK_VOXELS, MapRecord, region_centre
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import MapRecord
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.command import ToolError
@@ -61,7 +62,7 @@ def _field(record: MapRecord) -> str:
         codes = region.evidence.codes[:: len(region.evidence.codes) // _PROBES + 1]
         leaves = (morton.decode(codes, 3) + 0.5) * BLOCK_VOXELS
         offset = leaves * record.settings.leaf_m - record.settings.region_side_m / 2
-        centres.append(offset + region_centre(record.settings, region.index))
+        centres.append(offset + record.settings.region_centre(region.index))
     if not centres:
         return ""
     points = np.concatenate(centres)

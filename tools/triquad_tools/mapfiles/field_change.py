@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord, Region, region_centre, seen_voxels
+from triquad_format.records.region import MapRecord, Region, seen_voxels
 from triquad_map.reference.evaluator import MapEvaluator
 
 QUANTILE = 0.99
@@ -79,7 +79,7 @@ def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
     kinds: list[list[NDArray[np.float64]]] = [[np.zeros((0, 3))] for _ in range(3)]
     for region in before.regions:
         probes = draw_probes(before.settings, region, rng, count)
-        centre = region_centre(before.settings, region.index)
+        centre = before.settings.region_centre(region.index)
         for kind, field in zip(kinds, dataclasses.fields(probes), strict=True):
             kind.append(getattr(probes, field.name) + centre)
     everywhere = Probes(*(np.concatenate(kind) for kind in kinds))

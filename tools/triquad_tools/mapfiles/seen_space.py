@@ -5,17 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import (
-    BLOCK_VOXELS,
-    Evidence,
-    MapRecord,
-    Region,
-    masked,
-    owned_blocks,
-    region_corner,
-    seen_voxels,
-)
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
+from triquad_format.records.region import Evidence, MapRecord, Region, masked, seen_voxels
 
 
 @dataclass(frozen=True)
@@ -28,7 +19,7 @@ class Columns:
 
 def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
     """The evidence that answers of the region hang on; the rest lies in its neighbours' space."""
-    blocks, mine = morton.decode(region.evidence.codes, 3), owned_blocks(settings)
+    blocks, mine = morton.decode(region.evidence.codes, 3), settings.owned_blocks
     owned = ((blocks >= mine.start) & (blocks < mine.stop)).all(axis=1, keepdims=True)
     return masked(region.evidence, np.where(owned, np.uint8(0xFF), np.uint8(0)))
 
@@ -42,7 +33,7 @@ def evidence_box(settings: FieldSettings, region: Region) -> NDArray[np.float64]
         return None
     blocks = morton.decode(region.evidence.codes, 3)
     ends = np.stack([blocks.min(axis=0), blocks.max(axis=0) + 1])
-    return region_corner(settings, region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
+    return settings.region_corner(region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
 
 
 def evidence_bounds(record: MapRecord) -> NDArray[np.float64] | None:
@@ -84,5 +75,5 @@ def _metres(
     settings: FieldSettings, region: Region, voxels: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Middles ``[N, 3]`` of voxels ``[N, 3]`` of a region."""
-    corner = region_corner(settings, region.index)
+    corner = settings.region_corner(region.index)
     return corner + (voxels + 0.5) * settings.leaf_m

@@ -15,7 +15,7 @@ from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import FileRef, Manifest
 from triquad_format.mapfile.parts.part import REGION_TOPICS
-from triquad_format.records.region import RegionIndex
+from triquad_format.records.field_settings import RegionIndex
 
 from triquad_tools.console.report import print_columns, utc_time
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MAX_LEVEL, MapRecord, Region, region_centre
+from triquad_format.records.region import MAX_LEVEL, MapRecord, Region
 
 from triquad_tools.console.report import Row, print_columns, print_rows
 from triquad_tools.mapfiles.seen_space import evidence_box, owned_evidence
@@ -157,7 +157,7 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
         levels = np.bincount(evidence.levels, minlength=MAX_LEVEL + 1)
     return RegionSummary(
         index=region.index,
-        centre_m=_rounded(region_centre(record.settings, region.index)),
+        centre_m=_rounded(record.settings.region_centre(region.index)),
         parameters=region.parameters,
         precision=tuple(sorted({table.features.dtype.name for table in region.tables})),
         scales=tuple(sorted(table.scale for table in region.tables if table.scale is not None)),

@@ -13,7 +13,7 @@ from triquad_format.mapfile.manifest import Manifest
 from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord, region_centre, region_corner
+from triquad_format.records.region import MapRecord
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import centimetres, utc_time
@@ -103,9 +103,9 @@ def _window(grid: PlanGrid, settings: FieldSettings, key: PartKey) -> Window | N
     if key.topic != EVIDENCE and (key.topic, key.plane) != (VERTICES, _PLAN_PLANE):
         return None
     box = extent(settings, key)
-    corner = region_corner(settings, key.region)[:2]
+    corner = settings.region_corner(key.region)[:2]
     low, high = (corner + settings.leaf_m * end[:2] for end in (box.low, box.high))
-    centre = region_centre(settings, key.region)[:2]
+    centre = settings.region_centre(key.region)[:2]
     half = settings.region_pitch_m / 2
     return grid.window(np.maximum(low, centre - half), np.minimum(high, centre + half))
 
@@ -124,7 +124,7 @@ def sample_errors(record: MapRecord) -> SampleErrors:
     for region in record.regions:
         if region.training is not None:
             near = np.abs(region.training.sample_labels) <= record.settings.leaf_m / 2
-            centre = region_centre(record.settings, region.index)
+            centre = record.settings.region_centre(region.index)
             points.append(region.training.sample_points[near] + centre)
             labels.append(region.training.sample_labels[near].astype(np.float64))
     every = sum(map(len, points)) // _MOST_SAMPLES + 1

@@ -18,7 +18,7 @@ from triquad_format.mapfile.parts.columns import (
     unshuffle_codes,
 )
 from triquad_format.mapfile.parts.part import PREFIX, Part, PartKey
-from triquad_format.records.region import RegionIndex
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.wire.codec import ArraySpec, unpack_array
 from triquad_format.wire.structure import MAX_OBJECTS, binary_offsets, check_structure
 

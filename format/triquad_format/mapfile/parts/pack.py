@@ -33,12 +33,11 @@ from triquad_format.mapfile.parts.part import (
     cube_shift,
     square_shift,
 )
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
     MapRecord,
     Region,
-    RegionIndex,
     TrainingState,
     VertexTable,
     surface_counts,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from triquad_format.records import morton
 from triquad_format.records.crop import LeafBox, whole_region
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import AXES, BLOCK_VOXELS, RegionIndex
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
+from triquad_format.records.region import AXES
 
 PREFIX = "/triquad/"
 MAP = "/triquad/map"

@@ -32,7 +32,7 @@ from triquad_format.mapfile.parts.part import (
     cube_shift,
     square_shift,
 )
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
@@ -41,7 +41,6 @@ from triquad_format.records.region import (
     Evidence,
     Mlp,
     Region,
-    RegionIndex,
     TrainingState,
     VertexTable,
     surface_counts,

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, surface_counts
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
 
 from triquad_map.compiled.evidence.marking import mark_crossed, mark_ends

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
-from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, surface_counts
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.evidence.seen_voxels import (
     LOW,

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.region import BLOCK_VOXELS
+from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.status import Status
 
 from triquad_map.compiled.kernel import kernel

@@ -2,7 +2,8 @@
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES
 
 from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT, SeenVoxels
 from triquad_map.compiled.kernel import kernel

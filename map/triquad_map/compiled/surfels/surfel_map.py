@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Doubles, Ints, Longs
-from triquad_format.records.region import BLOCK_BYTES, BLOCK_VOXELS, surface_counts
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints
-from triquad_format.records.region import BLOCK_VOXELS
+from triquad_format.records.field_settings import BLOCK_VOXELS
 
 from triquad_map.compiled.evidence.seen_voxels import LOW
 from triquad_map.compiled.kernel import kernel
