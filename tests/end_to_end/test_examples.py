@@ -11,8 +11,10 @@ import pytest
 import triquad_client
 from numpy.typing import NDArray
 from PIL import Image, ImageColor
+from scipy.spatial import cKDTree
 from support import servers
 from triquad_tools.commands.inspect import main as inspect_map
+from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.plots.plan import FREE, UNKNOWN
 from triquad_tools.plots.slice_plan import SURFACE
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
@@ -75,6 +77,23 @@ def clearance(path: NDArray[np.float64]) -> float:
     along = np.arange(0, len(path) - 1, 0.005)
     places = [np.interp(along, np.arange(len(path)), axis) for axis in path.T]
     return float(SCENE.sdf(np.stack(places, axis=1)).min())
+
+
+def test_the_mesh_of_a_file_is_like_that_of_its_server(endpoint: str, tmp_path: Path) -> None:
+    file, saved = tmp_path / "map.triquad", tmp_path / "corner.ply"
+    low, high = (0.0, -8.0, -1.0), (10.0, 8.0, 5.0)
+    with triquad_client.connect(endpoint, "demo") as client:
+        client.download_map(file)
+        served = client.mesh((low, high))
+    command = [sys.executable, EXAMPLES / "mesh_of_a_file.py", file, saved]
+    command += ["--low", *map(str, low), "--high", *map(str, high)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=servers.WAIT_S)
+    assert done.returncode == 0, done.stderr
+    mesh = read_mesh(saved)
+    assert f"{len(mesh.faces):,} faces" in done.stdout
+    assert len(mesh.faces) == pytest.approx(len(served.faces), rel=0.01)
+    distances = cKDTree(served.vertices).query(mesh.vertices)[0]
+    assert np.quantile(distances, 0.99) < 0.005
 
 
 def test_the_planned_path_is_free(run: Run) -> None:

@@ -21,8 +21,8 @@ from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
 from triquad_format.records.region import MAX_SEEN_S, Evidence, masked, seen_voxels, surface_counts
+from triquad_format.records.seen_space import owned_evidence
 from triquad_format.recovery.recovered_map import recover
-from triquad_tools.mapfiles.seen_space import owned_evidence
 
 CUBES = dataclasses.replace(SMALL, depth=9)
 """Two cubes to a side."""

@@ -15,15 +15,14 @@ from triquad_client.mesh.mesh import joined
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record
+from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import mesh_tile, surface_tiles
 from triquad_server.mesh.tile_lattice import tile_lattice
 from triquad_tools.commands.pack import main
-from triquad_tools.mapfiles.mesh import surface_mesh
 from triquad_tools.mapfiles.meshfile import read_mesh
-from triquad_tools.mapfiles.seen_space import surface_voxels
 
 BOX = ["0.1", "-4.7", "-2", "12.3", "4.1", "3"]
 LOW, HIGH = np.array([0.1, -4.7, -2]), np.array([12.3, 4.1, 3])
@@ -186,11 +185,6 @@ def at(index):
     record = exact_map(table(0.1, 0.5))
     region = dataclasses.replace(record.regions[0], index=(index, 0, 0))
     return dataclasses.replace(record, regions=(region,))
-
-
-def test_far_regions_are_meshed_as_near_ones():
-    near, far = (surface_mesh(at(index), None, 0.2) for index in (0, 2**31 - 1))
-    assert len(near.faces) == len(far.faces) > 10_000
 
 
 def test_blocks_that_are_too_far_for_their_indices_are_told(tmp_path, capsys):

@@ -10,9 +10,8 @@ from support.map_records import random_record
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands.inspect import main
-from triquad_tools.mapfiles.seen_space import seen_columns
 from triquad_tools.plots.diff_plan import ADDED, GONE
-from triquad_tools.plots.map_plan import latest_epochs, sample_errors
+from triquad_tools.plots.map_plan import latest_epochs, sample_errors, seen_columns
 from triquad_tools.plots.plan import FREE, UNKNOWN, Layer, PlanGrid, Scale, draw_layers, draw_values
 from triquad_tools.plots.slice_plan import SURFACE
 

@@ -1,5 +1,6 @@
 """A map file that answers as a server does, without one."""
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -7,16 +8,19 @@ from typing import Any
 
 from triquad_format.errors import RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
-from triquad_format.mapfile.reader import MapFile, read_map_file
+from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.region import MapRecord
 from triquad_map.questions.answers import Answers, QuestionLimits
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
 
 from triquad_client.calls.queries import MapQueries
+from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
+from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.call import Batch, Call, ResultT
 from triquad_client.net.driver import BlockingDriver
+from triquad_client.offline.map_mesh import Report, map_mesh
 
 _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
 """Nobody else waits."""
@@ -27,7 +31,7 @@ class LocalDriver(BlockingDriver):
 
     def __init__(self, record: MapRecord) -> None:
         self._open = open_view(record)
-        self._view = self._open.view
+        self.view = self._open.view
         self._answers = Answers(self._epoch, _NO_LIMITS)
 
     @property
@@ -45,11 +49,11 @@ class LocalDriver(BlockingDriver):
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:
         """The view, where its epoch is asked for, or the newest."""
-        if number not in (0, self._view.epoch):
+        if number not in (0, self.view.epoch):
             raise RefusedError(
-                "epoch_gone", f"epoch {number} is not kept; kept is [{self._view.epoch}]"
+                "epoch_gone", f"epoch {number} is not kept; kept is [{self.view.epoch}]"
             )
-        yield self._view
+        yield self.view
 
 
 class OfflineMap(MapQueries):
@@ -59,14 +63,21 @@ class OfflineMap(MapQueries):
     the same.
     """
 
-    def __init__(self, file: MapFile) -> None:
-        """Use :func:`open_map`."""
+    def __init__(self, record: MapRecord, stamp_ns: int = 0) -> None:
+        """Open a map that is in memory already; use :func:`open_map` for a file."""
         super().__init__(self._answer)
-        driver = LocalDriver(file.record)
+        driver = LocalDriver(record)
         self._driver: LocalDriver | None = driver
-        self.name = file.record.name
-        self.epoch = file.record.epoch
-        self.stamp_ns = file.manifest.stamp_ns
+        # Meshes need no more of it: the view has the rest in a form of its own.
+        self._seen = dataclasses.replace(
+            record,
+            regions=tuple(
+                dataclasses.replace(region, tables=(), training=None) for region in record.regions
+            ),
+        )
+        self.name = record.name
+        self.epoch = record.epoch
+        self.stamp_ns = stamp_ns
         """When its epoch was written, nanoseconds since 1970; 0: the file does not tell."""
         self.compiled = driver.compiled
         """Whether compiled code answers, as in the server; else numpy, which is far slower."""
@@ -83,11 +94,35 @@ class OfflineMap(MapQueries):
         if driver is not None:
             driver.close()
 
+    def mesh(
+        self,
+        bounds: Bounds | None = None,
+        cell_m: float = 0.1,
+        report: Report | None = None,
+    ) -> Mesh:
+        """The surface where rays have seen one, by marching cubes: the faces centred in ``bounds``.
+
+        Args:
+            bounds: corners of a box, metres, map frame; ``None``: everywhere.
+            cell_m: side of the cells, 0.01 to 10 m; those of a server's mesh have 0.1 m unless it
+                is set otherwise.
+            report: is told after each block how many are done, and of how many.
+
+        Raises:
+            InvalidInputError: the bounds are not a box, the cells are out of range, there are more
+                than 50 million faces, or scikit-image is not installed.
+            ClosedError: the map was closed.
+        """
+        return map_mesh(self._opened().view, self._seen, bounds, cell_m=cell_m, report=report)
+
     def _answer(self, call: Call[ResultT]) -> ResultT:
+        return self._opened().run(call)
+
+    def _opened(self) -> LocalDriver:
         driver = self._driver
         if driver is None:
             raise ClosedError("the map is closed")
-        return driver.run(call)
+        return driver
 
 
 def open_map(path: str | Path) -> OfflineMap:
@@ -108,4 +143,5 @@ def open_map(path: str | Path) -> OfflineMap:
     chosen = Path(path)
     if chosen.is_dir():
         chosen = checkpoint_files(map_folder(chosen))[0].path
-    return OfflineMap(read_map_file(chosen))
+    file = read_map_file(chosen)
+    return OfflineMap(file.record, file.manifest.stamp_ns)

@@ -5,20 +5,16 @@ samples, in this process.
 """
 
 import numpy as np
+from triquad_client import OfflineMap
 from triquad_format.records.field_settings import ENCODINGS
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import settled_mapper
 from triquad_tools.evaluation.map_scores import score_street, street_probes
-from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
-from triquad_tools.mapfiles.mesh import surface_mesh
+from triquad_tools.evaluation.metrics import score_against_drive
 from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.street import street_drive
-
-_REFERENCE_M = 0.05
-_SAMPLES_MAX = 3_000_000
-_CELL_M = 0.1
 
 
 def measure_ablation(seed: int, scans: int, step_m: float) -> list[Figure]:
@@ -33,10 +29,8 @@ def _variant(encoding: str, drive: SimulatedDrive) -> list[Figure]:
     mapper = settled_mapper(f"with {encoding}", list(drive), settings)
     epoch = mapper.publish()
     field = score_street(epoch.query, street_probes(drive, np.random.default_rng(0)))
-    scoring = ScoreSettings(samples_max=_SAMPLES_MAX)
-    visible = drive.true_hits(_REFERENCE_M)
-    surface = surface_mesh(epoch.record(), None, _CELL_M)
-    mesh = score_against_scene(surface, drive.scene, visible, scoring)
+    with OfflineMap(epoch.record()) as opened:
+        mesh = score_against_drive(opened.mesh(), drive)
     return [
         Figure(f"{encoding}: parameters", epoch.parameters / 1e6, "M"),
         Figure(f"{encoding}: training samples", mapper.samples_trained / 1e6, "M"),

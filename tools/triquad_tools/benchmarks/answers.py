@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from triquad_format.records.region import MapRecord
+from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
 from triquad_map.questions.distance import DistanceOptions, Distances, distances
 from triquad_map.questions.spheres import spheres
@@ -14,7 +15,6 @@ from triquad_map.view import MapView
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.evaluation.map_scores import DrivenStreet
-from triquad_tools.mapfiles.seen_space import surface_voxels
 from triquad_tools.simulation.scene import Scene
 
 REACH_M = 5.0

@@ -19,19 +19,15 @@ from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.epochs import Epoch
 from triquad_server.mesh.preview import previews_of
-from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.core import seen_points
 from triquad_tools.benchmarks.figures import Figure, compare, seconds
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
-from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
 from triquad_tools.mapfiles.field_change import field_change
-from triquad_tools.mapfiles.mesh import surface_mesh
 from triquad_tools.mapfiles.packing import INTEGER_ERROR_M
 from triquad_tools.mapfiles.quantise import quantise
 
 _LARGE_BYTES = 100_000_000
-_MESH_SAMPLES = 3_000_000
 _SEED = 2  # of the points at which the file is compared with the live map
 _OFFLINE_SEED = 4
 _ROUNDS = 7
@@ -89,11 +85,8 @@ def _written(epoch: Epoch, record: MapRecord, path: Path) -> MapFileInfo:
 
 
 def _f_score(record: MapRecord, made: BenchStreet) -> float:
-    scene = made.drive.scene
-    mesh = surface_mesh(record, scene.bounds, Settings().mesh.cell_m)
-    scoring = ScoreSettings(samples_max=_MESH_SAMPLES)
-    scores = score_against_scene(mesh, scene, made.visible, scoring)
-    return 100 * scores.f_score
+    with OfflineMap(record) as opened:
+        return 100 * made.mesh_scores(opened.mesh(made.drive.scene.box)).f_score
 
 
 def _opening(record: MapRecord, folder: Path) -> list[Figure]:

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from triquad_client import Client, Mesh
+from triquad_client import Client
 from triquad_format.mapfile.reader import read_map
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
@@ -16,7 +16,6 @@ from triquad_tools.benchmarks.served import latency_figures, served, stream_besi
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.settling import FLUSH_TIMEOUT_S, wait_until_settled
 from triquad_tools.evaluation.map_scores import score_street
-from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
 
 _SOON_S = 2.0  # after the last scan
 _SETTLE_LIMIT_S = 300.0
@@ -46,9 +45,9 @@ def measure_server(made: BenchStreet) -> list[Figure]:
 def _early(client: Client, made: BenchStreet) -> list[Figure]:
     """The map soon after the last scan: all of it is taken from the epoch of that moment."""
     trained = client.status().samples_trained / 1e6
-    mesh = client.mesh(_bounds(made))
+    mesh = client.mesh(made.drive.scene.box)
     lost = client.flush(FLUSH_TIMEOUT_S)
-    scores = _mesh_scores(mesh, made)
+    scores = made.mesh_scores(mesh, _MESH_SAMPLES)
     return [
         Figure("scans dropped of 100", lost.lost + lost.refused, "", at_most=0),
         Figure("samples trained 2 s after the last scan", trained, "M"),
@@ -59,9 +58,9 @@ def _early(client: Client, made: BenchStreet) -> list[Figure]:
 
 def _converged(client: Client, made: BenchStreet) -> list[Figure]:
     street = score_street(client.query_sdf, made.probes)
-    mesh = client.mesh(_bounds(made))
-    times = [seconds(lambda: client.mesh(_bounds(made))) for _ in range(3)]
-    scores = _mesh_scores(mesh, made)
+    mesh = client.mesh(made.drive.scene.box)
+    times = [seconds(lambda: client.mesh(made.drive.scene.box)) for _ in range(3)]
+    scores = made.mesh_scores(mesh, _MESH_SAMPLES)
     return [
         Figure("converged: F-score", 100 * scores.f_score, "%", at_least=98),
         Figure("converged: accuracy, mean", 100 * scores.accuracy_m, "cm", at_most=0.9),
@@ -93,13 +92,3 @@ def _network(client: Client, made: BenchStreet, folder: Path) -> list[Figure]:
         Figure("100,000 points through the network", rate, "M points/s"),
         Figure("the same, share of the rate in process", share, "", at_least=0.6),
     ]
-
-
-def _bounds(made: BenchStreet) -> tuple[list[float], list[float]]:
-    low, high = made.drive.scene.bounds.tolist()
-    return low, high
-
-
-def _mesh_scores(mesh: Mesh, made: BenchStreet) -> MeshScores:
-    settings = ScoreSettings(samples_max=_MESH_SAMPLES)
-    return score_against_scene(mesh, made.drive.scene, made.visible, settings)

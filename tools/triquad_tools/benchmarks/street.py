@@ -5,12 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_client import Mesh
 from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
+from triquad_tools.evaluation.metrics import (
+    STREET_SAMPLES_MAX,
+    STREET_VOXEL_M,
+    MeshScores,
+    ScoreSettings,
+    score_against_scene,
+)
 from triquad_tools.recordings.cloud import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
@@ -18,7 +26,6 @@ from triquad_tools.simulation.street import street
 SCANS = 100
 _LENGTH_M = 110.0  # so that the map has some 2 million parameters
 _COLUMNS = 1024  # some 60,000 points a scan
-_VISIBLE_VOXEL_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -27,13 +34,18 @@ class BenchStreet(DrivenStreet):
 
     visible: NDArray[np.float64]  # [M, 3] exact surface points that the lidar hit
 
+    def mesh_scores(self, mesh: Mesh, samples_max: int = STREET_SAMPLES_MAX) -> MeshScores:
+        """Scores of a mesh within the scene's bounds, from so many samples at most."""
+        settings = ScoreSettings(samples_max=samples_max)
+        return score_against_scene(mesh, self.drive.scene, self.visible, settings)
+
 
 def bench_street(seed: int) -> BenchStreet:
     """100 scans along the exact street ``seed``."""
     scene = street(seed, _LENGTH_M)
     poses = drive(scene, SCANS, _LENGTH_M / SCANS)
     driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed))
-    visible = driven.drive.true_hits(_VISIBLE_VOXEL_M)
+    visible = driven.drive.true_hits(STREET_VOXEL_M)
     low, high = scene.bounds  # to which meshes are cut
     visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
     return BenchStreet(driven.drive, driven.scans, driven.probes, visible)

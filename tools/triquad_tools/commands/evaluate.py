@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_client import Client
 
 from triquad_tools.console.arguments import count, not_negative, positive, seed
 from triquad_tools.console.command import OK, ToolError, run
@@ -24,6 +23,7 @@ from triquad_tools.evaluation.metrics import (
     MeshScores,
     ScoreSettings,
     score_against_cloud,
+    score_against_drive,
     score_against_scene,
 )
 from triquad_tools.evaluation.open_map import open_map
@@ -34,8 +34,6 @@ from triquad_tools.simulation.street import street_drive
 
 _COMMAND = "triquad-eval"
 _SEED = 0  # of the points that are drawn; scores can be repeated
-_SERVER_SAMPLES_MAX = 3_000_000  # of a street's mesh: more change the scores by little
-_STREET_VOXEL_M = 0.05  # between the street's points that completion asks for
 
 Results = dict[str, Any]
 
@@ -86,12 +84,7 @@ def _on_street(options: argparse.Namespace) -> Results:
     probes = street_probes(drive, np.random.default_rng(_SEED))
     with open_map(options.target, options.map) as opened:
         results: Results = {"street": score_street(opened.query_sdf, probes)}
-        if isinstance(opened, Client):  # a file has no mesh
-            low, high = drive.scene.bounds.tolist()
-            mesh = opened.mesh((low, high))
-            visible = drive.true_hits(_STREET_VOXEL_M)
-            settings = ScoreSettings(samples_max=_SERVER_SAMPLES_MAX)
-            results["mesh"] = score_against_scene(mesh, drive.scene, visible, settings)
+        results["mesh"] = score_against_drive(opened.mesh(drive.scene.box), drive)
     return results
 
 

@@ -179,7 +179,7 @@ def _export(options: argparse.Namespace, path: Path) -> int:
     if grid:
         written = export_grid(source.record, box, cell_m, options.sparse, output)
     else:
-        from triquad_tools.mapfiles.mesh import export_mesh  # slow to import
+        from triquad_tools.mapfiles.meshfile import export_mesh  # slow to import
 
         written = export_mesh(source.record, box, cell_m, output)
     print(f"{output}: {written}")

@@ -19,7 +19,7 @@ from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wa
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.results import Intake, MapSize, Restart
 from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
-from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
+from triquad_tools.evaluation.metrics import MeshScores, score_against_drive
 from triquad_tools.plots.render import Camera, height_colours, render_mesh
 
 MAP = "demo"
@@ -28,8 +28,6 @@ _SEED = 0  # of the points that are asked
 _SETTLE_LIMIT_S = 70.0
 _QUERY_POINTS = 1_000
 _RESTART_POINTS = 50_000
-_MESH_SAMPLES = 3_000_000
-_VISIBLE_VOXEL_M = 0.05
 
 # The picture: over the start of the drive, down the street.
 _EYE_M = (-14.0, 0.8, 12.0)
@@ -95,19 +93,16 @@ def score(endpoint: str, street: DrivenStreet) -> Scored:
     """Compare the map with the exact street, and have the server write it to its store."""
     rng = np.random.default_rng(_SEED)
     points = rng.permutation(street.probes.near)[:_RESTART_POINTS]
-    scene = street.drive.scene
     with connect(endpoint, MAP) as client, progress("scoring") as report:
         report(0.0, "distances")
         field = score_street(client.query_sdf, street.probes)
         report(0.0, "mesh")
-        surface = client.mesh((scene.bounds[0].tolist(), scene.bounds[1].tolist()))
+        surface = client.mesh(street.drive.scene.box)
         checkpoint = client.checkpoint()
         answers = client.query_sdf(points)
         parameters = client.status().parameters
         report(0.0, "mesh against the exact surface")
-        settings = ScoreSettings(samples_max=_MESH_SAMPLES)
-        visible = street.drive.true_hits(_VISIBLE_VOXEL_M)
-        scores = score_against_scene(surface, scene, visible, settings)
+        scores = score_against_drive(surface, street.drive)
         report(0.0, f"{scores.samples:,} samples of the mesh")
     return Scored(field, scores, surface, parameters, checkpoint, points, answers)
 

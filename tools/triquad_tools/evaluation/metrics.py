@@ -14,7 +14,14 @@ from scipy.spatial import cKDTree
 from triquad_client import Mesh
 
 from triquad_tools.recordings.cloud import thin
+from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.scene import Scene
+
+STREET_VOXEL_M = 0.05
+"""Between the points of a simulated street that completion asks for."""
+
+STREET_SAMPLES_MAX = 3_000_000
+"""Of its mesh: more change the scores by little."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,12 @@ def score_against_scene(
     visible = _thinned_reference(visible, settings)
     samples = _samples(mesh, visible, settings)
     return _scores(np.abs(scene.sdf(samples)), samples, visible, settings)
+
+
+def score_against_drive(mesh: Mesh, drive: SimulatedDrive) -> MeshScores:
+    """Scores of a mesh against all that the lidar of a simulated drive hit."""
+    settings = ScoreSettings(samples_max=STREET_SAMPLES_MAX)
+    return score_against_scene(mesh, drive.scene, drive.true_hits(STREET_VOXEL_M), settings)
 
 
 def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:

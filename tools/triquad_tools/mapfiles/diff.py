@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import MapRecord
+from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import print_columns
-from triquad_tools.mapfiles.seen_space import surface_voxels
 
 NEAR_ENOUGH_M = 1e-4
 """A point this near to the zero of the field is on the surface."""

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.mapfile.files import replacing
+from triquad_format.records.cells import cells_of_boxes
 from triquad_format.records.region import MapRecord
+from triquad_format.records.seen_space import evidence_bounds, surface_voxels
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.mapfiles.seen_space import evidence_bounds, surface_voxels
 from triquad_tools.mapfiles.source import Box
 
 MAX_CELLS = 200_000_000
@@ -57,19 +58,6 @@ def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool,
         size = stream.tell()
     shape = " x ".join(str(count) for count in grid["sdf"].shape)
     return f"{size:,} bytes, distances {shape}"
-
-
-def cells_of_boxes(
-    first: NDArray[np.int64], last: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """All cells [C, 3] from ``first`` to ``last`` [N, 3] of each box, and the boxes' rows [C]."""
-    cells, rows = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.intp)]
-    for step in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
-        cell = first + step
-        inside = np.flatnonzero((cell <= last).all(axis=1))
-        cells.append(cell[inside])
-        rows.append(inside)
-    return np.concatenate(cells), np.concatenate(rows)
 
 
 def _dense(view: MapView, box: Box, cell_m: float) -> Arrays:

@@ -1,13 +1,16 @@
-"""Meshes read from files: PLY, GLB, OBJ and STL. :class:`triquad_client.Mesh` writes them."""
+"""Meshes in files, PLY, GLB, OBJ and STL: read, and written of a map."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
-from triquad_client import Mesh
+from triquad_client import Mesh, OfflineMap
+from triquad_format.mapfile.files import replacing
+from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.source import Box
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")
 
@@ -19,7 +22,12 @@ def read_mesh(path: Path) -> Mesh:
     """The mesh of a file, vertices as float64 in a frame with z up.
 
     A PLY file without faces gives a mesh without faces: a reference cloud.
+
+    Raises:
+        ToolError: there is no such file, or it cannot be read as a mesh.
     """
+    import trimesh  # slow to import
+
     if path.suffix not in MESH_SUFFIXES:
         names = ", ".join(MESH_SUFFIXES)
         raise ToolError(f"{path}: meshes are read from {names}, not {path.suffix!r}")
@@ -35,3 +43,21 @@ def read_mesh(path: Path) -> Mesh:
     if path.suffix == ".glb":
         vertices = vertices @ _GLTF_FROM_MAP
     return Mesh(vertices, faces)
+
+
+def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
+    """Write the mesh of a map, with cells of side ``cell_m``; returns what was written.
+
+    Given a box, it has the faces whose centroids lie in it.
+
+    Raises:
+        InvalidInputError: the mesh is too large, or a library is missing.
+        OSError: the file cannot be written.
+    """
+    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
+    with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
+        mesh = opened.mesh(bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"))
+    packed = mesh.file_bytes(path.suffix)
+    with replacing(path) as stream:
+        stream.write(packed)
+    return f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"

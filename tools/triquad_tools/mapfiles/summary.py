@@ -9,9 +9,9 @@ from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_LEVEL, MapRecord, Region
+from triquad_format.records.seen_space import evidence_box, owned_evidence
 
 from triquad_tools.console.report import Row, print_columns, print_rows
-from triquad_tools.mapfiles.seen_space import evidence_box, owned_evidence
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from triquad_format.mapfile.manifest import Manifest
 from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
 from triquad_format.mapfile.reader import MapFile
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records import morton
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import MapRecord
+from triquad_format.records.seen_space import owned_evidence
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import centimetres, utc_time
-from triquad_tools.mapfiles.seen_space import Columns, seen_columns
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
@@ -54,6 +56,30 @@ def draw_map(title: str, file: MapFile, path: Path) -> None:
         _errors_plan(grid, record),
     ]
     save_sheet(path, title, grid, plans)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Upright columns of voxels, each within one block of evidence."""
+
+    middles: Doubles  # [N, 2] metres, map frame
+    tops: Doubles  # [N] height of the middle of the highest voxel, metres
+
+
+def seen_columns(record: MapRecord, surface_only: bool = False) -> Columns:
+    """The columns in which rays ended or, unless ``surface_only``, through which they passed."""
+    settings, parts = record.settings, [np.empty((0, 3))]
+    for region in record.regions:
+        evidence = owned_evidence(settings, region)
+        # A byte holds one column.
+        octets = evidence.surface if surface_only else evidence.surface | evidence.free
+        rows, numbers = np.nonzero(octets)
+        x, y = np.divmod(numbers, BLOCK_VOXELS)
+        top = np.log2(octets[rows, numbers], dtype=np.float32).astype(np.int64)
+        voxels = morton.decode(evidence.codes, 3)[rows] * BLOCK_VOXELS + np.stack([x, y, top], 1)
+        parts.append(settings.region_corner(region.index) + (voxels + 0.5) * settings.leaf_m)
+    middles = np.concatenate(parts)
+    return Columns(middles[:, :2], middles[:, 2])
 
 
 def _draw_coverage(grid: PlanGrid, surface: Columns, seen: Columns, axes: Axes) -> None:

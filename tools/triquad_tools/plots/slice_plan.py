@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from triquad_client import Grid, Status
+from triquad_format.records.seen_space import evidence_bounds
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.evaluation.open_map import is_endpoint, open_map
-from triquad_tools.mapfiles.seen_space import evidence_bounds
 from triquad_tools.mapfiles.source import read_whole
 from triquad_tools.plots.plan import (
     FREE,

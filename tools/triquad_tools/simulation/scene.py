@@ -33,6 +33,12 @@ class Scene:
     drive_length_m: float = 0.0  # of the road along x, from the origin
     houses: tuple[Solid, ...] = ()  # those of the solids that are part of a house
 
+    @property
+    def box(self) -> tuple[list[float], list[float]]:
+        """The bounds as two corners, as the client's questions take them."""
+        low, high = self.bounds.tolist()
+        return low, high
+
     def sdf(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distances ``[N]`` in metres at points ``[N, 3]`` of the world."""
         return self._nearest(points)[0]

@@ -5,91 +5,74 @@ agree on the points that they share. Only faces where rays have seen a surface a
 the field has zeros that nobody taught it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from skimage.measure import marching_cubes
-from triquad_client import Mesh
-from triquad_client.mesh.mesh import Triangles, joined
-from triquad_format.mapfile.files import replacing
+from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
+from triquad_format.records.cells import cells_of_boxes
 from triquad_format.records.region import MapRecord
-from triquad_map.record_view import open_view
+from triquad_format.records.seen_space import surface_voxels
 from triquad_map.view import MapView
 
-from triquad_tools.console.command import ToolError
-from triquad_tools.console.progress import progress
-from triquad_tools.mapfiles.grid import cells_of_boxes
-from triquad_tools.mapfiles.seen_space import surface_voxels
-from triquad_tools.mapfiles.source import Box
+from triquad_client import checks
+from triquad_client.checks import Bounds
+from triquad_client.errors import InvalidInputError
+from triquad_client.mesh.mesh import Mesh, Triangles, joined
 
+CELL_RANGE_M = (0.01, 10.0)
 MAX_FACES = 50_000_000
 
 _BLOCK_CELLS = 32  # along the side of a block: bounds the memory that is needed at once
 _REACH_M = 0.02  # how far beside a voxel with seen surface the middle of a face may lie
-_EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
 
-Cells = NDArray[np.int64]
+Report = Callable[[int, int], None]
+"""Is told how many blocks are done, and of how many."""
 
 
 @dataclass(frozen=True)
 class _Voxels:
     """Voxels with seen surface, and the cells around each that may hold faces of it."""
 
-    places: Cells  # [N, 3] on the lattice of voxels
-    first: Cells  # [N, 3] least cell
-    last: Cells  # [N, 3] greatest cell
+    places: Longs  # [N, 3] on the lattice of voxels
+    first: Longs  # [N, 3] least cell
+    last: Longs  # [N, 3] greatest cell
 
     def __getitem__(self, rows: NDArray[np.intp]) -> "_Voxels":
         return _Voxels(self.places[rows], self.first[rows], self.last[rows])
 
 
-def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
-    """Write the mesh of a map; returns what was written.
+def map_mesh(
+    view: MapView, seen: MapRecord, bounds: Bounds | None, cell_m: float, report: Report | None
+) -> Mesh:
+    """The surface of a map where rays have seen one; ``OfflineMap.mesh`` documents the rest.
 
-    Raises:
-        ToolError: the mesh is too large.
-        OSError: the file cannot be written.
+    ``view`` answers for the field of the map, and ``seen`` holds its evidence; no more is read.
     """
-    mesh = surface_mesh(record, box, cell_m)
-    packed = mesh.file_bytes(path.suffix)
-    with replacing(path) as stream:
-        stream.write(packed)
-    return f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
-
-
-def surface_mesh(record: MapRecord, box: Box | None, cell_m: float) -> Mesh:
-    """The surface where rays have seen one, with cells of side ``cell_m``.
-
-    Given a box, it has the faces whose centroids lie in it.
-
-    Raises:
-        ToolError: there are too many faces.
-    """
-    view = open_view(record).view
-    low, high = _EVERYWHERE if box is None else box
-    blocks = list(_blocks(_voxels(record, low, high, cell_m)))
+    cell_m = checks.within("cell_m", cell_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
+    low, high = checks.box(bounds)
+    blocks = list(_blocks(_voxels(seen, low, high, cell_m)))
     tiles: list[Triangles] = []
     faces = 0
-    with progress("meshing", len(blocks)) as report:
-        for number, (block, voxels) in enumerate(blocks, start=1):
-            tiles.append(_block_mesh(view, block, voxels, cell_m))
-            faces += len(tiles[-1].faces)
-            if faces > MAX_FACES:
-                raise ToolError(f"the mesh has more than {MAX_FACES:,} faces: use --crop or --cell")
-            report(number, f"{faces:,} faces")
-    surface = joined(tiles, _BLOCK_CELLS * cell_m, low, high)
-    return Mesh(surface.vertices, surface.faces, record.epoch)
+    for number, (block, voxels) in enumerate(blocks, start=1):
+        tiles.append(_block_mesh(view, block, voxels, cell_m))
+        faces += len(tiles[-1].faces)
+        if faces > MAX_FACES:
+            raise InvalidInputError(
+                f"the mesh has more than {MAX_FACES:,} faces with cells of {cell_m:g} m: "
+                "ask for a smaller box, or larger cells"
+            )
+        if report is not None:
+            report(number, len(blocks))
+    surface = joined(tiles, _BLOCK_CELLS * cell_m, minimum=low, maximum=high)
+    return Mesh(surface.vertices, surface.faces, view.epoch)
 
 
-def _voxels(
-    record: MapRecord, low: NDArray[np.float64], high: NDArray[np.float64], cell_m: float
-) -> _Voxels:
+def _voxels(seen: MapRecord, low: Doubles, high: Doubles, cell_m: float) -> _Voxels:
     """The voxels of which faces may lie between two corners [3]."""
-    leaf_m = record.settings.leaf_m
-    middles = surface_voxels(record)
+    leaf_m = seen.settings.leaf_m
+    middles = surface_voxels(seen)
     reach_m = leaf_m / 2 + _REACH_M + cell_m / 2  # from a voxel's middle to that of a cell
     near = (middles >= low - 2 * reach_m) & (middles <= high + 2 * reach_m)
     middles = middles[near.all(axis=1)]
@@ -100,7 +83,7 @@ def _voxels(
     )
 
 
-def _blocks(voxels: _Voxels) -> Iterator[tuple[Cells, _Voxels]]:
+def _blocks(voxels: _Voxels) -> Iterator[tuple[Longs, _Voxels]]:
     """The blocks of cells [3] that voxels reach into, each with these voxels."""
     first, last = voxels.first // _BLOCK_CELLS, voxels.last // _BLOCK_CELLS
     blocks, rows = cells_of_boxes(first, last)
@@ -111,7 +94,7 @@ def _blocks(voxels: _Voxels) -> Iterator[tuple[Cells, _Voxels]]:
     return ((block, voxels[group]) for block, group in zip(each, groups, strict=False))
 
 
-def _block_mesh(view: MapView, block: Cells, voxels: _Voxels, cell_m: float) -> Triangles:
+def _block_mesh(view: MapView, block: Longs, voxels: _Voxels, cell_m: float) -> Triangles:
     origin = block * _BLOCK_CELLS
     cells = _covered(voxels.first - origin, voxels.last - origin)
     asked = np.argwhere(_any_of_eight(np.pad(cells, 1)))  # lattice points at their corners
@@ -127,8 +110,12 @@ def _block_mesh(view: MapView, block: Cells, voxels: _Voxels, cell_m: float) -> 
     return Triangles(vertices, surface.faces[seen])
 
 
-def _marched(volume: NDArray[np.float32], cells: NDArray[np.bool_]) -> Triangles:
+def _marched(volume: Floats, cells: Bools) -> Triangles:
     """Triangles between lattice points, in units of cells, counter-clockwise from free space."""
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError as error:
+        raise InvalidInputError("scikit-image is missing: pip install 'triquad[mesh]'") from error
     mask = np.zeros(volume.shape, np.bool_)
     mask[1:, 1:, 1:] = cells  # a cell is named by its upper corner there
     try:
@@ -138,7 +125,7 @@ def _marched(volume: NDArray[np.float32], cells: NDArray[np.bool_]) -> Triangles
     return Triangles(vertices.astype(np.float64), faces)
 
 
-def _covered(first: Cells, last: Cells) -> NDArray[np.bool_]:
+def _covered(first: Longs, last: Longs) -> Bools:
     """The cells of a block that lie in any of the boxes ``first`` to ``last`` [N, 3]."""
     low = np.clip(first, 0, _BLOCK_CELLS)
     beyond = np.clip(last + 1, 0, _BLOCK_CELLS)
@@ -151,14 +138,14 @@ def _covered(first: Cells, last: Cells) -> NDArray[np.bool_]:
     return np.asarray(boxes[:-1, :-1, :-1] > 0)
 
 
-def _any_of_eight(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _any_of_eight(flags: Bools) -> Bools:
     """Whether any of 2 x 2 x 2 neighbours is set; one less along each side than ``flags``."""
     flags = flags[:-1] | flags[1:]
     flags = flags[:, :-1] | flags[:, 1:]
     return flags[:, :, :-1] | flags[:, :, 1:]
 
 
-def _beside(voxels: Cells, points: NDArray[np.float64], leaf_m: float) -> NDArray[np.bool_]:
+def _beside(voxels: Longs, points: Doubles, leaf_m: float) -> Bools:
     """Whether points [P, 3] lie within the reach of any of the voxels [N, 3], on each axis."""
     sides = [
         np.floor((points + shift) / leaf_m).astype(np.int64) for shift in (-_REACH_M, _REACH_M)
@@ -171,6 +158,6 @@ def _beside(voxels: Cells, points: NDArray[np.float64], leaf_m: float) -> NDArra
     return near
 
 
-def _key(cells: Cells) -> NDArray[np.int64]:
+def _key(cells: Longs) -> Longs:
     """One number for each of cells [N, 3] that lie near to each other."""
     return np.asarray((cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2])

@@ -1,0 +1,46 @@
+"""The space that rays of a map have shown: its evidence in metres of the map frame."""
+
+import numpy as np
+
+from triquad_format.records import morton
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
+from triquad_format.records.region import Evidence, MapRecord, Region, masked, seen_voxels
+
+
+def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
+    """The evidence that answers of the region hang on; the rest lies in its neighbours' space."""
+    blocks, mine = morton.decode(region.evidence.codes, 3), settings.owned_blocks
+    owned = ((blocks >= mine.start) & (blocks < mine.stop)).all(axis=1, keepdims=True)
+    return masked(region.evidence, np.where(owned, np.uint8(0xFF), np.uint8(0)))
+
+
+def evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
+    """Corners [2, 3] of the box around a region's evidence, to whole blocks, metres, map frame.
+
+    ``None`` where there is no evidence.
+    """
+    if not len(region.evidence.codes):
+        return None
+    blocks = morton.decode(region.evidence.codes, 3)
+    ends = np.stack([blocks.min(axis=0), blocks.max(axis=0) + 1])
+    return settings.region_corner(region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
+
+
+def evidence_bounds(record: MapRecord) -> Doubles | None:
+    """The same box around all that rays have shown of a map."""
+    found = [evidence_box(record.settings, region) for region in record.regions]
+    boxes = [box for box in found if box is not None]
+    if not boxes:
+        return None
+    return np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))])
+
+
+def surface_voxels(record: MapRecord) -> Doubles:
+    """Middles [N, 3] of the voxels in which rays ended, metres, map frame."""
+    settings, parts = record.settings, [np.empty((0, 3))]
+    for region in record.regions:
+        evidence = owned_evidence(settings, region)
+        voxels = seen_voxels(evidence, evidence.surface)
+        parts.append(settings.region_corner(region.index) + (voxels + 0.5) * settings.leaf_m)
+    return np.concatenate(parts)

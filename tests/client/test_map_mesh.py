@@ -1,0 +1,143 @@
+"""Meshes of map files, without a server."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.exact_maps import SEEN_M, exact_map, table
+from triquad_client import ClosedError, InvalidInputError, Mesh, OfflineMap, open_map
+from triquad_client.offline import map_mesh
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.region import MapRecord
+
+TABLE = table(0.1, 0.5)
+RECORD = exact_map(TABLE, epoch=7)
+
+
+def mesh_of(record: MapRecord, **options: object) -> Mesh:
+    with OfflineMap(record) as offline:
+        return offline.mesh(**options)
+
+
+def centroids(mesh: Mesh) -> np.ndarray:
+    return mesh.vertices[mesh.faces].mean(axis=1)
+
+
+def test_the_mesh_of_a_file_lies_on_the_surface_that_was_seen(tmp_path: Path) -> None:
+    path = tmp_path / "map.triquad"
+    write_map(RECORD, path)
+    with open_map(path) as offline:
+        mesh = offline.mesh()
+    assert mesh.epoch == 7
+    x, y, z = mesh.vertices.T
+    away = np.abs(np.maximum(np.abs(x), np.abs(y)) - 2.0) > 0.2  # from the table's edge
+    np.testing.assert_allclose(z[away], TABLE(x, y)[away], atol=1e-4)
+    assert SEEN_M - 0.2 < np.abs(mesh.vertices).max() < SEEN_M + 0.2
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    area = np.cross(b - a, c - a)[:, 2].sum() / 2  # seen from above, where free space is
+    assert area == pytest.approx((2 * SEEN_M) ** 2, rel=0.02)
+
+
+def test_it_is_saved_as_any_mesh_is(tmp_path: Path) -> None:
+    mesh = mesh_of(RECORD, cell_m=0.4)
+    for suffix in (".ply", ".glb", ".obj", ".stl"):
+        mesh.save(tmp_path / f"mesh{suffix}")
+        assert (tmp_path / f"mesh{suffix}").stat().st_size > 12 * len(mesh.faces)
+    assert len(mesh.to_trimesh().faces) == len(mesh.faces)
+
+
+def test_larger_cells_make_fewer_faces() -> None:
+    fine, coarse = (len(mesh_of(RECORD, cell_m=cell_m).faces) for cell_m in (0.1, 0.2))
+    assert 3.5 < fine / coarse < 4.5
+
+
+def test_a_box_holds_the_faces_whose_centroids_lie_in_it() -> None:
+    whole = mesh_of(RECORD, cell_m=0.2)
+    low, high = np.array([-3.05, -1.0, 0.0]), np.array([0.0, np.inf, 0.3])
+    part = mesh_of(RECORD, bounds=(low.tolist(), high.tolist()), cell_m=0.2)
+    inside = ((centroids(whole) >= low) & (centroids(whole) <= high)).all(axis=1)
+    assert 0 < len(part.faces) == inside.sum() < len(whole.faces)
+    nowhere = mesh_of(RECORD, bounds=((50, 50, 50), (60, 60, 60)))
+    assert nowhere.vertices.shape == nowhere.faces.shape == (0, 3)
+
+
+def test_far_regions_are_meshed_as_near_ones() -> None:
+    def at(index: int) -> MapRecord:
+        region = dataclasses.replace(RECORD.regions[0], index=(index, 0, 0))
+        return dataclasses.replace(RECORD, regions=(region,))
+
+    near, far = (mesh_of(at(index), cell_m=0.2) for index in (0, 2**31 - 1))
+    assert len(near.faces) == len(far.faces) > 10_000
+
+
+def test_progress_is_told() -> None:
+    told: list[tuple[int, int]] = []
+    mesh_of(RECORD, cell_m=0.2, report=lambda done, blocks: told.append((done, blocks)))
+    assert [done for done, _ in told] == list(range(1, len(told) + 1))
+    assert {blocks for _, blocks in told} == {len(told)}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cell_m": 0.001}, r"cell_m = 0\.001: use 0\.01 to 10"),
+        ({"cell_m": "fine"}, "cell_m = 'fine' is not a number"),
+        ({"bounds": ((0, 0, 0), (-1, 1, 1))}, "the minimum must not exceed the maximum"),
+        ({"bounds": ((0, 0), (1, 1))}, "each corner has three coordinates"),
+    ],
+)
+def test_arguments_that_cannot_be_used_are_refused(
+    options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        mesh_of(RECORD, **options)
+
+
+def test_a_mesh_that_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_mesh, "MAX_FACES", 1000)
+    with pytest.raises(InvalidInputError, match=r"1,000 faces with cells of 0\.1 m.*smaller box"):
+        mesh_of(RECORD)
+
+
+def test_a_closed_map_has_no_mesh() -> None:
+    offline = OfflineMap(RECORD)
+    offline.close()
+    with pytest.raises(ClosedError):
+        offline.mesh()
+
+
+def test_without_scikit_image_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    with pytest.raises(InvalidInputError, match=r"scikit-image.*pip install 'triquad\[mesh\]'"):
+        mesh_of(RECORD)
+
+
+PLAIN = """
+import sys
+for name in ("numba", "llvmlite", "torch", "trimesh", "triquad_server", "triquad_tools"):
+    sys.modules[name] = None  # as if it were not installed
+import triquad_client
+with triquad_client.open_map(sys.argv[1]) as offline:
+    mesh = offline.mesh(cell_m=0.4)
+    mesh.save(sys.argv[2])
+    print(offline.compiled, len(mesh.faces))
+"""
+
+
+def test_it_needs_neither_numba_nor_torch_nor_the_tools(tmp_path: Path) -> None:
+    path = tmp_path / "map.triquad"
+    write_map(RECORD, path)
+    done = subprocess.run(
+        [sys.executable, "-c", PLAIN, path, tmp_path / "mesh.ply"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    compiled, faces = done.stdout.split()
+    assert compiled == "False"
+    assert int(faces) == len(mesh_of(RECORD, cell_m=0.4).faces)
+    assert (tmp_path / "mesh.ply").exists()
