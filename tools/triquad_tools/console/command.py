@@ -12,8 +12,8 @@ INTERRUPTED = 130
 """As shells have it: 128 and the number of SIGINT."""
 
 
-class ToolError(Exception):
-    """Base of all errors of the tools; each names the file, the place in it and the value."""
+class ToolError(TriquadError):
+    """What the tools refuse, or what failed in them: names the file, the place and the value."""
 
 
 def run(
