@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from triquad_format.records.arrays import Doubles
 from triquad_map.questions.align import Alignment, AlignOptions, align
 from triquad_map.view import MapView
 
@@ -108,19 +108,17 @@ def attempts(placed: PlacedScans, offset: Offset, tries: int = _TRIES) -> list[A
     ]
 
 
-def displaced(
-    pose: NDArray[np.float64], offset: Offset, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def displaced(pose: Doubles, offset: Offset, rng: np.random.Generator) -> Doubles:
     """A pose [4, 4] moved and turned (about itself) by an offset at random."""
     shift, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     turn = Rotation.from_rotvec(offset.degrees * axis, degrees=True).as_matrix()
-    moved: NDArray[np.float64] = pose.copy()
+    moved: Doubles = pose.copy()
     moved[:3, :3] = turn @ pose[:3, :3]
     moved[:3, 3] += offset.metres * shift
     return moved
 
 
-def _attempt(view: MapView, scan: PosedScan, guess: NDArray[np.float64]) -> Attempt:
+def _attempt(view: MapView, scan: PosedScan, guess: Doubles) -> Attempt:
     points = np.asarray(scan.points, np.float64)
     started = time.perf_counter()
     alignment = align(view, points, guess, AlignOptions())

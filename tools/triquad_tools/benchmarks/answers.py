@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import spearmanr
+from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
@@ -37,10 +37,10 @@ _GHOST_CLEAR_M = 0.5  # from all that was seen
 class AnswerProbes:
     """Points [N, 3], metres."""
 
-    seen_free: NDArray[np.float64]  # on rays, short of where they ended
-    corridor: NDArray[np.float64]  # around the sensor's way, clear of all surfaces
-    never_seen: NDArray[np.float64]  # inside houses and under the ground
-    ghosts: NDArray[np.float64]  # unseen, but all three projections are of seen surface
+    seen_free: Doubles  # on rays, short of where they ended
+    corridor: Doubles  # around the sensor's way, clear of all surfaces
+    never_seen: Doubles  # inside houses and under the ground
+    ghosts: Doubles  # unseen, but all three projections are of seen surface
 
 
 def measure_answers(street: DrivenStreet, record: MapRecord, view: MapView) -> list[Figure]:
@@ -89,9 +89,9 @@ def _distances(
 def _errors(
     name: str,
     answer: Distances,
-    truth: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
+    truth: Doubles,
+    slopes: Doubles,
+    chosen: Bools,
     bounds: tuple[float, float, float] | None,
 ) -> list[Figure]:
     error = (answer.distance_m - truth)[chosen]
@@ -109,9 +109,7 @@ def _errors(
     ]  # fmt: skip
 
 
-def _calibration(
-    answer: Distances, truth: NDArray[np.float64], chosen: NDArray[np.bool_]
-) -> list[Figure]:
+def _calibration(answer: Distances, truth: Doubles, chosen: Bools) -> list[Figure]:
     """Whether errors fall as the stated confidence rises."""
     chosen = chosen & answer.found
     error = np.abs(answer.distance_m - truth)[chosen]
@@ -130,7 +128,7 @@ def _calibration(
 
 
 def _unknown(probes: AnswerProbes, view: MapView) -> list[Figure]:
-    def share(points: NDArray[np.float64]) -> float:
+    def share(points: Doubles) -> float:
         return float(100 * (view.status(points) == Status.UNKNOWN).mean())
 
     return [
@@ -156,7 +154,7 @@ def _corridor(probes: AnswerProbes, view: MapView) -> list[Figure]:
     ]  # fmt: skip
 
 
-def _along_rays(street: DrivenStreet, rng: np.random.Generator) -> NDArray[np.float64]:
+def _along_rays(street: DrivenStreet, rng: np.random.Generator) -> Doubles:
     each = _ALONG_RAYS // len(street.scans)
     points = []
     for scan in street.scans:
@@ -168,7 +166,7 @@ def _along_rays(street: DrivenStreet, rng: np.random.Generator) -> NDArray[np.fl
     return np.concatenate(points)
 
 
-def _corridor_points(street: DrivenStreet, rng: np.random.Generator) -> NDArray[np.float64]:
+def _corridor_points(street: DrivenStreet, rng: np.random.Generator) -> Doubles:
     way = street.drive.poses[:, :3, 3]
     part = rng.integers(len(way) - 1, size=2 * _CORRIDOR)
     share = rng.uniform(size=(2 * _CORRIDOR, 1))
@@ -181,7 +179,7 @@ def _corridor_points(street: DrivenStreet, rng: np.random.Generator) -> NDArray[
     return np.asarray(points[near & clear][:_CORRIDOR])
 
 
-def _never_seen(street: DrivenStreet, rng: np.random.Generator) -> NDArray[np.float64]:
+def _never_seen(street: DrivenStreet, rng: np.random.Generator) -> Doubles:
     hits = street.drive.true_hits(1.0)
     low, high = hits.min(axis=0), hits.max(axis=0)
     under = rng.uniform(low, high, (4 * _NEVER_SEEN, 3))
@@ -190,9 +188,7 @@ def _never_seen(street: DrivenStreet, rng: np.random.Generator) -> NDArray[np.fl
     return np.concatenate([street.probes.in_houses, under[deep][:_NEVER_SEEN]])
 
 
-def _ghosts(
-    street: DrivenStreet, record: MapRecord, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def _ghosts(street: DrivenStreet, record: MapRecord, rng: np.random.Generator) -> Doubles:
     """Places that three planes of features cannot tell from seen surface."""
     voxels = surface_voxels(record)
     leaf_m = record.settings.leaf_m

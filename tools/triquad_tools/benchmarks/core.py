@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_server.engine.adam import Rates
 from triquad_server.engine.tensor_field import TensorField
@@ -69,10 +69,10 @@ def measure_core(made: BenchStreet) -> list[Figure]:
     ]
 
 
-def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> NDArray[np.float64]:
+def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> Doubles:
     """Random points [N, 3] of what rays have shown of the street, free or surface."""
     low, high = made.drive.scene.bounds
-    found: list[NDArray[np.float64]] = []
+    found: list[Doubles] = []
     while sum(map(len, found)) < _QUERY_POINTS:
         points = rng.uniform(low, high, (_QUERY_POINTS, 3))
         found.append(points[epoch.status(points) != Status.UNKNOWN])
@@ -97,7 +97,7 @@ def _training(region: LiveRegion, settings: Settings) -> list[Figure]:
     ]
 
 
-def _queries(epoch: Epoch, region: LiveRegion, points: NDArray[np.float64]) -> list[Figure]:
+def _queries(epoch: Epoch, region: LiveRegion, points: Doubles) -> list[Figure]:
     local = (points - region.centre).astype(np.float32)
     field, team = region.field, Teams().answers
     slow, fast = TensorField(field.settings, field.tree, field.tensors), field.freeze()

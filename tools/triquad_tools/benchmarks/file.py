@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_client import OfflineMap, open_map
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import MapFileInfo, write_map
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.reference.evaluator import MapEvaluator
@@ -136,7 +136,7 @@ def measure_offline(made: BenchStreet) -> list[Figure]:
     ]
 
 
-def _differences(offline: OfflineMap, epoch: Epoch, points: NDArray[np.float64]) -> list[Figure]:
+def _differences(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Figure]:
     field, live_field = offline.query_sdf(points), epoch.query(points)
     have, want = offline.query_distance(points), distances(epoch, points, DistanceOptions())
     sdf_m = np.quantile(np.abs(field.sdf - live_field.sdf), 0.99)
@@ -150,7 +150,7 @@ def _differences(offline: OfflineMap, epoch: Epoch, points: NDArray[np.float64])
     ]
 
 
-def _ratios(offline: OfflineMap, epoch: Epoch, points: NDArray[np.float64]) -> list[Figure]:
+def _ratios(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Figure]:
     """How many times as long as the server's epoch the file takes."""
     figures = []
     for count in (1_000, 100_000):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_client import Client, Mesh, MeshWatch
+from triquad_format.records.arrays import Bools
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_server.epochs import Epoch
 from triquad_server.mesh.tile_cache import TileCache
@@ -257,7 +258,7 @@ class _Triangles:
         self._corners = np.concatenate([np.zeros((0, 3, 3)), *corners])  # [F, 3, 3]
         self._tree = cKDTree(self._corners.mean(axis=1))
 
-    def farther(self, points: NDArray[np.floating], limit_m: float) -> NDArray[np.bool_]:
+    def farther(self, points: NDArray[np.floating], limit_m: float) -> Bools:
         """Whether points [N, 3] are farther from the triangles."""
         from trimesh.triangles import closest_point  # slow to import
 

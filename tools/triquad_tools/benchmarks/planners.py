@@ -10,8 +10,8 @@ from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import zenoh
-from numpy.typing import NDArray
 from triquad_format.mapfile.reader import read_map
+from triquad_format.records.arrays import Doubles
 from triquad_format.wire import keys
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
@@ -23,7 +23,7 @@ from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.console.settling import wait_until_settled
 from triquad_tools.demo.probe import ProbeReport
 
-Points = NDArray[np.float64]
+Points = Doubles
 
 _ASKED = 1_000
 _CLIENTS = 16

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_client import Client, connect
 from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.mapfile.writer import write_map
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.benchmarks.figures import Figure
@@ -40,7 +40,7 @@ class Served:
         """A client of its own, for a ``with`` statement."""
         return connect(self.endpoint, MAP, timeout_s=_TIMEOUT_S)
 
-    def planner(self, points: NDArray[np.float64], question: str) -> Probe:
+    def planner(self, points: Doubles, question: str) -> Probe:
         """A process that asks a question at points [N, 3], for a ``with`` statement."""
         return Probe(self.endpoint, MAP, points, question)
 

@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from triquad_client import Mesh
+from triquad_format.records.arrays import Doubles
 from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
@@ -32,7 +31,7 @@ _COLUMNS = 1024  # some 60,000 points a scan
 class BenchStreet(DrivenStreet):
     """A drive of 10 s, and the truth about it."""
 
-    visible: NDArray[np.float64]  # [M, 3] exact surface points that the lidar hit
+    visible: Doubles  # [M, 3] exact surface points that the lidar hit
 
     def mesh_scores(self, mesh: Mesh, samples_max: int = STREET_SAMPLES_MAX) -> MeshScores:
         """Scores of a mesh within the scene's bounds, from so many samples at most."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.arguments import count, not_negative, positive, seed
 from triquad_tools.console.command import OK, ToolError, run
@@ -103,7 +103,7 @@ def _at_withheld(options: argparse.Namespace) -> Results:
         return {"withheld": score_withheld(opened.query_sdf, clouds)}
 
 
-def _reference(path: Path, voxel_m: float, range_min_m: float) -> NDArray[np.float64]:
+def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
     """The points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
     if path.is_dir():
         folder = read_folder(path)

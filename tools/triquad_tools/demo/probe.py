@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
 
@@ -26,7 +26,7 @@ PERIOD_S = 0.05
 _STOP_TIMEOUT_S = 60.0
 
 
-QUESTIONS: "dict[str, Callable[[Client, NDArray[np.float64]], int]]" = {
+QUESTIONS: "dict[str, Callable[[Client, Doubles], int]]" = {
     "sdf": lambda client, points: client.query_sdf(points).epoch,
     "gradient": lambda client, points: client.query_sdf(points, gradient=True).epoch,
     "distance": lambda client, points: client.query_distance(points).epoch,
@@ -54,7 +54,7 @@ class Probe:
     """The planner's process; leaving the ``with`` statement ends it in any case."""
 
     def __init__(
-        self, endpoint: str, map_name: str, points: NDArray[np.float64], question: str = "sdf"
+        self, endpoint: str, map_name: str, points: Doubles, question: str = "sdf"
     ) -> None:
         """Start to ask a question of ``QUESTIONS`` at points [N, 3], a few thousand at most."""
         command = [sys.executable, "-m", __name__, endpoint, map_name, question, str(len(points))]
@@ -87,7 +87,7 @@ class Probe:
 
 
 def ask_until(
-    stop: threading.Event, client: "Client", points: NDArray[np.float64], question: str = "sdf"
+    stop: threading.Event, client: "Client", points: Doubles, question: str = "sdf"
 ) -> ProbeReport:
     """Ask a question of ``QUESTIONS`` at ``points`` [N, 3] until ``stop`` is set."""
     from triquad_client import TriquadError

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.image import imsave
-from numpy.typing import NDArray
 from triquad_client import CheckpointInfo, Client, Mesh, SdfResult, connect
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import without_training
 from triquad_server.mesh.preview import previews_of
 
@@ -52,7 +52,7 @@ class Scored:
     surface: Mesh
     parameters: int
     checkpoint: CheckpointInfo
-    points: NDArray[np.float64]  # [N, 3] where it was asked
+    points: Doubles  # [N, 3] where it was asked
     answers: SdfResult
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import SdfResult
+from triquad_format.records.arrays import Bytes, Doubles
 from triquad_format.records.status import Status
 from triquad_map.view import FieldAnswer
 
@@ -33,10 +34,10 @@ MapQuery = Callable[..., SdfResult | FieldAnswer]
 class StreetProbes:
     """Where a map of a street is asked, and the truth there."""
 
-    near: NDArray[np.float64]  # [N, 3] within NEAR_M of surface that the lidar truly hit
-    exact_sdf: NDArray[np.float64]  # [N] metres
-    exact_gradient: NDArray[np.float64]  # [N, 3]
-    in_houses: NDArray[np.float64]  # [M, 3] where no ray can have been
+    near: Doubles  # [N, 3] within NEAR_M of surface that the lidar truly hit
+    exact_sdf: Doubles  # [N] metres
+    exact_gradient: Doubles  # [N, 3]
+    in_houses: Doubles  # [M, 3] where no ray can have been
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     )
 
 
-def score_withheld(query: MapQuery, clouds: Iterable[NDArray[np.float64]]) -> WithheldScores:
+def score_withheld(query: MapQuery, clouds: Iterable[Doubles]) -> WithheldScores:
     """Scores of a map at the points ``[N, 3]`` of scans it never saw, map frame.
 
     A point without any region around it has no distance: it counts as infinitely far off.
@@ -144,9 +145,7 @@ def score_withheld(query: MapQuery, clouds: Iterable[NDArray[np.float64]]) -> Wi
     )
 
 
-def _points_in_houses(
-    scene: Scene, positions: NDArray[np.float64], rng: np.random.Generator
-) -> NDArray[np.float64]:
+def _points_in_houses(scene: Scene, positions: Doubles, rng: np.random.Generator) -> Doubles:
     """Uniform points ``[M, 3]`` above the ground in houses beside the sensor's ``positions``."""
     low = np.maximum(scene.bounds[0], positions.min(axis=0) - _HOUSE_REACH_M)
     high = np.minimum(scene.bounds[1], positions.max(axis=0) + _HOUSE_REACH_M)
@@ -155,7 +154,7 @@ def _points_in_houses(
     return drawn[scene.is_inside_house(drawn, HOUSE_MARGIN_M)][:_HOUSE_PROBES]
 
 
-def _share(statuses: NDArray[np.uint8], wanted: Status) -> float:
+def _share(statuses: Bytes, wanted: Status) -> float:
     return float(np.mean(statuses == wanted)) if len(statuses) else float("nan")
 
 

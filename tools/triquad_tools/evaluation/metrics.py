@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_client import Mesh
+from triquad_format.records.arrays import Bools, Doubles
 
 from triquad_tools.recordings.cloud import thin
 from triquad_tools.simulation.lidar import SimulatedDrive
@@ -51,9 +52,7 @@ class MeshScores:
     references: int  # points of the truth
 
 
-def score_against_cloud(
-    mesh: Mesh, reference: NDArray[np.float64], settings: ScoreSettings
-) -> MeshScores:
+def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> MeshScores:
     """Scores of a mesh against a cloud ``[M, 3]`` of true surface points, metres, same frame.
 
     The spacing of the cloud bounds the accuracy from below: a cloud of 3 cm spacing shows no
@@ -67,7 +66,7 @@ def score_against_cloud(
 
 
 def score_against_scene(
-    mesh: Mesh, scene: Scene, visible: NDArray[np.float64], settings: ScoreSettings
+    mesh: Mesh, scene: Scene, visible: Doubles, settings: ScoreSettings
 ) -> MeshScores:
     """Scores of a mesh against an exact scene.
 
@@ -97,7 +96,7 @@ def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> 
     return float(np.median(angles)) if len(angles) else float("nan")
 
 
-def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> Doubles:
     """Random points ``[count, 3]`` on a mesh, of uniform density over its area."""
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]  # [F, 3, 3]
     sides = corners[:, 1:] - corners[:, :1]
@@ -108,7 +107,7 @@ def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.
     u, v = rng.uniform(size=(2, count, 1))
     over = u + v > 1.0
     u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
-    points: NDArray[np.float64] = corners[faces, 0] + u * sides[faces, 0] + v * sides[faces, 1]
+    points: Doubles = corners[faces, 0] + u * sides[faces, 0] + v * sides[faces, 1]
     return points
 
 
@@ -119,17 +118,13 @@ def mesh_area_m2(mesh: Mesh) -> float:
     return 0.5 * float(np.linalg.norm(cross, axis=1).sum())
 
 
-def _thinned_reference(
-    reference: NDArray[np.float64], settings: ScoreSettings
-) -> NDArray[np.float64]:
+def _thinned_reference(reference: Doubles, settings: ScoreSettings) -> Doubles:
     if len(reference) == 0:
         raise ValueError("no reference points to score against")
     return thin(np.asarray(reference, np.float64), settings.voxel_m)
 
 
-def _samples(
-    mesh: Mesh, reference: NDArray[np.float64], settings: ScoreSettings
-) -> NDArray[np.float64]:
+def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles:
     """Thinned samples of the mesh in the truth's bounding box.
 
     The box is grown by the accuracy's cut: a level road is the very bottom of its box, and
@@ -147,15 +142,12 @@ def _samples(
     return thin(samples, settings.voxel_m)
 
 
-def _tree(points: NDArray[np.float64]) -> cKDTree:
+def _tree(points: Doubles) -> cKDTree:
     return cKDTree(points, balanced_tree=False, compact_nodes=False)  # much faster to build
 
 
 def _scores(
-    distances: NDArray[np.float64],
-    samples: NDArray[np.float64],
-    reference: NDArray[np.float64],
-    settings: ScoreSettings,
+    distances: Doubles, samples: Doubles, reference: Doubles, settings: ScoreSettings
 ) -> MeshScores:
     """Scores from the distances of samples to the truth, and of the truth to the samples."""
     kept = distances[distances < settings.accuracy_cut_m]
@@ -181,5 +173,5 @@ def _scores(
     )
 
 
-def _mean(values: NDArray[np.float64] | NDArray[np.bool_]) -> float:
+def _mean(values: Doubles | Bools) -> float:
     return float(np.mean(values)) if len(values) else float("nan")

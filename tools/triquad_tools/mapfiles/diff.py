@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
@@ -30,16 +31,16 @@ _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
 class Sighting:
     """Surface points of one map, and what the other map says of them."""
 
-    points: NDArray[np.float64]  # [N, 3] metres, map frame
-    sdf: NDArray[np.float32]  # [N] metres; NaN where the other map has nothing
-    status: NDArray[np.uint8]  # [N] triquad_format.records.status.Status
+    points: Doubles  # [N, 3] metres, map frame
+    sdf: Floats  # [N] metres; NaN where the other map has nothing
+    status: Bytes  # [N] triquad_format.records.status.Status
     leaf_m: float  # of the map whose surface it is
 
     def part(self, rows: NDArray[np.intp]) -> "Sighting":
         """Some of the points."""
         return Sighting(self.points[rows], self.sdf[rows], self.status[rows], self.leaf_m)
 
-    def having(self, status: Status) -> NDArray[np.float64]:
+    def having(self, status: Status) -> Doubles:
         """The points of which the other map says ``status``."""
         return np.asarray(self.points[self.status == status])
 
@@ -108,7 +109,7 @@ def difference(comparison: Comparison, tile_m: float) -> MapDiff:
     return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
 
 
-def surface_points(record: MapRecord) -> NDArray[np.float64]:
+def surface_points(record: MapRecord) -> Doubles:
     """Points ``[N, 3]`` where the field is zero, at most one for each voxel where rays ended.
 
     The middles of these voxels are moved along the gradient by Newton's method. Those that have
@@ -131,7 +132,7 @@ def surface_points(record: MapRecord) -> NDArray[np.float64]:
         points[under_way] += (-np.sign(sdf) * length / slope)[:, None] * gradient
         distance = np.linalg.norm(points[under_way] - middles[under_way], axis=1)
         under_way = under_way[distance <= math.sqrt(3) * leaf_m]
-    found: NDArray[np.float64] = points[arrived]
+    found: Doubles = points[arrived]
     return found
 
 

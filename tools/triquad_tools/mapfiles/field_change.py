@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord, Region, seen_voxels
 from triquad_map.reference.evaluator import MapEvaluator
@@ -39,12 +40,12 @@ class FieldChange:
 class Probes:
     """Random points of the kinds of :class:`FieldChange`, metres from a region's centre."""
 
-    surface: NDArray[np.float64]  # [P, 3]
-    near: NDArray[np.float64]  # [P, 3]
-    free: NDArray[np.float64]  # [P, 3]
+    surface: Doubles  # [P, 3]
+    near: Doubles  # [P, 3]
+    free: Doubles  # [P, 3]
 
     @property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> Doubles:
         """All of them [N, 3], in the order of the fields."""
         return np.concatenate([self.surface, self.near, self.free])
 
@@ -76,7 +77,7 @@ def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
     """How far distances moved from one map to another that has the same regions and evidence."""
     rng = np.random.default_rng(seed)
     count = max(PROBES // max(len(before.regions), 1), _LEAST_PROBES)
-    kinds: list[list[NDArray[np.float64]]] = [[np.zeros((0, 3))] for _ in range(3)]
+    kinds: list[list[Doubles]] = [[np.zeros((0, 3))] for _ in range(3)]
     for region in before.regions:
         probes = draw_probes(before.settings, region, rng, count)
         centre = before.settings.region_centre(region.index)

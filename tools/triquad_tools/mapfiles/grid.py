@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.mapfile.files import replacing
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.cells import cells_of_boxes
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import evidence_bounds, surface_voxels
@@ -37,7 +37,7 @@ _ROUNDING = 1e-9
 Arrays = dict[str, Any]
 """Arrays by their names in the archive."""
 
-Positions = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+Positions = Callable[[Longs], Doubles]
 """The places [N, 3] of numbered lattice points, metres, map frame."""
 
 
@@ -72,7 +72,7 @@ def _dense(view: MapView, box: Box, cell_m: float) -> Arrays:
     shape = tuple(max(end - start + 1, 0) for start, end in zip(low, last, strict=True))
     first = np.array(low, np.float64)
 
-    def positions(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+    def positions(numbers: Longs) -> Doubles:
         cells = np.stack(np.unravel_index(numbers, shape), axis=1)
         return np.asarray((first + cells) * cell_m)
 
@@ -88,7 +88,7 @@ def _sparse(view: MapView, record: MapRecord, box: Box | None, cell_m: float) ->
     if np.abs(indices).max(initial=0) > np.iinfo(np.int32).max:
         raise ToolError("its regions lie too far from the origin for --sparse: use --crop")
 
-    def positions(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+    def positions(numbers: Longs) -> Doubles:
         block, inner = np.divmod(numbers, BLOCK_CELLS**3)
         inside = np.stack(np.unravel_index(inner, (BLOCK_CELLS,) * 3), axis=1)
         return np.asarray((indices[block] * BLOCK_CELLS + inside) * cell_m)
@@ -110,7 +110,7 @@ def _filled(view: MapView, shape: tuple[int, ...], positions: Positions) -> Arra
     return {"sdf": sdf.reshape(shape), "status": status.reshape(shape)}
 
 
-def _blocks_near_surface(record: MapRecord, box: Box | None, cell_m: float) -> NDArray[np.int64]:
+def _blocks_near_surface(record: MapRecord, box: Box | None, cell_m: float) -> Longs:
     """Indices [B, 3], in order, each once."""
     middles = surface_voxels(record)
     if box is not None:

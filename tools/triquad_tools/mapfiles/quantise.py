@@ -16,8 +16,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import FormatError
+from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_INTEGER, MapRecord, Region, VertexTable, masked
 from triquad_map.record_view import open_view
@@ -123,11 +123,11 @@ class _RegionProbes:
         self.points = draw_probes(settings, region, np.random.default_rng(_SEARCH_SEED))
         self._before = self._distances(region.tables)
 
-    def moves(self, tables: tuple[VertexTable, ...]) -> NDArray[np.float32]:
+    def moves(self, tables: tuple[VertexTable, ...]) -> Floats:
         """How far distances move [P], metres, where the region has these tables."""
         return self._distances(tables) - self._before
 
-    def _distances(self, tables: tuple[VertexTable, ...]) -> NDArray[np.float32]:
+    def _distances(self, tables: tuple[VertexTable, ...]) -> Floats:
         """Signed distances [P], metres; 0 beside the region's cube."""
         region = dataclasses.replace(self._record.regions[0], tables=tables)
         opened = open_view(dataclasses.replace(self._record, regions=(region,)))

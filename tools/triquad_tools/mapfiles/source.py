@@ -4,21 +4,20 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import NoIndexError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
 from triquad_format.mapfile.files import FileBytes, named
 from triquad_format.mapfile.index import MapIndex, file_in
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile, read_map_file
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import crop_record, without_training
 from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
 
 from triquad_tools.console.command import ToolError
 
-Box = NDArray[np.float64]
+Box = Doubles
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
 
 

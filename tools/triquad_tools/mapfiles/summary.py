@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile
+from triquad_format.records.arrays import Bytes, Doubles
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_LEVEL, MapRecord, Region
 from triquad_format.records.seen_space import evidence_box, owned_evidence
@@ -175,11 +175,11 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
     )
 
 
-def _bits(masks: NDArray[np.uint8]) -> int:
+def _bits(masks: Bytes) -> int:
     return int(np.unpackbits(masks).sum(dtype=np.int64))
 
 
-def _rounded(place: NDArray[np.float64]) -> tuple[float, ...]:
+def _rounded(place: Doubles) -> tuple[float, ...]:
     """Coordinates without the noise of their last bits."""
     return tuple(place.round(6).tolist())
 

@@ -8,12 +8,11 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
-from numpy.typing import NDArray
 from triquad_format.mapfile.manifest import Manifest
 from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import owned_evidence
@@ -99,7 +98,7 @@ def _ages_plan(grid: PlanGrid, manifest: Manifest, seen: Columns) -> Plan:
     return Plan("Last changed", lambda axes: draw_layers(axes, layers[::-1]), note)
 
 
-def _age_layers(epochs: NDArray[np.int64], manifest: Manifest) -> list[Layer]:
+def _age_layers(epochs: Longs, manifest: Manifest) -> list[Layer]:
     """The epochs in a plan, oldest first, so few layers that colours can tell them apart."""
     stamps_ns = {entry.epoch: entry.stamp_ns for entry in manifest.entries}
     found = np.unique(epochs[epochs != _NEVER])
@@ -114,7 +113,7 @@ def _age_layers(epochs: NDArray[np.int64], manifest: Manifest) -> list[Layer]:
     return layers
 
 
-def latest_epochs(grid: PlanGrid, manifest: Manifest) -> NDArray[np.int64]:
+def latest_epochs(grid: PlanGrid, manifest: Manifest) -> Longs:
     """``[rows, columns]``: the epoch in which a place last changed; -1 where there is none."""
     latest = np.full((grid.rows, grid.columns), _NEVER, np.int64)
     for entry in manifest.entries:
@@ -140,8 +139,8 @@ def _window(grid: PlanGrid, settings: FieldSettings, key: PartKey) -> Window | N
 class SampleErrors:
     """Errors at replay samples near the surface."""
 
-    points: NDArray[np.float64]  # [N, 3] metres, map frame
-    errors_m: NDArray[np.float64]  # [N] |signed distance - label|
+    points: Doubles  # [N, 3] metres, map frame
+    errors_m: Doubles  # [N] |signed distance - label|
 
 
 def sample_errors(record: MapRecord) -> SampleErrors:

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.stats import binned_statistic_2d
+from triquad_format.records.arrays import Bools, Doubles
 
 UNKNOWN = "#bdbdbd"
 FREE = "#f3f3f3"
@@ -34,7 +35,7 @@ _ROOM_IN = (2.3, 1.7)  # beside a plan for its scale, below it for its legend
 _DPI = 110
 _LETTERS_PT = 13  # can be read in half the size, too
 
-Values = NDArray[np.float64]
+Values = Doubles
 """One value for each cell ``[rows, columns]``, row 0 that of the smallest y; NaN where none is."""
 
 Draw = Callable[[Axes], None]
@@ -45,7 +46,7 @@ Window = tuple[slice, slice]
 class PlanGrid:
     """Square cells over a rectangle of the map frame's XY plane."""
 
-    low_m: NDArray[np.float64]  # [2] corner of smallest x and y
+    low_m: Doubles  # [2] corner of smallest x and y
     cell_m: float
     rows: int
     columns: int
@@ -64,9 +65,9 @@ class PlanGrid:
         return cls(first * cell_m, cell_m, int(wanted[1]), int(wanted[0]))
 
     @property
-    def high_m(self) -> NDArray[np.float64]:
+    def high_m(self) -> Doubles:
         """``[2]`` corner of largest x and y."""
-        corner: NDArray[np.float64] = self.low_m + self.cell_m * np.array([self.columns, self.rows])
+        corner: Doubles = self.low_m + self.cell_m * np.array([self.columns, self.rows])
         return corner
 
     def window(self, low_m: NDArray[np.floating], high_m: NDArray[np.floating]) -> Window:
@@ -75,7 +76,7 @@ class PlanGrid:
         first, last = (np.clip(end, 0, [self.columns, self.rows]).astype(int) for end in ends)
         return slice(first[1], last[1]), slice(first[0], last[0])
 
-    def marked(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def marked(self, points: NDArray[np.floating]) -> Bools:
         """``[rows, columns]``: whether a cell holds any of the points ``[N, 2 or 3]``."""
         return self.statistic(points, np.zeros(len(points)), "count") > 0
 
@@ -121,7 +122,7 @@ class Layer:
 
     label: str
     colour: str
-    cells: NDArray[np.bool_]  # [rows, columns]
+    cells: Bools  # [rows, columns]
 
 
 def save_sheet(path: Path, title: str, grid: PlanGrid, plans: Sequence[Plan]) -> None:

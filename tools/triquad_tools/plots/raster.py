@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats, Ints
 from triquad_map.compiled.kernel import kernel
 
 
@@ -11,14 +12,12 @@ from triquad_map.compiled.kernel import kernel
 class Raster:
     """What each pixel shows; row 0 is the top of the picture."""
 
-    nearness: NDArray[np.float64]  # [H, W] greater is nearer; minus infinity where nothing is
-    faces: NDArray[np.int32]  # [H, W] rows of faces; -1 where nothing is
-    weights: NDArray[np.float32]  # [H, W, 3] of the face's corners, linear in the picture
+    nearness: Doubles  # [H, W] greater is nearer; minus infinity where nothing is
+    faces: Ints  # [H, W] rows of faces; -1 where nothing is
+    weights: Floats  # [H, W, 3] of the face's corners, linear in the picture
 
 
-def rasterise(
-    corners: NDArray[np.float64], faces: NDArray[np.integer], width: int, height: int
-) -> Raster:
+def rasterise(corners: Doubles, faces: NDArray[np.integer], width: int, height: int) -> Raster:
     """Draw triangles into a z-buffer.
 
     Args:
@@ -40,13 +39,7 @@ def rasterise(
 
 
 @kernel()
-def _draw(
-    corners: NDArray[np.float64],
-    faces: NDArray[np.int32],
-    nearness: NDArray[np.float64],
-    owners: NDArray[np.int32],
-    weights: NDArray[np.float32],
-) -> None:
+def _draw(corners: Doubles, faces: Ints, nearness: Doubles, owners: Ints, weights: Floats) -> None:
     height, width = nearness.shape
     for f in range(faces.shape[0]):
         ax, ay, an = corners[faces[f, 0]]
@@ -77,11 +70,11 @@ def _draw(
                     weights[row, column, 2] = wc
 
 
-def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+def vertex_normals(vertices: Doubles, faces: Ints) -> Doubles:
     """Unit normals ``[V, 3]``: those of the faces around a vertex, weighted by their area."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     shares = [np.bincount(faces.ravel(), part, len(vertices)) for part in across.repeat(3, 0).T]
-    normals: NDArray[np.float64] = np.stack(shares, axis=1)
+    normals: Doubles = np.stack(shares, axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     return normals

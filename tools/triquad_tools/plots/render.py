@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints
 
 from triquad_tools.plots.raster import Raster, rasterise, vertex_normals
 
@@ -40,16 +41,16 @@ _HEIGHT_STOPS = np.array(
 class Camera:
     """A perspective camera in the map frame; the picture's top is towards +z."""
 
-    eye: NDArray[np.float64]  # [3] metres
-    target: NDArray[np.float64]  # [3] metres, in the middle of the picture
+    eye: Doubles  # [3] metres
+    target: Doubles  # [3] metres, in the middle of the picture
     view_deg: float = 35.0  # vertical opening angle
 
     @property
-    def axes(self) -> NDArray[np.float64]:
+    def axes(self) -> Doubles:
         """Unit vectors ``[3, 3]``: to the right, down, and forward, in the map frame."""
         return view_axes(self.target - self.eye)
 
-    def project(self, points: NDArray[np.float64], width: int, height: int) -> NDArray[np.float64]:
+    def project(self, points: Doubles, width: int, height: int) -> Doubles:
         """Column, row and inverse depth ``[N, 3]`` of points ``[N, 3]``; NaN behind the eye."""
         seen = (points - self.eye) @ self.axes.T
         depth = np.where(seen[:, 2] > _NEAR_M, seen[:, 2], np.nan)
@@ -58,7 +59,7 @@ class Camera:
         row = 0.5 * height + pixels * seen[:, 1] / depth
         return np.column_stack([column, row, 1.0 / depth])
 
-    def unproject(self, nearness: NDArray[np.float64]) -> NDArray[np.float64]:
+    def unproject(self, nearness: Doubles) -> Doubles:
         """Points ``[H, W, 3]`` of the world that the pixels of a picture show."""
         height, width = nearness.shape
         pixels = self._pixels_per_tangent(height)
@@ -66,14 +67,14 @@ class Camera:
         columns = (np.arange(width) + 0.5 - 0.5 * width) / pixels
         rows = (np.arange(height) + 0.5 - 0.5 * height) / pixels
         rays = columns[None, :, None] * right + rows[:, None, None] * down + forward
-        points: NDArray[np.float64] = self.eye + rays / nearness[:, :, None]
+        points: Doubles = self.eye + rays / nearness[:, :, None]
         return points
 
     def _pixels_per_tangent(self, height: int) -> float:
         return 0.5 * height / math.tan(0.5 * math.radians(self.view_deg))
 
 
-def view_axes(forward: NDArray[np.float64]) -> NDArray[np.float64]:
+def view_axes(forward: Doubles) -> Doubles:
     """Unit vectors ``[3, 3]`` to the right, down and forward of a view in a direction ``[3]``."""
     forward = forward / np.linalg.norm(forward)
     up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
@@ -89,7 +90,7 @@ def render_mesh(
     camera: Camera,
     width: int = 1600,
     height: int = 900,
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """A picture ``[height, width, 3]`` of a mesh.
 
     Args:
@@ -114,7 +115,7 @@ def render_mesh(
     return _encode(fine.mean(axis=(1, 3)))
 
 
-def height_colours(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
+def height_colours(vertices: NDArray[np.floating]) -> Doubles:
     """Colours ``[V, 3]`` of vertices by their height, blue below to red above."""
     if not len(vertices):
         return np.zeros((0, 3))
@@ -125,12 +126,8 @@ def height_colours(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _shade(
-    points: NDArray[np.float64],
-    faces: NDArray[np.int32],
-    camera: Camera,
-    raster: Raster,
-    colours: NDArray[np.floating],
-) -> NDArray[np.float64]:
+    points: Doubles, faces: Ints, camera: Camera, raster: Raster, colours: NDArray[np.floating]
+) -> Doubles:
     """Light ``[P, 3]`` that the covered pixels send, in the order of the picture's rows."""
     covered = raster.faces >= 0
     owners, weights = faces[raster.faces[covered]], raster.weights[covered]
@@ -141,15 +138,13 @@ def _shade(
     normals[inside] *= -1.0
     sun = np.maximum(normals @ _TOWARDS_SUN, 0.0) * _sunlit(points, faces, places, normals)
     up = (0.5 + 0.5 * normals[:, 2])[:, None]
-    light: NDArray[np.float64] = sun[:, None] * _SUN + up * _SKY_LIGHT + (1.0 - up) * _GROUND_LIGHT
+    light: Doubles = sun[:, None] * _SUN + up * _SKY_LIGHT + (1.0 - up) * _GROUND_LIGHT
     light *= _blend(colours, owners, weights)
     light[inside] *= _BACK
     return light
 
 
-def _blend(
-    values: NDArray[np.floating], owners: NDArray[np.int32], weights: NDArray[np.float32]
-) -> NDArray[np.float64]:
+def _blend(values: NDArray[np.floating], owners: Ints, weights: Floats) -> Doubles:
     """Values ``[P, 3]`` of pixels from those of vertices ``[V, 3]``."""
     blended = np.zeros((len(owners), 3))
     for corner in range(3):
@@ -157,26 +152,21 @@ def _blend(
     return blended
 
 
-def _seen_from_inside(corners: NDArray[np.float64], eye: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _seen_from_inside(corners: Doubles, eye: Doubles) -> Bools:
     """Whether faces with corners ``[P, 3, 3]`` turn their back to the eye."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    away: NDArray[np.bool_] = np.einsum("pi,pi->p", normals, corners[:, 0] - eye) > 0.0
+    away: Bools = np.einsum("pi,pi->p", normals, corners[:, 0] - eye) > 0.0
     return away
 
 
-def _sunlit(
-    points: NDArray[np.float64],
-    faces: NDArray[np.int32],
-    places: NDArray[np.float64],
-    normals: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _sunlit(points: Doubles, faces: Ints, places: Doubles, normals: Doubles) -> Doubles:
     """Share of the sun ``[P]`` that reaches places ``[P, 3]``: a shadow map, softened."""
     axes = view_axes(-_TOWARDS_SUN)
     seen = points @ axes.T
     low = seen[:, :2].min(axis=0)
     metres = max(float((seen[:, :2].max(axis=0) - low).max()) / (_SHADOW_PIXELS - 2), 1e-9)
 
-    def picture(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def picture(at: Doubles) -> Doubles:
         inside = at @ axes.T
         return np.column_stack([(inside[:, :2] - low) / metres + 1.0, -inside[:, 2]])
 
@@ -192,7 +182,7 @@ def _sunlit(
     return lit
 
 
-def _contact_shadow(raster: Raster) -> NDArray[np.float32]:
+def _contact_shadow(raster: Raster) -> Floats:
     """Brightness ``[H, W]``: darker where a pixel lies behind what surrounds it."""
     step = _SUPERSAMPLING  # soft: the finer pixels would show no more
     nearness = raster.nearness[::step, ::step].astype(np.float32)
@@ -207,12 +197,12 @@ def _contact_shadow(raster: Raster) -> NDArray[np.float32]:
     return brightness.repeat(step, axis=0).repeat(step, axis=1)
 
 
-def _sky(width: int, height: int) -> NDArray[np.float64]:
+def _sky(width: int, height: int) -> Doubles:
     down = np.linspace(0.0, 1.0, height)[:, None, None]
     return np.repeat(_SKY_TOP + (_SKY_LOW - _SKY_TOP) * down, width, axis=1)
 
 
-def _encode(light: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _encode(light: Doubles) -> Bytes:
     """Linear light as 8-bit sRGB, near enough."""
     levels = np.round(255.0 * np.clip(light, 0.0, 1.0) ** (1.0 / 2.2))
     return np.asarray(levels, np.uint8)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_tools.recordings.kitti import KittiFolder
 
@@ -16,7 +17,7 @@ class PosedScan:
     """A scan, and where it was taken."""
 
     points: NDArray[np.floating]  # [N, 3] metres, sensor frame
-    world_from_sensor: NDArray[np.float64]  # [4, 4]
+    world_from_sensor: Doubles  # [4, 4]
 
 
 def is_withheld(index: int, every: int) -> bool:
@@ -24,9 +25,7 @@ def is_withheld(index: int, every: int) -> bool:
     return every > 0 and index % every == every - 1
 
 
-def points_in_range(
-    points: NDArray[np.float32], range_min_m: float, range_max_m: float = np.inf
-) -> NDArray[np.float32]:
+def points_in_range(points: Floats, range_min_m: float, range_max_m: float = np.inf) -> Floats:
     """The points ``[N, 3]``, sensor frame, whose ranges lie within both limits.
 
     Points that are not finite are left out as soon as a limit is given.
@@ -34,22 +33,22 @@ def points_in_range(
     if range_min_m <= 0.0 and not np.isfinite(range_max_m):
         return points
     ranges = np.linalg.norm(points, axis=1)
-    kept: NDArray[np.float32] = points[(ranges >= range_min_m) & (ranges <= range_max_m)]
+    kept: Floats = points[(ranges >= range_min_m) & (ranges <= range_max_m)]
     return kept
 
 
 def world_points(
     folder: KittiFolder, index: int, range_min_m: float = 0.0, range_max_m: float = np.inf
-) -> NDArray[np.float64]:
+) -> Doubles:
     """The finite points ``[N, 3]`` of one scan within limits of the range, world frame."""
     points = points_in_range(folder.read_points(index), range_min_m, range_max_m)
     points = points[np.isfinite(points).all(axis=1)]
     pose = folder.poses[index]
-    world: NDArray[np.float64] = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    world: Doubles = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     return world
 
 
-def thin(points: NDArray[np.float64], voxel_m: float) -> NDArray[np.float64]:
+def thin(points: Doubles, voxel_m: float) -> Doubles:
     """The first of the points ``[N, 3]`` in each voxel of side ``voxel_m``, in their order."""
     if len(points) == 0:
         return points
@@ -60,7 +59,7 @@ def thin(points: NDArray[np.float64], voxel_m: float) -> NDArray[np.float64]:
     return points[np.sort(np.unique(keys, return_index=True)[1])]
 
 
-def merged(clouds: Iterable[NDArray[np.float64]], voxel_m: float) -> NDArray[np.float64]:
+def merged(clouds: Iterable[Doubles], voxel_m: float) -> Doubles:
     """All clouds as one ``[N, 3]``, one point per voxel of side ``voxel_m``."""
     kept = [np.empty((0, 3))]  # the first is what is merged so far
     for cloud in clouds:

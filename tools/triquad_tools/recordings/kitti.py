@@ -14,7 +14,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.pose import is_rotation, orthonormal, rotation_error
 
 from triquad_tools.console.command import ToolError
@@ -29,13 +29,13 @@ class KittiFolder:
     """The scans of a folder with their poses and times; points are read when asked for."""
 
     scan_paths: tuple[Path, ...]
-    poses: NDArray[np.float64]  # [n, 4, 4] world_from_lidar, rigid
-    stamps_ns: NDArray[np.int64]  # [n]
+    poses: Doubles  # [n, 4, 4] world_from_lidar, rigid
+    stamps_ns: Longs  # [n]
 
     def __len__(self) -> int:
         return len(self.scan_paths)
 
-    def read_points(self, index: int) -> NDArray[np.float32]:
+    def read_points(self, index: int) -> Floats:
         """Points ``[N, 3]`` of one scan, metres, lidar frame, as the file has them."""
         path = self.scan_paths[index]
         size = path.stat().st_size
@@ -90,12 +90,12 @@ def _lines(path: Path) -> list[tuple[str, str]]:
     return [(f"{path}:{i}", line) for i, line in enumerate(lines, start=1) if line.strip()]
 
 
-def _read_poses(path: Path) -> NDArray[np.float64]:
+def _read_poses(path: Path) -> Doubles:
     poses = [_parse_pose(place, line) for place, line in _lines(path)]
     return np.array(poses, np.float64).reshape(-1, 4, 4)
 
 
-def _read_calibration(path: Path) -> NDArray[np.float64]:
+def _read_calibration(path: Path) -> Doubles:
     for place, line in _lines(path):
         name, _, numbers = line.partition(":")
         if name.strip() == "Tr":
@@ -103,7 +103,7 @@ def _read_calibration(path: Path) -> NDArray[np.float64]:
     raise ToolError(f"{path}: has no line 'Tr:'")
 
 
-def _parse_pose(place: str, line: str) -> NDArray[np.float64]:
+def _parse_pose(place: str, line: str) -> Doubles:
     """The rigid pose ``[4, 4]`` of 12 numbers, its rotation made orthonormal."""
     words = line.split()
     if len(words) != 12:
@@ -130,7 +130,7 @@ def _parse_number(place: str, word: str) -> float:
     return number
 
 
-def _read_stamps(path: Path) -> NDArray[np.int64]:
+def _read_stamps(path: Path) -> Longs:
     """Times in nanoseconds; decimal, for a float of seconds since 1970 is off by 100 ns."""
     stamps: list[int] = []
     for place, line in _lines(path):

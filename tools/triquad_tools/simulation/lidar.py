@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.recordings.cloud import PosedScan, merged
 from triquad_tools.simulation.scene import Scene
@@ -22,7 +22,7 @@ _TILT_RAD = math.radians(1.0)  # of the gentle roll and pitch
 class SimulatedScan(PosedScan):
     """What the sensor measured: returns with range noise, and the truth behind each."""
 
-    true_hits: NDArray[np.float64]  # [N, 3] metres, world frame, exactly on the surface
+    true_hits: Doubles  # [N, 3] metres, world frame, exactly on the surface
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Lidar:
     noise_m: float = 0.01  # standard deviation of the range
 
     @cached_property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Doubles:
         """Unit vectors ``[beams * columns, 3]`` of the rays, sensor frame, column by column."""
         low, high = math.radians(self.elevation_min_deg), math.radians(self.elevation_max_deg)
         azimuth = np.arange(self.columns) * (2.0 * math.pi / self.columns)
@@ -52,7 +52,7 @@ class Lidar:
         return np.stack(rays, axis=-1).reshape(-1, 3)
 
     def scan(
-        self, scene: Scene, world_from_sensor: NDArray[np.float64], rng: np.random.Generator
+        self, scene: Scene, world_from_sensor: Doubles, rng: np.random.Generator
     ) -> SimulatedScan:
         """One scan of ``scene`` from a pose ``[4, 4]`` in its free space."""
         rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
@@ -74,7 +74,7 @@ class SimulatedDrive:
 
     scene: Scene
     lidar: Lidar
-    poses: NDArray[np.float64]  # [n, 4, 4] world_from_sensor
+    poses: Doubles  # [n, 4, 4] world_from_sensor
     seed: int = 0
     period_s: float = 0.1
 
@@ -93,7 +93,7 @@ class SimulatedDrive:
         """Time of scan ``index`` in nanoseconds from the start of the drive."""
         return round(index * self.period_s * 1e9)
 
-    def true_hits(self, voxel_m: float = 0.02) -> NDArray[np.float64]:
+    def true_hits(self, voxel_m: float = 0.02) -> Doubles:
         """What the sensor could have seen: exact surface points ``[N, 3]``, world frame.
 
         The noise-free hits of all scans, one per voxel of side ``voxel_m``.
@@ -101,7 +101,7 @@ class SimulatedDrive:
         return merged((scan.true_hits for scan in self), voxel_m)
 
 
-def drive(scene: Scene, n_scans: int, step_m: float) -> NDArray[np.float64]:
+def drive(scene: Scene, n_scans: int, step_m: float) -> Doubles:
     """Poses ``world_from_sensor [n_scans, 4, 4]`` of a drive along a street.
 
     The sensor starts at ``x = 0``, 1.8 m above the road, in the lane at ``y < 0``, weaving gently
@@ -122,7 +122,7 @@ def drive(scene: Scene, n_scans: int, step_m: float) -> NDArray[np.float64]:
     return poses
 
 
-def _positions(travelled: NDArray[np.float64], length_m: float) -> NDArray[np.float64]:
+def _positions(travelled: Doubles, length_m: float) -> Doubles:
     """Positions ``[n, 3]`` on a stadium of two lanes joined by half circles."""
     turn = math.pi * _LANE_M
     lap = travelled % (2.0 * (length_m + turn))

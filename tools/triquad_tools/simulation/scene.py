@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_map.compiled.kernel import kernel
 
 from triquad_tools.simulation.solids import BOUND, Solid, X, Y, Z, distance_to, solid_table
@@ -29,7 +29,7 @@ class Scene:
     """
 
     solids: tuple[Solid, ...]
-    bounds: NDArray[np.float64]  # [2, 3] lower and upper corner of the part of interest, metres
+    bounds: Doubles  # [2, 3] lower and upper corner of the part of interest, metres
     drive_length_m: float = 0.0  # of the road along x, from the origin
     houses: tuple[Solid, ...] = ()  # those of the solids that are part of a house
 
@@ -39,15 +39,15 @@ class Scene:
         low, high = self.bounds.tolist()
         return low, high
 
-    def sdf(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sdf(self, points: Doubles) -> Doubles:
         """Signed distances ``[N]`` in metres at points ``[N, 3]`` of the world."""
         return self._nearest(points)[0]
 
-    def gradient(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(self, points: Doubles) -> Doubles:
         """Unit gradients ``[N, 3]`` of the signed distance at points ``[N, 3]`` of the world."""
         return self._nearest(points)[1]
 
-    def is_exact(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_exact(self, points: Doubles) -> Bools:
         """Whether the signed distance is exact, ``[N]``, at points ``[N, 3]`` of the world.
 
         No part of the surface is nearer than the distance says; it is exact where the closest
@@ -57,15 +57,11 @@ class Scene:
         closest = points - distances[:, None] * gradients
         return (distances >= 0.0) | (np.abs(self.sdf(closest)) < _ON_SURFACE_M)
 
-    def is_inside_house(
-        self, points: NDArray[np.float64], margin_m: float = 0.5
-    ) -> NDArray[np.bool_]:
+    def is_inside_house(self, points: Doubles, margin_m: float = 0.5) -> Bools:
         """Whether points ``[N, 3]`` lie deeper than ``margin_m`` in a house: space never seen."""
         return self._houses.sdf(points) < -margin_m
 
-    def cast(
-        self, origin: NDArray[np.float64], directions: NDArray[np.float64], range_max_m: float
-    ) -> NDArray[np.float64]:
+    def cast(self, origin: Doubles, directions: Doubles, range_max_m: float) -> Doubles:
         """Ranges ``[N]`` in metres at which rays first hit a solid; infinite where none does.
 
         Args:
@@ -83,7 +79,7 @@ class Scene:
         return _cast(ordered, offsets[order], gaps[order], start, rays, range_max_m)
 
     @cached_property
-    def _table(self) -> NDArray[np.float64]:
+    def _table(self) -> Doubles:
         return solid_table(self.solids)
 
     @cached_property
@@ -94,14 +90,12 @@ class Scene:
     def _houses(self) -> "Scene":
         return Scene(self.houses, self.bounds)
 
-    def _nearest(
-        self, points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _nearest(self, points: Doubles) -> tuple[Doubles, Doubles]:
         """Distances [N] to the nearest solids, and their gradients [N, 3]."""
         return _nearest(self._table, *self._grid, _rows(points))
 
 
-def _rows(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rows(points: Doubles) -> Doubles:
     """``points`` as the contiguous ``[N, 3]`` float64 that the kernels are compiled for."""
     rows = np.ascontiguousarray(points, np.float64)
     if rows.ndim != 2 or rows.shape[1] != 3:
@@ -115,13 +109,13 @@ class _CandidateGrid(NamedTuple):
     The last list, for points beside the grid, names all solids.
     """
 
-    origin: NDArray[np.float64]  # [3] metres, lower corner
-    shape: NDArray[np.int64]  # [3] cells
-    starts: NDArray[np.int64]  # [cells + 2] into members
-    members: NDArray[np.int64]  # rows of the table of solids
+    origin: Doubles  # [3] metres, lower corner
+    shape: Longs  # [3] cells
+    starts: Longs  # [cells + 2] into members
+    members: Longs  # rows of the table of solids
 
 
-def _candidate_grid(solids: NDArray[np.float64], bounds: NDArray[np.float64]) -> _CandidateGrid:
+def _candidate_grid(solids: Doubles, bounds: Doubles) -> _CandidateGrid:
     """The grid over ``bounds [2, 3]`` for a table of solids ``[S, 11]``."""
     shape = np.ceil((bounds[1] - bounds[0]) / CELL_M).astype(np.int64)
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
@@ -139,7 +133,7 @@ def _candidate_grid(solids: NDArray[np.float64], bounds: NDArray[np.float64]) ->
 
 
 @kernel()
-def _all_distances(solids: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _all_distances(solids: Doubles, points: Doubles) -> Doubles:
     distances = np.empty((points.shape[0], solids.shape[0]))
     for i in range(points.shape[0]):
         for s in range(solids.shape[0]):
@@ -149,7 +143,7 @@ def _all_distances(solids: NDArray[np.float64], points: NDArray[np.float64]) -> 
 
 
 @kernel()
-def _cell(origin: NDArray[np.float64], shape: NDArray[np.int64], point: NDArray[np.float64]) -> int:
+def _cell(origin: Doubles, shape: Longs, point: Doubles) -> int:
     """The flat index of a point's cell; one past the last for a point beside the grid."""
     flat = np.int64(0)
     for axis in range(3):
@@ -162,13 +156,8 @@ def _cell(origin: NDArray[np.float64], shape: NDArray[np.int64], point: NDArray[
 
 @kernel()
 def _nearest(
-    solids: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    shape: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    members: NDArray[np.int64],
-    points: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    solids: Doubles, origin: Doubles, shape: Longs, starts: Longs, members: Longs, points: Doubles
+) -> tuple[Doubles, Doubles]:
     count = points.shape[0]
     distances = np.full(count, np.inf)
     gradients = np.zeros((count, 3))
@@ -186,13 +175,13 @@ def _nearest(
 
 @kernel()
 def _cast(
-    solids: NDArray[np.float64],
-    offsets: NDArray[np.float64],
-    gaps: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    directions: NDArray[np.float64],
+    solids: Doubles,
+    offsets: Doubles,
+    gaps: Doubles,
+    origin: Doubles,
+    directions: Doubles,
     range_max_m: float,
-) -> NDArray[np.float64]:
+) -> Doubles:
     # Every solid is convex, so its signed distance is a convex function along any ray: Newton's
     # method started outside never steps past the first hit.
     outside = np.empty(solids.shape[0])  # squared distance to the centre less squared radius
@@ -220,13 +209,7 @@ def _cast(
 
 
 @kernel()
-def _hit(
-    row: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    start: float,
-    limit: float,
-) -> float:
+def _hit(row: Doubles, origin: Doubles, direction: Doubles, start: float, limit: float) -> float:
     """Range from ``start`` on at which a ray hits one solid; ``limit`` if that is nearer."""
     dx, dy, dz = direction[0], direction[1], direction[2]
     t = start

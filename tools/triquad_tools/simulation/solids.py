@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
 from triquad_map.compiled.kernel import kernel
 
 Vector = tuple[float, float, float]
@@ -70,7 +70,7 @@ def gable(centre: Vector, half: Vector, eave: float, yaw: float = 0.0) -> Solid:
     return Solid(GABLE, centre, yaw, (*half, eave), math.hypot(*half))
 
 
-def solid_table(solids: tuple[Solid, ...]) -> NDArray[np.float64]:
+def solid_table(solids: tuple[Solid, ...]) -> Doubles:
     """The table ``[S, 11]`` of solids that the kernels read."""
     return np.array([solid.row for solid in solids], np.float64).reshape(-1, _COLUMNS)
 
@@ -79,7 +79,7 @@ Distance = tuple[float, float, float, float]  # and its gradient
 
 
 @kernel()
-def _box_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
+def _box_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
     qx, qy, qz = abs(x) - row[_A], abs(y) - row[_B], abs(z) - row[_C]
     sx, sy, sz = math.copysign(1.0, x), math.copysign(1.0, y), math.copysign(1.0, z)
     if qx <= 0.0 and qy <= 0.0 and qz <= 0.0:
@@ -104,7 +104,7 @@ def _extrude(profile: float, along: float) -> tuple[float, float, float]:
 
 
 @kernel()
-def _cylinder_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
+def _cylinder_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
     rho = math.sqrt(x * x + y * y)
     distance, wr, wz = _extrude(rho - row[_A], abs(z) - row[_B])
     ux, uy = (x / rho, y / rho) if rho > 0.0 else (1.0, 0.0)
@@ -112,7 +112,7 @@ def _cylinder_distance(row: NDArray[np.float64], x: float, y: float, z: float) -
 
 
 @kernel()
-def _gable_profile(row: NDArray[np.float64], y: float, z: float) -> tuple[float, float, float]:
+def _gable_profile(row: Doubles, y: float, z: float) -> tuple[float, float, float]:
     """Distance to the right half of a gable's outline (``y >= 0``, ``z`` from the bottom)."""
     width, ridge, eave = row[_B], 2.0 * row[_C], row[_D]
     slope = math.sqrt(width * width + (ridge - eave) * (ridge - eave))
@@ -137,14 +137,14 @@ def _gable_profile(row: NDArray[np.float64], y: float, z: float) -> tuple[float,
 
 
 @kernel()
-def _gable_distance(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
+def _gable_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
     profile, gy, gz = _gable_profile(row, abs(y), z + row[_C])
     distance, wp, wx = _extrude(profile, abs(x) - row[_A])
     return distance, math.copysign(wx, x), math.copysign(wp * gy, y), wp * gz
 
 
 @kernel()
-def distance_to(row: NDArray[np.float64], x: float, y: float, z: float) -> Distance:
+def distance_to(row: Doubles, x: float, y: float, z: float) -> Distance:
     """Signed distance of a world point to the solid of a row, and its gradient, world frame."""
     kind = row[_KIND]
     if kind == HALF_SPACE:
