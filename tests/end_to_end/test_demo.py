@@ -22,6 +22,7 @@ from triquad_tools.demo.results import (
     table_rows,
 )
 from triquad_tools.demo.server import DemoServer
+from triquad_tools.evaluation import metrics
 from triquad_tools.evaluation.map_scores import StreetScores
 from triquad_tools.evaluation.metrics import MeshScores
 from triquad_tools.mapfiles.meshfile import read_mesh
@@ -45,7 +46,7 @@ def test_a_few_scans_leave_all_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(steps, "_SETTLE_LIMIT_S", 3.0)
-    monkeypatch.setattr(steps, "_MESH_SAMPLES", 100_000)
+    monkeypatch.setattr(metrics, "STREET_SAMPLES_MAX", 100_000)
     out = tmp_path / "out"
     before = signal.getsignal(signal.SIGTERM)
     code = demo.main(["--out", str(out), "--scans", "2"])

@@ -19,7 +19,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from support.servers import service_and_client, sphere
 from triquad_client import Client
-from triquad_tools.console.settling import wait_until_settled
+from triquad_tools.recordings.publishing import wait_until_settled
 
 _BESIDE = "heartbeat"
 """The thread that does work of its own beside every operation."""

@@ -77,13 +77,10 @@ def on_street(made: BenchStreet) -> PlacedScans:
     """The street's map, and scans from beside the drive."""
     view = settled_mapper("the street", made.scans).publish()
     rng = np.random.default_rng(_SEED)
-    drive = made.drive
-    scans: list[PosedScan] = []
-    for index in np.linspace(0, len(drive) - 1, _STREET_SCANS).astype(int):
-        pose = displaced(drive.poses[index], Offset(0.4, 3.0), rng)
-        scan = drive.lidar.scan(drive.scene, pose, rng)
-        scans.append(PosedScan(scan.points.astype(np.float64), pose))
-    return PlacedScans(view, tuple(scans))
+    chosen = np.linspace(0, len(made.drive) - 1, _STREET_SCANS).astype(int)
+    poses = (displaced(made.drive.poses[index], Offset(0.4, 3.0), rng) for index in chosen)
+    scan, scene = made.drive.lidar.scan, made.drive.scene
+    return PlacedScans(view, tuple(scan(scene, pose, rng) for pose in poses))
 
 
 def recorded(path: Path, scans: int | None = None) -> PlacedScans:
@@ -92,8 +89,7 @@ def recorded(path: Path, scans: int | None = None) -> PlacedScans:
     mapped: list[PosedScan] = []
     withheld: list[PosedScan] = []
     for index, pose in enumerate(folder.poses[:scans]):
-        points = points_in_range(folder.read_points(index), _RANGE_MIN_M)
-        scan = PosedScan(points.astype(np.float64), pose)
+        scan = PosedScan(points_in_range(folder.read_points(index), _RANGE_MIN_M), pose)
         (withheld if is_withheld(index, _SKIP_EVERY) else mapped).append(scan)
     return PlacedScans(settled_mapper(path.name, mapped).publish(), tuple(withheld))
 
@@ -127,9 +123,9 @@ def _attempt(view: MapView, scan: PosedScan, guess: Doubles) -> Attempt:
     chord = float(np.linalg.norm(found[:3, :3] - true[:3, :3])) / np.sqrt(8.0)
     return Attempt(
         alignment,
-        float(np.linalg.norm(found[:3, 3] - true[:3, 3])),
-        float(np.degrees(2.0 * np.arcsin(min(chord, 1.0)))),
-        seconds,
+        error_m=float(np.linalg.norm(found[:3, 3] - true[:3, 3])),
+        error_deg=float(np.degrees(2.0 * np.arcsin(min(chord, 1.0)))),
+        seconds=seconds,
     )
 
 
@@ -151,7 +147,9 @@ def _figures(name: str, placed: PlacedScans) -> list[Figure]:
         if number == 0:
             figures += _spread(f"{title}: position", [100 * one.error_m for one in results], "cm")
             figures += _spread(f"{title}: rotation", [one.error_deg for one in results], "deg")
-            figures += _spread(f"{title}: time", [1e3 * one.seconds for one in results], "ms", 100)
+            figures += _spread(
+                f"{title}: time", [1e3 * one.seconds for one in results], "ms", tail_at_most=100
+            )
     return figures
 
 

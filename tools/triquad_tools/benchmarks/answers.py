@@ -74,8 +74,8 @@ def _distances(
     known = answer.unknown_distance_m >= answer.distance_m
     figures = [Figure("points to which a surface is nearer than unknown space",
                       100 * known.mean(), "%")]  # fmt: skip
-    figures += _errors("known space", answer, truth, slopes, known, (5.0, 12.0, 0.15))
-    figures += _errors("nearest surface seen", answer, truth, slopes, feet_seen, None)
+    figures += _errors("known space", answer, truth, slopes, chosen=known, bounds=(5.0, 12.0, 0.15))
+    figures += _errors("nearest surface seen", answer, truth, slopes, chosen=feet_seen)
     wary = np.minimum(answer.distance_m, answer.unknown_distance_m) - truth
     figures += [
         Figure("all, unknown as an obstacle: too large, 99.9 %", np.quantile(wary, 0.999), "m"),
@@ -92,7 +92,7 @@ def _errors(
     truth: Doubles,
     slopes: Doubles,
     chosen: Bools,
-    bounds: tuple[float, float, float] | None,
+    bounds: tuple[float, float, float] | None = None,
 ) -> list[Figure]:
     error = (answer.distance_m - truth)[chosen]
     away = chosen & (truth > _NEAR_M)

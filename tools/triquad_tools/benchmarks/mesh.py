@@ -20,9 +20,8 @@ from triquad_server.threads import Teams
 from triquad_tools.benchmarks.figures import Figure, seconds
 from triquad_tools.benchmarks.served import latency_figures, served
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
-from triquad_tools.console.progress import progress
-from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.demo.probe import ask_until
+from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
 from triquad_tools.simulation.lidar import SimulatedScan
 
 _SETTLE_LIMIT_S = 600.0
@@ -42,7 +41,8 @@ def measure_mesh(made: BenchStreet) -> list[Figure]:
 def _network(made: BenchStreet) -> list[Figure]:
     with served() as server, server.another_client() as other:
         client = server.client
-        _teach(client, made.scans)
+        publish_all(client, made.scans)
+        wait_until_settled(client, _SETTLE_LIMIT_S)
         figures = _fetched(client)
         with client.watch_mesh() as early:
             early.catch_up(_FETCH_LIMIT_S)
@@ -54,17 +54,6 @@ def _network(made: BenchStreet) -> list[Figure]:
         figures.append(Figure("tiles that a late joiner has otherwise", different, "", at_most=0))
         figures += _levels(client, other, made)
     return figures
-
-
-def _teach(client: Client, scans: list[SimulatedScan]) -> None:
-    """Publish scans and wait until they are learnt."""
-    with progress("publishing scans", len(scans)) as report:
-        for number, scan in enumerate(scans, 1):
-            client.publish_scan(scan.points, scan.world_from_sensor)
-            keep_few_pending(client, number)
-            report(number, f"{number} of {len(scans)} scans")
-    client.flush(FLUSH_TIMEOUT_S)
-    wait_until_settled(client, _SETTLE_LIMIT_S)
 
 
 def _fetched(client: Client) -> list[Figure]:
@@ -208,7 +197,9 @@ def _changed(before: dict[TileIndex, Mesh], epoch: Epoch, settings: MeshSettings
     cache = TileCache(settings, Teams().meshing)
     cache.refresh(epoch)
     _make(cache)
-    return changed_tiles(before, _meshes(cache), settings.tolerance_m, settings.cell_m)
+    return changed_tiles(
+        before, _meshes(cache), tolerance_m=settings.tolerance_m, cell_m=settings.cell_m
+    )
 
 
 def _make(cache: TileCache) -> set[TileIndex]:

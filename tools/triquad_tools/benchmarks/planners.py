@@ -20,8 +20,8 @@ from triquad_tools.benchmarks.answers import REACH_M, measure_answers
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.served import MAP, Served, latency_figures, served, stream
 from triquad_tools.benchmarks.street import BenchStreet
-from triquad_tools.console.settling import wait_until_settled
 from triquad_tools.demo.probe import ProbeReport
+from triquad_tools.recordings.publishing import wait_until_settled
 
 Points = Doubles
 
@@ -49,7 +49,7 @@ def measure_planners(made: BenchStreet) -> list[Figure]:
         wait_until_settled(server.client, _SETTLE_LIMIT_S)
         server.client.download_map(server.folder / "map.triquad")
         record = read_map(server.folder / "map.triquad")
-    view = Mapper(MAP, Settings(), "cpu", record).publish()
+    view = Mapper(MAP, Settings(), "cpu", record=record).publish()
     return measure_answers(made, record, view) + figures
 
 
@@ -76,7 +76,7 @@ def _one(server: Served, made: BenchStreet, points: Points) -> list[Figure]:
         stream(server.client, made.scans, "streaming beside one planner")
         met = probe.finish()
     name = f"{_ASKED} distances to {REACH_M:g} m with gradient while streaming"
-    return latency_figures(name, met, 5, 20)
+    return latency_figures(name, met, median_ms=5, tail_ms=20)
 
 
 def _sixteen(server: Served, made: BenchStreet, points: Sequence[Points]) -> list[Figure]:

@@ -89,7 +89,7 @@ def stream_beside_planner(
 
 
 def latency_figures(
-    name: str, met: ProbeReport, median_ms: float | None = None, tail_ms: float | None = None
+    name: str, met: ProbeReport, *, median_ms: float | None = None, tail_ms: float | None = None
 ) -> list[Figure]:
     """How soon a planner's queries were answered, and what the median and 99 % should be."""
     return [

@@ -14,8 +14,8 @@ from triquad_tools.benchmarks.core import seen_points
 from triquad_tools.benchmarks.figures import Figure, seconds
 from triquad_tools.benchmarks.served import latency_figures, served, stream_beside_planner
 from triquad_tools.benchmarks.street import BenchStreet
-from triquad_tools.console.settling import FLUSH_TIMEOUT_S, wait_until_settled
 from triquad_tools.evaluation.map_scores import score_street
+from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
 
 _SOON_S = 2.0  # after the last scan
 _SETTLE_LIMIT_S = 300.0
@@ -30,7 +30,7 @@ def measure_server(made: BenchStreet) -> list[Figure]:
         met = stream_beside_planner(server, made)
         time.sleep(_SOON_S)
         name = "1,000 points with gradient while streaming"
-        figures = latency_figures(name, met, 4, 15) + _early(client, made)
+        figures = latency_figures(name, met, median_ms=4, tail_ms=15) + _early(client, made)
         started = time.monotonic()
         wait_until_settled(client, _SETTLE_LIMIT_S)
         settled_s = time.monotonic() - started
@@ -78,7 +78,7 @@ def _converged(client: Client, made: BenchStreet) -> list[Figure]:
 def _network(client: Client, made: BenchStreet, folder: Path) -> list[Figure]:
     """Queries of 100,000 points through the network, against the same map in this process."""
     client.download_map(folder / "map.triquad")
-    epoch = Mapper("bench", Settings(), "cpu", read_map(folder / "map.triquad")).publish()
+    epoch = Mapper("bench", Settings(), "cpu", record=read_map(folder / "map.triquad")).publish()
     points = seen_points(epoch, made, np.random.default_rng(0))
     times: list[float] = []
     ratios: list[float] = []

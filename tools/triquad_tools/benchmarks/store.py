@@ -56,7 +56,7 @@ def _row(made: BenchStreet) -> MapRecord:
 
 def _costs(record: MapRecord, made: BenchStreet) -> list[Figure]:
     """Bytes and time of a complete checkpoint, and of those after driving on in one region."""
-    mapper = Mapper(MAP, Settings(), "cpu", record)
+    mapper = Mapper(MAP, Settings(), "cpu", record=record)
     with (
         tempfile.TemporaryDirectory(prefix="triquad-bench-") as root,
         closing(Store(Path(root), MAP, Settings().store)) as store,

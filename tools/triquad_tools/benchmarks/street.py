@@ -43,7 +43,7 @@ def bench_street(seed: int) -> BenchStreet:
     """100 scans along the exact street ``seed``."""
     scene = street(seed, _LENGTH_M)
     poses = drive(scene, SCANS, _LENGTH_M / SCANS)
-    driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed))
+    driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed=seed))
     visible = driven.drive.true_hits(STREET_VOXEL_M)
     low, high = scene.bounds  # to which meshes are cut
     visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]

@@ -141,7 +141,7 @@ def _slice(options: argparse.Namespace) -> int:
     from triquad_tools.plots.slice_plan import SliceOptions, draw_slice  # slow to import
 
     wanted = SliceOptions(options.slice, options.box, options.cell or _CELL_M)
-    draw_slice(str(options.files[0]), options.map or "default", wanted, options.plot)
+    draw_slice(str(options.files[0]), options.map or "default", wanted, path=options.plot)
     return OK
 
 

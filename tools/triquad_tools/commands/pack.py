@@ -162,8 +162,8 @@ def _check_target(source: Path, target: Path, force: bool) -> None:
 def _pack_map(options: argparse.Namespace, path: Path) -> int:
     precision = chosen_precision(options.precision, options.max_error)
     training = not options.no_training and precision.max_error_m is None
-    source, complete = _source(options, path, _box(options.crop), training)
-    written = pack_map(source, precision, options.output, path.stat().st_size)
+    source, complete = _source(options, path, box=_box(options.crop), training=training)
+    written = pack_map(source, precision, options.output, bytes_before=path.stat().st_size)
     print(f"{options.output}: {written}")
     return OK if complete else FAILED
 
@@ -177,11 +177,11 @@ def _export(options: argparse.Namespace, path: Path) -> int:
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
     if grid:
-        written = export_grid(source.record, box, cell_m, options.sparse, output)
+        written = export_grid(source.record, box, cell_m, sparse=options.sparse, path=output)
     else:
         from triquad_tools.mapfiles.meshfile import export_mesh  # slow to import
 
-        written = export_mesh(source.record, box, cell_m, output)
+        written = export_mesh(source.record, box, cell_m, path=output)
     print(f"{output}: {written}")
     return OK if complete else FAILED
 

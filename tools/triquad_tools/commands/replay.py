@@ -12,9 +12,13 @@ from triquad_client import Client, FlushReport, connect
 from triquad_tools.console.arguments import count, not_negative, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, run
 from triquad_tools.console.progress import progress
-from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.kitti import KittiFolder, read_folder
+from triquad_tools.recordings.publishing import (
+    FLUSH_TIMEOUT_S,
+    keep_few_pending,
+    wait_until_settled,
+)
 
 _COMMAND = "triquad-replay"
 
@@ -84,7 +88,7 @@ def _publish_all(
             points = points_in_range(folder.read_points(index), options.range_min)
             if len(points):
                 stamp_s = int(folder.stamps_ns[index]) / 1e9
-                client.publish_scan(points, folder.poses[index], stamp_s, options.source)
+                client.publish_scan(points, folder.poses[index], stamp_s, source=options.source)
                 published += 1
                 if pace.by_server:
                     keep_few_pending(client, published)
@@ -96,7 +100,7 @@ def _publish_all(
     after = client.status().scans_dropped
     refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
     refusals = {reason: count for reason, count in refusals.items() if count > 0}
-    return ReplayReport(published, skipped, flush, refusals, seconds)
+    return ReplayReport(published, skipped, flush, refusals=refusals, seconds=seconds)
 
 
 def due_times(pace: Pace, stamps_ns: Sequence[int]) -> list[float]:

@@ -12,21 +12,20 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from itertools import pairwise
 
 import numpy as np
+from triquad_client import Client, connect
+from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
-
-if TYPE_CHECKING:
-    from triquad_client import Client
 
 PERIOD_S = 0.05
 _STOP_TIMEOUT_S = 60.0
 
 
-QUESTIONS: "dict[str, Callable[[Client, Doubles], int]]" = {
+QUESTIONS: dict[str, Callable[[Client, Doubles], int]] = {
     "sdf": lambda client, points: client.query_sdf(points).epoch,
     "gradient": lambda client, points: client.query_sdf(points, gradient=True).epoch,
     "distance": lambda client, points: client.query_distance(points).epoch,
@@ -87,11 +86,9 @@ class Probe:
 
 
 def ask_until(
-    stop: threading.Event, client: "Client", points: Doubles, question: str = "sdf"
+    stop: threading.Event, client: Client, points: Doubles, question: str = "sdf"
 ) -> ProbeReport:
     """Ask a question of ``QUESTIONS`` at ``points`` [N, 3] until ``stop`` is set."""
-    from triquad_client import TriquadError
-
     latencies_s: list[float] = []
     epochs: list[int] = []
     errors = 0
@@ -105,19 +102,24 @@ def ask_until(
             errors += 1
             last_error = f"{type(error).__name__}: {error}"
         stop.wait(PERIOD_S - (time.perf_counter() - started))
-    quantiles = [float("nan")] * 4
-    if latencies_s:
-        quantiles = (1e3 * np.quantile(latencies_s, [0.5, 0.95, 0.99, 1.0])).tolist()
-    backwards = sum(later < before for before, later in zip(epochs, epochs[1:], strict=False))
-    queries = len(latencies_s) + errors
-    different = len(set(epochs))
-    return ProbeReport(queries, errors, last_error, different, backwards, len(points), *quantiles)
+    quantiles = 1e3 * np.quantile(latencies_s or [np.nan], [0.5, 0.95, 0.99, 1.0])
+    p50, p95, p99, longest = quantiles.tolist()
+    return ProbeReport(
+        queries=len(latencies_s) + errors,
+        errors=errors,
+        last_error=last_error,
+        epochs=len(set(epochs)),
+        epochs_backwards=sum(later < before for before, later in pairwise(epochs)),
+        points=len(points),
+        latency_p50_ms=p50,
+        latency_p95_ms=p95,
+        latency_p99_ms=p99,
+        latency_max_ms=longest,
+    )
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the process; ``argv`` is endpoint, map, question and how many points are read."""
-    from triquad_client import connect
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     endpoint, map_name, question, count = argv
     points = np.frombuffer(sys.stdin.buffer.read(24 * int(count)), "<f8").reshape(-1, 3)

@@ -1,14 +1,11 @@
 """What the demonstration measured, as a table, and what of it was promised."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from triquad_tools.console.report import Row, centimetres, percent
-
-if TYPE_CHECKING:
-    from triquad_tools.demo.probe import ProbeReport
-    from triquad_tools.evaluation.map_scores import StreetScores
-    from triquad_tools.evaluation.metrics import MeshScores
+from triquad_tools.demo.probe import ProbeReport
+from triquad_tools.evaluation.map_scores import StreetScores
+from triquad_tools.evaluation.metrics import MeshScores
 
 
 @dataclass(frozen=True)
@@ -61,9 +58,9 @@ class DemoResults:
     seed: int
     cpus: int
     intake: Intake
-    queries: "ProbeReport"
-    street: "StreetScores"
-    mesh: "MeshScores"
+    queries: ProbeReport
+    street: StreetScores
+    mesh: MeshScores
     restart: Restart
     size: MapSize
     phases_s: dict[str, float]
@@ -91,15 +88,11 @@ def broken_promises(results: DemoResults) -> list[str]:
     if results.intake.settled:  # a map that still learns may change
         at_most["restart difference (m)"] = (restart.sdf_difference_max_m, 0.002)
         at_most["statuses changed by the restart"] = (restart.statuses_changed, 0)
-    # NaN keeps no promise.
     return [
-        f"{name} is {value:.4g}; promised is at least {limit:g}"
-        for name, (value, limit) in at_least.items()
-        if not value >= limit
-    ] + [
-        f"{name} is {value:.4g}; promised is at most {limit:g}"
-        for name, (value, limit) in at_most.items()
-        if not value <= limit
+        f"{name} is {value:.4g}; promised is {bound} {limit:g}"
+        for bound, sign, promises in (("at least", 1, at_least), ("at most", -1, at_most))
+        for name, (value, limit) in promises.items()
+        if not sign * value >= sign * limit  # NaN keeps no promise
     ]
 
 
@@ -113,7 +106,7 @@ def table_rows(results: DemoResults) -> list[Row]:
     ]
 
 
-def _speed_rows(intake: Intake, queries: "ProbeReport") -> list[Row]:
+def _speed_rows(intake: Intake, queries: ProbeReport) -> list[Row]:
     settled = "until nothing was left to learn" if intake.settled else "cut off; still learning"
     return [
         Row(
@@ -140,7 +133,7 @@ def _speed_rows(intake: Intake, queries: "ProbeReport") -> list[Row]:
     ]
 
 
-def _quality_rows(street: "StreetScores", mesh: "MeshScores") -> list[Row]:
+def _quality_rows(street: StreetScores, mesh: MeshScores) -> list[Row]:
     return [
         Row(
             "SDF error",

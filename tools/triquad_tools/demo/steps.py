@@ -15,12 +15,12 @@ from triquad_format.records.crop import without_training
 from triquad_server.mesh.preview import previews_of
 
 from triquad_tools.console.progress import progress
-from triquad_tools.console.settling import FLUSH_TIMEOUT_S, keep_few_pending, wait_until_settled
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.results import Intake, MapSize, Restart
 from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
 from triquad_tools.evaluation.metrics import MeshScores, score_against_drive
 from triquad_tools.plots.render import Camera, height_colours, render_mesh
+from triquad_tools.recordings.publishing import publish_all, wait_until_settled
 
 MAP = "demo"
 
@@ -66,14 +66,7 @@ def learn(endpoint: str, street: DrivenStreet) -> Learnt:
 
 def _stream(client: Client, street: DrivenStreet) -> Intake:
     started = time.monotonic()
-    start_s = time.time()
-    with progress("streaming scans", len(street.scans)) as report:
-        for index, scan in enumerate(street.scans):
-            stamp_s = start_s + street.drive.stamp_ns(index) / 1e9
-            client.publish_scan(scan.points, scan.world_from_sensor, stamp_s)
-            keep_few_pending(client, index + 1)
-            report(index + 1, f"{index + 1} of {len(street.scans)} scans")
-        flush = client.flush(FLUSH_TIMEOUT_S)
+    flush = publish_all(client, street.scans)
     taken_in = time.monotonic()
     status = wait_until_settled(client, _SETTLE_LIMIT_S)
     return Intake(
@@ -104,7 +97,15 @@ def score(endpoint: str, street: DrivenStreet) -> Scored:
         report(0.0, "mesh against the exact surface")
         scores = score_against_drive(surface, street.drive)
         report(0.0, f"{scores.samples:,} samples of the mesh")
-    return Scored(field, scores, surface, parameters, checkpoint, points, answers)
+    return Scored(
+        street=field,
+        mesh=scores,
+        surface=surface,
+        parameters=parameters,
+        checkpoint=checkpoint,
+        points=points,
+        answers=answers,
+    )
 
 
 def compare(endpoint: str, scored: Scored) -> Restart:

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import SdfResult
-from triquad_format.records.arrays import Bytes, Doubles
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.view import FieldAnswer
 
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import median_angle_deg
+from triquad_tools.evaluation.metrics import mean_or_nan, median_angle_deg
 from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 from triquad_tools.simulation.scene import Scene
 
@@ -105,18 +105,16 @@ def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     answer = query(probes.near, gradient=True)
     assert answer.gradient is not None
     known = np.isfinite(answer.sdf)
-    nan = float("nan")
     errors = np.abs(answer.sdf.astype(np.float64) - probes.exact_sdf)[known]
-    angle = median_angle_deg(answer.gradient[known], probes.exact_gradient[known])
     houses = query(probes.in_houses)
     return StreetScores(
-        sdf_error_m=float(errors.mean()) if len(errors) else nan,
+        sdf_error_m=mean_or_nan(errors),
         sdf_error_median_m=_quantile(errors, 0.5),
         sdf_error_p95_m=_quantile(errors, 0.95),
-        gradient_angle_deg=angle,
-        near_surface_ratio=_share(answer.status, Status.SURFACE),
+        gradient_angle_deg=median_angle_deg(answer.gradient[known], probes.exact_gradient[known]),
+        near_surface_ratio=mean_or_nan(answer.status == Status.SURFACE),
         near_points=len(probes.near),
-        houses_unknown_ratio=_share(houses.status, Status.UNKNOWN),
+        houses_unknown_ratio=mean_or_nan(houses.status == Status.UNKNOWN),
         house_points=len(probes.in_houses),
     )
 
@@ -136,8 +134,8 @@ def score_withheld(query: MapQuery, clouds: Iterable[Doubles]) -> WithheldScores
     on_surface = distance[status == Status.SURFACE]
     return WithheldScores(
         points=len(distance),
-        surface_ratio=_share(status, Status.SURFACE),
-        unknown_ratio=_share(status, Status.UNKNOWN),
+        surface_ratio=mean_or_nan(status == Status.SURFACE),
+        unknown_ratio=mean_or_nan(status == Status.UNKNOWN),
         sdf_median_m=_quantile(distance, 0.5),
         sdf_p90_m=_quantile(distance, 0.9),
         surface_sdf_median_m=_quantile(on_surface, 0.5),
@@ -152,10 +150,6 @@ def _points_in_houses(scene: Scene, positions: Doubles, rng: np.random.Generator
     low[2] = max(low[2], 0.0)
     drawn = rng.uniform(low, high, (_HOUSE_PROBES * 5, 3))
     return drawn[scene.is_inside_house(drawn, HOUSE_MARGIN_M)][:_HOUSE_PROBES]
-
-
-def _share(statuses: Bytes, wanted: Status) -> float:
-    return float(np.mean(statuses == wanted)) if len(statuses) else float("nan")
 
 
 def _quantile(values: NDArray[np.floating], level: float) -> float:

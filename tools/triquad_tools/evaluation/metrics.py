@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_client import Mesh
-from triquad_format.records.arrays import Bools, Doubles
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.recordings.cloud import thin
 from triquad_tools.simulation.lidar import SimulatedDrive
@@ -157,14 +157,14 @@ def _scores(
             reference, distance_upper_bound=settings.completion_cut_m, workers=-1
         )[0]
         missing = np.minimum(missing, found)
-    accuracy_ratio = _mean(kept < settings.threshold_m)
-    completion_ratio = _mean(missing < settings.threshold_m)
+    accuracy_ratio = mean_or_nan(kept < settings.threshold_m)
+    completion_ratio = mean_or_nan(missing < settings.threshold_m)
     total = accuracy_ratio + completion_ratio
     return MeshScores(
-        accuracy_m=_mean(kept),
+        accuracy_m=mean_or_nan(kept),
         accuracy_median_m=float(np.median(kept)) if len(kept) else float("nan"),
         accuracy_ratio=accuracy_ratio,
-        completion_m=_mean(missing),
+        completion_m=mean_or_nan(missing),
         completion_ratio=completion_ratio,
         f_score=2.0 * accuracy_ratio * completion_ratio / total if total > 0.0 else 0.0,
         outlier_ratio=1.0 - len(kept) / len(distances) if len(distances) else float("nan"),
@@ -173,5 +173,6 @@ def _scores(
     )
 
 
-def _mean(values: Doubles | Bools) -> float:
+def mean_or_nan(values: NDArray[np.floating | np.bool_]) -> float:
+    """The mean of values [N], or the share of those that are true; NaN where there are none."""
     return float(np.mean(values)) if len(values) else float("nan")

@@ -54,7 +54,7 @@ class Probes:
         moved = np.abs(differences)
         ends = np.cumsum([len(self.surface), len(self.near)])
         surface, near, free = (_quantile(part) for part in np.split(moved, ends))
-        return FieldChange(surface, near, free, float(moved.max(initial=0.0)))
+        return FieldChange(surface, near, free, largest_m=float(moved.max(initial=0.0)))
 
 
 def draw_probes(
@@ -79,7 +79,7 @@ def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
     count = max(PROBES // max(len(before.regions), 1), _LEAST_PROBES)
     kinds: list[list[Doubles]] = [[np.zeros((0, 3))] for _ in range(3)]
     for region in before.regions:
-        probes = draw_probes(before.settings, region, rng, count)
+        probes = draw_probes(before.settings, region, rng, count=count)
         centre = before.settings.region_centre(region.index)
         for kind, field in zip(kinds, dataclasses.fields(probes), strict=True):
             kind.append(getattr(probes, field.name) + centre)

@@ -110,7 +110,9 @@ def _logged(file: CheckpointFile, indices: "_Indices") -> LoggedCheckpoint:
         pass  # another tool rewrote it: only reading all of it shows whether it is intact
     except (FormatError, OSError) as error:
         problem = str(error)
-    return LoggedCheckpoint(file.path.name, file.epoch, file.complete, size, parts, problem)
+    return LoggedCheckpoint(
+        file.path.name, file.epoch, file.complete, bytes=size, parts=parts, problem=problem
+    )
 
 
 class _Indices:

@@ -85,7 +85,7 @@ def _draw_coverage(grid: PlanGrid, surface: Columns, seen: Columns, axes: Axes) 
     draw_layers(axes, [Layer("only free space was seen", FREE, grid.marked(seen.middles))])
     low, high = np.quantile(surface.tops, [0.01, 0.99]) if len(surface.tops) else (0.0, 0.0)
     label = "height of the topmost surface in m"
-    scale = Scale(label, "viridis", float(low), float(max(high, low + _LEAST_RANGE_M)))
+    scale = Scale(label, "viridis", low=float(low), high=float(max(high, low + _LEAST_RANGE_M)))
     draw_values(axes, grid.statistic(surface.middles, surface.tops, "max"), scale)
 
 
@@ -166,7 +166,7 @@ def _errors_plan(grid: PlanGrid, record: MapRecord) -> Plan:
         return Plan(heading, lambda axes: draw_nothing(axes, "no samples in this file"))
     cells = grid.statistic(found.points, 100 * found.errors_m, "mean")
     high = max(float(np.ceil(np.nanquantile(cells, 0.99))), _LEAST_RANGE_CM)
-    scale = Scale("mean |signed distance - label| in cm", "plasma_r", 0.0, high)
+    scale = Scale("mean |signed distance - label| in cm", "plasma_r", low=0.0, high=high)
     mean, p95 = found.errors_m.mean(), np.quantile(found.errors_m, 0.95)
     note = (
         f"mean {centimetres(mean)}, 95 % {centimetres(p95)} at {len(found.points):,} samples "

@@ -62,7 +62,7 @@ class PlanGrid:
         count = np.floor(high / cell_m).astype(np.int64) - first + 1
         wanted = np.maximum(count, max(math.ceil(_LEAST_SIDE * count.max()), _LEAST_CELLS))
         first -= (wanted - count) // 2
-        return cls(first * cell_m, cell_m, int(wanted[1]), int(wanted[0]))
+        return cls(first * cell_m, cell_m, rows=int(wanted[1]), columns=int(wanted[0]))
 
     @property
     def high_m(self) -> Doubles:
@@ -154,7 +154,7 @@ def draw_values(axes: Axes, values: Values, scale: Scale) -> None:
     """Colour the cells that have a value, and show the scale."""
     known = values[np.isfinite(values)]
     below, above = bool((known < scale.low).any()), bool((known > scale.high).any())
-    extend = {(False, False): "neither", (True, False): "min", (False, True): "max"}
+    extend = ("neither", "min", "max", "both")[below + 2 * above]
     image = axes.imshow(
         values,
         cmap=scale.colours,
@@ -165,9 +165,7 @@ def draw_values(axes: Axes, values: Values, scale: Scale) -> None:
         interpolation="none",
     )
     beside = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
-    axes.figure.colorbar(
-        image, cax=beside, label=scale.label, extend=extend.get((below, above), "both")
-    )
+    axes.figure.colorbar(image, cax=beside, label=scale.label, extend=extend)
 
 
 def draw_layers(axes: Axes, layers: Sequence[Layer]) -> None:

@@ -107,7 +107,7 @@ def render_mesh(
     if len(faces):
         points = np.ascontiguousarray(vertices, np.float64)
         rows = np.ascontiguousarray(faces, np.int32)
-        raster = rasterise(camera.project(points, wide, high), rows, wide, high)
+        raster = rasterise(camera.project(points, wide, high), rows, width=wide, height=high)
         light = _shade(points, rows, camera, raster, colours)
         covered = raster.faces >= 0
         picture[covered] = light * _contact_shadow(raster)[covered, None]
@@ -170,7 +170,9 @@ def _sunlit(points: Doubles, faces: Ints, places: Doubles, normals: Doubles) -> 
         inside = at @ axes.T
         return np.column_stack([(inside[:, :2] - low) / metres + 1.0, -inside[:, 2]])
 
-    shadows = rasterise(picture(points), faces, _SHADOW_PIXELS, _SHADOW_PIXELS).nearness
+    shadows = rasterise(
+        picture(points), faces, width=_SHADOW_PIXELS, height=_SHADOW_PIXELS
+    ).nearness
     # A step off the surface, so that it does not shade itself.
     off = picture(places + 2.5 * metres * normals)
     columns, rows = off[:, 0].astype(np.int64), off[:, 1].astype(np.int64)

@@ -54,7 +54,7 @@ def draw_slice(target: str, map_name: str, options: SliceOptions, path: Path) ->
     with open_map(target, map_name) as opened:
         answer = opened.query_grid(bounds, options.cell_m, _MAX_DISTANCE_M)
     shape = answer.shape
-    grid = PlanGrid(shape.corner[:2], shape.cell_m, shape.counts[1], shape.counts[0])
+    grid = PlanGrid(shape.corner[:2], shape.cell_m, rows=shape.counts[1], columns=shape.counts[0])
     plans = [
         Plan("Distance", partial(_draw_distance, answer)),
         Plan("Status", partial(_draw_status, answer)),
@@ -76,7 +76,7 @@ def _draw_distance(answer: Grid, axes: Axes) -> None:
     colours = colormaps["viridis"].with_extremes(under=_BEHIND)
     label = f"m to the nearest surface, {_MAX_DISTANCE_M:g} or more\norange: behind it"
     values = np.asarray(answer.distance_m[:, :, 0].T, np.float64)
-    draw_values(axes, values, Scale(label, colours, 0.0, _MAX_DISTANCE_M))
+    draw_values(axes, values, Scale(label, colours, low=0.0, high=_MAX_DISTANCE_M))
 
 
 def _draw_status(answer: Grid, axes: Axes) -> None:

@@ -76,7 +76,6 @@ class SimulatedDrive:
     lidar: Lidar
     poses: Doubles  # [n, 4, 4] world_from_sensor
     seed: int = 0
-    period_s: float = 0.1
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -88,10 +87,6 @@ class SimulatedDrive:
         """Scan ``index`` of the drive."""
         rng = np.random.default_rng([self.seed, index])
         return self.lidar.scan(self.scene, self.poses[index], rng)
-
-    def stamp_ns(self, index: int) -> int:
-        """Time of scan ``index`` in nanoseconds from the start of the drive."""
-        return round(index * self.period_s * 1e9)
 
     def true_hits(self, voxel_m: float = 0.02) -> Doubles:
         """What the sensor could have seen: exact surface points ``[N, 3]``, world frame.

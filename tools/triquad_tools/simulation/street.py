@@ -32,13 +32,13 @@ def street(seed: int, length_m: float = 100.0) -> Scene:
         parts += _cars(rng, side, length_m)
         parts += _poles_and_trees(rng, side, length_m)
     bounds = np.array([[-_MARGIN_M, -24.0, -0.5], [length_m + _MARGIN_M, 24.0, _TOP_M]])
-    return Scene(tuple(parts), bounds, length_m, tuple(houses))
+    return Scene(tuple(parts), bounds, drive_length_m=length_m, houses=tuple(houses))
 
 
 def street_drive(seed: int, scans: int, step_m: float = 1.0) -> SimulatedDrive:
     """A drive along street ``seed``, scans ``step_m`` apart; always the same scans."""
     scene = street(seed)
-    return SimulatedDrive(scene, Lidar(), drive(scene, scans, step_m), seed)
+    return SimulatedDrive(scene, Lidar(), drive(scene, scans, step_m), seed=seed)
 
 
 def _standing(foot: Vector, half_x: float, half_y: float, height: float, yaw: float = 0.0) -> Solid:

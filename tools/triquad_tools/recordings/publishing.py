@@ -1,12 +1,12 @@
-"""Waiting for a server: until it has taken in scans, and until it has learnt them."""
+"""Publishing scans no faster than a server takes them in, and waiting until they are learnt."""
 
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+
+from triquad_client import Client, FlushReport, ServerStatus
 
 from triquad_tools.console.progress import progress
-
-if TYPE_CHECKING:
-    from triquad_client import Client, ServerStatus
+from triquad_tools.recordings.cloud import PosedScan
 
 _POLL_S = 0.5  # the server says how it is doing when it is asked, not when it changes
 
@@ -15,7 +15,7 @@ FLUSH_TIMEOUT_S = 120.0
 _PENDING = 4
 
 
-def keep_few_pending(client: "Client", published: int) -> None:
+def keep_few_pending(client: Client, published: int) -> None:
     """Call after each scan: lets 4 to 8 scans be under way, far fewer than a server queues.
 
     Not after every scan, for the server publishes an epoch before it answers.
@@ -24,7 +24,17 @@ def keep_few_pending(client: "Client", published: int) -> None:
         client.flush(FLUSH_TIMEOUT_S, pending=_PENDING)
 
 
-def wait_until_settled(client: "Client", limit_s: float | None = None) -> "ServerStatus":
+def publish_all(client: Client, scans: Sequence[PosedScan]) -> FlushReport:
+    """Publish scans, and wait until the server has taken in all of them."""
+    with progress("publishing scans", len(scans)) as report:
+        for number, scan in enumerate(scans, start=1):
+            client.publish_scan(scan.points, scan.world_from_sensor)
+            keep_few_pending(client, number)
+            report(number, f"{number} of {len(scans)} scans")
+        return client.flush(FLUSH_TIMEOUT_S)
+
+
+def wait_until_settled(client: Client, limit_s: float | None = None) -> ServerStatus:
     """The server's status once nothing is left to learn, or after ``limit_s`` seconds."""
     started = time.monotonic()
     with progress("training", limit_s) as report:
