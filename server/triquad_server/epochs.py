@@ -45,24 +45,16 @@ class Epoch(ComposedView):
         split: Split,
     ) -> None:
         """The map called ``name``; ``split`` runs the work of its answers."""
-        super().__init__(number, settings, regions, split)
+        super().__init__(number, settings, regions, split=split)
+        self.number = number
+        self.field_settings = settings
         self.frozen_regions = regions
         self._name = name
-
-    @property
-    def number(self) -> int:
-        """Number of this epoch."""
-        return self.epoch
 
     @property
     def regions(self) -> int:
         """Regions of the map."""
         return len(self.frozen_regions)
-
-    @property
-    def field_settings(self) -> FieldSettings:
-        """Shape of the field."""
-        return self._settings
 
     @property
     def vertices(self) -> int:
@@ -80,7 +72,7 @@ class Epoch(ComposedView):
             region_record(region.index, region.engine, region.evidence, training=None)
             for region in self.frozen_regions
         )
-        return MapRecord(self._name, self.number, self._settings, regions)
+        return MapRecord(self._name, self.number, settings=self.field_settings, regions=regions)
 
 
 class QueryGate:

@@ -10,7 +10,6 @@ from triquad_format.wire import keys
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
-    FlushRequest,
     MapChunkRequest,
     MapInfoRequest,
     ResetRequest,
@@ -18,7 +17,6 @@ from triquad_format.wire.messages import (
     StatusRequest,
     TileListRequest,
     TileRequest,
-    TileUpdatesRequest,
 )
 from triquad_format.wire.query_messages import (
     AlignRequest,
@@ -34,7 +32,8 @@ from triquad_server.counter import Counter
 from triquad_server.epochs import EpochLimits
 from triquad_server.health import Health, Heartbeat, Identity
 from triquad_server.intake.flush import FlushHandler
-from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
+from triquad_server.intake.scan import ScanIntake
+from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
@@ -187,9 +186,7 @@ class Service:
             },
             _TILE_WORKERS,
         )
-        self._serve(
-            {keys.TILE_UPDATES: lambda request: feed.add(request, request.read(TileUpdatesRequest))}
-        )
+        self._serve({keys.TILE_UPDATES: feed.add})
 
     def _serve_status(self, health: Health) -> None:
         """How the server is doing, and whether scans are in the map."""
@@ -203,7 +200,7 @@ class Service:
         self._serve(
             {
                 keys.STATUS: answering(StatusRequest, lambda _: health.status()),
-                keys.FLUSH: lambda request: flush.add(request, request.read(FlushRequest)),
+                keys.FLUSH: flush.add,
             }
         )
 

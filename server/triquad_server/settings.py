@@ -137,11 +137,6 @@ class MeshSettings(BaseModel):
     cache_bytes: Annotated[int, Field(ge=0, le=2**40)] = 200_000_000
     """Bytes of encoded tiles that are cached; others are made again when they are asked for."""
 
-    @property
-    def tile_side_m(self) -> float:
-        """Side of a tile."""
-        return self.cell_m * self.tile_cells
-
 
 class StoreSettings(BaseModel):
     """When checkpoints are written and how far back they are kept."""

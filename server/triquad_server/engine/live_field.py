@@ -14,11 +14,69 @@ from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
 from triquad_map.compiled.field.quadtree import LiveQuadtree
 
-from triquad_server.engine.adam import Parameter
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
 
 FrozenField = FrozenCompiledField | TensorField
 """A field that does not change any more. Safe for any thread."""
+
+
+class Parameter:
+    """Rows of trained values with the optimiser's state of each; growing keeps both together.
+
+    All four tensors are views of the rows in use, which the optimiser changes in place.
+    """
+
+    def __init__(self, values: Tensor) -> None:
+        """Begin with ``values`` [rows, ...], which are copied, and no steps taken."""
+        self._count = len(values)
+        self._values = values.clone()
+        self._means = torch.zeros_like(values)
+        self._variances = torch.zeros_like(values)
+        self._steps = torch.zeros(len(values), dtype=torch.int32, device=values.device)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def values(self) -> Tensor:
+        """The parameter [rows, ...]."""
+        return self._values[: self._count]
+
+    @property
+    def means(self) -> Tensor:
+        """Running means of the gradients, shaped as ``values``."""
+        return self._means[: self._count]
+
+    @property
+    def variances(self) -> Tensor:
+        """Running means of the squared gradients, shaped as ``values``."""
+        return self._variances[: self._count]
+
+    @property
+    def steps(self) -> Tensor:
+        """Steps that each row took [rows] int32."""
+        return self._steps[: self._count]
+
+    def append(self, values: Tensor) -> None:
+        """Add rows that took no step yet; the state of the others stays."""
+        count = self._count + len(values)
+        if count > len(self._values):
+            capacity = max(count, 2 * len(self._values))
+            self._values = _with_room(self._values, capacity)
+            self._means = _with_room(self._means, capacity)
+            self._variances = _with_room(self._variances, capacity)
+            self._steps = _with_room(self._steps, capacity)
+        new = slice(self._count, count)
+        self._values[new] = values
+        for state in (self._means, self._variances, self._steps):
+            state[new] = 0
+        self._count = count
+
+    def restore(self, means: Tensor, variances: Tensor, steps: Tensor) -> None:
+        """Take over optimiser state, shaped as this parameter's."""
+        self.means.copy_(means)
+        self.variances.copy_(variances)
+        self.steps.copy_(steps)
 
 
 class LiveField:
@@ -72,7 +130,8 @@ class LiveField:
     @property
     def arrays(self) -> FieldArrays:
         """The numbers as arrays, which share memory with the field where it is on the CPU."""
-        return self.tensors.arrays
+        mlp = tuple(part.values[0].cpu().numpy() for part in self.mlp)
+        return FieldArrays(self.features.values.cpu().numpy(), mlp, self.frequencies.cpu().numpy())
 
     def grow(self, leaves: Longs) -> None:
         """Make room for surfaces in ``leaves`` [N, 3]; new feature vectors start at random.
@@ -92,15 +151,22 @@ class LiveField:
 
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""
-        # The frequencies never change.
-        values = self.tensors
-        copied = FieldTensors(
-            values.features.clone(), tuple(part.clone() for part in values.mlp), values.frequencies
-        )
         tree = self.tree.freeze()
-        if self.device.type == "cpu":
-            return FrozenCompiledField(self.settings, tree, copied.arrays)
-        return TensorField(self.settings, tree, copied)
+        frequencies = self.frequencies  # which never change
+        features = self.features.values.clone()
+        mlp = tuple(part.values[0].clone() for part in self.mlp)
+        if self.device.type != "cpu":
+            return TensorField(self.settings, tree, FieldTensors(features, mlp, frequencies))
+        arrays = tuple(part.numpy() for part in mlp)
+        numbers = FieldArrays(features.numpy(), arrays, frequencies.numpy())
+        return FrozenCompiledField(self.settings, tree, numbers)
+
+
+def _with_room(rows: Tensor, capacity: int) -> Tensor:
+    # Memory that nothing has been written to is not taken from the system.
+    roomy = rows.new_empty((capacity, *rows.shape[1:]))
+    roomy[: len(rows)] = rows
+    return roomy
 
 
 def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> LiveField:

@@ -16,7 +16,7 @@ from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import thin
 from triquad_map.composition.region import field_samples
 
-from triquad_server.engine.adam import Rates
+from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums, Rates
 from triquad_server.engine.live_field import (
     LiveField,
     field_from_record,
@@ -24,7 +24,7 @@ from triquad_server.engine.live_field import (
     region_record,
     training_state,
 )
-from triquad_server.engine.trainer import CompiledTrainer, GradientSums, TensorTrainer
+from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs import FrozenRegion
 from triquad_server.intake.scan import ScanRays
 from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals

@@ -11,9 +11,10 @@ from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord
 
-from triquad_server.engine.trainer import GradientSums
+from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.epochs import Epoch, FrozenRegion
-from triquad_server.intake.scan import ScanRays, ScanRefusedError, usable_rays
+from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.scan import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.settings import Settings

@@ -14,11 +14,10 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
 from triquad_server.epochs import EpochHistory, EpochLimits
-from triquad_server.errors import MapperStoppedError
-from triquad_server.intake.scan import ScanRefusedError
+from triquad_server.errors import MapperStoppedError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_queries import check_box
+from triquad_server.mesh.mesher import check_box
 from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)

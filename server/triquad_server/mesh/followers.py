@@ -19,9 +19,8 @@ from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_map.compiled.team import lower_priority
 
+from triquad_server.mesh.mesher import TileIndex, TileLattice, check_box, check_level
 from triquad_server.mesh.tile_cache import CachedTile
-from triquad_server.mesh.tile_lattice import TileIndex, TileLattice
-from triquad_server.mesh.tile_queries import check_box, check_level
 from triquad_server.net.requests import Request
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import NICENESS
