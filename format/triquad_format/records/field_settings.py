@@ -40,7 +40,7 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 
 def _ranged(default: float, low: float, high: float) -> Any:
     """A field with its range as metadata, named as pydantic names it: the server reads it there."""
-    return dataclasses.field(default=default, metadata={"ge": low, "le": high})
+    return dataclasses.field(default=default, metadata={"ge": low, "le": high, "strict": True})
 
 
 @dataclass(frozen=True)
