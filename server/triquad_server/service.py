@@ -29,8 +29,7 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.counter import Counter
-from triquad_server.epochs import EpochLimits
-from triquad_server.health import Health, Heartbeat, Identity
+from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan import ScanIntake
 from triquad_server.intake.scan_queue import ScanQueue
@@ -95,14 +94,24 @@ class Service:
 
     def _open(self, failed: Callable[[], None]) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
-        identity = Identity(self._served.name, secrets.token_hex(8), self._served.device)
         self._mapper = self._open_mapper(failed)
         checkpoints = Checkpoints(
-            self._mapper, self._served.store, self._settings.store.period_s, self._served.restored
+            self._mapper,
+            self._served.store,
+            period_s=self._settings.store.period_s,
+            last=self._served.restored,
         )
-        health = Health(identity, self._requests_refused, self._scans, self._mapper, checkpoints)
+        health = Health(
+            map_name=self._served.name,
+            server=secrets.token_hex(8),
+            device=self._served.device,
+            requests_refused=self._requests_refused,
+            scans=self._scans,
+            mapper=self._mapper,
+            checkpoints=checkpoints,
+        )
         self._serve_queries()
-        self._serve_mesh(identity.server)
+        self._serve_mesh(health.server)
         self._serve_status(health)
         self._serve_downloads()
         checkpoints.start()
@@ -116,18 +125,13 @@ class Service:
         )
         self._parts.callback(self._mapper.rest)
         self._open_intake()
-        self._parts.callback(Heartbeat(self._session, identity.map_name, health).close)
-        alive = keys.alive_key(identity.map_name, identity.server)
+        self._parts.callback(Heartbeat(self._session, health).close)
+        alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
-        limits = self._settings.service
         mapper = MapperThread(
-            self._served.mapper,
-            self._scans,
-            limits.publish_period_s,
-            EpochLimits(limits.epochs_kept, limits.epochs_pinned, limits.pin_s),
-            failed,
+            self._served.mapper, self._scans, self._settings.service, failed=failed
         )
         mapper.start()
         self._parts.callback(mapper.close)
@@ -193,8 +197,8 @@ class Service:
         flush = FlushHandler(
             self._scans.ledger,
             self._mapper.publish_soon,
-            self._settings.service.flush_timeout_max_s,
-            self._settings.service.request_queue,
+            timeout_max_s=self._settings.service.flush_timeout_max_s,
+            limit=self._settings.service.request_queue,
         )
         self._parts.callback(flush.close)
         self._serve(

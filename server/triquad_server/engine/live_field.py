@@ -28,55 +28,38 @@ class Parameter:
 
     def __init__(self, values: Tensor) -> None:
         """Begin with ``values`` [rows, ...], which are copied, and no steps taken."""
-        self._count = len(values)
-        self._values = values.clone()
-        self._means = torch.zeros_like(values)
-        self._variances = torch.zeros_like(values)
-        self._steps = torch.zeros(len(values), dtype=torch.int32, device=values.device)
+        self.values = values.clone()
+        self.means = torch.zeros_like(values)  # running means of the gradients
+        self.variances = torch.zeros_like(values)  # running means of the squared gradients
+        self.steps = torch.zeros(len(values), dtype=torch.int32, device=values.device)  # [rows]
+        self._room: tuple[Tensor, ...] = (self.values, self.means, self.variances, self.steps)
 
     def __len__(self) -> int:
-        return self._count
-
-    @property
-    def values(self) -> Tensor:
-        """The parameter [rows, ...]."""
-        return self._values[: self._count]
-
-    @property
-    def means(self) -> Tensor:
-        """Running means of the gradients, shaped as ``values``."""
-        return self._means[: self._count]
-
-    @property
-    def variances(self) -> Tensor:
-        """Running means of the squared gradients, shaped as ``values``."""
-        return self._variances[: self._count]
-
-    @property
-    def steps(self) -> Tensor:
-        """Steps that each row took [rows] int32."""
-        return self._steps[: self._count]
+        return len(self.values)
 
     def append(self, values: Tensor) -> None:
-        """Add rows that took no step yet; the state of the others stays."""
-        count = self._count + len(values)
-        if count > len(self._values):
-            capacity = max(count, 2 * len(self._values))
-            self._values = _with_room(self._values, capacity)
-            self._means = _with_room(self._means, capacity)
-            self._variances = _with_room(self._variances, capacity)
-            self._steps = _with_room(self._steps, capacity)
-        new = slice(self._count, count)
-        self._values[new] = values
-        for state in (self._means, self._variances, self._steps):
-            state[new] = 0
-        self._count = count
+        """Add rows [N, ...] that took no step yet; the state of the others stays."""
+        used, count = len(self), len(self) + len(values)
+        if count > len(self._room[0]):
+            capacity = max(count, 2 * len(self._room[0]))
+            self._room = tuple(_with_room(rows, capacity) for rows in self._room)
+        self._room[0][used:count] = values
+        for state in self._room[1:]:
+            state[used:count] = 0
+        self.values, self.means, self.variances, self.steps = (rows[:count] for rows in self._room)
 
     def restore(self, means: Tensor, variances: Tensor, steps: Tensor) -> None:
         """Take over optimiser state, shaped as this parameter's."""
         self.means.copy_(means)
         self.variances.copy_(variances)
         self.steps.copy_(steps)
+
+
+def _with_room(rows: Tensor, capacity: int) -> Tensor:
+    # Memory that nothing has been written to is not taken from the system.
+    roomy = rows.new_empty((capacity, *rows.shape[1:]))
+    roomy[: len(rows)] = rows
+    return roomy
 
 
 class LiveField:
@@ -162,13 +145,6 @@ class LiveField:
         return FrozenCompiledField(self.settings, tree, numbers)
 
 
-def _with_room(rows: Tensor, capacity: int) -> Tensor:
-    # Memory that nothing has been written to is not taken from the system.
-    roomy = rows.new_empty((capacity, *rows.shape[1:]))
-    roomy[: len(rows)] = rows
-    return roomy
-
-
 def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> LiveField:
     """A field of which nothing is learnt yet, drawn at random."""
     generator = torch.Generator(device).manual_seed(seed)
@@ -181,7 +157,7 @@ def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> L
         for size in ((inputs, outputs), (outputs,)):
             uniform = torch.rand(size, generator=generator, device=device) * 2 - 1
             mlp.append(uniform * (1 / math.sqrt(inputs)))
-    return LiveField(settings, frequencies, mlp, generator)
+    return LiveField(settings, frequencies, mlp, generator=generator)
 
 
 def region_record(
@@ -196,7 +172,7 @@ def region_record(
     for plane in range(len(AXES)):
         for h, level in enumerate(field.settings.levels):
             codes, rows = field.tree.table(plane, h)
-            tables.append(VertexTable(plane, level, codes, arrays.features[rows]))
+            tables.append(VertexTable(plane, level, codes, features=arrays.features[rows]))
     mlp = [part.copy() for part in arrays.mlp]
     return Region(
         index=index,
@@ -248,12 +224,12 @@ def field_from_record(
         settings,
         _tensor(record.frequencies, device),
         [_tensor(array, device) for layer in layers for array in layer],
-        torch.Generator(device).manual_seed(seed),
+        generator=torch.Generator(device).manual_seed(seed),
     )
     for table in record.tables:
         h = table.level - settings.levels[0]
         features = _tensor(table.vectors(), device)
-        field.restore(table.plane, h, table.codes.astype(np.int64), features)
+        field.restore(table.plane, h, table.codes.astype(np.int64), features=features)
     if record.training is not None:
         _restore_optimiser(field, record.training)
     return field

@@ -34,7 +34,7 @@ class TensorTrainer:
         first_row = torch.zeros(1, dtype=torch.int64, device=field.device)
         for parameter, weight in zip(self._field.mlp, mlp, strict=True):
             assert weight.grad is not None
-            step_rows(parameter, first_row, weight.grad[None], rates)
+            step_rows(parameter, first_row, weight.grad[None], rates=rates)
         if corners is not None and encoded is not None and encoded.grad is not None:
             self._step_features(corners, encoded.grad, rates)
         return loss.detach()
@@ -58,9 +58,9 @@ class TensorTrainer:
         touched[0] = False  # absent vertices stay zero
         if total.device.type == "cpu":
             chosen = touched.nonzero()[:, 0]
-            step_rows(features, chosen, total[chosen], rates)
+            step_rows(features, chosen, total[chosen], rates=rates)
         else:
-            step_where(features, touched, total, rates)
+            step_where(features, touched, total, rates=rates)
 
 
 def step_rows(parameter: Parameter, rows: Tensor, gradient: Tensor, rates: Rates) -> None:
@@ -70,7 +70,7 @@ def step_rows(parameter: Parameter, rows: Tensor, gradient: Tensor, rates: Rates
     variances = parameter.variances[rows].lerp_(gradient.square(), 1 - rates.variance_decay)
     parameter.means[rows] = means
     parameter.variances[rows] = variances
-    direction = _direction(means, variances, parameter.steps[rows], rates)
+    direction = _direction(means, variances, parameter.steps[rows], rates=rates)
     parameter.values[rows] -= rates.learning_rate * direction
 
 
@@ -85,7 +85,7 @@ def step_where(parameter: Parameter, mask: Tensor, gradient: Tensor, rates: Rate
     parameter.means.lerp_(gradient, (1 - rates.mean_decay) * mask)
     parameter.variances.lerp_(gradient.square(), (1 - rates.variance_decay) * mask)
     steps = parameter.steps.clamp(min=1)
-    direction = _direction(parameter.means, parameter.variances, steps, rates)
+    direction = _direction(parameter.means, parameter.variances, steps, rates=rates)
     parameter.values.sub_(rates.learning_rate * mask * direction)
 
 

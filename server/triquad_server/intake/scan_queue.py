@@ -127,7 +127,7 @@ class SourceLedger:
         with self.changed:
             track = self._tracks.get((source, session))
             if track is None:
-                return FlushReply(0, 0, sequence + 1, None)
+                return FlushReply(taken=0, refused=0, lost=sequence + 1, last_refusal=None)
             track.lose_up_to(sequence)
             return self.outcome(source, session, sequence)
 

@@ -150,7 +150,10 @@ class Mapper:
         return self._epoch
 
     def reset(self, minimum: Doubles, maximum: Doubles) -> None:
-        """Forget what lies between two corners [3]; regions wholly between them disappear."""
+        """Forget what lies between two corners [3], metres, map frame.
+
+        Regions wholly between them disappear.
+        """
         half = self._field_settings.region_side_m / 2
         for index, region in list(self._regions.items()):
             low, high = region.centre - half, region.centre + half
@@ -176,11 +179,10 @@ class Mapper:
         regions = tuple(
             region.record() for index, region in self._regions.items() if index in changed
         )
-        return MapChanges(
-            MapRecord(self._name, newest.number, self._field_settings, regions),
-            tuple(self._regions),
-            newest,
+        record = MapRecord(
+            self._name, newest.number, settings=self._field_settings, regions=regions
         )
+        return MapChanges(record, tuple(self._regions), newest)
 
     def _freeze(self, region: LiveRegion, before: dict[RegionIndex, FrozenRegion]) -> FrozenRegion:
         """The region as it is now; the last frozen one where it did not change since."""

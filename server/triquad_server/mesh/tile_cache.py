@@ -136,7 +136,7 @@ class _TileLevel:
         ready.sort(key=lambda tile: tile.revision)
         to_make.sort(key=lambda index: (self.changed[index], index))
         removed = [index for index in known if index not in self.changed]
-        return TileDelta(ready, removed, to_make, revision)
+        return TileDelta(ready, removed, to_make, revision=revision)
 
     def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
         """What a tile has to agree with, by the tiles whose it is, in its own lattice.
@@ -217,7 +217,8 @@ class TileCache:
     ) -> TileDelta:
         """What is new in a box to somebody who knows everything up to the revision ``known_to``.
 
-        ``known`` are versions of tiles that are known whatever the revision.
+        The box has the corners ``low`` and ``high`` [3], metres, map frame; ``known`` are versions
+        of tiles that are known whatever the revision.
         """
         with self._lock:
             return self._levels[level].delta(
