@@ -19,8 +19,13 @@ from triquad_format.mapfile.parts.columns import (
 )
 from triquad_format.mapfile.parts.part import PREFIX, Part, PartKey
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.wire.codec import ArraySpec, unpack_array
-from triquad_format.wire.structure import MAX_OBJECTS, binary_offsets, check_structure
+from triquad_format.wire.codec import (
+    MAX_OBJECTS,
+    ArraySpec,
+    binary_offsets,
+    check_structure,
+    unpack_array,
+)
 
 _MAX_REGION_INDEX = 2**31 - 1
 _MAX_ITEMS = 64
