@@ -13,8 +13,7 @@ from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.net.connection import Connection, open_connection
-from triquad_client.net.driver import RemoteDriver
+from triquad_client.net.connection import Connection, RemoteDriver, open_connection
 from triquad_client.offline.synced_map import SyncedMap
 
 

@@ -23,8 +23,7 @@ from triquad_client.mesh.followed_mesh import (
 )
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.call import Ask, Call, ResultT, ask, offload
-from triquad_client.net.connection import Connection
-from triquad_client.net.driver import RemoteDriver
+from triquad_client.net.connection import Connection, RemoteDriver
 
 _LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
 

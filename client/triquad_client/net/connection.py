@@ -1,4 +1,4 @@
-"""The Zenoh session of a client, and requests over it."""
+"""The Zenoh session of a client, requests over it, and the driver that makes them."""
 
 import json
 import weakref
@@ -21,7 +21,7 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
-from triquad_client.net.call import Ask, ReplyT
+from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
 
 _LIVELINESS_TIMEOUT_S = 3.0
 
@@ -148,6 +148,32 @@ class Connection:
         if self.closed:
             return closed_error()
         return ConnectError(f"the connection is broken: {error}")
+
+
+class RemoteDriver(BlockingDriver):
+    """Runs calls over a connection, in the threads that make them."""
+
+    def __init__(
+        self, connection: Connection, cancellation: zenoh.CancellationToken | None = None
+    ) -> None:
+        """Once ``cancellation`` is cancelled, every call ends with an error."""
+        self._connection = connection
+        self._cancellation = cancellation
+
+    def maps(self) -> list[str]:
+        """Names of the maps of all servers that can be reached."""
+        return map_names(self._connection.look_for_maps(cancellation=self._cancellation))
+
+    async def _replies(self, batch: Batch) -> list[Any]:
+        return await exchange(batch, self._send, self._receive)
+
+    async def _send(self, ask: Ask[Any]) -> Iterable[zenoh.Reply]:
+        return self._connection.send(ask, cancellation=self._cancellation)
+
+    async def _receive(self, ask: Ask[Any], replies: Iterable[zenoh.Reply]) -> Any:
+        for reply in replies:
+            return self._connection.read(ask, reply)
+        raise self._connection.no_reply_error(ask, self.maps())
 
 
 def closed_error() -> ClosedError:
