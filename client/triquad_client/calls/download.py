@@ -4,11 +4,10 @@ import hashlib
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.files import check_range, replacing
 from triquad_format.mapfile.writer import MapFileInfo, write_map
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import crop_record
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
@@ -98,9 +97,7 @@ def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
     return (yield from retried("chunk_gone", lambda: offload(job)))
 
 
-def _fetch_box(
-    run: Run, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
-) -> MapFileInfo:
+def _fetch_box(run: Run, path: Path, minimum: Doubles, maximum: Doubles) -> MapFileInfo:
     try:
         stored = StoredMap(RemoteBytes(run, run(newest_file(training=False))))
         record = crop_record(stored.box(minimum, maximum), minimum, maximum)

@@ -20,7 +20,7 @@ class MapQueries:
     Positions are metres in the map frame. Questions of any size are answered from one epoch,
     a published state of the map that never changes. ``at_epoch`` is its number, ``None`` is the
     newest; once the server does not keep it any more, :class:`RefusedError` with the code
-    ``epoch_gone`` is raised.
+    ``epoch_gone`` is raised, and :class:`InvalidInputError` where an argument cannot be used.
     """
 
     def __init__(self, run: Run, epoch: int | None = None) -> None:
@@ -72,7 +72,7 @@ class MapQueries:
     def query_spheres(
         self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Spheres:
-        """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one number or [N]."""
+        """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one, or [N], metres."""
         return self._run(questions.spheres(centres, radii_m, self._chosen(at_epoch)))
 
     def query_segments(

@@ -89,7 +89,7 @@ class WatchedMesh:
         with self._changing:
             now = self._followed
             if now is not before:  # by what is known now, the reply may be old
-                return MeshUpdate((), (), now.epoch, now.complete, size_bytes=0)
+                return MeshUpdate((), (), now.epoch, complete=now.complete, size_bytes=0)
             self._followed = after
         removed = tuple(sorted(before.tiles.keys() - after.tiles.keys()))
         return MeshUpdate(

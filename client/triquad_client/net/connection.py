@@ -40,11 +40,6 @@ class Connection:
         self.map_name = map_name
         self.timeout_s = timeout_s
 
-    @property
-    def closed(self) -> bool:
-        """Whether the session was closed."""
-        return self._session.is_closed()
-
     def close(self) -> None:
         """Close the session; closing twice does no harm. What is under way ends unanswered."""
         self._close()
@@ -55,7 +50,12 @@ class Connection:
         receiver: Receiver = None,
         cancellation: zenoh.CancellationToken | None = None,
     ) -> Iterable[zenoh.Reply]:
-        """Send a request; its reply comes from what is returned, or to ``receiver``."""
+        """Send a request; its reply comes from what is returned, or to ``receiver``.
+
+        Raises:
+            ClosedError: the session was closed.
+            ConnectError: it is broken.
+        """
         try:
             replies: Iterable[zenoh.Reply] = self._session.get(
                 self._key(ask),
@@ -95,7 +95,7 @@ class Connection:
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
-        if self.closed:
+        if self._session.is_closed():
             return closed_error()
         info = self._session.info
         if not (info.routers_zid() or info.peers_zid()):
@@ -110,7 +110,10 @@ class Connection:
         )
 
     def put(self, key: str, message: Message) -> None:
-        """Publish a message; blocks where the network is slower than the publisher."""
+        """Publish a message; blocks where the network is slower than the publisher.
+
+        Raises as :meth:`send`.
+        """
         try:
             self._session.put(
                 key,
@@ -126,7 +129,7 @@ class Connection:
     def look_for_maps(
         self, receiver: Receiver = None, cancellation: zenoh.CancellationToken | None = None
     ) -> Iterable[zenoh.Reply]:
-        """Ask all servers that can be reached for their maps; replies as of :meth:`send`."""
+        """Ask all servers in reach for their maps; replies and errors as of :meth:`send`."""
         try:
             replies: Iterable[zenoh.Reply] = self._session.liveliness().get(
                 keys.alive_key("*", "*"),
@@ -145,7 +148,7 @@ class Connection:
         return max(self.timeout_s, ask.min_timeout_s) + ask.server_wait_s
 
     def _broken(self, error: Exception) -> Exception:
-        if self.closed:
+        if self._session.is_closed():
             return closed_error()
         return ConnectError(f"the connection is broken: {error}")
 
