@@ -80,10 +80,10 @@ def stamp_ns(stamp_s: float) -> int:
     return round(stamp_s * 1e9)
 
 
-def chosen_epoch(at_epoch: int | None) -> int | None:
-    """The number of an epoch, or ``None`` for the newest."""
+def chosen_epoch(at_epoch: int | None) -> int:
+    """The number of an epoch as it is sent: 0 is the newest."""
     if at_epoch is None:
-        return None
+        return 0
     try:
         if isinstance(at_epoch, bool):
             raise TypeError("a truth value")

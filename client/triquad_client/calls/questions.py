@@ -233,7 +233,7 @@ def align(
         world_from_sensor=checks.rigid_pose(guess),
         max_distance_m=checks.within("max_distance_m", options.max_distance_m),
         max_iterations=options.max_iterations,
-        epoch=NEWEST if epoch is None else epoch,
+        epoch=epoch,
     )
     reply = yield from ask(Ask(keys.ALIGN, request, AlignReply))
     return Alignment(**vars(reply))
@@ -260,7 +260,7 @@ def _in_parts(
         return [first, *rest]
 
     epoch = checks.chosen_epoch(at_epoch)
-    if epoch is not None:
+    if epoch != NEWEST:
         return (yield from parts(epoch))
     # The map may go on while the parts are under way: then all of it is asked again.
     return (yield from retried("epoch_gone", lambda: parts(NEWEST)))
