@@ -22,12 +22,11 @@ from triquad_format.mapfile.metadata import (
     pack_facts,
     pack_metadata,
 )
-from triquad_format.mapfile.parts.body import pack_part, seams
-from triquad_format.mapfile.parts.columns import FLOATS
-from triquad_format.mapfile.parts.pack import pack_record
+from triquad_format.mapfile.parts.pack import pack_part, pack_record, seams
 from triquad_format.mapfile.parts.part import (
     ENCODINGS,
     EVIDENCE,
+    FLOATS,
     MANIFEST,
     MAP,
     MAX_PART_BYTES,
