@@ -7,7 +7,7 @@ import pytest
 from support.map_records import SMALL, assert_same, random_record, with_integers
 from support.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
-from triquad_format.mapfile.files import FileBytes
+from triquad_format.mapfile.index import FileBytes
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton

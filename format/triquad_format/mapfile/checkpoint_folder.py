@@ -10,8 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from triquad_format.errors import MapFileError
-from triquad_format.mapfile.files import FileBytes, named
-from triquad_format.mapfile.index import DAMAGED_SUFFIX, MapIndex, files_in
+from triquad_format.mapfile.index import DAMAGED_SUFFIX, FileBytes, MapIndex, files_in, named
 from triquad_format.mapfile.manifest import Manifest
 
 _NAME = re.compile(r"epoch-([0-9]{9,19})(\.delta)?\.triquad")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.files import named
+from triquad_format.mapfile.index import named
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
