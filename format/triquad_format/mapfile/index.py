@@ -36,7 +36,11 @@ OpenFile = Callable[[FileRef], RandomAccess]
 
 @contextlib.contextmanager
 def named(name: str) -> Iterator[None]:
-    """Put the file's name and, for damage, the remedy into what is raised."""
+    """Put the file's name and, for damage, the remedy into what is raised.
+
+    Raises:
+        MapFileError: instead of any :class:`FormatError`, and where memory does not suffice.
+    """
     try:
         yield
     except FormatError as error:
@@ -65,10 +69,10 @@ class FileBytes:
     """The bytes of a file; they stay readable while it is open, even where it is deleted."""
 
     def __init__(self, path: Path) -> None:
+        """Open a file; errors are those of :func:`open_regular`."""
         self.name = str(path)
         self._stream = open_regular(path)
         self.size = os.fstat(self._stream.fileno()).st_size
-        self.bytes_read = 0
 
     def read(self, offset: int, length: int) -> bytes:
         """As :meth:`RandomAccess.read`; threads may read at the same time."""
@@ -79,7 +83,6 @@ class FileBytes:
             if not more:
                 raise DamagedMapFileError(f"it was cut to {offset + len(data)} bytes meanwhile")
             data += more
-        self.bytes_read += length
         return data
 
     def close(self) -> None:
@@ -88,7 +91,7 @@ class FileBytes:
 
 
 def check_range(offset: int, length: int, size: int) -> None:
-    """Raise :class:`DamagedMapFileError` unless the bytes lie within ``size``."""
+    """Raise :class:`DamagedMapFileError` unless the file's ``size`` bytes hold that range."""
     if offset < 0 or length < 0 or offset + length > size:
         raise DamagedMapFileError(
             f"bytes {offset} to {offset + length} are needed, but it has {size}: it is incomplete"
@@ -134,7 +137,7 @@ class OtherFiles:
             raise DamagedMapFileError(f"{entry.file.name}, which holds parts: {error}") from error
 
     def close(self) -> None:
-        """Close them."""
+        """Close those that were opened."""
         for index in self._indices.values():
             index.close()
 
@@ -206,6 +209,7 @@ class MapIndex:
 
         Raises:
             MapFileError: the part is damaged, or the file that holds it is missing or another.
+            OSError: a file cannot be read.
         """
         if entry.file is not None:
             return self._others.payload(entry)

@@ -184,4 +184,5 @@ def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRec
         for entry in entries:
             parts.add(entry.key, payload_of(entry))
         regions.append(parts.region())
-    return MapRecord(manifest.facts.name, manifest.facts.epoch, settings, tuple(regions))
+    facts = manifest.facts
+    return MapRecord(facts.name, facts.epoch, settings, regions=tuple(regions))

@@ -27,7 +27,6 @@ from triquad_format.mapfile.parts.pack import pack_part, pack_record, seams
 from triquad_format.mapfile.parts.part import (
     ENCODINGS,
     EVIDENCE,
-    FLOATS,
     MANIFEST,
     MAP,
     MAX_PART_BYTES,
@@ -44,7 +43,7 @@ from triquad_format.mapfile.parts.part import (
 )
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import FLOATS, MapRecord
 
 # Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
 # good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
@@ -172,7 +171,11 @@ def write_parts(
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A stream whose bytes replace the file at ``path``, durably, where nothing is raised."""
+    """A stream whose bytes replace the file at ``path``, durably, where nothing is raised.
+
+    Raises:
+        OSError: the file cannot be written; the one that was there stays.
+    """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as stream:

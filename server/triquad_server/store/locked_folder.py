@@ -71,7 +71,7 @@ class LockedFolder:
         _delete(path.glob(_UNFINISHED))
 
     def close(self) -> None:
-        """Let go."""
+        """Let others have the folder."""
         self._lock.close()
 
     def renew_lock(self) -> None:

@@ -82,7 +82,7 @@ class McapWriter:
         Args:
             topic: of one of the channels.
             payload: what the message holds.
-            time_ns: of the message, nanoseconds since 1970.
+            time_ns: nanoseconds since 1970.
             level: of zstd.
             seams: offsets in the payload where bytes of another kind begin.
 

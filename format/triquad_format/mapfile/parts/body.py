@@ -28,12 +28,7 @@ _MAX_STRING_BYTES = 4096
 
 
 def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "PartBody":
-    """The body of a part.
-
-    Args:
-        topic: of the part.
-        payload: of the part.
-        max_items: limit on the length of its lists.
+    """The body of a part, whose lists have at most ``max_items`` items.
 
     Raises:
         DamagedMapFileError: it is not a msgpack map, or exceeds a limit.

@@ -73,10 +73,7 @@ def pack_record(
 def pack_region(region: Region, settings: FieldSettings, feature_dtype: str) -> Iterator[Part]:
     """The parts of a checked region, in the order of the file.
 
-    Args:
-        region: as :func:`triquad_format.records.record_check.check_record` accepts it.
-        settings: of its map.
-        feature_dtype: one of ``FLOATS``, for features that are not integers.
+    ``feature_dtype``, one of ``FLOATS``, is for features that are not integers.
 
     Raises:
         FormatError: features do not fit ``feature_dtype``; the text names the region.

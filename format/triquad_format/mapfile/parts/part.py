@@ -14,7 +14,7 @@ from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Longs
 from triquad_format.records.crop import LeafBox, whole_region
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
-from triquad_format.records.region import AXES, MAX_LEVEL
+from triquad_format.records.region import AXES, FLOATS, MAX_LEVEL
 
 PREFIX = "/triquad/"
 MAP = "/triquad/map"
@@ -51,9 +51,6 @@ _LEAVES_LOG2 = 8
 
 CELL_LEAVES = 1 << _LEAVES_LOG2
 """Side of a cell in leaves: 51.2 m at the default leaf."""
-
-FLOATS = ("<f2", "<f4")
-"""Precisions in which long columns of floats are stored."""
 
 LEVEL_BITS = MAX_LEVEL.bit_length()
 """Planes of bits that hold levels of evidence."""
@@ -96,7 +93,7 @@ def vertex_reach(settings: FieldSettings) -> int:
 
 
 def extent(settings: FieldSettings, key: PartKey) -> LeafBox:
-    """The column over a square, or the cube, that a part is of; else all of its region."""
+    """The column over a square, or the cube, that a part is of; else all of its region: leaves."""
     box = whole_region(settings)
     axes = {VERTICES: list(AXES[key.plane]), EVIDENCE: [0, 1, 2]}.get(key.topic, [])
     if axes:
@@ -156,7 +153,7 @@ def shuffle(array: NDArray[np.generic]) -> Bytes:
 
 
 def unshuffle(planes: Bytes, dtype: str) -> NDArray[np.generic]:
-    """The inverse of :func:`shuffle`."""
+    """The array ``[...]`` of this dtype; the inverse of :func:`shuffle`."""
     values = np.ascontiguousarray(np.moveaxis(planes, 0, -1))
     return np.frombuffer(values.data, dtype).reshape(planes.shape[1:])
 
@@ -201,7 +198,7 @@ def split_integers(integers: NDArray[np.int16]) -> NDArray[np.int8]:
 
 
 def join_integers(planes: NDArray[np.int8]) -> NDArray[np.int16]:
-    """The inverse of :func:`split_integers`."""
+    """Integers ``[V, S]``; the inverse of :func:`split_integers`."""
     integers = planes[0].astype(np.int32)
     for plane in planes[1:]:
         integers += plane.astype(np.int32) << 8
