@@ -4,8 +4,8 @@ import hashlib
 from pathlib import Path
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.files import check_range, replacing
-from triquad_format.mapfile.writer import MapFileInfo, write_map
+from triquad_format.mapfile.index import check_range
+from triquad_format.mapfile.writer import MapFileInfo, replacing, write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
