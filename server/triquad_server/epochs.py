@@ -17,6 +17,7 @@ from triquad_map.composition.composed_view import ComposedView
 from triquad_map.composition.region import Split
 
 from triquad_server.engine.live_field import FrozenField, region_record
+from triquad_server.settings import ServiceSettings
 
 
 @dataclass(frozen=True)
@@ -45,24 +46,16 @@ class Epoch(ComposedView):
         split: Split,
     ) -> None:
         """The map called ``name``; ``split`` runs the work of its answers."""
-        super().__init__(number, settings, regions, split)
+        super().__init__(number, settings, regions, split=split)
+        self.number = number
+        self.field_settings = settings
         self.frozen_regions = regions
         self._name = name
-
-    @property
-    def number(self) -> int:
-        """Number of this epoch."""
-        return self.epoch
 
     @property
     def regions(self) -> int:
         """Regions of the map."""
         return len(self.frozen_regions)
-
-    @property
-    def field_settings(self) -> FieldSettings:
-        """Shape of the field."""
-        return self._settings
 
     @property
     def vertices(self) -> int:
@@ -80,7 +73,7 @@ class Epoch(ComposedView):
             region_record(region.index, region.engine, region.evidence, training=None)
             for region in self.frozen_regions
         )
-        return MapRecord(self._name, self.number, self._settings, regions)
+        return MapRecord(self._name, self.number, settings=self.field_settings, regions=regions)
 
 
 class QueryGate:
@@ -109,26 +102,17 @@ class QueryGate:
             self._idle.wait_for(lambda: self._in_flight == 0, limit_s)
 
 
-@dataclass(frozen=True)
-class EpochLimits:
-    """Which epochs stay."""
-
-    kept: int  # so many of the newest stay, at least 1
-    pinned: int  # so many older ones stay at most: those that were asked for by number last
-    pin_s: float  # an older epoch stays for so long after it was last asked for
-
-
 class EpochHistory:
     """The newest epochs, and older ones while they are asked for by number."""
 
     def __init__(
-        self, first: Epoch, limits: EpochLimits, clock: Callable[[], float] = time.monotonic
+        self, first: Epoch, settings: ServiceSettings, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """``clock`` tells seconds that never run backwards."""
+        """``settings`` tell which epochs stay, ``clock`` seconds that never run backwards."""
         self.gate = QueryGate()
         self.newest = first  # the epoch published last
         self._lock = threading.Lock()
-        self._limits = limits
+        self._settings = settings
         self._clock = clock
         self._epochs = {first.number: first}  # oldest first
         self._asked: dict[int, float] = {}  # when, by number; longest ago first
@@ -163,16 +147,16 @@ class EpochHistory:
 
     @contextmanager
     def view(self, number: int) -> Iterator[Epoch]:
-        """The epoch of that number, or the newest for 0; training gives way while it is asked."""
+        """As :meth:`get`; training gives way while the epoch is asked."""
         with self.gate.query():
             yield self.get(number)
 
     def _tidy(self) -> None:
         """Let go of older epochs whose time is over, or that exceed the limit."""
-        older = list(self._epochs)[: -self._limits.kept]
-        since = self._clock() - self._limits.pin_s
+        older = list(self._epochs)[: -self._settings.epochs_kept]
+        since = self._clock() - self._settings.pin_s
         pinned = [n for n, asked in self._asked.items() if n in older and asked >= since]
-        stay = pinned[max(0, len(pinned) - self._limits.pinned) :]
+        stay = pinned[max(0, len(pinned) - self._settings.epochs_pinned) :]
         for number in older:
             if number not in stay:
                 del self._epochs[number]

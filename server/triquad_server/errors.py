@@ -1,4 +1,4 @@
-"""The errors of the server's shell; :mod:`triquad_server.intake.scan` has those of scans."""
+"""The errors of the server."""
 
 from triquad_format.errors import TriquadError
 
@@ -21,3 +21,11 @@ class StoreBaseError(StoreError):
 
 class MapperStoppedError(ServerError):
     """The mapper thread has ended and takes no more commands."""
+
+
+class ScanRefusedError(TriquadError):
+    """A scan that cannot be used; ``reason`` is the short key under which it is counted."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason

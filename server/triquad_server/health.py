@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import triquad_format
 import zenoh
@@ -23,49 +23,35 @@ _BEATS_PER_LOG_LINE = 5
 
 
 @dataclass(frozen=True)
-class Identity:
-    """Which server this is."""
+class Health:
+    """Knows how the server is doing."""
 
     map_name: str
     server: str  # a name of this process
     device: str
-
-
-class Health:
-    """Knows how the server is doing."""
-
-    def __init__(
-        self,
-        identity: Identity,
-        requests_refused: Counter,
-        scans: ScanQueue,
-        mapper: MapperThread,
-        checkpoints: Checkpoints,
-    ) -> None:
-        self._identity = identity
-        self._requests_refused = requests_refused
-        self._scans = scans
-        self._mapper = mapper
-        self._checkpoints = checkpoints
-        self._started = time.monotonic()
+    requests_refused: Counter
+    scans: ScanQueue
+    mapper: MapperThread
+    checkpoints: Checkpoints
+    started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
         """The status now."""
-        epoch = self._mapper.epochs.newest
-        progress = self._mapper.progress
+        epoch = self.mapper.epochs.newest
+        progress = self.mapper.progress
         return ServerStatus(
-            map_name=self._identity.map_name,
-            server=self._identity.server,
+            map_name=self.map_name,
+            server=self.server,
             version=triquad_format.__version__,
-            device=self._identity.device,
+            device=self.device,
             epoch=epoch.number,
-            settled=progress.settled and len(self._scans) == 0,
+            settled=progress.settled and len(self.scans) == 0,
             scans_taken=progress.scans_taken,
-            scans_dropped=self._scans.dropped.counts(),
-            scans_lost=self._scans.ledger.lost(),
-            scans_waiting=len(self._scans),
-            points_dropped=self._mapper.points_dropped.counts(),
-            requests_refused=self._requests_refused.counts(),
+            scans_dropped=self.scans.dropped.counts(),
+            scans_lost=self.scans.ledger.lost(),
+            scans_waiting=len(self.scans),
+            points_dropped=self.mapper.points_dropped.counts(),
+            requests_refused=self.requests_refused.counts(),
             samples_trained=progress.samples_trained,
             rays_kept=progress.rays_kept,
             loss=float(progress.loss),
@@ -73,21 +59,21 @@ class Health:
             vertices=epoch.vertices,
             parameters=epoch.parameters,
             memory_bytes=resident_bytes(),
-            uptime_s=time.monotonic() - self._started,
-            last_checkpoint=self._checkpoints.last,
-            store_error=self._checkpoints.error,
+            uptime_s=time.monotonic() - self.started_s,
+            last_checkpoint=self.checkpoints.last,
+            store_error=self.checkpoints.error,
         )
 
 
 class Heartbeat:
     """Tells the network and the log how the server is doing."""
 
-    def __init__(self, session: zenoh.Session, map_name: str, health: Health) -> None:
+    def __init__(self, session: zenoh.Session, health: Health) -> None:
         self._health = health
         # Not the priority of the replies: a publisher that drops, at the priority of one that
         # blocks, waits for the same slow client.
         self._publisher = session.declare_publisher(
-            keys.status_key(map_name),
+            keys.status_key(health.map_name),
             encoding=keys.encoding(ServerStatus),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_LOW,

@@ -1,5 +1,6 @@
 """Starting and stopping a server process."""
 
+import functools
 import logging
 import sys
 import threading
@@ -68,7 +69,11 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         teams = Teams()
         _prepare(options.settings, device, teams)
         mapper = Mapper(
-            options.map_name, options.settings, device, restored.record if restored else None, teams
+            options.map_name,
+            options.settings,
+            device,
+            record=restored.record if restored else None,
+            teams=teams,
         )
         session = stack.enter_context(closing(open_session(options.network)))
         served = ServedMap(
@@ -79,7 +84,8 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
             restored=restored.info if restored else None,
             teams=teams,
         )
-        service = Service(session, served, options.settings, lambda: stops.put(Stop.INTERNAL_ERROR))
+        failed = functools.partial(stops.put, Stop.INTERNAL_ERROR)
+        service = Service(session, served, options.settings, failed=failed)
         stack.enter_context(closing(service))
         spare_from_collection()
         _log_ready(options, service.epoch, device)
@@ -133,7 +139,7 @@ def _prepare(settings: Settings, device: str, teams: Teams) -> None:
             _log.info("%.0f s so far; next: %s", seconds, stage)
 
     try:
-        warm_up(settings, device, teams, report)
+        warm_up(settings, device, teams, report=report)
     finally:
         first_time.cancel()
 

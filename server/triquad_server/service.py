@@ -10,7 +10,6 @@ from triquad_format.wire import keys
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
-    FlushRequest,
     MapChunkRequest,
     MapInfoRequest,
     ResetRequest,
@@ -18,7 +17,6 @@ from triquad_format.wire.messages import (
     StatusRequest,
     TileListRequest,
     TileRequest,
-    TileUpdatesRequest,
 )
 from triquad_format.wire.query_messages import (
     AlignRequest,
@@ -31,10 +29,10 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.counter import Counter
-from triquad_server.epochs import EpochLimits
-from triquad_server.health import Health, Heartbeat, Identity
+from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
-from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
+from triquad_server.intake.scan import ScanIntake
+from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
@@ -96,14 +94,24 @@ class Service:
 
     def _open(self, failed: Callable[[], None]) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
-        identity = Identity(self._served.name, secrets.token_hex(8), self._served.device)
         self._mapper = self._open_mapper(failed)
         checkpoints = Checkpoints(
-            self._mapper, self._served.store, self._settings.store.period_s, self._served.restored
+            self._mapper,
+            self._served.store,
+            period_s=self._settings.store.period_s,
+            last=self._served.restored,
         )
-        health = Health(identity, self._requests_refused, self._scans, self._mapper, checkpoints)
+        health = Health(
+            map_name=self._served.name,
+            server=secrets.token_hex(8),
+            device=self._served.device,
+            requests_refused=self._requests_refused,
+            scans=self._scans,
+            mapper=self._mapper,
+            checkpoints=checkpoints,
+        )
         self._serve_queries()
-        self._serve_mesh(identity.server)
+        self._serve_mesh(health.server)
         self._serve_status(health)
         self._serve_downloads()
         checkpoints.start()
@@ -117,18 +125,13 @@ class Service:
         )
         self._parts.callback(self._mapper.rest)
         self._open_intake()
-        self._parts.callback(Heartbeat(self._session, identity.map_name, health).close)
-        alive = keys.alive_key(identity.map_name, identity.server)
+        self._parts.callback(Heartbeat(self._session, health).close)
+        alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
-        limits = self._settings.service
         mapper = MapperThread(
-            self._served.mapper,
-            self._scans,
-            limits.publish_period_s,
-            EpochLimits(limits.epochs_kept, limits.epochs_pinned, limits.pin_s),
-            failed,
+            self._served.mapper, self._scans, self._settings.service, failed=failed
         )
         mapper.start()
         self._parts.callback(mapper.close)
@@ -187,23 +190,21 @@ class Service:
             },
             _TILE_WORKERS,
         )
-        self._serve(
-            {keys.TILE_UPDATES: lambda request: feed.add(request, request.read(TileUpdatesRequest))}
-        )
+        self._serve({keys.TILE_UPDATES: feed.add})
 
     def _serve_status(self, health: Health) -> None:
         """How the server is doing, and whether scans are in the map."""
         flush = FlushHandler(
             self._scans.ledger,
             self._mapper.publish_soon,
-            self._settings.service.flush_timeout_max_s,
-            self._settings.service.request_queue,
+            timeout_max_s=self._settings.service.flush_timeout_max_s,
+            limit=self._settings.service.request_queue,
         )
         self._parts.callback(flush.close)
         self._serve(
             {
                 keys.STATUS: answering(StatusRequest, lambda _: health.status()),
-                keys.FLUSH: lambda request: flush.add(request, request.read(FlushRequest)),
+                keys.FLUSH: flush.add,
             }
         )
 

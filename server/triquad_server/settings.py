@@ -5,18 +5,20 @@
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from triquad_format.records.field_settings import FieldSettings
 
 _RECORD = ConfigDict(
     frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
 )
+# Neither text nor a truth value is a number.
+_SECTION = _RECORD | ConfigDict(strict=True)
 
 
 class ScanSettings(BaseModel):
     """Which points of a scan are used, and where its rays are sampled."""
 
-    model_config = _RECORD
+    model_config = _SECTION
 
     range_min_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
     """Nearer points are dropped."""
@@ -58,7 +60,7 @@ class ScanSettings(BaseModel):
 class TrainingSettings(BaseModel):
     """How the field is trained."""
 
-    model_config = _RECORD
+    model_config = _SECTION
 
     batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
     """Samples per step."""
@@ -107,7 +109,7 @@ class TrainingSettings(BaseModel):
 class MeshSettings(BaseModel):
     """The lattice of mesh tiles, and how clients follow them."""
 
-    model_config = _RECORD
+    model_config = _SECTION
 
     cell_m: Annotated[float, Field(ge=0.01, le=10)] = 0.1
     """Side of the cells of marching cubes."""
@@ -137,16 +139,11 @@ class MeshSettings(BaseModel):
     cache_bytes: Annotated[int, Field(ge=0, le=2**40)] = 200_000_000
     """Bytes of encoded tiles that are cached; others are made again when they are asked for."""
 
-    @property
-    def tile_side_m(self) -> float:
-        """Side of a tile."""
-        return self.cell_m * self.tile_cells
-
 
 class StoreSettings(BaseModel):
     """When checkpoints are written and how far back they are kept."""
 
-    model_config = _RECORD
+    model_config = _SECTION
 
     period_s: Annotated[float, Field(ge=0, le=1e7)] = 60.0
     """Time between checkpoints while the map changes; 0: only on request."""
@@ -164,7 +161,7 @@ class StoreSettings(BaseModel):
 class ServiceSettings(BaseModel):
     """Limits of the network service."""
 
-    model_config = _RECORD
+    model_config = _SECTION
 
     scan_queue: Annotated[int, Field(ge=1, le=10_000)] = 32
     """Scans that wait; the oldest is pushed out, and counted."""
@@ -210,15 +207,6 @@ class Settings(BaseModel):
     mesh: MeshSettings = MeshSettings()
     store: StoreSettings = StoreSettings()
     service: ServiceSettings = ServiceSettings()
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _numbers_are_no_truth_values(cls, section: object, info: ValidationInfo) -> object:
-        """Refuse ``true``, which Python takes for 1."""
-        for key, value in section.items() if isinstance(section, dict) else ():
-            if isinstance(value, bool):
-                raise ValueError(f"{info.field_name}.{key} = {value}: no setting is a truth value")
-        return section
 
     @model_validator(mode="after")
     def _regions_hold_scans(self) -> "Settings":

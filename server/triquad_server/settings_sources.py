@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 from pydantic_settings import (
     BaseSettings,
@@ -21,6 +21,9 @@ from triquad_format.errors import SettingsError
 from triquad_server.settings import Settings, setting_schemas
 
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
+
+_NUMBERS = {"integer": TypeAdapter[float](int), "number": TypeAdapter(float)}
+"""What reads text as a number, by the type in a setting's schema."""
 
 
 class _Sources(Settings, BaseSettings):
@@ -58,8 +61,8 @@ def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> 
     """
     sources = [
         _Source(f"settings file {file}", {} if file is None else _read_file(file)),
-        _Source("environment", _read_environment()),
-        _Source("--set", _parse_assignments(assignments)),
+        _Source("environment", _with_numbers(_read_environment())),
+        _Source("--set", _with_numbers(_parse_assignments(assignments))),
     ]
     merged: dict[str, Any] = {}
     for _, tables in sources:
@@ -109,6 +112,25 @@ def _parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     return tables
 
 
+def _with_numbers(tables: dict[str, Any]) -> dict[str, Any]:
+    """Tables of texts as a file would have them: those of numbers are read, where they can be."""
+    schemas = setting_schemas()
+
+    def read(section: str, key: str, text: str) -> float | str:
+        numbers = _NUMBERS.get(schemas.get(section, {}).get(key, {}).get("type", "string"))
+        try:
+            return numbers.validate_python(text) if numbers else text
+        except ValidationError:
+            return text
+
+    return {
+        section: {key: read(section, key, text) for key, text in table.items()}
+        if isinstance(table, dict)
+        else table
+        for section, table in tables.items()
+    }
+
+
 def _explain(details: ErrorDetails, sources: list[_Source]) -> str:
     """What is wrong with a setting, and what is right."""
     location = details["loc"]
@@ -128,11 +150,18 @@ def _problem(details: ErrorDetails, name: str) -> str:
         case "model_type" | "dataclass_type":
             return f"{name} = {value} is not a section: write [{name}]"
         case "greater_than_equal" | "less_than_equal":
-            schema = setting_schemas()[str(location[0])][str(location[1])]
-            low, high = schema["minimum"], schema["maximum"]
-            return f"{name} = {value} is out of range: use {low} to {high}"
+            return f"{name} = {value} is out of range: use {_allowed(location)}"
+        case "int_type" | "float_type":
+            quotes = ", without quotes" if isinstance(details["input"], str) else ""
+            return f"{name} = {value} is of another type: use {_allowed(location)}{quotes}"
         case _:
             return f"{name} = {value}: {details['msg']}"
+
+
+def _allowed(location: tuple[int | str, ...]) -> str:
+    """The type and the range of a number."""
+    schema = setting_schemas()[str(location[0])][str(location[1])]
+    return f"{schema['minimum']} to {schema['maximum']} ({schema['type']})"
 
 
 def _unknown(location: tuple[int | str, ...]) -> str:

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.composition.region import in_one
-from triquad_server.epochs import Epoch, EpochHistory, EpochLimits
+from triquad_server.epochs import Epoch, EpochHistory
+from triquad_server.settings import ServiceSettings
 
 
 @dataclass
@@ -22,7 +23,8 @@ def epoch(number):
 
 
 def history(kept, pinned=0, pin_s=30.0, clock=None):
-    return EpochHistory(epoch(1), EpochLimits(kept, pinned, pin_s), clock or Clock())
+    settings = ServiceSettings(epochs_kept=kept, epochs_pinned=pinned, pin_s=pin_s)
+    return EpochHistory(epoch(1), settings, clock or Clock())
 
 
 def is_gone(epochs, number):

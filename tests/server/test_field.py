@@ -9,7 +9,7 @@ from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.evidence.evidence import LiveEvidence
-from triquad_server.engine.adam import Rates
+from triquad_server.engine.compiled_trainer import Batch, Rates
 from triquad_server.engine.live_field import (
     LiveField,
     field_from_record,
@@ -17,7 +17,7 @@ from triquad_server.engine.live_field import (
     region_record,
 )
 from triquad_server.engine.tensor_field import TensorField
-from triquad_server.engine.trainer import Batch, TensorTrainer
+from triquad_server.engine.tensor_trainer import TensorTrainer
 
 CPU = torch.device("cpu")
 RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99)

@@ -7,17 +7,21 @@ import pytest
 from support import servers
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import FlushReply, FlushRequest
-from triquad_server.intake import flush, sources
+from triquad_server.intake import flush, scan_queue
 from triquad_server.intake.flush import FlushHandler
-from triquad_server.intake.sources import SourceLedger
+from triquad_server.intake.scan_queue import SourceLedger
 
 
 class PendingRequest:
     """Stands for a Zenoh query; keeps its one answer."""
 
-    def __init__(self, defect=None):
+    def __init__(self, asks, defect=None):
+        self._asks = asks
         self._defect = defect
         self._replies: queue.SimpleQueue[object] = queue.SimpleQueue()
+
+    def read(self, _kind):
+        return self._asks
 
     def answer(self, message):
         if self._defect:
@@ -54,7 +58,7 @@ def asks(sequence=0, **changes):
     "request_",
     [
         asks(-1),
-        asks(sources.MAX_SEQUENCE),
+        asks(scan_queue.MAX_SEQUENCE),
         asks(2**63 - 1),
         asks(source=""),
         asks(source="a/b"),
@@ -66,34 +70,34 @@ def asks(sequence=0, **changes):
 )
 def test_requests_out_of_range_are_refused_and_others_are_answered(handler, request_):
     with pytest.raises(RefusedError) as caught:
-        handler.add(PendingRequest(), request_)
+        handler.add(PendingRequest(request_))
     assert caught.value.code == "bad_request"
-    good = PendingRequest()
-    handler.add(good, asks(2))
+    good = PendingRequest(asks(2))
+    handler.add(good)
     assert good.reply == FlushReply(0, 0, 3, None)
 
 
 def test_an_internal_error_ends_one_request_and_no_other(handler):
-    bad, good = PendingRequest(RuntimeError("a defect")), PendingRequest()
-    handler.add(bad, asks())
+    bad, good = PendingRequest(asks(), RuntimeError("a defect")), PendingRequest(asks())
+    handler.add(bad)
     assert bad.reply == "internal"
-    handler.add(good, asks())
+    handler.add(good)
     assert good.reply == FlushReply(0, 0, 1, None)
 
 
 def test_a_scan_that_stays_out_of_the_map_ends_in_a_timeout(handler, ledger):
     ledger.arrive(servers.scan(0))
-    request = PendingRequest()
-    handler.add(request, asks(timeout_s=0.01))
+    request = PendingRequest(asks(timeout_s=0.01))
+    handler.add(request)
     assert request.reply == "timeout"
 
 
 def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
     asked = threading.Event()
     with closing(FlushHandler(ledger, asked.set, 600.0, 8)) as handler:
-        request = PendingRequest()
+        request = PendingRequest(asks())
         ledger.arrive(servers.scan(0))
-        handler.add(request, asks())
+        handler.add(request)
         ledger.take(servers.scan(0))
         assert asked.wait(servers.WAIT_S)
         ledger.publish()
@@ -101,19 +105,19 @@ def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
 
 
 def test_pending_requests_are_refused_when_the_server_stops(ledger):
-    request = PendingRequest()
+    request = PendingRequest(asks())
     with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
         ledger.arrive(servers.scan(0))
-        handler.add(request, asks())
+        handler.add(request)
     assert request.reply == "timeout"
 
 
 def test_questions_about_strangers_push_nobody_out(handler, ledger, monkeypatch):
-    monkeypatch.setattr(sources, "MAX_SESSIONS", 2)
+    monkeypatch.setattr(scan_queue, "MAX_SESSIONS", 2)
     ledger.arrive(servers.scan(0))
     for session in range(100, 110):
-        stranger = PendingRequest()
-        handler.add(stranger, asks(4, session=session))
+        stranger = PendingRequest(asks(4, session=session))
+        handler.add(stranger)
         assert stranger.reply == FlushReply(0, 0, 5, None)
     assert ledger.arrived("lidar", 7, 0)
     assert ledger.lost() == {}

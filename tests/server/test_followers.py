@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from triquad_server.mesh.followers import MAX_CLIENTS, Bandwidth, TileReply
+from triquad_server.mesh.mesher import TileBorder, tile_lattice
 from triquad_server.mesh.tile_cache import CachedTile, TileBytes
-from triquad_server.mesh.tile_lattice import TileBorder, tile_lattice
 from triquad_server.settings import MeshSettings
 
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from support.small_world import settings, settle, settled_mapper, surface_error, world
 from triquad_format.records.status import Status
-from triquad_server.engine.trainer import GradientSums
-from triquad_server.intake.scan import ScanRefusedError
+from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings

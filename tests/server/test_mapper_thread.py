@@ -9,23 +9,22 @@ import pytest
 from support import servers
 from support.small_world import settings, world
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
-from triquad_server.epochs import EpochLimits
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.settings import StoreSettings
+from triquad_server.settings import ServiceSettings, StoreSettings
 from triquad_server.store.checkpoints import Checkpoints
 from triquad_server.store.store import Store
 
 NEVER_S = 3600.0
-KEPT = EpochLimits(4, 0, 0.0)
+SETTINGS = ServiceSettings(publish_period_s=NEVER_S, epochs_kept=4, epochs_pinned=0, pin_s=0.0)
 
 
 @contextmanager
 def running(mapper: Mapper, failed: Callable[[], None] = lambda: None) -> Iterator[MapperThread]:
     """The thread of a mapper, which publishes when a command asks for it."""
-    with closing(MapperThread(mapper, ScanQueue(8), NEVER_S, KEPT, failed)) as thread:
+    with closing(MapperThread(mapper, ScanQueue(8), SETTINGS, failed)) as thread:
         thread.start()
         yield thread
 
@@ -70,7 +69,7 @@ def test_commands_of_a_thread_that_failed_are_refused_with_the_cause() -> None:
 
 def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
     thread = MapperThread(
-        Mapper("test", settings(), "cpu"), ScanQueue(8), NEVER_S, KEPT, failed=lambda: None
+        Mapper("test", settings(), "cpu"), ScanQueue(8), SETTINGS, failed=lambda: None
     )
     with ThreadPoolExecutor(1) as pool:
         pending = pool.submit(thread.call, lambda mapper: mapper.settled)

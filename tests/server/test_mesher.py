@@ -3,8 +3,8 @@ import pytest
 from support.small_world import settings, settled_mapper, world
 from triquad_server.epochs import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.mesher import TileMesh, mesh_tile, surface_tiles
-from triquad_server.mesh.tile_lattice import tile_lattice
+from triquad_server.mesh.mesher import TileMesh, mesh_tile, tile_lattice
+from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_server.settings import MeshSettings
 
 LATTICE = tile_lattice(settings().mesh, 0)
@@ -46,7 +46,7 @@ def test_neighbouring_tiles_meet_without_seams(
     tiles: dict[tuple[int, int, int], TileMesh],
 ) -> None:
     """On their common face, both tiles have the same vertices."""
-    side = settings().mesh.tile_side_m
+    side = LATTICE.tile_side_m
     met = []
     for (x, y, z), tile in tiles.items():
         other = tiles.get((x + 1, y, z))
@@ -89,7 +89,7 @@ def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
     epoch, lattice = mapper.publish(), tile_lattice(small.mesh, 0)
     low = np.array([3.0, -2.0, -1.0])
     listed = {tuple(tile) for tile in surface_tiles(epoch, lattice).tolist()}
-    side = small.mesh.tile_side_m
+    side = lattice.tile_side_m
     for offset in np.ndindex(3, 6, 3):
         x, y, z = (np.floor(low / side).astype(int) + offset).tolist()
         if len(mesh_tile(epoch, (x, y, z), lattice).faces):
@@ -99,7 +99,7 @@ def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
 def test_tiles_are_those_that_meet_the_bounds(epoch: Epoch) -> None:
     everything = surface_tiles(epoch, LATTICE)
     assert LATTICE.meets(everything, np.full(3, -np.inf), np.full(3, np.inf)).all()
-    side = settings().mesh.tile_side_m
+    side = LATTICE.tile_side_m
     tiles = {tuple(tile) for tile in everything.tolist()}
     seen = {tuple(tile) for tile in np.floor(world(4).hits / side).astype(int).tolist()}
     assert seen <= tiles

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from triquad_server.intake.scan import ScanRefusedError, usable_rays
+from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.scan import usable_rays
 from triquad_server.settings import ScanSettings
 
 SETTINGS = ScanSettings()

@@ -39,6 +39,18 @@ def test_the_environment_goes_before_the_file_and_the_command_line_before_both(
     assert (training.batch, training.seed, training.max_regions) == (3, 2, 1)
 
 
+def test_a_file_has_numbers_and_text_stands_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[training]\nlearning_rate = 1\n")
+    monkeypatch.setenv("TRIQUAD_FIELD__LEAF_M", "1")
+    settings = load_settings(path, ["scan.max_points=4096", "scan.spread_m=1e-1"])
+    assert settings.training.learning_rate == 1.0
+    assert settings.field.leaf_m == 1.0
+    assert (settings.scan.max_points, settings.scan.spread_m) == (4096, 0.1)
+
+
 def test_settings_that_are_printed_can_be_read(tmp_path: Path) -> None:
     settings = load_settings(
         assignments=["field.encoding=fourier", "scan.thin_m=0.001", "mesh.reach_m=1e-5"]
@@ -75,7 +87,7 @@ def test_errors_name_the_environment(
     ("assignment", "words"),
     [
         ("training.bacth=1", ["unknown setting training.bacth: did you mean training.batch?"]),
-        ("training.batch=0", ["training.batch = '0' is out of range: use 1 to 10000000"]),
+        ("training.batch=0", ["training.batch = 0 is out of range: use 1 to 10000000"]),
         ("training.batch", ["training.batch", "SECTION.KEY=VALUE"]),
         ("batch=4096", ["batch=4096", "SECTION.KEY=VALUE"]),
     ],
@@ -96,7 +108,14 @@ def test_errors_name_the_command_line(assignment: str, words: list[str]) -> None
         ("[field]\ndepth = true\n", ["field.depth", "True"]),
         ("[field]\nencoding = 'all'\n", ["encoding", "all", "both"]),
         ("[training]\nbatch = 0\n", ["training.batch = 0", "use 1 to 10000000"]),
-        ("[training]\nbatch = 2.5\n", ["training.batch = 2.5", "integer"]),
+        ("[training]\nbatch = 2.5\n", ["training.batch = 2.5", "1 to 10000000 (integer)"]),
+        ("[training]\nbatch = 2.0\n", ["training.batch = 2.0", "integer"]),
+        ("[scan]\nmax_points = '4096'\n", ["scan.max_points = '4096'", "without quotes"]),
+        (
+            "[scan]\nspread_m = '0.1'\n",
+            ["spread_m = '0.1'", "0.001 to 10 (number), without"],
+        ),
+        ("[field]\ndepth = '8'\n", ["field.depth = '8'", "6 to 15 (integer), without quotes"]),
         ("[training]\nbatch = 0\nseed = -1\n", ["training.batch = 0", "training.seed = -1"]),
         ("[scan]\nrange_max_m = 1\n", ["range_max_m = 1", "range_min_m = 1.5"]),
         ("field = 3\n", ["field", "3"]),

@@ -19,8 +19,8 @@ from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.mesher import mesh_tile, surface_tiles
-from triquad_server.mesh.tile_lattice import tile_lattice
+from triquad_server.mesh.mesher import mesh_tile, tile_lattice
+from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.meshfile import read_mesh
 
@@ -76,7 +76,7 @@ def test_a_mesh_is_the_one_that_a_server_gives(map_file, tmp_path):
     indices = surface_tiles(epoch, lattice).tolist()
     tiles = [mesh_tile(epoch, tuple(index), lattice) for index in indices]
     parts = [(tile.origin + tile.vertices, tile.faces) for tile in tiles]
-    served = Mesh(*joined(parts, settings().mesh.tile_side_m, *everywhere))
+    served = Mesh(*joined(parts, lattice.tile_side_m, *everywhere))
     written = read_mesh(export(map_file, tmp_path, "mesh.ply"))
     assert len(written.faces) == pytest.approx(len(served.faces), rel=0.01)
     for one, other in ((written, served), (served, written)):

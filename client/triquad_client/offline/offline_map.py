@@ -18,8 +18,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.call import Batch, Call, ResultT
-from triquad_client.net.driver import BlockingDriver
+from triquad_client.net.call import Batch, BlockingDriver, Call, ResultT
 from triquad_client.offline.map_mesh import Report, map_mesh
 
 _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)

@@ -14,11 +14,52 @@ from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
 from triquad_map.compiled.field.quadtree import LiveQuadtree
 
-from triquad_server.engine.adam import Parameter
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
 
 FrozenField = FrozenCompiledField | TensorField
 """A field that does not change any more. Safe for any thread."""
+
+
+class Parameter:
+    """Rows of trained values with the optimiser's state of each; growing keeps both together.
+
+    All four tensors are views of the rows in use, which the optimiser changes in place.
+    """
+
+    def __init__(self, values: Tensor) -> None:
+        """Begin with ``values`` [rows, ...], which are copied, and no steps taken."""
+        self.values = values.clone()
+        self.means = torch.zeros_like(values)  # running means of the gradients
+        self.variances = torch.zeros_like(values)  # running means of the squared gradients
+        self.steps = torch.zeros(len(values), dtype=torch.int32, device=values.device)  # [rows]
+        self._room: tuple[Tensor, ...] = (self.values, self.means, self.variances, self.steps)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def append(self, values: Tensor) -> None:
+        """Add rows [N, ...] that took no step yet; the state of the others stays."""
+        used, count = len(self), len(self) + len(values)
+        if count > len(self._room[0]):
+            capacity = max(count, 2 * len(self._room[0]))
+            self._room = tuple(_with_room(rows, capacity) for rows in self._room)
+        self._room[0][used:count] = values
+        for state in self._room[1:]:
+            state[used:count] = 0
+        self.values, self.means, self.variances, self.steps = (rows[:count] for rows in self._room)
+
+    def restore(self, means: Tensor, variances: Tensor, steps: Tensor) -> None:
+        """Take over optimiser state, shaped as this parameter's."""
+        self.means.copy_(means)
+        self.variances.copy_(variances)
+        self.steps.copy_(steps)
+
+
+def _with_room(rows: Tensor, capacity: int) -> Tensor:
+    # Memory that nothing has been written to is not taken from the system.
+    roomy = rows.new_empty((capacity, *rows.shape[1:]))
+    roomy[: len(rows)] = rows
+    return roomy
 
 
 class LiveField:
@@ -72,7 +113,8 @@ class LiveField:
     @property
     def arrays(self) -> FieldArrays:
         """The numbers as arrays, which share memory with the field where it is on the CPU."""
-        return self.tensors.arrays
+        mlp = tuple(part.values[0].cpu().numpy() for part in self.mlp)
+        return FieldArrays(self.features.values.cpu().numpy(), mlp, self.frequencies.cpu().numpy())
 
     def grow(self, leaves: Longs) -> None:
         """Make room for surfaces in ``leaves`` [N, 3]; new feature vectors start at random.
@@ -92,15 +134,15 @@ class LiveField:
 
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""
-        # The frequencies never change.
-        values = self.tensors
-        copied = FieldTensors(
-            values.features.clone(), tuple(part.clone() for part in values.mlp), values.frequencies
-        )
         tree = self.tree.freeze()
-        if self.device.type == "cpu":
-            return FrozenCompiledField(self.settings, tree, copied.arrays)
-        return TensorField(self.settings, tree, copied)
+        frequencies = self.frequencies  # which never change
+        features = self.features.values.clone()
+        mlp = tuple(part.values[0].clone() for part in self.mlp)
+        if self.device.type != "cpu":
+            return TensorField(self.settings, tree, FieldTensors(features, mlp, frequencies))
+        arrays = tuple(part.numpy() for part in mlp)
+        numbers = FieldArrays(features.numpy(), arrays, frequencies.numpy())
+        return FrozenCompiledField(self.settings, tree, numbers)
 
 
 def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> LiveField:
@@ -115,7 +157,7 @@ def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> L
         for size in ((inputs, outputs), (outputs,)):
             uniform = torch.rand(size, generator=generator, device=device) * 2 - 1
             mlp.append(uniform * (1 / math.sqrt(inputs)))
-    return LiveField(settings, frequencies, mlp, generator)
+    return LiveField(settings, frequencies, mlp, generator=generator)
 
 
 def region_record(
@@ -130,7 +172,7 @@ def region_record(
     for plane in range(len(AXES)):
         for h, level in enumerate(field.settings.levels):
             codes, rows = field.tree.table(plane, h)
-            tables.append(VertexTable(plane, level, codes, arrays.features[rows]))
+            tables.append(VertexTable(plane, level, codes, features=arrays.features[rows]))
     mlp = [part.copy() for part in arrays.mlp]
     return Region(
         index=index,
@@ -182,12 +224,12 @@ def field_from_record(
         settings,
         _tensor(record.frequencies, device),
         [_tensor(array, device) for layer in layers for array in layer],
-        torch.Generator(device).manual_seed(seed),
+        generator=torch.Generator(device).manual_seed(seed),
     )
     for table in record.tables:
         h = table.level - settings.levels[0]
         features = _tensor(table.vectors(), device)
-        field.restore(table.plane, h, table.codes.astype(np.int64), features)
+        field.restore(table.plane, h, table.codes.astype(np.int64), features=features)
     if record.training is not None:
         _restore_optimiser(field, record.training)
     return field

@@ -10,7 +10,7 @@ from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest
 
-from triquad_server.intake.sources import MAX_SEQUENCE, SourceLedger
+from triquad_server.intake.scan_queue import MAX_SEQUENCE, SourceLedger
 from triquad_server.net.requests import Request
 
 _log = logging.getLogger(__name__)
@@ -82,12 +82,13 @@ class FlushHandler:
             self._ledger.changed.notify_all()
         self._thread.join()
 
-    def add(self, request: Request, asks: FlushRequest) -> None:
-        """Take over a request; it is answered once its scan is settled.
+    def add(self, request: Request) -> None:
+        """Take over a flush request; it is answered once its scan is settled.
 
         Raises:
-            RefusedError: a field is out of range, or too many are pending.
+            RefusedError: it cannot be decoded, a field is out of range, or too many are pending.
         """
+        asks = request.read(FlushRequest)
         self._check(asks)
         now = time.monotonic()
         with self._ledger.changed:

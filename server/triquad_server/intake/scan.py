@@ -1,25 +1,106 @@
-"""Checking scans at the edge: what is refused, and which points are used."""
+"""Scans from the network to rays: received, decoded, checked at the edge, thinned."""
 
+import logging
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import zenoh
+from triquad_format.errors import FormatError, ProtocolVersionError, WireError
 from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.pose import is_rigid, rotation_error
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import Scan
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import empty_keys, enter
 
+from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.net.requests import payload_limit
 from triquad_server.settings import ScanSettings
+
+_log = logging.getLogger(__name__)
 
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
 
 
-class ScanRefusedError(Exception):
-    """A scan that cannot be used; ``reason`` is the short key under which it is counted."""
+class ScanIntake:
+    """Receives scans from Zenoh, decodes them and puts them into the queue."""
 
-    def __init__(self, reason: str, text: str) -> None:
-        super().__init__(text)
-        self.reason = reason
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_name: str,
+        queue: ScanQueue,
+        *,
+        max_points: int,
+        arrived: Callable[[], None],
+    ) -> None:
+        """Begin to receive; ``arrived`` is called after each scan that was queued.
+
+        Scans of more than ``max_points`` points are refused here, so that the queue, whose limit
+        is a number of scans, is bounded in bytes too.
+        """
+        self._max_points = max_points
+        self._queue = queue
+        self._arrived = arrived
+        # A ring, since a full channel of another kind would stall the network's threads.
+        self._subscriber = session.declare_subscriber(
+            keys.all_scans_key(map_name), zenoh.handlers.RingChannel(queue.limit)
+        )
+        self._thread = threading.Thread(target=self._run, name="scan-intake")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Take no more scans."""
+        self._subscriber.undeclare()
+        self._thread.join()
+
+    def _run(self) -> None:
+        for sample in self._subscriber:
+            try:
+                self._receive(str(sample.key_expr), sample.payload)
+            except Exception:  # an internal error must not stop the intake of other scans
+                self._queue.dropped.add("internal")
+                _log.exception("a scan on %s could not be received", sample.key_expr)
+            self._arrived()
+
+    def _receive(self, key: str, payload: zenoh.ZBytes) -> None:
+        max_bytes = payload_limit(self._max_points)
+        if len(payload) > max_bytes:
+            self._drop("too_large", key, f"{len(payload)} bytes exceed {max_bytes}")
+            return
+        try:
+            scan = codec.decode(Scan, payload.to_bytes())
+        except ProtocolVersionError as error:
+            self._drop("bad_version", key, error)
+        except WireError as error:
+            self._drop("decode", key, error)
+        else:
+            self._enter(key, scan)
+
+    def _enter(self, key: str, scan: Scan) -> None:
+        """Put a decoded scan into the queue, where it may be there."""
+        if key.rpartition("/")[2] != scan.source:
+            self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
+            return
+        try:
+            keys.check_name("source", scan.source)
+        except FormatError as error:
+            self._drop("bad_source", key, error)
+            return
+        points = len(scan.points)
+        if points > self._max_points:
+            text = f"{points} points exceed the limit of {self._max_points}"
+            self._queue.refuse(scan, "too_many_points", text)
+            return
+        self._queue.put(scan)
+
+    def _drop(self, reason: str, key: str, cause: object) -> None:
+        self._queue.dropped.add(reason)
+        _log.debug("scan on %s dropped (%s): %s", key, reason, cause)
 
 
 @dataclass(frozen=True)
@@ -31,7 +112,7 @@ class ScanRays:
     points_dropped: dict[str, int]  # points of the scan that are not used, by reason
 
 
-def check_pose(world_from_sensor: Doubles) -> None:
+def _check_pose(world_from_sensor: Doubles) -> None:
     """Refuse a pose [4, 4] that is not finite, not rigid or outside the world."""
     pose = world_from_sensor
     if pose.shape != (4, 4):
@@ -98,7 +179,7 @@ def usable_rays(points: Floats, world_from_sensor: Doubles, settings: ScanSettin
     Raises:
         ScanRefusedError: the pose is bad, or no point can be used.
     """
-    check_pose(world_from_sensor)
+    _check_pose(world_from_sensor)
     _check_points(points, settings.max_points)
     kept, not_finite, too_near, too_far = _select(
         np.ascontiguousarray(points),

@@ -1,20 +1,182 @@
-"""Scans on their way from the network to the mapper."""
+"""The queue of scans, and the ledger of what became of each: taken, refused or lost."""
 
-import logging
 import threading
-from collections import deque
-from collections.abc import Callable
+from collections import OrderedDict, deque
+from dataclasses import dataclass
 
-import zenoh
-from triquad_format.errors import FormatError, ProtocolVersionError, WireError
-from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import Scan
+from triquad_format.wire.messages import FlushReply, Scan
 
 from triquad_server.counter import Counter
-from triquad_server.intake.sources import SourceLedger
-from triquad_server.net.requests import payload_limit
 
-_log = logging.getLogger(__name__)
+MAX_SESSIONS = 1024
+"""Sessions of publishers that are remembered; the one heard of longest ago is forgotten."""
+
+MAX_SEQUENCE = 2**48
+
+FORGOTTEN = "*"
+"""Stands for all forgotten sources where losses are listed."""
+
+_MAX_COUNT = 2**63 - 1
+
+
+@dataclass
+class _Track:
+    """Counts of one session of one source. Scans of one session stay in order all the way."""
+
+    arrived: int = -1  # highest sequence that arrived or was given up
+    done: int = -1  # highest sequence that came out of the queue
+    waiting: int = 0  # scans in the queue
+    unpublished: int | None = None  # lowest sequence taken that no epoch shows yet
+    stamp_ns: int = -(2**63)
+    taken: int = 0
+    refused: int = 0
+    lost: int = 0
+    last_refusal: str | None = None
+
+    def lose_up_to(self, sequence: int) -> None:
+        """Count what did not arrive, up to and with ``sequence``, as lost."""
+        self.lost += max(0, sequence - self.arrived)
+        self.arrived = max(self.arrived, sequence)
+
+    def refuse(self, text: str) -> None:
+        """Count a refused scan."""
+        self.refused += 1
+        self.last_refusal = text
+
+    def settled(self, sequence: int) -> bool:
+        """Whether a scan was taken, refused or lost."""
+        return sequence <= (self.done if self.waiting else self.arrived)
+
+
+class SourceLedger:
+    """Accounts for every scan by source, session and sequence; safe for any thread.
+
+    Counts are those of this process: a scan of a session that it never received is lost.
+    """
+
+    def __init__(self) -> None:
+        self.changed = threading.Condition()  # notified when the outcome of a scan may be known
+        self._tracks: OrderedDict[tuple[str, int], _Track] = OrderedDict()
+        self._forgotten_lost = 0
+
+    def arrive(self, scan: Scan) -> str | None:
+        """Record a scan's arrival; the reason where its sequence or stamp refuses it."""
+        with self.changed:
+            if not 0 <= scan.sequence < MAX_SEQUENCE:
+                return "bad_sequence"
+            track = self._track(scan.source, scan.session)
+            if scan.sequence <= track.arrived:
+                return "sequence_backwards"
+            track.lose_up_to(scan.sequence - 1)
+            track.arrived = scan.sequence
+            if scan.stamp_ns < track.stamp_ns:
+                track.refuse(
+                    f"scan {scan.sequence}: its stamp {scan.stamp_ns} ns lies before the "
+                    f"{track.stamp_ns} ns of an earlier scan; stamp scans in order"
+                )
+                self.changed.notify_all()
+                return "time_backwards"
+            track.stamp_ns = scan.stamp_ns
+            track.waiting += 1
+            return None
+
+    def take(self, scan: Scan) -> None:
+        """Record that a scan went into the map."""
+        with self.changed:
+            track = self._leave_queue(scan)
+            track.taken += 1
+            if track.unpublished is None:
+                track.unpublished = scan.sequence
+
+    def refuse(self, scan: Scan, text: str) -> None:
+        """Record that the map refused a scan."""
+        with self.changed:
+            self._leave_queue(scan).refuse(f"scan {scan.sequence}: {text}")
+
+    def turn_away(self, scan: Scan, text: str) -> None:
+        """Record that a scan that just arrived is not let into the queue.
+
+        Earlier ones may still wait there, so it says nothing of them.
+        """
+        with self.changed:
+            track = self._track(scan.source, scan.session)
+            track.waiting = max(0, track.waiting - 1)
+            track.refuse(f"scan {scan.sequence}: {text}")
+            self.changed.notify_all()
+
+    def push_out(self, scan: Scan) -> None:
+        """Record that a scan was pushed out of the full queue."""
+        with self.changed:
+            self._leave_queue(scan).lost += 1
+
+    def publish(self) -> None:
+        """Record that an epoch shows all scans that were taken so far."""
+        with self.changed:
+            shown = [track for track in self._tracks.values() if track.unpublished is not None]
+            for track in shown:
+                track.unpublished = None
+            if shown:
+                self.changed.notify_all()
+
+    def give_up(self, source: str, session: int, sequence: int) -> FlushReply | None:
+        """Count what has not arrived up to ``sequence`` as lost; the outcome, as :meth:`outcome`.
+
+        A session that was never heard of is answered but not remembered: questions must not push
+        out the sessions that send scans.
+        """
+        with self.changed:
+            track = self._tracks.get((source, session))
+            if track is None:
+                return FlushReply(taken=0, refused=0, lost=sequence + 1, last_refusal=None)
+            track.lose_up_to(sequence)
+            return self.outcome(source, session, sequence)
+
+    def arrived(self, source: str, session: int, sequence: int) -> bool:
+        """Whether a scan, or a later one of its session, arrived."""
+        with self.changed:
+            track = self._tracks.get((source, session))
+            return track is not None and sequence <= track.arrived
+
+    def settled(self, source: str, session: int, sequence: int) -> bool:
+        """Whether a scan was taken, refused or lost."""
+        with self.changed:
+            track = self._tracks.get((source, session))
+            return track is not None and track.settled(sequence)
+
+    def outcome(self, source: str, session: int, sequence: int) -> FlushReply | None:
+        """The counts of a session, once the scan is settled and an epoch shows it if taken."""
+        with self.changed:
+            track = self._tracks.get((source, session))
+            if track is None or not track.settled(sequence):
+                return None
+            if track.unpublished is not None and track.unpublished <= sequence:
+                return None
+            return FlushReply(track.taken, track.refused, track.lost, track.last_refusal)
+
+    def lost(self) -> dict[str, int]:
+        """Scans lost, by source."""
+        with self.changed:
+            counts = {FORGOTTEN: self._forgotten_lost} if self._forgotten_lost else {}
+            for (source, _), track in self._tracks.items():
+                if track.lost:
+                    counts[source] = min(_MAX_COUNT, counts.get(source, 0) + track.lost)
+            return counts
+
+    def _leave_queue(self, scan: Scan) -> _Track:
+        track = self._track(scan.source, scan.session)
+        track.waiting = max(0, track.waiting - 1)
+        track.done = max(track.done, scan.sequence)
+        self.changed.notify_all()
+        return track
+
+    def _track(self, source: str, session: int) -> _Track:
+        """The track of a session, now the one heard of last."""
+        track = self._tracks.setdefault((source, session), _Track())
+        self._tracks.move_to_end((source, session))
+        if len(self._tracks) > MAX_SESSIONS:
+            _, forgotten = self._tracks.popitem(last=False)
+            self._forgotten_lost = min(_MAX_COUNT, self._forgotten_lost + forgotten.lost)
+        return track
 
 
 class ScanQueue:
@@ -57,80 +219,3 @@ class ScanQueue:
         with self._lock:
             self._in_hand = bool(self._scans)
             return self._scans.popleft() if self._scans else None
-
-
-class ScanIntake:
-    """Receives scans from Zenoh, decodes them and puts them into the queue."""
-
-    def __init__(
-        self,
-        session: zenoh.Session,
-        map_name: str,
-        queue: ScanQueue,
-        *,
-        max_points: int,
-        arrived: Callable[[], None],
-    ) -> None:
-        """Begin to receive; ``arrived`` is called after each scan that was queued.
-
-        Scans of more than ``max_points`` points are refused here, so that the queue, whose limit
-        is a number of scans, is bounded in bytes too.
-        """
-        self._max_points = max_points
-        self._queue = queue
-        self._arrived = arrived
-        # A ring, since a full channel of another kind would stall the network's threads.
-        self._subscriber = session.declare_subscriber(
-            keys.all_scans_key(map_name), zenoh.handlers.RingChannel(queue.limit)
-        )
-        self._thread = threading.Thread(target=self._run, name="scan-intake")
-        self._thread.start()
-
-    def close(self) -> None:
-        """Take no more scans."""
-        self._subscriber.undeclare()
-        self._thread.join()
-
-    def _run(self) -> None:
-        for sample in self._subscriber:
-            try:
-                self._receive(str(sample.key_expr), sample.payload)
-            except Exception:  # an internal error must not stop the intake of other scans
-                self._queue.dropped.add("internal")
-                _log.exception("a scan on %s could not be received", sample.key_expr)
-            self._arrived()
-
-    def _receive(self, key: str, payload: zenoh.ZBytes) -> None:
-        max_bytes = payload_limit(self._max_points)
-        if len(payload) > max_bytes:
-            self._drop("too_large", key, f"{len(payload)} bytes exceed {max_bytes}")
-            return
-        try:
-            scan = codec.decode(Scan, payload.to_bytes())
-        except ProtocolVersionError as error:
-            self._drop("bad_version", key, error)
-        except WireError as error:
-            self._drop("decode", key, error)
-        else:
-            self._enter(key, scan)
-
-    def _enter(self, key: str, scan: Scan) -> None:
-        """Put a decoded scan into the queue, where it may be there."""
-        if key.rpartition("/")[2] != scan.source:
-            self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
-            return
-        try:
-            keys.check_name("source", scan.source)
-        except FormatError as error:
-            self._drop("bad_source", key, error)
-            return
-        points = len(scan.points)
-        if points > self._max_points:
-            text = f"{points} points exceed the limit of {self._max_points}"
-            self._queue.refuse(scan, "too_many_points", text)
-            return
-        self._queue.put(scan)
-
-    def _drop(self, reason: str, key: str, cause: object) -> None:
-        self._queue.dropped.add(reason)
-        _log.debug("scan on %s dropped (%s): %s", key, reason, cause)

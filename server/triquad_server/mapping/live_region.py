@@ -16,7 +16,7 @@ from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import thin
 from triquad_map.composition.region import field_samples
 
-from triquad_server.engine.adam import Rates
+from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums, Rates
 from triquad_server.engine.live_field import (
     LiveField,
     field_from_record,
@@ -24,7 +24,7 @@ from triquad_server.engine.live_field import (
     region_record,
     training_state,
 )
-from triquad_server.engine.trainer import CompiledTrainer, GradientSums, TensorTrainer
+from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs import FrozenRegion
 from triquad_server.intake.scan import ScanRays
 from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
@@ -103,7 +103,7 @@ class LiveRegion:
     def restore(cls, record: Region, setup: RegionSetup) -> "LiveRegion":
         """A region from its record; without training state its replay pool starts empty."""
         seed, _ = setup.seeds(record.index)
-        field = field_from_record(record, setup.field, setup.device, seed)
+        field = field_from_record(record, setup.field, setup.device, seed=seed)
         evidence = LiveEvidence.from_record(1 << setup.field.depth, record.evidence)
         region = cls(record.index, setup, field, evidence)
         state = record.training
@@ -134,8 +134,10 @@ class LiveRegion:
 
         ``normals`` [N, 3] are those at the rays' ends, NaN where unknown.
         """
-        half = self._settings.region_side_m / 2
-        intervals = ray_intervals(rays, normals, self.centre, half, self._setup.scan)
+        half_side_m = self._settings.region_side_m / 2
+        intervals = ray_intervals(
+            rays, normals, self.centre, half_side_m=half_side_m, settings=self._setup.scan
+        )
         if len(intervals) == 0:
             return
         self.pool.add(intervals)
@@ -179,7 +181,7 @@ class LiveRegion:
         surfels = (
             first_surfels(evidence, samples, epoch)
             if before is None
-            else before.surfels.updated(evidence, samples, epoch, most)
+            else before.surfels.updated(evidence, samples, epoch, most=most)
         )
         return FrozenRegion(
             index=self.index,
@@ -201,7 +203,7 @@ class LiveRegion:
             labels=samples.labels,
             budget_samples=self.budget_samples,
         )
-        return region_record(self.index, self.field, self.evidence.freeze(), state)
+        return region_record(self.index, self.field, self.evidence.freeze(), training=state)
 
     def _cooling(self) -> float:
         """Share of the learning rate: falls as the budget is used up, so that the field settles."""

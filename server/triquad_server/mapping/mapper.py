@@ -11,9 +11,10 @@ from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord
 
-from triquad_server.engine.trainer import GradientSums
+from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.epochs import Epoch, FrozenRegion
-from triquad_server.intake.scan import ScanRays, ScanRefusedError, usable_rays
+from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.scan import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.settings import Settings
@@ -149,7 +150,10 @@ class Mapper:
         return self._epoch
 
     def reset(self, minimum: Doubles, maximum: Doubles) -> None:
-        """Forget what lies between two corners [3]; regions wholly between them disappear."""
+        """Forget what lies between two corners [3], metres, map frame.
+
+        Regions wholly between them disappear.
+        """
         half = self._field_settings.region_side_m / 2
         for index, region in list(self._regions.items()):
             low, high = region.centre - half, region.centre + half
@@ -175,11 +179,10 @@ class Mapper:
         regions = tuple(
             region.record() for index, region in self._regions.items() if index in changed
         )
-        return MapChanges(
-            MapRecord(self._name, newest.number, self._field_settings, regions),
-            tuple(self._regions),
-            newest,
+        record = MapRecord(
+            self._name, newest.number, settings=self._field_settings, regions=regions
         )
+        return MapChanges(record, tuple(self._regions), newest)
 
     def _freeze(self, region: LiveRegion, before: dict[RegionIndex, FrozenRegion]) -> FrozenRegion:
         """The region as it is now; the last frozen one where it did not change since."""

@@ -13,12 +13,12 @@ from triquad_format.wire.messages import ResetReply, ResetRequest
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
-from triquad_server.epochs import EpochHistory, EpochLimits
-from triquad_server.errors import MapperStoppedError
-from triquad_server.intake.scan import ScanRefusedError
+from triquad_server.epochs import EpochHistory
+from triquad_server.errors import MapperStoppedError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_queries import check_box
+from triquad_server.mesh.mesher import check_box
+from triquad_server.settings import ServiceSettings
 from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
@@ -56,15 +56,14 @@ class MapperThread:
         self,
         mapper: Mapper,
         scans: ScanQueue,
-        publish_period_s: float,
-        kept: EpochLimits,
+        settings: ServiceSettings,
         failed: Callable[[], None],
     ) -> None:
         """Publish the first epoch; ``failed`` is called where an internal error ends the thread."""
         self._mapper = mapper
         self._scans = scans
         self.points_dropped = Counter()  # of scans that were taken, by reason
-        self._period_s = publish_period_s
+        self._period_s = settings.publish_period_s
         self._failed = failed
         self._lock = threading.Lock()
         self._commands: deque[_Command] = deque()
@@ -78,7 +77,7 @@ class MapperThread:
         self._scans_taken = 0
         self._loss = 0.0  # as of the newest epoch
         self._step_s = _GIVE_WAY_S  # what the last step of training took
-        self.epochs = EpochHistory(mapper.publish(), kept)
+        self.epochs = EpochHistory(mapper.publish(), settings)
         self.progress = Progress()
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")

@@ -19,16 +19,12 @@ from triquad_map.compiled.voxel_index import (
     with_room,
 )
 
+_FINE_M, _COARSE_M = 0.15, 0.5  # sides of the cells
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
 _MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
 _FULL = 65_536  # points of a cell, above which older ones count for less
 _RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
-
-PointMoments = Floats
-Normals = Floats
-Rows = Ints
-Counts = Floats
 
 
 @kernel()
@@ -37,8 +33,8 @@ def _add(
     start: int,
     cell_m: float,
     index: Index,
-    moments: PointMoments,
-    rows: Rows,
+    moments: Floats,
+    rows: Ints,
     count: int,
 ) -> tuple[int, int]:
     """Add points to the moments [cells, 10] of their cells, relative to the cells' centres."""
@@ -71,7 +67,7 @@ def _add(
 
 
 @kernel()
-def _gather(row: int, cell_m: float, index: Index, moments: PointMoments, total: Doubles) -> None:
+def _gather(row: int, cell_m: float, index: Index, moments: Floats, total: Doubles) -> None:
     """Sum the moments of the 27 cells around that of a row, relative to its centre."""
     total[:] = 0
     x, y, z = unpack(index.row_keys[row])
@@ -136,7 +132,7 @@ def _plane_normal(m: Doubles, normal: Doubles) -> bool:
 
 
 @kernel()
-def _outdated(rows: Rows, normals: Doubles, moments: PointMoments, basis: Counts) -> Rows:
+def _outdated(rows: Ints, normals: Doubles, moments: Floats, basis: Floats) -> Ints:
     """Cells of points without a normal whose own is of far fewer points than there are.
 
     Their ``basis`` is brought up to date.
@@ -153,9 +149,7 @@ def _outdated(rows: Rows, normals: Doubles, moments: PointMoments, basis: Counts
 
 
 @kernel()
-def _estimate(
-    rows: Rows, cell_m: float, index: Index, moments: PointMoments, normals: Normals
-) -> None:
+def _estimate(rows: Ints, cell_m: float, index: Index, moments: Floats, normals: Floats) -> None:
     """Set the normals [cells, 3] of cells; NaN where there is no plane."""
     total, normal = np.empty(10), np.empty(3)
     for row in rows:
@@ -166,7 +160,7 @@ def _estimate(
 
 
 @kernel()
-def _adopt(rows: Rows, of_cells: Normals, normals: Doubles) -> None:
+def _adopt(rows: Ints, of_cells: Floats, normals: Doubles) -> None:
     """Replace those of ``normals`` that are NaN by those of their cells."""
     for i in range(len(rows)):
         if np.isnan(normals[i, 0]):
@@ -186,7 +180,7 @@ class MomentGrid:
         # Points in each cell when its normal was estimated.
         self._basis = np.zeros(1024, np.float32)
 
-    def add(self, points: Doubles) -> Rows:
+    def add(self, points: Doubles) -> Ints:
         """Add points [N, 3], metres, map frame; returns the row of each one's cell."""
         rows = np.empty(len(points), np.int32)
         done = 0
@@ -200,7 +194,7 @@ class MomentGrid:
                 self._refit(slice(None))
         return rows
 
-    def fill(self, normals: Doubles, rows: Rows) -> None:
+    def fill(self, normals: Doubles, rows: Ints) -> None:
         """Replace those of ``normals`` [N, 3] that are NaN by those of the cells ``rows`` [N]."""
         outdated = _outdated(rows, normals, self._moments, self._basis)
 
@@ -244,14 +238,9 @@ class MomentGrid:
 class SurfaceNormals:
     """Normals of the surfaces around the sensor; those farthest from it go first."""
 
-    def __init__(
-        self,
-        team: Team,
-        fine_m: float = 0.15,
-        coarse_m: float = 0.5,
-        max_cells: int = 150_000,  # of each grid, at some 100 bytes
-    ) -> None:
-        self._grids = (MomentGrid(fine_m, team), MomentGrid(coarse_m, team))
+    def __init__(self, team: Team, max_cells: int = 150_000) -> None:
+        """Each grid has ``max_cells`` cells, at some 100 bytes."""
+        self._grids = (MomentGrid(_FINE_M, team), MomentGrid(_COARSE_M, team))
         self._max_cells = max_cells
 
     def add(self, points: Doubles, sensor: Doubles) -> Doubles:

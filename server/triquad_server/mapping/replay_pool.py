@@ -16,7 +16,7 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import with_room
 
-from triquad_server.engine.trainer import Batch
+from triquad_server.engine.compiled_trainer import Batch
 from triquad_server.mapping.ray_intervals import (
     COLUMNS,
     END,
@@ -121,7 +121,7 @@ class ReplayPool:
         places = self._rng.integers(self._size, size=count)
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
-        return draw_ordered_samples(self._intervals, places, self._placement, self._rng, self._team)
+        return self._draw_ordered(places)
 
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
@@ -130,7 +130,7 @@ class ReplayPool:
             self._keep(self._rng.permutation(self._size)[:capacity])
 
     def forget(self, low: Doubles, high: Doubles) -> None:
-        """Drop the intervals that end between the corners ``low`` and ``high`` [3]."""
+        """Drop the intervals that end between two corners [3], metres from the region's centre."""
         ends = self._intervals[: self._size, END : END + 3]
         self._keep(np.flatnonzero(~((ends >= low) & (ends <= high)).all(axis=1)))
         self.offered = self._size
@@ -138,7 +138,12 @@ class ReplayPool:
     def sample(self, count: int) -> Batch:
         """Samples on at most ``count`` intervals, one on each: what a checkpoint keeps."""
         places = self._rng.permutation(self._size)[:count]
-        return draw_ordered_samples(self._intervals, places, self._placement, self._rng, self._team)
+        return self._draw_ordered(places)
+
+    def _draw_ordered(self, places: Longs) -> Batch:
+        return draw_ordered_samples(
+            self._intervals, places, self._placement, rng=self._rng, team=self._team
+        )
 
     def _choose(self, count: int, fresh: int) -> Tensor:
         """Intervals [count, COLUMNS] at random, on the device."""

@@ -19,9 +19,8 @@ from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_map.compiled.team import lower_priority
 
+from triquad_server.mesh.mesher import TileIndex, TileLattice, check_box, check_level
 from triquad_server.mesh.tile_cache import CachedTile
-from triquad_server.mesh.tile_lattice import TileIndex, TileLattice
-from triquad_server.mesh.tile_queries import check_box, check_level
 from triquad_server.net.requests import Request
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import NICENESS
@@ -78,6 +77,9 @@ def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
     """Refuse a request for changes with a field out of range.
 
     ``server`` is the name that this server's replies carry, ``revision`` the newest of them.
+
+    Raises:
+        RefusedError: a field is out of range, or too many tiles are known.
     """
     check_box(asks.minimum, asks.maximum)
     check_level(asks.level)
@@ -221,7 +223,7 @@ class TileSenders:
     def send(self, follower: Follower, reply: TileUpdates) -> None:
         """Send a reply, in the background. For the thread that asks :meth:`may_send`."""
         self._bandwidth.spend(
-            follower.asks.client, len(reply.data), follower.bytes_per_s, time.monotonic()
+            follower.asks.client, len(reply.data), follower.bytes_per_s, now_s=time.monotonic()
         )
         with self._lock:
             self.sending += 1

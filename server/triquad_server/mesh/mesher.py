@@ -1,4 +1,4 @@
-"""Meshes of tiles: marching cubes on a fixed lattice of the map frame.
+"""Mesh tiles: their lattices, how neighbours meet on them, and marching cubes there.
 
 Lattice points are multiples of the cell, whatever the tile, so neighbouring tiles share the
 points of their common face and meet without seams, also where they were meshed at different
@@ -7,20 +7,154 @@ saw a surface are kept: elsewhere the field has zeros that no ray taught it.
 """
 
 import functools
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
-from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.errors import RefusedError
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.status import Status
+from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import STEPS, TileSurface
 from triquad_map.compiled.kernel import kernel
 from triquad_map.composition.composed_view import ComposedView
 
-from triquad_server.epochs import Epoch
-from triquad_server.mesh.marching_cubes import Crossings
-from triquad_server.mesh.tile_lattice import TileBorder, TileIndex, TileLattice, tiles_meeting
+from triquad_server.mesh.marching_cubes import Crossings, centroids
+from triquad_server.settings import MeshSettings
+
+TileIndex = tuple[int, int, int]
+
+_GROUP_CELLS = 8
+
+
+@dataclass(frozen=True)
+class TileLattice:
+    """Where the cells and tiles of one level lie: at multiples of their sides."""
+
+    cell_m: float
+    cells: int  # along the side of a tile, the same on all levels
+    reach_m: float  # centres of faces lie at most this far from voxels with seen surface
+    group: int  # cells along the side of the groups that are searched first
+
+    @property
+    def tile_side_m(self) -> float:
+        """Side of a tile."""
+        return self.cell_m * self.cells
+
+    @property
+    def margin_m(self) -> float:
+        """A change so far from a tile, or farther, does not concern it."""
+        return self.cell_m + self.reach_m
+
+    def meets(self, tiles: NDArray[np.integer], low: Doubles, high: Doubles) -> Bools:
+        """Which [T] of tiles [T, 3] meet the box between two corners [3], metres, map frame."""
+        corners = tiles * self.tile_side_m
+        return np.asarray(((corners <= high) & (corners + self.tile_side_m >= low)).all(axis=1))
+
+    def tiles_meeting(self, low: Doubles, high: Doubles, margin_m: float = 0.0) -> Longs:
+        """Tiles [T, 3], each once, that come within ``margin_m`` of any of N boxes.
+
+        ``low`` and ``high`` [N, 3] are the boxes' corners, metres, map frame.
+        """
+        first = np.floor((low - margin_m) / self.tile_side_m).astype(np.int64)
+        last = np.floor((high + margin_m) / self.tile_side_m).astype(np.int64)
+        tiles = [np.zeros((0, 3), np.int64)]
+        for offset in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
+            tile = first + offset
+            tiles.append(tile[(tile <= last).all(axis=1)])
+        return _each_once(np.concatenate(tiles))
+
+
+def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
+    """The lattice of a level, ``0 <= level < LEVELS``.
+
+    A tile of level ``l`` covers ``2**l`` tiles of level 0 along each axis. Groups of cells are of
+    the same size on all levels, so that no level searches farther around than level 0.
+    """
+    scale = 1 << level
+    return TileLattice(
+        cell_m=settings.cell_m * scale,
+        cells=settings.tile_cells,
+        reach_m=settings.reach_m * scale,
+        group=_GROUP_CELLS // scale,
+    )
+
+
+def _each_once(cells: Longs) -> Longs:
+    """The different ones of cells [N, 3], in order."""
+    if len(cells) == 0:
+        return cells
+    low = cells.min(axis=0)
+    x, y, z = (int(size) for size in cells.max(axis=0) - low + 1)
+    if x * y * z >= 2**62:
+        return np.asarray(np.unique(cells, axis=0))
+    # By one number each: numpy holds Python's lock while it sorts rows.
+    names = np.unique(((cells - low) * (y * z, z, 1)).sum(axis=1))
+    each = np.stack([names // (y * z), names // z % y, names % z], axis=1) + low
+    return np.asarray(each, np.int64)
+
+
+@dataclass(frozen=True)
+class TileBorder:
+    """Signed distances at lattice points of a tile's faces: what it was made of, so that others can
+    meet it there."""
+
+    points: NDArray[np.int16]  # [P, 3] lattice points of the tile
+    values: Floats  # [P] metres
+
+    @classmethod
+    def of_tile(cls, points: Longs, volume: Floats) -> "TileBorder":
+        """Those of a tile's lattice points [P, 3] that lie on its faces."""
+        last = len(volume) - 1
+        outer = points[((points == 0) | (points == last)).any(axis=1)]
+        return cls(outer.astype(np.int16), volume[tuple(outer.T)])
+
+    @classmethod
+    def joined(cls, borders: Iterable["TileBorder"]) -> "TileBorder":
+        """All points of several borders; where one occurs twice, both say the same."""
+        parts = list(borders)
+        return cls(
+            np.concatenate([np.zeros((0, 3), np.int16), *(part.points for part in parts)]),
+            np.concatenate([np.zeros(0, np.float32), *(part.values for part in parts)]),
+        )
+
+    def seen_from(self, offset: tuple[int, int, int], cells: int) -> "TileBorder":
+        """The points that a neighbour shares, in its own lattice.
+
+        Args:
+            offset: how many tiles this one lies from the neighbour, each -1, 0 or 1.
+            cells: along the side of a tile.
+        """
+        points = self.points + (np.array(offset) * cells).astype(np.int16)
+        shared = ((points >= 0) & (points <= cells)).all(axis=1)
+        return TileBorder(points[shared], self.values[shared])
+
+    def put(self, volume: Floats) -> None:
+        """Enter the values where ``volume`` [S, S, S] waits for one (NaN)."""
+        places = tuple(self.points.T)
+        waits = np.isnan(volume[places])
+        volume[tuple(self.points[waits].T)] = self.values[waits]
+
+
+def check_level(level: int) -> None:
+    """Refuse a level of detail that there is not.
+
+    Raises:
+        RefusedError: there is no such level.
+    """
+    if not 0 <= level < LEVELS:
+        raise RefusedError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
+
+
+def check_box(minimum: Doubles, maximum: Doubles) -> None:
+    """Refuse a box [3], [3] with NaN or with corners the wrong way round; infinite is allowed.
+
+    Raises:
+        RefusedError: it is such a box.
+    """
+    if np.isnan([minimum, maximum]).any() or (minimum > maximum).any():
+        raise RefusedError("bad_request", f"not a box: minimum {minimum}, maximum {maximum}")
 
 
 @dataclass(frozen=True)
@@ -29,37 +163,25 @@ class TileMesh:
 
     origin: Doubles  # [3] metres, map frame: the tile's minimum corner
     cell_m: float
-    points: NDArray[np.uint16]  # [V, 3] lower lattice points of the edges that hold the vertices
-    axes: Bytes  # [V] along which the edges run
-    fractions: Doubles  # [V] how far along them, 0 to 1
-    faces: Ints  # [F, 3] counter-clockwise seen from free space
+    crossings: Crossings  # the mesh, in cells from the origin
     border: TileBorder  # what it was made of on its faces
 
     @property
     def vertices(self) -> Floats:
         """The vertices [V, 3], metres, relative to the origin."""
-        places = self.points.astype(np.float64)
-        places[np.arange(len(places)), self.axes] += self.fractions
-        return (places * self.cell_m).astype(np.float32)
+        return (self.crossings.places * self.cell_m).astype(np.float32)
+
+    @property
+    def faces(self) -> Ints:
+        """Three vertices each [F, 3], counter-clockwise seen from free space."""
+        return self.crossings.faces
 
     @property
     def surface(self) -> TileSurface:
         """The mesh as it travels."""
-        steps = np.rint(self.fractions * STEPS).astype(np.uint8)
-        return TileSurface(self.points, self.axes, steps, self.faces)
-
-
-def surface_tiles(epoch: Epoch, lattice: TileLattice) -> Ints:
-    """Tiles [T, 3], sorted, that meet a block with seen surface, or what is meshed around it."""
-    settings = epoch.field_settings
-    side_m = BLOCK_VOXELS * settings.leaf_m
-    tiles: set[TileIndex] = set()
-    for region in epoch.frozen_regions:
-        corner = region.centre - settings.region_side_m / 2
-        low = region.evidence.surface_cells() * side_m + corner
-        around = tiles_meeting(low, low + side_m, lattice.reach_m, lattice)
-        tiles.update((x, y, z) for x, y, z in around.tolist())
-    return np.array(sorted(tiles), np.int32).reshape(-1, 3)
+        found = self.crossings
+        steps = np.rint(found.fractions * STEPS).astype(np.uint8)
+        return TileSurface(found.points, found.axes, steps, faces=found.faces)
 
 
 def mesh_tile(
@@ -75,21 +197,15 @@ def mesh_tile(
     """
     first = np.asarray(tile, np.int64) * lattice.cells
     seen = _seen_cells(source, first, lattice)
-    volume, points = _lattice_values(source, seen, first, lattice, around)
+    volume, points = _lattice_values(source, seen, first=first, lattice=lattice, around=around)
     found = Crossings(seen, volume)
-    places = found.points.astype(np.float64)
-    places[np.arange(len(places)), found.axes] += found.fractions
-    centroids = _centroids((places + first) * lattice.cell_m, found.faces)
-    kept = source.status(centroids, lattice.reach_m) == Status.SURFACE
-    used, faces = _renumbered(found.faces[kept], len(places))
+    middles = centroids((found.places + first) * lattice.cell_m, found.faces)
+    found.keep(source.status(middles, lattice.reach_m) == Status.SURFACE)
     return TileMesh(
-        (first * lattice.cell_m).astype(np.float64),
-        lattice.cell_m,
-        found.points[used],
-        found.axes[used],
-        found.fractions[used],
-        faces,
-        TileBorder.of_tile(points, volume),
+        origin=(first * lattice.cell_m).astype(np.float64),
+        cell_m=lattice.cell_m,
+        crossings=found,
+        border=TileBorder.of_tile(points, volume),
     )
 
 
@@ -128,34 +244,6 @@ def _positions(cells: Longs, offset: float, first: Longs, cell_m: float) -> Doub
         for axis in range(3):
             positions[i, axis] = (first[axis] + cells[i, axis] + offset) * cell_m
     return positions
-
-
-@kernel()
-def _centroids(vertices: Doubles, faces: Ints) -> Doubles:
-    centroids = np.empty((len(faces), 3))
-    for i in range(len(faces)):
-        a, b, c = vertices[faces[i, 0]], vertices[faces[i, 1]], vertices[faces[i, 2]]
-        for axis in range(3):
-            centroids[i, axis] = (a[axis] + b[axis] + c[axis]) / 3
-    return centroids
-
-
-@kernel()
-def _renumbered(faces: Ints, vertices: int) -> tuple[Longs, Ints]:
-    """The vertices that faces use, in the order in which they do, and the faces with these."""
-    numbers = np.full(vertices, -1, np.int32)
-    used = np.empty(vertices, np.int64)
-    renumbered = np.empty(faces.shape, np.int32)
-    count = 0
-    for i in range(len(faces)):
-        for corner in range(3):
-            vertex = faces[i, corner]
-            if numbers[vertex] < 0:
-                numbers[vertex] = count
-                used[count] = vertex
-                count += 1
-            renumbered[i, corner] = numbers[vertex]
-    return used[:count], renumbered
 
 
 @functools.lru_cache(maxsize=8)

@@ -72,7 +72,7 @@ def previews_of(
     """
     shown = distances or _distances_of(record)
     parts = {
-        region.index: preview_part(region, record.settings, shown, stamp_ns or 0)
+        region.index: preview_part(region, record.settings, shown, stamp_ns=stamp_ns or 0)
         for region in record.regions
     }
     return Previews(preview_schema(), parts)

@@ -135,7 +135,7 @@ class SurfaceChanges:
         low = cells.min(axis=0, initial=0)
         _, first, group = np.unique(_key(cells - low), return_index=True, return_inverse=True)
         groups = ((cells[first] + 0.5) * self._group_m).astype(np.float64)
-        return _Voxels(keys[order], centres, groups, group.ravel())
+        return _Voxels(keys[order], centres, groups, group=group.ravel())
 
     def _offsets(self, region: FrozenRegion, centres: Doubles) -> Floats:
         """How far [V] the surface is from the centres; at most a voxel: beyond are others."""

@@ -15,15 +15,14 @@ from triquad_map.compiled.team import Team
 from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs import Epoch
-from triquad_server.mesh.mesher import mesh_tile
-from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
-from triquad_server.mesh.tile_lattice import (
+from triquad_server.mesh.mesher import (
     TileBorder,
     TileIndex,
     TileLattice,
+    mesh_tile,
     tile_lattice,
-    tiles_meeting,
 )
+from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
 from triquad_server.settings import MeshSettings
 
 _AROUND = [
@@ -100,8 +99,8 @@ class _TileLevel:
         """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
         low, high = changes.places - half_m, changes.places + half_m
         touched = [
-            *tiles_meeting(low, high, self.lattice.margin_m, self.lattice).tolist(),
-            *tiles_meeting(changes.drifted, changes.drifted, 0.0, self.lattice).tolist(),
+            *self.lattice.tiles_meeting(low, high, self.lattice.margin_m).tolist(),
+            *self.lattice.tiles_meeting(changes.drifted, changes.drifted).tolist(),
         ]
         known = len(self.changed)
         for x, y, z in touched:
@@ -137,7 +136,7 @@ class _TileLevel:
         ready.sort(key=lambda tile: tile.revision)
         to_make.sort(key=lambda index: (self.changed[index], index))
         removed = [index for index in known if index not in self.changed]
-        return TileDelta(ready, removed, to_make, revision)
+        return TileDelta(ready, removed, to_make, revision=revision)
 
     def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
         """What a tile has to agree with, by the tiles whose it is, in its own lattice.
@@ -193,9 +192,9 @@ class TileCache:
             if self._changes is None:
                 self._changes = SurfaceChanges(
                     epoch.field_settings,
-                    self._settings.tolerance_m,
-                    self._settings.tile_side_m,
-                    self._team,
+                    tolerance_m=self._settings.tolerance_m,
+                    group_m=self.lattice(0).tile_side_m,
+                    team=self._team,
                 )
             changes = self._changes.since_last(epoch.frozen_regions)
             for level in self._levels:
@@ -203,7 +202,7 @@ class TileCache:
             self._epoch = epoch
             # The threads that answer queries are spared: these give way to them.
             self._view = ComposedView(
-                epoch.number, epoch.field_settings, epoch.frozen_regions, self._team.split
+                epoch.number, epoch.field_settings, epoch.frozen_regions, split=self._team.split
             )
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
@@ -218,7 +217,8 @@ class TileCache:
     ) -> TileDelta:
         """What is new in a box to somebody who knows everything up to the revision ``known_to``.
 
-        ``known`` are versions of tiles that are known whatever the revision.
+        The box has the corners ``low`` and ``high`` [3], metres, map frame; ``known`` are versions
+        of tiles that are known whatever the revision.
         """
         with self._lock:
             return self._levels[level].delta(
@@ -232,8 +232,8 @@ class TileCache:
         tiles = self._levels[level]
         with self._lock:
             borders = tiles.borders_around(index)
-        around = TileBorder.joined(self._agreeing(tiles, index, borders, view))
-        mesh = mesh_tile(view, index, tiles.lattice, around)
+        around = TileBorder.joined(self._agreeing(tiles, index, borders=borders, view=view))
+        mesh = mesh_tile(view, index, tiles.lattice, around=around)
         data = encode_tile(mesh.surface)
         digest = hashlib.sha256(data).digest()
         with self._lock:

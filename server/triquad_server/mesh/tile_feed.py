@@ -18,8 +18,8 @@ from triquad_server.mesh.followers import (
     check_updates,
     new_follower,
 )
+from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
-from triquad_server.mesh.tile_lattice import TileIndex
 from triquad_server.net.requests import Request
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import NICENESS
@@ -74,12 +74,13 @@ class TileFeed:
         self._thread.join()
         self._senders.close()
 
-    def add(self, request: Request, asks: TileUpdatesRequest) -> None:
-        """Take over a request; it is answered once there are tiles for it, or in time.
+    def add(self, request: Request) -> None:
+        """Take over a request for updates; it is answered once there are some, or in time.
 
         Raises:
-            RefusedError: a field is out of range, or too many are pending.
+            RefusedError: it cannot be decoded, a field is out of range, or too many are pending.
         """
+        asks = request.read(TileUpdatesRequest)
         check_updates(asks, self._server, self._cache.revision)
         follower = new_follower(
             request,

@@ -1,15 +1,20 @@
-"""Answers to queries of single mesh tiles, and of which there are; checks of what is asked."""
+"""Answers to queries of single mesh tiles, and of which there are."""
 
 import numpy as np
 from triquad_format.errors import RefusedError
-from triquad_format.records.arrays import Doubles
-from triquad_format.wire.limits import LEVELS
+from triquad_format.records.arrays import Ints
+from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
-from triquad_server.epochs import EpochHistory
-from triquad_server.mesh.mesher import mesh_tile, surface_tiles
+from triquad_server.epochs import Epoch, EpochHistory
+from triquad_server.mesh.mesher import (
+    TileIndex,
+    TileLattice,
+    check_box,
+    check_level,
+    mesh_tile,
+)
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.mesh.tile_lattice import TileIndex
 
 MAX_TILES = 1_000_000
 """Tiles of one list."""
@@ -27,7 +32,11 @@ class TileQueries:
         self._cache = cache
 
     def tiles(self, request: TileListRequest) -> TileList:
-        """The tiles that meet the request's box."""
+        """The tiles that meet the request's box.
+
+        Raises:
+            RefusedError: a field is out of range, the epoch is gone, or the tiles are too many.
+        """
         check_box(request.minimum, request.maximum)
         check_level(request.level)
         epoch = self._epochs.get(request.epoch)
@@ -46,9 +55,13 @@ class TileQueries:
         )
 
     def tile(self, request: TileRequest) -> Tile:
-        """The mesh of one tile."""
+        """The mesh of one tile.
+
+        Raises:
+            RefusedError: a field is out of range, or the epoch is gone.
+        """
         index = (request.x, request.y, request.z)
-        check_index(index)
+        _check_index(index)
         check_level(request.level)
         epoch = self._epochs.get(request.epoch)
         mesh = mesh_tile(epoch, index, self._cache.lattice(request.level))
@@ -63,19 +76,20 @@ class TileQueries:
         )
 
 
-def check_level(level: int) -> None:
-    """Refuse a level of detail that there is not."""
-    if not 0 <= level < LEVELS:
-        raise RefusedError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
+def surface_tiles(epoch: Epoch, lattice: TileLattice) -> Ints:
+    """Tiles [T, 3], sorted, that meet a block with seen surface, or what is meshed around it."""
+    settings = epoch.field_settings
+    side_m = BLOCK_VOXELS * settings.leaf_m
+    tiles: set[TileIndex] = set()
+    for region in epoch.frozen_regions:
+        corner = region.centre - settings.region_side_m / 2
+        low = region.evidence.surface_cells() * side_m + corner
+        around = lattice.tiles_meeting(low, low + side_m, lattice.reach_m)
+        tiles.update((x, y, z) for x, y, z in around.tolist())
+    return np.array(sorted(tiles), np.int32).reshape(-1, 3)
 
 
-def check_box(minimum: Doubles, maximum: Doubles) -> None:
-    """Refuse a box [3], [3] with NaN or with corners the wrong way round; infinite is allowed."""
-    if np.isnan([minimum, maximum]).any() or (minimum > maximum).any():
-        raise RefusedError("bad_request", f"not a box: minimum {minimum}, maximum {maximum}")
-
-
-def check_index(index: TileIndex) -> None:
+def _check_index(index: TileIndex) -> None:
     """Refuse a tile that is too far away."""
     if max(map(abs, index)) > TILE_INDEX_LIMIT:
         raise RefusedError(

@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
-from triquad_server.engine.adam import Rates
+from triquad_server.engine.compiled_trainer import Batch, Rates
 from triquad_server.engine.tensor_field import TensorField
-from triquad_server.engine.trainer import Batch, TensorTrainer
+from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs import Epoch
 from triquad_server.launch import warm_up
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.mesher import mesh_tile, surface_tiles
-from triquad_server.mesh.tile_lattice import tile_lattice
+from triquad_server.mesh.mesher import mesh_tile, tile_lattice
+from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_server.settings import MeshSettings, Settings
 from triquad_server.threads import Teams
 

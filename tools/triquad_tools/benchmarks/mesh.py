@@ -12,8 +12,8 @@ from triquad_client import Client, Mesh, MeshWatch
 from triquad_format.records.arrays import Bools
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_server.epochs import Epoch
+from triquad_server.mesh.mesher import TileIndex, tile_lattice
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.mesh.tile_lattice import TileIndex, tile_lattice, tiles_meeting
 from triquad_server.settings import MeshSettings, Settings
 from triquad_server.threads import Teams
 
@@ -163,7 +163,7 @@ def _work(made: BenchStreet) -> list[Figure]:
     changed = _changed(before, epoch, settings.mesh)
     lattice = tile_lattice(settings.mesh, 0)
     ends = scan.points @ scan.world_from_sensor[:3, :3].T + scan.world_from_sensor[:3, 3]
-    hit = len(tiles_meeting(ends, ends, lattice.margin_m, lattice))
+    hit = len(lattice.tiles_meeting(ends, ends, lattice.margin_m))
     return [
         Figure("tiles that may hold a surface", whole, ""),
         Figure("one more scan: tiles with its end points", hit, ""),

@@ -207,7 +207,7 @@ def move_row(
     scales: tuple[float, float],
     epsilon: float,
 ) -> None:
-    """One step of Adam, as :mod:`triquad_server.engine.adam` has it; clears the row's gradient.
+    """One step of Adam, as in :mod:`triquad_server.engine.compiled_trainer`; clears the gradient.
 
     Numbers are float32.
 

@@ -1,9 +1,8 @@
 import threading
 
 from support import servers
-from triquad_server.intake import sources
-from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.intake.sources import SourceLedger
+from triquad_server.intake import scan_queue
+from triquad_server.intake.scan_queue import ScanQueue, SourceLedger
 
 SCAN = servers.scan()
 SOURCE = (SCAN.source, SCAN.session)
@@ -89,7 +88,7 @@ def test_what_is_given_up_counts_as_lost():
 
 
 def test_sessions_remembered_are_bounded_and_losses_are_not_forgotten(monkeypatch):
-    monkeypatch.setattr(sources, "MAX_SESSIONS", 3)
+    monkeypatch.setattr(scan_queue, "MAX_SESSIONS", 3)
     ledger = SourceLedger()
     for session in range(10):
         ledger.arrive(servers.scan(1, session=session))

@@ -1,0 +1,97 @@
+"""Training a field on tensors, by automatic differentiation: any device, and the reference."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from triquad_server.engine.compiled_trainer import EPSILON, Batch, Rates
+from triquad_server.engine.live_field import LiveField, Parameter
+from triquad_server.engine.tensor_field import Corners, TensorField
+
+
+class TensorTrainer:
+    """Trains a field by automatic differentiation, on the device where it is."""
+
+    def __init__(self, field: LiveField) -> None:
+        self._field = field
+        self._tensor_field = TensorField(field.settings, field.tree, field.tensors)
+
+    def train(self, batch: Batch, rates: Rates) -> Tensor:
+        """One optimiser step; returns the loss before it.
+
+        The loss is the cross entropy between the two distances squashed by a sigmoid
+        (3QFP, equation 5).
+        """
+        field = self._up_to_date()
+        corners = field.around(batch.points)
+        encoded = None if corners is None else field.gather(corners).requires_grad_()
+        mlp = tuple(part.detach().requires_grad_() for part in field.tensors.mlp)
+        with torch.enable_grad():
+            logits = field.logits(batch.points, encoded, mlp)
+            target = torch.sigmoid(batch.labels / field.settings.logit_scale_m)
+            loss = F.binary_cross_entropy_with_logits(logits, target)
+            torch.autograd.backward(loss)
+        first_row = torch.zeros(1, dtype=torch.int64, device=field.device)
+        for parameter, weight in zip(self._field.mlp, mlp, strict=True):
+            assert weight.grad is not None
+            step_rows(parameter, first_row, weight.grad[None], rates=rates)
+        if corners is not None and encoded is not None and encoded.grad is not None:
+            self._step_features(corners, encoded.grad, rates)
+        return loss.detach()
+
+    def _up_to_date(self) -> TensorField:
+        """The field with all vertices that it has now."""
+        if len(self._tensor_field.tensors.features) != len(self._field.features):
+            field = self._field
+            self._tensor_field = TensorField(field.settings, field.tree, field.tensors)
+        return self._tensor_field
+
+    def _step_features(self, corners: Corners, gradient: Tensor, rates: Rates) -> None:
+        features = self._field.features
+        size = features.values.shape[1]
+        rows = corners.rows.view(-1)
+        shares = gradient.view(-1, 1, size) * corners.weights.view(-1, corners.rows.shape[2], 1)
+        total = torch.zeros_like(features.values)
+        total.index_add_(0, rows, shares.view(-1, size))
+        touched = torch.zeros(len(total), dtype=torch.bool, device=total.device)
+        touched[rows] = True
+        touched[0] = False  # absent vertices stay zero
+        if total.device.type == "cpu":
+            chosen = touched.nonzero()[:, 0]
+            step_rows(features, chosen, total[chosen], rates=rates)
+        else:
+            step_where(features, touched, total, rates=rates)
+
+
+def step_rows(parameter: Parameter, rows: Tensor, gradient: Tensor, rates: Rates) -> None:
+    """One step of ``rows`` [T], all different, along their ``gradient`` [T, ...]."""
+    parameter.steps[rows] += 1
+    means = parameter.means[rows].lerp_(gradient, 1 - rates.mean_decay)
+    variances = parameter.variances[rows].lerp_(gradient.square(), 1 - rates.variance_decay)
+    parameter.means[rows] = means
+    parameter.variances[rows] = variances
+    direction = _direction(means, variances, parameter.steps[rows], rates=rates)
+    parameter.values[rows] -= rates.learning_rate * direction
+
+
+def step_where(parameter: Parameter, mask: Tensor, gradient: Tensor, rates: Rates) -> None:
+    """As :func:`step_rows` for the rows where ``mask`` [rows] is set; ``gradient`` [rows, ...].
+
+    It goes over all rows, but need not know how many are set, for which a GPU would have to be
+    waited for.
+    """
+    parameter.steps.add_(mask)
+    mask = mask.reshape(-1, *[1] * (gradient.dim() - 1))
+    parameter.means.lerp_(gradient, (1 - rates.mean_decay) * mask)
+    parameter.variances.lerp_(gradient.square(), (1 - rates.variance_decay) * mask)
+    steps = parameter.steps.clamp(min=1)
+    direction = _direction(parameter.means, parameter.variances, steps, rates=rates)
+    parameter.values.sub_(rates.learning_rate * mask * direction)
+
+
+def _direction(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) -> Tensor:
+    """What rows [R, ...] that took ``steps`` [R] lose at a learning rate of 1."""
+    age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
+    mean = means / (1 - rates.mean_decay**age)
+    deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()
+    return mean / (deviation + EPSILON)
