@@ -12,7 +12,6 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.surfels.surfel_search import (
     GROUP_SHIFT,
@@ -20,7 +19,7 @@ from triquad_map.compiled.surfels.surfel_search import (
     SurfelIndex,
     find_nearest,
 )
-from triquad_map.compiled.voxel_index import VoxelIndex
+from triquad_map.compiled.voxel_index import LOW, SHIFT, VoxelIndex
 from triquad_map.composition.region import NearestSurfels
 from triquad_map.surface import SampleField, SurfelKind, Surfels, fit_surfels, support_confidence
 
