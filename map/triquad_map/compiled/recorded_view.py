@@ -7,7 +7,8 @@ from triquad_map.compiled.field.field import recorded_field
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.team import Team
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.composition.region import RecordedRegion, Split, field_samples
+from triquad_map.composition.field_view import field_samples
+from triquad_map.composition.region import RecordedRegion, Split
 
 
 class RecordedView(ComposedView):

@@ -14,7 +14,7 @@ from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.compiled.surfels.surfel_map import first_surfels
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import thin
-from triquad_map.composition.region import field_samples
+from triquad_map.composition.field_view import field_samples
 
 from triquad_server.engine.adam import Rates
 from triquad_server.engine.live_field import (
