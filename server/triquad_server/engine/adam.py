@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from triquad_format.records.arrays import Floats, Ints
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
-from triquad_map.compiled.field.field import Touched
 from triquad_map.compiled.kernel import kernel
 
 EPSILON = 1e-10
@@ -147,6 +146,13 @@ class ParameterRows(NamedTuple):
     means: Floats  # [rows, size]
     variances: Floats  # [rows, size]
     steps: Ints  # [rows]
+
+
+class Touched(NamedTuple):
+    """Which feature rows a thread has added a gradient to."""
+
+    stamps: Ints  # [rows] the step in which each row was touched last
+    rows: Ints  # [rows] those touched in this step, in the order in which they were
 
 
 class CompiledRates(NamedTuple):

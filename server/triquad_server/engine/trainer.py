@@ -1,4 +1,8 @@
-"""Training a field: in compiled code on the CPU; on tensors, the reference, elsewhere."""
+"""Training a field: in compiled code on the CPU; on tensors, the reference, elsewhere.
+
+The loss is the cross entropy between the true and the field's distances, both squashed by a sigmoid
+(3QFP, equation 5).
+"""
 
 from dataclasses import dataclass
 
@@ -7,13 +11,24 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 from triquad_format.records.arrays import Floats
-from triquad_map.compiled.field.field import Touched, accumulate, make_field
-from triquad_map.compiled.field.mlp import Mlp
+from triquad_map.compiled.field.encoding import BATCH, PointBatch, add_feature_gradient, load
+from triquad_map.compiled.field.field import (
+    CompiledField,
+    Mlp,
+    add_weight_gradient,
+    backward,
+    batch_for,
+    forward,
+    make_field,
+    transposed,
+)
+from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import THREADS, Team, share
 
 from triquad_server.engine.adam import (
     CompiledRates,
     Rates,
+    Touched,
     compiled_rates,
     parameter_rows,
     step_row,
@@ -60,6 +75,77 @@ class GradientSums:
             )
 
 
+@kernel(fastmath=True)
+def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, known: int) -> int:
+    """Add the rows of the first ``count`` points to the ``known`` ones; returns how many now."""
+    for t in range(count):
+        for i in range(batch.rows.shape[1]):
+            row = batch.rows[t, i]
+            if touched.stamps[row] != step and row != 0:  # absent vertices learn nothing
+                touched.stamps[row] = step
+                touched.rows[known] = row
+                known += 1
+    return known
+
+
+@kernel(fastmath=True)
+def _cross_entropy(batch: PointBatch, targets: Floats, share: float) -> float:
+    """Set the slopes of the batch's logits; returns the sum of the losses."""
+    loss = 0.0
+    batch.slopes[:] = 0
+    for t in range(len(targets)):
+        logit = batch.logits[t]
+        tail = np.exp(-abs(logit))  # never overflows
+        squashed = (np.float32(1) if logit >= 0 else tail) / (np.float32(1) + tail)
+        loss += max(logit, np.float32(0)) - logit * targets[t] + np.log1p(tail)
+        batch.slopes[t] = (squashed - targets[t]) * np.float32(share)
+    return loss
+
+
+@kernel(fastmath=True)
+def _add_loss_gradient(
+    points: Floats,
+    targets: Floats,
+    share: float,
+    field: CompiledField,
+    mlp_sums: Mlp,
+    feature_sums: Floats,
+    touched: Touched,
+    step: int,
+) -> tuple[int, float]:
+    """Add the gradient of the cross entropy between ``targets`` [N] and the squashed logits.
+
+    Args:
+        points: [N, 3] metres from the region's centre.
+        targets: [N] in [0, 1].
+        share: weight of each sample.
+        field: the field.
+        mlp_sums: gradients of the MLP.
+        feature_sums: gradients of the features, shaped as they; row 0 collects what is for
+            vertices that do not exist.
+        touched: the rows that a gradient was added to.
+        step: differs from that of all other steps with the same ``touched``.
+
+    Returns:
+        How many rows were touched, and the sum of the samples' losses times ``share``.
+    """
+    levels = field.geometry.levels
+    batch = batch_for(field)
+    w1_transposed, w2_transposed = transposed(field.mlp, levels * field.features.shape[1])
+    known = 0
+    loss = 0.0
+    for first in range(0, len(points), BATCH):
+        count = load(batch, points, first)
+        forward(batch, field)
+        loss += _cross_entropy(batch, targets[first : first + count], share)
+        backward(batch, field.mlp, w1_transposed, w2_transposed)
+        add_weight_gradient(batch, mlp_sums)
+        if levels > 0:
+            add_feature_gradient(batch, count, levels, feature_sums)
+            known = _record_touched(batch, count, touched, step, known)
+    return known, float(loss * share)
+
+
 class CompiledTrainer:
     """Trains a field in compiled code, in its own memory, which is the CPU's."""
 
@@ -81,15 +167,15 @@ class CompiledTrainer:
 
         def work(part: int) -> None:
             mine = slice(*share(len(points), part))
-            counts[part], losses[part] = accumulate(
+            counts[part], losses[part] = _add_loss_gradient(
                 points[mine],
                 targets[mine],
                 1.0 / len(points),
                 field,
-                mlp_sums[part],
-                sums.features[part],
-                sums.touched[part],
-                sums.step,
+                mlp_sums=mlp_sums[part],
+                feature_sums=sums.features[part],
+                touched=sums.touched[part],
+                step=sums.step,
             )
 
         self._team.each(work)
@@ -117,11 +203,7 @@ class TensorTrainer:
         self._tensor_field = TensorField(field.settings, field.tree, field.tensors)
 
     def train(self, batch: Batch, rates: Rates) -> Tensor:
-        """One optimiser step; returns the loss before it.
-
-        The loss is the cross entropy between the two distances squashed by a sigmoid
-        (3QFP, equation 5).
-        """
+        """One optimiser step; returns the loss before it."""
         field = self._up_to_date()
         corners = field.around(batch.points)
         encoded = None if corners is None else field.gather(corners).requires_grad_()

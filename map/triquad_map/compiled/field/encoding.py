@@ -1,8 +1,7 @@
 """The field's encoding of a batch of points: interpolated features and Fourier features.
 
-The same as :mod:`triquad_server.engine.corners` and :mod:`triquad_server.engine.tensor_field`
-compute with tensors. Fourier phases are counted in turns, not radians, which makes their reduction
-exact.
+The same as :mod:`triquad_server.engine.tensor_field` computes with tensors. Fourier phases are
+counted in turns, not radians, which makes their reduction exact.
 """
 
 from typing import NamedTuple
