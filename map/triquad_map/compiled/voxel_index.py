@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 
 from triquad_map.compiled.kernel import kernel
@@ -173,18 +173,12 @@ def enter(keys: Longs, x: float, y: float, z: float, cell_m: float) -> bool:
 
 
 @kernel()
-def _first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Longs) -> Bools:
+def thin(points: Doubles, cell_m: float, keys: Longs) -> Bools:
+    """Mask [N] of the first of the points [N, 3] in each cell that is not in the set yet."""
     chosen = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         chosen[i] = enter(keys, points[i, 0], points[i, 1], points[i, 2], cell_m)
     return chosen
-
-
-def thin(points: NDArray[np.floating], cell_m: float) -> Bools:
-    """Mask [N] that keeps one of the points [N, 3] per cell of side ``cell_m``, the first."""
-    return np.asarray(
-        _first_per_cell(np.ascontiguousarray(points), cell_m, empty_keys(len(points)))
-    )
 
 
 @kernel(inline="always")

@@ -58,7 +58,7 @@ class ComposedView(FieldView):
 
         def work(first: int, last: int) -> None:
             for region in near:
-                self._improve_surface(nearest, points, range(first, last), region)
+                self._improve_surface(nearest, points, part=range(first, last), region=region)
 
         self._split(count, work, _LEAST_SEARCHES)
         return nearest
@@ -168,7 +168,9 @@ class ComposedView(FieldView):
         distances = found.distance / leaf_m
         before = distances.copy()
         nearest = np.empty((len(points), 3))
-        region.evidence.find_unknown(voxels, self._settings.owned_blocks, distances, nearest)
+        region.evidence.find_unknown(
+            voxels, self._settings.owned_blocks, distances=distances, nearest=nearest
+        )
         nearer = distances < before
         found.distance[nearer] = distances[nearer] * leaf_m
         corner = region.centre - self._settings.region_side_m / 2

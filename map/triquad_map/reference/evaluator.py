@@ -50,9 +50,9 @@ def _recorded(settings: FieldSettings, region: Region) -> RecordedRegion:
     return RecordedRegion(
         settings,
         region.index,
-        engine,
-        evidence,
-        lambda: fitted_surfels(region.evidence, evidence, field),
+        engine=engine,
+        evidence=evidence,
+        fit=lambda: fitted_surfels(region.evidence, evidence, field),
     )
 
 

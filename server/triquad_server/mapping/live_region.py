@@ -13,7 +13,7 @@ from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.compiled.surfels.surfel_map import first_surfels
 from triquad_map.compiled.team import Team
-from triquad_map.compiled.voxel_index import thin
+from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.composition.field_view import field_samples
 
 from triquad_server.engine.adam import Rates
@@ -127,7 +127,9 @@ class LiveRegion:
         self.field.grow(new)
         self.changed = True
         short = _CARVE_SHORT_M / self._settings.leaf_m
-        return lambda: self.evidence.carve(origin, ends[thin(ends, 1.0)], short)
+        return lambda: self.evidence.carve(
+            origin, ends[thin(ends, 1.0, empty_keys(len(ends)))], short
+        )
 
     def learn(self, rays: ScanRays, normals: Doubles) -> None:
         """Keep what the rays teach, to be trained on.

@@ -164,13 +164,11 @@ class Observations:
         return observations
 
     def _grow(self) -> None:
-        places, weights, sectors, seen_s = self._observed
-        capacity = 2 * len(seen_s)
-        self._observed = Observed(
-            places,
-            with_room(weights, capacity),
-            with_room(sectors, capacity),
-            with_room(seen_s, capacity),
+        old, capacity = self._observed, 2 * len(self._observed.seen_s)
+        self._observed = old._replace(
+            weights=with_room(old.weights, capacity),
+            sectors=with_room(old.sectors, capacity),
+            seen_s=with_room(old.seen_s, capacity),
         )
 
 

@@ -281,17 +281,17 @@ def make_field(
 ) -> CompiledField:
     """The form of a field that kernels take; it shares memory with the arrays and the tree."""
     geometry = Geometry(
-        np.float32(settings.leaf_m),
-        np.float32(1 << (settings.depth - 1)),
-        settings.feature_levels if settings.encoding != "fourier" else 0,
-        tree.shape,
+        leaf_m=np.float32(settings.leaf_m),
+        half_side=np.float32(1 << (settings.depth - 1)),
+        levels=settings.feature_levels if settings.encoding != "fourier" else 0,
+        shape=tree.shape,
     )
     w1, b1, w2, b2, w3, b3 = arrays.mlp
     turns = arrays.frequencies / np.float32(settings.region_side_m / 2)
     return CompiledField(
-        geometry,
-        tree.vertices,
-        arrays.features,
-        Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
-        turns if settings.encoding != "features" else turns[:0],
+        geometry=geometry,
+        vertices=tree.vertices,
+        features=arrays.features,
+        mlp=Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
+        turns_per_m=turns if settings.encoding != "features" else turns[:0],
     )
