@@ -57,7 +57,7 @@ class AsyncClient(AsyncMapQueries):
         source: str = "default",
     ) -> None:
         await self._driver.in_order(
-            lambda: self._scans.publish(points, world_from_sensor, stamp_s, source)
+            lambda: self._scans.publish(points, world_from_sensor, stamp_s, source=source)
         )
 
     async def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
@@ -73,7 +73,7 @@ class AsyncClient(AsyncMapQueries):
         return await self._run(fetch_tiles(bounds, level))
 
     async def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
-        return await self._run(fetch_tile(x, y, z, level))
+        return await self._run(fetch_tile((x, y, z), level))
 
     async def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
         return await self._run(fetch_mesh(bounds, level))
@@ -85,7 +85,7 @@ class AsyncClient(AsyncMapQueries):
         max_bytes_per_s: int | None = None,
         known: KnownTiles | None = None,
     ) -> AsyncMeshWatch:
-        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s, known)
+        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s=max_bytes_per_s, known=known)
         return AsyncMeshWatch(self._run, followed)
 
     async def status(self) -> ServerStatus:
@@ -152,7 +152,7 @@ def connect_async(
 
     Arguments and errors are those of :func:`connect`.
     """
-    return Connecting(lambda: open_connection(endpoint, map, timeout_s, config))
+    return Connecting(lambda: open_connection(endpoint, map, timeout_s, config=config))
 
 
 def _close_late(opening: "Future[Connection]") -> None:

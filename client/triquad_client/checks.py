@@ -10,9 +10,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
 from triquad_map.questions.distance import Unknown
+from triquad_map.questions.grid import GridShape
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
 
@@ -20,9 +22,10 @@ Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
 
 FARTHEST_M = 1e9
+_MAX_CELLS = 100_000_000  # of a grid
 
 
-def query_points(points: ArrayLike) -> NDArray[np.float64]:
+def query_points(points: ArrayLike) -> Doubles:
     """Points [N, 3] as float64, all finite and at most ``FARTHEST_M`` from the map's origin."""
     array = _points(points, np.float64, InvalidInputError)
     # All at once, as point by point takes ten times as long.
@@ -38,7 +41,7 @@ def query_points(points: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
-def scan_points(points: ArrayLike) -> NDArray[np.float32]:
+def scan_points(points: ArrayLike) -> Floats:
     """Points [N, 3] of a scan as float32; points that are not finite may be among them."""
     array = _points(points, np.float32, InvalidScanError)
     if len(array) == 0:
@@ -46,7 +49,7 @@ def scan_points(points: ArrayLike) -> NDArray[np.float32]:
     return array
 
 
-def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
+def rigid_pose(world_from_sensor: ArrayLike) -> Doubles:
     """A pose [4, 4] as float64: a rotation and a translation, within 1e-3."""
     try:
         pose = np.asarray(world_from_sensor, np.float64)
@@ -65,7 +68,7 @@ def rigid_pose(world_from_sensor: ArrayLike) -> NDArray[np.float64]:
         raise InvalidScanError(
             f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?"
         )
-    exact: NDArray[np.float64] = pose.copy()
+    exact: Doubles = pose.copy()
     exact[3] = (0, 0, 0, 1)
     return exact
 
@@ -77,10 +80,10 @@ def stamp_ns(stamp_s: float) -> int:
     return round(stamp_s * 1e9)
 
 
-def chosen_epoch(at_epoch: int | None) -> int | None:
-    """The number of an epoch, or ``None`` for the newest."""
+def chosen_epoch(at_epoch: int | None) -> int:
+    """The number of an epoch as it is sent: 0 is the newest."""
     if at_epoch is None:
-        return None
+        return 0
     try:
         if isinstance(at_epoch, bool):
             raise TypeError("a truth value")
@@ -92,7 +95,7 @@ def chosen_epoch(at_epoch: int | None) -> int | None:
     return number
 
 
-def box(bounds: Bounds | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
     """The corners [3] of ``bounds``; ``None`` is everywhere."""
     if bounds is None:
         return np.full(3, -np.inf), np.full(3, np.inf)
@@ -121,12 +124,28 @@ def bytes_per_second(limit: int | None) -> int:
     return limit or 0
 
 
-def finite_box(bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def finite_box(bounds: Bounds) -> tuple[Doubles, Doubles]:
     """The corners [3] of ``bounds``, infinite sides at ``FARTHEST_M``."""
     minimum, maximum = (np.clip(corner, -FARTHEST_M, FARTHEST_M) for corner in box(bounds))
     if not (minimum < maximum).all():
         raise InvalidInputError(f"bounds = {bounds!r} hold nothing")
     return minimum, maximum
+
+
+def grid_shape(bounds: Bounds, cell_m: float) -> GridShape:
+    """The grid of cells that fill ``bounds``; a flat box lies in the middle of one layer."""
+    side_m = within("cell_m", cell_m)
+    low, high = box(bounds)
+    if not np.isfinite([low, high]).all():
+        raise InvalidInputError(f"bounds = {bounds!r}: a grid needs finite ones")
+    counts = np.maximum(np.ceil((high - low) / side_m - 1e-6), 1.0)
+    if counts.prod() > _MAX_CELLS:
+        raise InvalidInputError(
+            f"{counts.prod():.3g} cells of {side_m:g} m in {bounds!r}: "
+            f"ask for at most {_MAX_CELLS:g}"
+        )
+    corner = np.where(high > low, low, low - side_m / 2)
+    return GridShape(corner, side_m, (int(counts[0]), int(counts[1]), int(counts[2])))
 
 
 def unknown_policy(unknown: Unknown | str) -> Unknown:
@@ -151,7 +170,7 @@ def within(
     return number
 
 
-def radii(values: ArrayLike, count: int) -> NDArray[np.float32]:
+def radii(values: ArrayLike, count: int) -> Floats:
     """Radii [count], from as many or a single one."""
     try:
         array = np.broadcast_to(np.asarray(values, np.float32), (count,))
@@ -166,7 +185,7 @@ def radii(values: ArrayLike, count: int) -> NDArray[np.float32]:
     return array
 
 
-def directions(vectors: ArrayLike) -> NDArray[np.float64]:
+def directions(vectors: ArrayLike) -> Doubles:
     """Unit vectors [N, 3] along ``vectors``."""
     array = query_points(vectors)
     lengths = np.linalg.norm(array, axis=1)
@@ -174,6 +193,15 @@ def directions(vectors: ArrayLike) -> NDArray[np.float64]:
         index = int((lengths <= 0).argmax())
         raise InvalidInputError(f"direction {index} is {array[index]}: it has no length")
     return np.asarray(array / lengths[:, None], np.float64)
+
+
+def ray_origins(origins: ArrayLike, count: int) -> Doubles:
+    """Origins [count, 3], from as many or a single one."""
+    given = np.asarray(origins)
+    places = query_points(given[None] if given.shape == (3,) else given)
+    if len(places) not in (1, count):
+        raise InvalidInputError(f"{len(places)} origins for {count} directions: one, or as many")
+    return np.broadcast_to(places, (count, 3))
 
 
 def _points(points: ArrayLike, dtype: Any, error: type[InvalidInputError]) -> NDArray[Any]:

@@ -13,8 +13,7 @@ from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.net.connection import Connection, open_connection
-from triquad_client.net.driver import RemoteDriver
+from triquad_client.net.connection import Connection, RemoteDriver, open_connection
 from triquad_client.offline.synced_map import SyncedMap
 
 
@@ -61,18 +60,19 @@ class Client(MapQueries):
         Args:
             points: [N, 3] metres, sensor frame; points that are not finite are left out.
             world_from_sensor: [4, 4] rigid pose of the sensor in the map frame.
-            stamp_s: since 1970, never running backwards within a source; ``None``: now.
+            stamp_s: seconds since 1970, never running backwards within a source; ``None``: now.
             source: name of the sensor.
 
         Raises:
             InvalidScanError: the scan cannot be used; nothing was sent.
         """
-        self._scans.publish(points, world_from_sensor, stamp_s, source)
+        self._scans.publish(points, world_from_sensor, stamp_s, source=source)
 
     def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
         """Wait until what this client published is dealt with and queries see it.
 
         Args:
+            timeout_s: how long, at most.
             pending: number of scans that may still be under way: more than 0 lets a fast
                 publisher run ahead of the server by so many.
 
@@ -80,7 +80,7 @@ class Client(MapQueries):
             What became of the scans so far.
 
         Raises:
-            RefusedError: ``timeout``.
+            RefusedError: ``timeout``, where that was not long enough.
         """
         return self._run(self._scans.flush(timeout_s, pending))
 
@@ -100,20 +100,20 @@ class Client(MapQueries):
         """The mesh tiles that meet ``bounds``, with the epoch in which each last changed.
 
         Args:
-            bounds: corners of a box; ``None``: everywhere.
+            bounds: corners of a box, metres, map frame; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells and tiles twice as large as the one before.
         """
         return self._run(fetch_tiles(bounds, level))
 
     def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
         """The newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
-        return self._run(fetch_tile(x, y, z, level))
+        return self._run(fetch_tile((x, y, z), level))
 
     def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
         """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch.
 
         Args:
-            bounds: corners of a box; ``None``: everywhere.
+            bounds: corners of a box, metres, map frame; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
         """
         return self._run(fetch_mesh(bounds, level))
@@ -128,12 +128,15 @@ class Client(MapQueries):
         """Follow the mesh tiles that meet ``bounds``: they are fetched once, then as they change.
 
         Args:
-            bounds: corners of a box; ``None``: everywhere.
+            bounds: corners of a box, metres, map frame; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
             max_bytes_per_s: what this watch may take of the network; the server may allow less.
             known: tiles of an earlier watch, which are not fetched again.
+
+        Raises:
+            InvalidInputError: an argument cannot be used, or ``known`` is of another level.
         """
-        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s, known)
+        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s=max_bytes_per_s, known=known)
         return MeshWatch(self._connection, followed)
 
     def status(self) -> ServerStatus:
@@ -141,11 +144,19 @@ class Client(MapQueries):
         return self._run(admin.status())
 
     def checkpoint(self) -> CheckpointInfo:
-        """Have the server write the map to its store now."""
+        """Have the server write the map to its store now.
+
+        Raises:
+            RefusedError: ``store``, where it cannot be written.
+        """
         return self._run(admin.checkpoint())
 
     def reset(self, bounds: Bounds | None = None) -> int:
-        """Forget what was learnt within ``bounds``; returns the first epoch without it."""
+        """Forget what was learnt within ``bounds``; returns the first epoch without it.
+
+        Args:
+            bounds: corners of a box, metres, map frame; ``None``: everything is forgotten.
+        """
         return self._run(admin.reset(bounds))
 
     def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
@@ -224,4 +235,4 @@ def connect(
         UnknownMapError: no server there has this map.
         InvalidInputError: there cannot be a map of this name.
     """
-    return Client(open_connection(endpoint, map, timeout_s, config))
+    return Client(open_connection(endpoint, map, timeout_s, config=config))

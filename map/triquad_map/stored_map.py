@@ -7,9 +7,9 @@ from types import TracebackType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_format.mapfile.files import FileBytes, RandomAccess, named
-from triquad_format.mapfile.index import MapIndex, OpenFile, files_in
+from triquad_format.mapfile.index import FileBytes, MapIndex, OpenFile, files_in, named
 from triquad_format.mapfile.manifest import Entry, Manifest
+from triquad_format.mapfile.mcap.reader import RandomAccess
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     FIELD_TOPICS,

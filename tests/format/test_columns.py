@@ -3,7 +3,7 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from triquad_format.mapfile.parts.columns import (
+from triquad_format.mapfile.parts.part import (
     join_integers,
     join_levels,
     shuffle,

@@ -20,8 +20,7 @@ from support.mapfile_edit import (
     write_record,
 )
 from triquad_format.errors import DamagedMapFileError, MapFileError, NoIndexError
-from triquad_format.mapfile.files import FileBytes
-from triquad_format.mapfile.index import MapIndex
+from triquad_format.mapfile.index import FileBytes, MapIndex
 from triquad_format.mapfile.manifest import FileRef
 from triquad_format.mapfile.reader import read_map
 from triquad_format.recovery.recovered_map import recover

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from triquad_format.errors import WireError
 from triquad_format.wire import codec
+from triquad_format.wire.codec import check_structure
 from triquad_format.wire.messages import StatusRequest
-from triquad_format.wire.structure import check_structure
 
 VALUES = st.recursive(
     st.none()

@@ -7,7 +7,7 @@ import pytest
 from support.map_records import SMALL, assert_same, random_record, with_integers
 from support.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
-from triquad_format.mapfile.files import FileBytes
+from triquad_format.mapfile.index import FileBytes
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
@@ -20,6 +20,16 @@ from triquad_map.stored_map import StoredMap
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 WIDE = dataclasses.replace(SMALL, depth=11, feature_levels=4)
 """A region of 512 m: 8 squares of 64 m along each side."""
+
+
+class CountedFile(FileBytes):
+    """Counts the bytes that are read."""
+
+    bytes_read = 0
+
+    def read(self, offset, length):
+        self.bytes_read += length
+        return super().read(offset, length)
 
 
 def assert_same_answer(have, want):
@@ -41,7 +51,7 @@ def test_opening_and_asking_at_one_place_reads_index_and_tile_alone(tmp_path):
     record = random_record(40, settings=FieldSettings(), points=20_000)
     path = tmp_path / "map.triquad"
     write_map(record, path)
-    source = FileBytes(path)
+    source = CountedFile(path)
     with StoredMap(source) as map_file:
         opened = source.bytes_read
         index = opened / path.stat().st_size
@@ -150,7 +160,7 @@ def assert_same_places(have, want):
 def test_a_small_box_is_read_from_few_parts(tmp_path):
     path = tmp_path / "map.triquad"
     write_map(random_record(44, settings=WIDE, points=3000), path)
-    source = FileBytes(path)
+    source = CountedFile(path)
     with StoredMap(source) as map_file:
         map_file.box([-1, -1, -1], [1, 1, 1])
         assert source.bytes_read < 0.2 * path.stat().st_size

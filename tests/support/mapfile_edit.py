@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.files import check_range
+from triquad_format.mapfile.index import check_range
 from triquad_format.mapfile.manifest import FileRef, pack_manifest, unpack_manifest
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_record

@@ -29,7 +29,11 @@ def status() -> Call[ServerStatus]:
 
 
 def settle(timeout_s: float) -> Call[ServerStatus]:
-    """Its status, once the server has nothing left to learn."""
+    """Its status, once the server has nothing left to learn.
+
+    Raises:
+        RequestTimeoutError: it still had something after ``timeout_s``.
+    """
     deadline = time.monotonic() + timeout_s
     while not (now := (yield from status())).settled:
         if time.monotonic() > deadline:

@@ -41,7 +41,9 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> Distances:
         options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
-        return await self._run(questions.distance(points, options, unknown, self._chosen(at_epoch)))
+        return await self._run(
+            questions.distance(points, options, unknown, at_epoch=self._chosen(at_epoch))
+        )
 
     async def query_spheres(
         self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
@@ -57,7 +59,9 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> Segments:
         options = SegmentOptions(radius_m, max_distance_m)
-        return await self._run(questions.segments(starts, ends, options, self._chosen(at_epoch)))
+        return await self._run(
+            questions.segments(starts, ends, options, at_epoch=self._chosen(at_epoch))
+        )
 
     async def query_polyline(
         self,
@@ -78,7 +82,9 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> RayRanges:
         options = RayOptions(max_range_m, through_unknown)
-        return await self._run(questions.rays(origins, directions, options, self._chosen(at_epoch)))
+        return await self._run(
+            questions.rays(origins, directions, options, at_epoch=self._chosen(at_epoch))
+        )
 
     async def query_grid(
         self,
@@ -87,7 +93,7 @@ class AsyncMapQueries:
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Grid:
-        call = questions.grid(bounds, cell_m, max_distance_m, self._chosen(at_epoch))
+        call = questions.grid(bounds, cell_m, max_distance_m, at_epoch=self._chosen(at_epoch))
         return await self._run(call)
 
     async def align(
@@ -98,7 +104,9 @@ class AsyncMapQueries:
         at_epoch: int | None = None,
     ) -> Alignment:
         options = AlignOptions(max_distance_m)
-        call = questions.align(points, world_from_sensor_guess, options, self._chosen(at_epoch))
+        call = questions.align(
+            points, world_from_sensor_guess, options, at_epoch=self._chosen(at_epoch)
+        )
         return await self._run(call)
 
     def _chosen(self, at_epoch: int | None) -> int | None:

@@ -1,14 +1,11 @@
 """Fetching the map as a file; its chunks go in the background of everything else."""
 
 import hashlib
-from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.files import check_range, replacing
-from triquad_format.mapfile.writer import MapFileInfo, write_map
+from triquad_format.mapfile.index import check_range
+from triquad_format.mapfile.writer import MapFileInfo, replacing, write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
@@ -73,41 +70,39 @@ class RemoteBytes:
 
 def fetch(path: Path, training: bool) -> Call[MapInfo]:
     """Write the newest map to ``path``, as ``Client.download_map``."""
+
+    def job(run: Run) -> MapInfo:
+        info = run(newest_file(training))
+        remote = RemoteBytes(run, info)
+        digest = hashlib.sha256()
+        with replacing(path) as file:
+            for offset in range(0, info.bytes, _BLOCK_BYTES):
+                data = remote.read(offset, min(_BLOCK_BYTES, info.bytes - offset))
+                digest.update(data)
+                file.write(data)
+            found = digest.hexdigest()
+            if found != info.sha256:
+                raise DownloadError(f"the file's SHA-256 is {found}, not {info.sha256}")
+        return info
+
     # Newer map files may push this one out of the server: then the newest is taken.
-    return retried("chunk_gone", lambda: offload(lambda run: _fetch(run, path, training)))
-
-
-def _fetch(run: Run, path: Path, training: bool) -> MapInfo:
-    info = run(newest_file(training))
-    remote = RemoteBytes(run, info)
-    digest = hashlib.sha256()
-    with replacing(path) as file:
-        for offset in range(0, info.bytes, _BLOCK_BYTES):
-            data = remote.read(offset, min(_BLOCK_BYTES, info.bytes - offset))
-            digest.update(data)
-            file.write(data)
-        if digest.hexdigest() != info.sha256:
-            raise DownloadError(f"the file's SHA-256 is {digest.hexdigest()}, not {info.sha256}")
-    return info
+    return retried("chunk_gone", lambda: offload(job))
 
 
 def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
     """Write what answers in the bounds, as ``Client.download_box``."""
-    minimum, maximum = checks.finite_box(bounds)
-    job = partial(_fetch_box, path=path, minimum=minimum, maximum=maximum)
+    low, high = checks.finite_box(bounds)
+
+    def job(run: Run) -> MapFileInfo:
+        try:
+            stored = StoredMap(RemoteBytes(run, run(newest_file(training=False))))
+            record = crop_record(stored.box(low, high), low, high)
+            if not record.has_evidence:
+                raise DownloadError(
+                    f"nothing of the map lies between {low.tolist()} and {high.tolist()}"
+                )
+            return write_map(record, path, stamp_ns=stored.manifest.stamp_ns or None)
+        except FormatError as error:
+            raise DownloadError(str(error)) from error
+
     return (yield from retried("chunk_gone", lambda: offload(job)))
-
-
-def _fetch_box(
-    run: Run, path: Path, minimum: NDArray[np.float64], maximum: NDArray[np.float64]
-) -> MapFileInfo:
-    try:
-        stored = StoredMap(RemoteBytes(run, run(newest_file(training=False))))
-        record = crop_record(stored.box(minimum, maximum), minimum, maximum)
-        if not record.has_evidence:
-            raise DownloadError(
-                f"nothing of the map lies between {minimum.tolist()} and {maximum.tolist()}"
-            )
-        return write_map(record, path, stamp_ns=stored.manifest.stamp_ns or None)
-    except FormatError as error:
-        raise DownloadError(str(error)) from error

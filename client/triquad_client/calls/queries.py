@@ -20,7 +20,7 @@ class MapQueries:
     Positions are metres in the map frame. Questions of any size are answered from one epoch,
     a published state of the map that never changes. ``at_epoch`` is its number, ``None`` is the
     newest; once the server does not keep it any more, :class:`RefusedError` with the code
-    ``epoch_gone`` is raised.
+    ``epoch_gone`` is raised, and :class:`InvalidInputError` where an argument cannot be used.
     """
 
     def __init__(self, run: Run, epoch: int | None = None) -> None:
@@ -65,12 +65,14 @@ class MapQueries:
             UnknownSpaceError: ``unknown`` is ``"error"`` and unknown space is nearer somewhere.
         """
         options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
-        return self._run(questions.distance(points, options, unknown, self._chosen(at_epoch)))
+        return self._run(
+            questions.distance(points, options, unknown, at_epoch=self._chosen(at_epoch))
+        )
 
     def query_spheres(
         self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Spheres:
-        """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one number or [N]."""
+        """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one, or [N], metres."""
         return self._run(questions.spheres(centres, radii_m, self._chosen(at_epoch)))
 
     def query_segments(
@@ -91,7 +93,7 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = SegmentOptions(radius_m, max_distance_m)
-        return self._run(questions.segments(starts, ends, options, self._chosen(at_epoch)))
+        return self._run(questions.segments(starts, ends, options, at_epoch=self._chosen(at_epoch)))
 
     def query_polyline(
         self,
@@ -122,7 +124,9 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = RayOptions(max_range_m, through_unknown)
-        return self._run(questions.rays(origins, directions, options, self._chosen(at_epoch)))
+        return self._run(
+            questions.rays(origins, directions, options, at_epoch=self._chosen(at_epoch))
+        )
 
     def query_grid(
         self,
@@ -139,7 +143,9 @@ class MapQueries:
             max_distance_m: surfaces are looked for up to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
-        return self._run(questions.grid(bounds, cell_m, max_distance_m, self._chosen(at_epoch)))
+        return self._run(
+            questions.grid(bounds, cell_m, max_distance_m, at_epoch=self._chosen(at_epoch))
+        )
 
     def align(
         self,
@@ -157,7 +163,9 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = AlignOptions(max_distance_m)
-        call = questions.align(points, world_from_sensor_guess, options, self._chosen(at_epoch))
+        call = questions.align(
+            points, world_from_sensor_guess, options, at_epoch=self._chosen(at_epoch)
+        )
         return self._run(call)
 
     def _chosen(self, at_epoch: int | None) -> int | None:

@@ -1,16 +1,20 @@
 """Questions about the map: arguments checked, asked in parts of one epoch, and the replies joined.
 
-:mod:`triquad_map.questions.answers` is the other side. ``at_epoch`` is the number of an epoch;
-``None`` is the newest.
+Positions are metres in the map frame, where nothing else is said. ``at_epoch`` is the number of an
+epoch; ``None`` is the newest. What cannot be asked raises :class:`InvalidInputError`.
+:mod:`triquad_map.questions.answers` is the other side.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_RANGE_M
-from triquad_format.wire.messages import SdfReply, SdfRequest
+from triquad_format.wire.messages import MapReply, SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
     AlignReply,
     AlignRequest,
@@ -27,26 +31,15 @@ from triquad_format.wire.query_messages import (
 )
 from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions, thinned
 from triquad_map.questions.distance import DistanceOptions, Distances, Unknown, with_unknown
-from triquad_map.questions.grid import Grid, GridShape
+from triquad_map.questions.grid import Grid
 from triquad_map.questions.rays import RayOptions, RayRanges
 from triquad_map.questions.segments import Polyline, SegmentOptions, Segments, along_polyline
 from triquad_map.questions.spheres import Spheres
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import InvalidInputError
-from triquad_client.net.call import (
-    NEWEST,
-    Ask,
-    Call,
-    ask,
-    in_parts,
-    joined,
-    offload,
-    offsets,
-    origin_of,
-    retried,
-)
+from triquad_client.errors import BadReplyError, InvalidInputError
+from triquad_client.net.call import NEWEST, Ask, Call, ask, ask_each, offload, retried
 
 # Items of one request: it takes the server some tens of milliseconds, and others wait as long.
 _PART_SDF_POINTS = 100_000
@@ -54,7 +47,9 @@ _PART_POINTS = 20_000  # around which something is searched for
 _PART_WAYS = 2_000  # segments or rays
 _PART_CELLS = 20_000  # unless a layer has more
 
-_MAX_CELLS = 100_000_000
+_ORIGIN_SAMPLE = 1000  # points
+
+MapReplyT = TypeVar("MapReplyT", bound=MapReply)
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ class SdfResult:
 
 
 def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResult]:
-    """The trained field at ``points`` [N, 3] of the map frame, metres."""
+    """The trained field at ``points`` [N, 3]."""
     if isinstance(points, np.ndarray) and points.size > 3 * _PART_SDF_POINTS:
         checked = yield from offload(lambda _: checks.query_points(points))
     else:
@@ -77,10 +72,10 @@ def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResu
     def request(part: slice, epoch: int) -> Ask[SdfReply]:
         return _ask_sdf(checked[part], gradient, epoch)
 
-    parts = yield from in_parts(len(checked), _PART_SDF_POINTS, request, at_epoch)
+    parts = yield from _in_parts(request, len(checked), most=_PART_SDF_POINTS, at_epoch=at_epoch)
     if len(parts) == 1:
-        return SdfResult(**joined(parts))
-    return (yield from offload(lambda _: SdfResult(**joined(parts))))
+        return SdfResult(**_joined(parts))
+    return (yield from offload(lambda _: SdfResult(**_joined(parts))))
 
 
 def pin_newest() -> Call[int]:
@@ -94,25 +89,25 @@ def pin_newest() -> Call[int]:
     return (yield from retried("epoch_gone", pin))
 
 
-def _ask_sdf(points: NDArray[np.float64], gradient: bool, epoch: int) -> Ask[SdfReply]:
-    origin = origin_of(points)
-    request = SdfRequest(origin, offsets(points, origin), gradient, epoch)
+def _ask_sdf(points: Doubles, gradient: bool, epoch: int) -> Ask[SdfReply]:
+    origin = _origin_of(points)
+    request = SdfRequest(origin, _offsets(points, origin), gradient=gradient, epoch=epoch)
     return Ask(keys.SDF, request, SdfReply)
 
 
 def distance(
     points: ArrayLike, options: DistanceOptions, unknown: Unknown | str, at_epoch: int | None
 ) -> Call[Distances]:
-    """True distances to the nearest surface at ``points`` [N, 3] of the map frame, metres."""
+    """True distances to the nearest surface at ``points`` [N, 3]."""
     checked = checks.query_points(points)
     policy = checks.unknown_policy(unknown)
     reach_m = checks.within("max_distance_m", options.max_distance_m)
 
     def request(part: slice, epoch: int) -> Ask[DistanceReply]:
-        origin = origin_of(checked[part])
+        origin = _origin_of(checked[part])
         message = DistanceRequest(
             origin=origin,
-            points=offsets(checked[part], origin),
+            points=_offsets(checked[part], origin),
             max_distance_m=reach_m,
             surface_point=options.surface_point,
             unknown_distance=options.unknown_distance or policy is not Unknown.FREE,
@@ -120,18 +115,18 @@ def distance(
         )
         return Ask(keys.DISTANCE, message, DistanceReply)
 
-    parts = yield from in_parts(len(checked), _PART_POINTS, request, at_epoch)
-    fields = joined(parts, flags=["found"])
+    parts = yield from _in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
+    fields = _joined(parts, flags=["found"])
     for name in ("surface_point", "unknown_point"):
         if fields[name] is not None:
             fields[name] = fields[name] + _origins(checked, [len(part.found) for part in parts])
     return with_unknown(Distances(**fields), checked, policy)
 
 
-def _origins(points: NDArray[np.float64], counts: list[int]) -> NDArray[np.float64]:
+def _origins(points: Doubles, counts: list[int]) -> Doubles:
     """The origin [N, 3] from which each of ``points`` [N, 3] was sent, in parts of ``counts``."""
     starts = range(0, max(1, len(points)), _PART_POINTS)
-    origins = [origin_of(points[start : start + _PART_POINTS]) for start in starts]
+    origins = [_origin_of(points[start : start + _PART_POINTS]) for start in starts]
     return np.repeat(origins, counts, axis=0)
 
 
@@ -141,18 +136,18 @@ def spheres(centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None) -> Cal
     radii = checks.radii(radii_m, len(checked))
 
     def request(part: slice, epoch: int) -> Ask[SpheresReply]:
-        origin = origin_of(checked[part])
-        message = SpheresRequest(origin, offsets(checked[part], origin), radii[part], epoch)
+        origin = _origin_of(checked[part])
+        message = SpheresRequest(origin, _offsets(checked[part], origin), radii[part], epoch=epoch)
         return Ask(keys.SPHERES, message, SpheresReply)
 
-    parts = yield from in_parts(len(checked), _PART_POINTS, request, at_epoch)
-    return Spheres(**joined(parts))
+    parts = yield from _in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
+    return Spheres(**_joined(parts))
 
 
 def segments(
     starts: ArrayLike, ends: ArrayLike, options: SegmentOptions, at_epoch: int | None
 ) -> Call[Segments]:
-    """What a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
+    """What a ball meets that moves from ``starts`` to ``ends`` [N, 3]."""
     first, last = checks.query_points(starts), checks.query_points(ends)
     if len(first) != len(last):
         raise InvalidInputError(f"{len(first)} starts and {len(last)} ends: give as many")
@@ -160,27 +155,28 @@ def segments(
     reach_m = checks.within("max_distance_m", options.max_distance_m)
 
     def request(part: slice, epoch: int) -> Ask[SegmentsReply]:
-        origin = origin_of(first[part])
+        origin = _origin_of(first[part])
         message = SegmentsRequest(
             origin=origin,
-            starts=offsets(first[part], origin),
-            ends=offsets(last[part], origin),
+            starts=_offsets(first[part], origin),
+            ends=_offsets(last[part], origin),
             radius_m=radius_m,
             max_distance_m=reach_m,
             epoch=epoch,
         )
         return Ask(keys.SEGMENTS, message, SegmentsReply)
 
-    parts = yield from in_parts(len(first), _PART_WAYS, request, at_epoch)
-    return Segments(**joined(parts, flags=["blocked", "meets_unknown"]))
+    parts = yield from _in_parts(request, len(first), most=_PART_WAYS, at_epoch=at_epoch)
+    return Segments(**_joined(parts, flags=["blocked", "meets_unknown"]))
 
 
 def polyline(points: ArrayLike, options: SegmentOptions, at_epoch: int | None) -> Call[Polyline]:
-    """What a ball meets that moves along ``points`` [N, 3], metres, map frame."""
+    """What a ball meets that moves along ``points`` [N, 3]."""
     checked = checks.query_points(points)
     if len(checked) < 2:
         raise InvalidInputError(f"a polyline of {len(checked)} points: give two or more")
-    return along_polyline((yield from segments(checked[:-1], checked[1:], options, at_epoch)))
+    pieces = yield from segments(checked[:-1], checked[1:], options, at_epoch=at_epoch)
+    return along_polyline(pieces)
 
 
 def rays(
@@ -188,20 +184,14 @@ def rays(
 ) -> Call[RayRanges]:
     """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3]."""
     ways = checks.directions(directions)
-    given = np.asarray(origins)
-    places = checks.query_points(given[None] if given.shape == (3,) else given)
-    if len(places) not in (1, len(ways)):
-        raise InvalidInputError(
-            f"{len(places)} origins for {len(ways)} directions: one, or as many"
-        )
-    starts = np.broadcast_to(places, ways.shape)
+    starts = checks.ray_origins(origins, len(ways))
     reach_m = checks.within("max_range_m", options.max_range_m, MAX_RANGE_M)
 
     def request(part: slice, epoch: int) -> Ask[RaysReply]:
-        origin = origin_of(starts[part])
+        origin = _origin_of(starts[part])
         message = RaysRequest(
             origin=origin,
-            starts=offsets(starts[part], origin),
+            starts=_offsets(starts[part], origin),
             directions=ways[part].astype(np.float32),
             max_range_m=reach_m,
             through_unknown=options.through_unknown,
@@ -209,46 +199,31 @@ def rays(
         )
         return Ask(keys.RAYS, message, RaysReply)
 
-    parts = yield from in_parts(len(ways), _PART_WAYS, request, at_epoch)
-    return RayRanges(**joined(parts))
+    parts = yield from _in_parts(request, len(ways), most=_PART_WAYS, at_epoch=at_epoch)
+    return RayRanges(**_joined(parts))
 
 
 def grid(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | None) -> Call[Grid]:
     """The map at the cells that fill ``bounds``; a flat box is one layer of them."""
-    shape = _grid_shape(bounds, checks.within("cell_m", cell_m))
+    shape = checks.grid_shape(bounds, cell_m)
     reach_m = checks.within("max_distance_m", max_distance_m)
     columns, *layer = shape.counts
 
     def request(part: slice, epoch: int) -> Ask[GridReply]:
         corner = shape.corner + (part.start * shape.cell_m, 0.0, 0.0)
         counts = np.array([min(part.stop, columns) - part.start, *layer], np.int32)
-        message = GridRequest(corner, shape.cell_m, counts, reach_m, epoch)
+        message = GridRequest(corner, shape.cell_m, counts, max_distance_m=reach_m, epoch=epoch)
         return Ask(keys.GRID, message, GridReply)
 
     at_once = max(1, _PART_CELLS // (layer[0] * layer[1]))
-    parts = yield from in_parts(columns, at_once, request, at_epoch)
-    return Grid(shape, **joined(parts))
-
-
-def _grid_shape(bounds: Bounds, cell_m: float) -> GridShape:
-    low, high = checks.box(bounds)
-    if not np.isfinite([low, high]).all():
-        raise InvalidInputError(f"bounds = {bounds!r}: a grid needs finite ones")
-    counts = np.maximum(np.ceil((high - low) / cell_m - 1e-6), 1.0)
-    if counts.prod() > _MAX_CELLS:
-        raise InvalidInputError(
-            f"{counts.prod():.3g} cells of {cell_m:g} m in {bounds!r}: "
-            f"ask for at most {_MAX_CELLS:g}"
-        )
-    # A flat box lies in the middle of its layer.
-    corner = np.where(high > low, low, low - cell_m / 2)
-    return GridShape(corner, cell_m, (int(counts[0]), int(counts[1]), int(counts[2])))
+    parts = yield from _in_parts(request, columns, most=at_once, at_epoch=at_epoch)
+    return Grid(shape, **_joined(parts))
 
 
 def align(
     points: ArrayLike, guess: ArrayLike, options: AlignOptions, at_epoch: int | None
 ) -> Call[Alignment]:
-    """The pose of ``points`` [N, 3] of the sensor frame, near a guess [4, 4]."""
+    """The pose of ``points`` [N, 3], metres, sensor frame, near a guess [4, 4]."""
     epoch = checks.chosen_epoch(at_epoch)
     cloud = checks.scan_points(points)
     # Here, not only where it is answered: a hundredth of a scan travels.
@@ -258,7 +233,65 @@ def align(
         world_from_sensor=checks.rigid_pose(guess),
         max_distance_m=checks.within("max_distance_m", options.max_distance_m),
         max_iterations=options.max_iterations,
-        epoch=NEWEST if epoch is None else epoch,
+        epoch=epoch,
     )
     reply = yield from ask(Ask(keys.ALIGN, request, AlignReply))
     return Alignment(**vars(reply))
+
+
+def _in_parts(
+    request: Callable[[slice, int], Ask[MapReplyT]], count: int, *, most: int, at_epoch: int | None
+) -> Call[Sequence[MapReplyT]]:
+    """The replies about ``count`` items, ``most`` at a time, all from one epoch.
+
+    ``request`` makes what is asked about some of the items, of the epoch of some number.
+
+    Raises:
+        InvalidInputError: ``at_epoch`` is neither the number of an epoch nor ``None``, the newest.
+    """
+
+    def parts(epoch: int) -> Call[Sequence[MapReplyT]]:
+        first = yield from ask(request(slice(0, most), epoch))
+        if count <= most:
+            return [first]
+        rest = yield from ask_each(
+            range(most, count, most), lambda start: request(slice(start, start + most), first.epoch)
+        )
+        return [first, *rest]
+
+    epoch = checks.chosen_epoch(at_epoch)
+    if epoch != NEWEST:
+        return (yield from parts(epoch))
+    # The map may go on while the parts are under way: then all of it is asked again.
+    return (yield from retried("epoch_gone", lambda: parts(NEWEST)))
+
+
+def _joined(replies: Sequence[MapReply], flags: Sequence[str] = ()) -> dict[str, Any]:
+    """The fields of replies about parts as one: arrays end to end, ``flags`` as truth values.
+
+    Raises:
+        BadReplyError: the replies do not fit together.
+    """
+    try:
+        fields = {
+            name: np.concatenate([getattr(reply, name) for reply in replies])
+            if isinstance(value, np.ndarray)
+            else value
+            for name, value in vars(replies[0]).items()
+        }
+    except ValueError as error:
+        raise BadReplyError(f"the replies about parts do not fit together: {error}") from error
+    return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
+
+
+def _origin_of(points: Doubles) -> Doubles:
+    """An origin [3] among points [N, 3], from which they travel in single precision."""
+    # The median, so that a few far points do not cost the others their precision; of a sample,
+    # as it takes longer than all the rest.
+    some = points[:: max(1, len(points) // _ORIGIN_SAMPLE)]
+    return np.asarray(np.median(some, axis=0)) if len(points) else np.zeros(3)
+
+
+def _offsets(points: Doubles, origin: Doubles) -> Floats:
+    """Points [N, 3] as they travel: relative to an origin [3]."""
+    return (points - origin).astype(np.float32)

@@ -62,7 +62,8 @@ class ScanPublisher:
         stamp_ns = time.time_ns() if stamp_s is None else checks.stamp_ns(stamp_s)
         # Held while sending: the server takes a scan that is overtaken by its successor for lost.
         with self._sending:
-            state = self._source(source)
+            with self._lock:
+                state = self._sources.setdefault(source, _Source())
             if stamp_ns < state.stamp_ns and stamp_s is None:
                 stamp_ns = state.stamp_ns  # the system's clock was set back
             if stamp_ns < state.stamp_ns:
@@ -96,10 +97,6 @@ class ScanPublisher:
             lost=sum(reply.lost for reply in replies),
             last_refusal=refusals[-1] if refusals else None,
         )
-
-    def _source(self, name: str) -> _Source:
-        with self._lock:
-            return self._sources.setdefault(name, _Source())
 
     def _requests(self, timeout_s: float, pending: int) -> Iterator[FlushRequest]:
         """One request per source; the scans that may be pending are shared out among them."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import WireError
+from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_format.wire.tile_codec import decode_tile
@@ -40,9 +41,8 @@ class MeshTile:
 class KnownTiles:
     """Tiles for a later watch to go on with.
 
-    :meth:`MeshWatch.known_tiles` gives them, :meth:`Client.watch_mesh` takes them.
-
-    They are of one level of one server process. Where that was restarted they are fetched anew.
+    :meth:`MeshWatch.known_tiles` gives them, :meth:`Client.watch_mesh` takes them. They are of one
+    level of one server process: where that was restarted, they are fetched anew.
     """
 
     server: str
@@ -66,8 +66,8 @@ class MeshUpdate:
 class FollowedMesh:
     """What is known of the mesh tiles of a box; a reply gives another one."""
 
-    minimum: NDArray[np.float64]  # [3] metres, map frame
-    maximum: NDArray[np.float64]  # [3]
+    minimum: Doubles  # [3] metres, map frame
+    maximum: Doubles  # [3]
     level: int
     max_bytes_per_s: int  # 0: whatever the server allows
     name: str  # on which the server counts these bytes
@@ -153,7 +153,7 @@ class FollowedMesh:
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""
         tiles = [Triangles(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values()]
-        whole = joined(tiles, self.tile_side_m, self.minimum, self.maximum)
+        whole = joined(tiles, self.tile_side_m, minimum=self.minimum, maximum=self.maximum)
         return Mesh(whole.vertices, whole.faces, self.epoch)
 
     def known_tiles(self) -> KnownTiles:

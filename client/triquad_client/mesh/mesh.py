@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Ints
 from triquad_format.wire import keys
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
@@ -83,20 +84,20 @@ class Mesh:
 class Triangles(NamedTuple):
     """A surface in the map frame."""
 
-    vertices: NDArray[np.float64]  # [V, 3] metres
-    faces: NDArray[np.int32]  # [F, 3]
+    vertices: Doubles  # [V, 3] metres
+    faces: Ints  # [F, 3]
 
 
 def fetch_tiles(bounds: Bounds | None, level: int) -> Call[TileList]:
     """The tiles that meet the bounds."""
     minimum, maximum = checks.box(bounds)
-    request = TileListRequest(minimum, maximum, NEWEST, checks.level_of_detail(level))
+    request = TileListRequest(minimum, maximum, NEWEST, level=checks.level_of_detail(level))
     return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
 
 
-def fetch_tile(x: int, y: int, z: int, level: int) -> Call[Mesh]:
+def fetch_tile(index: Sequence[int], level: int) -> Call[Mesh]:
     """The newest mesh of one tile."""
-    tile = yield from ask(_ask_tile((x, y, z), NEWEST, checks.level_of_detail(level)))
+    tile = yield from ask(_ask_tile(index, NEWEST, checks.level_of_detail(level)))
     return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
 
 
@@ -111,7 +112,7 @@ def fetch_mesh(bounds: Bounds | None, level: int) -> Call[Mesh]:
 
         def join(_: Run) -> Mesh:
             parts = [Triangles(tile.origin + tile.vertices, tile.faces) for tile in tiles]
-            whole = joined(parts, listed.tile_side_m, minimum, maximum)
+            whole = joined(parts, listed.tile_side_m, minimum=minimum, maximum=maximum)
             return Mesh(whole.vertices, whole.faces, listed.epoch)
 
         return (yield from offload(join))
@@ -121,16 +122,13 @@ def fetch_mesh(bounds: Bounds | None, level: int) -> Call[Mesh]:
 
 def _ask_tile(index: Sequence[int], epoch: int, level: int) -> Ask[Tile]:
     x, y, z = index
-    return Ask(keys.TILE, TileRequest(x, y, z, epoch, level), Tile, background=True)
+    return Ask(keys.TILE, TileRequest(x, y, z, epoch=epoch, level=level), Tile, background=True)
 
 
 def joined(
-    tiles: Sequence[Triangles],
-    tile_side_m: float,
-    minimum: NDArray[np.float64],
-    maximum: NDArray[np.float64],
+    tiles: Sequence[Triangles], tile_side_m: float, minimum: Doubles, maximum: Doubles
 ) -> Triangles:
-    """One mesh of the tiles' faces whose centroids lie in the box between two corners [3]."""
+    """The tiles' faces whose centroids lie in the box between two corners [3], as one mesh."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in tiles)])
     shifted = [faces + int(start) for (_, faces), start in zip(tiles, starts, strict=False)]
     vertices, faces = welded(
@@ -143,18 +141,11 @@ def joined(
     return compacted(vertices, faces[inside])
 
 
-def welded(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32], tile_side_m: float
-) -> Triangles:
-    """The mesh with one vertex where tiles had several.
+def welded(vertices: Doubles, faces: Ints, tile_side_m: float) -> Triangles:
+    """The mesh with one vertex where tiles had several, without faces that this made degenerate.
 
-    Args:
-        vertices: [V, 3], metres.
-        faces: [F, 3].
-        tile_side_m: side of the tiles; only vertices on their faces are looked at.
-
-    Returns:
-        The mesh without faces that welding made degenerate.
+    Of ``vertices`` [V, 3], metres, only those on the sides of tiles, ``tile_side_m`` long, can be
+    the same.
     """
     steps = vertices / tile_side_m
     border = (np.abs(steps - np.round(steps)) < WELD_M / tile_side_m).any(axis=1)
@@ -166,7 +157,7 @@ def welded(
     return compacted(vertices, joined[(a != b) & (b != c) & (c != a)])
 
 
-def compacted(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> Triangles:
+def compacted(vertices: Doubles, faces: NDArray[np.integer]) -> Triangles:
     """The mesh without vertices that no face uses."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
@@ -174,7 +165,7 @@ def compacted(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> Tria
     return Triangles(vertices[used], number[faces].astype(np.int32).reshape(-1, 3))
 
 
-def _representatives(points: NDArray[np.float64]) -> NDArray[np.intp]:
+def _representatives(points: Doubles) -> NDArray[np.intp]:
     """For each point [N, 3], the index of the point that stands for it."""
     chosen = np.arange(len(points))
     for shift in _SHIFTS:

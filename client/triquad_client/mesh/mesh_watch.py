@@ -23,8 +23,7 @@ from triquad_client.mesh.followed_mesh import (
 )
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.call import Ask, Call, ResultT, ask, offload
-from triquad_client.net.connection import Connection
-from triquad_client.net.driver import RemoteDriver
+from triquad_client.net.connection import Connection, RemoteDriver
 
 _LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
 
@@ -90,7 +89,7 @@ class WatchedMesh:
         with self._changing:
             now = self._followed
             if now is not before:  # by what is known now, the reply may be old
-                return MeshUpdate((), (), now.epoch, now.complete, size_bytes=0)
+                return MeshUpdate((), (), now.epoch, complete=now.complete, size_bytes=0)
             self._followed = after
         removed = tuple(sorted(before.tiles.keys() - after.tiles.keys()))
         return MeshUpdate(

@@ -16,9 +16,14 @@ from typing import Any, TypeAlias, TypeVar
 
 import zenoh
 
-from triquad_client.net.call import Ask, Batch, Run
-from triquad_client.net.connection import Connection, Receiver, closed_error, map_names
-from triquad_client.net.driver import Driver, RemoteDriver, exchange
+from triquad_client.net.call import Ask, Batch, Driver, Run, exchange
+from triquad_client.net.connection import (
+    Connection,
+    Receiver,
+    RemoteDriver,
+    closed_error,
+    map_names,
+)
 
 _REQUESTS_IN_FLIGHT = 32
 """Requests of one operation, over all calls, that wait for their replies at the same time. Servers

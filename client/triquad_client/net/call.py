@@ -1,22 +1,22 @@
-"""Calls: what a client asks a server and makes of the replies, without the waiting.
+"""Calls: what a client asks a server and makes of the replies; and the drivers that run them.
 
-A call is a generator. It yields steps, is sent what became of each, and returns the result. Who
-runs it decides how to wait (:mod:`triquad_client.net.driver`). To add a call, write its generator
-with the helpers below, and a line in ``Client`` and ``AsyncClient``.
+A call is a generator. It yields steps, is sent what became of each, and returns the result. A
+driver takes the steps in one loop, and its kind decides how to wait. To add a call, write its
+generator with ``ask``, ``ask_each``, ``offload`` and ``retried``, and a line in ``Client`` and
+``AsyncClient``.
 """
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Awaitable, Callable, Generator, Iterable
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
-from triquad_format.wire.messages import MapReply
-
-from triquad_client import checks
-from triquad_client.errors import BadReplyError
 
 NEWEST = 0
 """Asks for the newest epoch, a published state of the map; another number pins that epoch."""
@@ -25,12 +25,11 @@ _PARTS_IN_FLIGHT = 4
 """Requests of one call that wait for their replies at the same time."""
 
 _ATTEMPTS = 3
-_ORIGIN_SAMPLE = 1000
 
 ItemT = TypeVar("ItemT")
 ReplyT = TypeVar("ReplyT", bound=Message)
-MapReplyT = TypeVar("MapReplyT", bound=MapReply)
 ResultT = TypeVar("ResultT")
+PendingT = TypeVar("PendingT")
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,6 @@ class Run(Protocol):
 
     def __call__(self, call: Call[ResultT]) -> ResultT:
         """What the call returns; raises what it raises."""
-        ...
 
 
 class AsyncRun(Protocol):
@@ -92,7 +90,6 @@ class AsyncRun(Protocol):
 
     async def __call__(self, call: Call[ResultT]) -> ResultT:
         """What the call returns; raises what it raises."""
-        ...
 
 
 def ask(request: Ask[ReplyT]) -> Call[ReplyT]:
@@ -129,59 +126,78 @@ def retried(code: str, attempt: Callable[[], Call[ResultT]]) -> Call[ResultT]:
     return (yield from attempt())
 
 
-def in_parts(
-    count: int, most: int, request: Callable[[slice, int], Ask[MapReplyT]], at_epoch: int | None
-) -> Call[Sequence[MapReplyT]]:
-    """The replies about ``count`` items, ``most`` at a time, all from one epoch.
+class Driver(ABC):
+    """Takes the steps of calls, one after the other; subclasses say how."""
 
-    ``request`` makes what is asked about some of the items, of the epoch of some number.
+    async def run_call(self, call: Call[ResultT]) -> ResultT:
+        """What the call returns; raises what it raises."""
+        with closing(call):
+            resume = partial(call.send, None)
+            while True:
+                try:
+                    step = resume()
+                except StopIteration as end:
+                    result: ResultT = end.value
+                    return result
+                try:
+                    resume = partial(call.send, await self._take(step))
+                except Exception as error:
+                    resume = partial(call.throw, error)
 
-    Raises:
-        InvalidInputError: ``at_epoch`` is neither the number of an epoch nor ``None``, the newest.
-    """
+    async def _take(self, step: Step) -> Any:
+        if isinstance(step, Batch):
+            return await self._replies(step)
+        if isinstance(step, Pause):
+            return await self._pause(step.seconds)
+        return await self._work(step.job)
 
-    def parts(epoch: int) -> Call[Sequence[MapReplyT]]:
-        first = yield from ask(request(slice(0, most), epoch))
-        if count <= most:
-            return [first]
-        rest = yield from ask_each(
-            range(most, count, most), lambda start: request(slice(start, start + most), first.epoch)
-        )
-        return [first, *rest]
+    @abstractmethod
+    async def _replies(self, batch: Batch) -> list[Any]:
+        """The replies to the requests, in the order of the items."""
 
-    epoch = checks.chosen_epoch(at_epoch)
-    if epoch is not None:
-        return (yield from parts(epoch))
-    # The map may go on while the parts are under way: then all of it is asked again.
-    return (yield from retried("epoch_gone", lambda: parts(NEWEST)))
+    @abstractmethod
+    async def _pause(self, seconds: float) -> None:
+        """Let time pass."""
 
-
-def joined(replies: Sequence[MapReply], flags: Sequence[str] = ()) -> dict[str, Any]:
-    """The fields of replies about parts as one: arrays end to end, ``flags`` as truth values.
-
-    Raises:
-        BadReplyError: the replies do not fit together.
-    """
-    try:
-        fields = {
-            name: np.concatenate([getattr(reply, name) for reply in replies])
-            if isinstance(value, np.ndarray)
-            else value
-            for name, value in vars(replies[0]).items()
-        }
-    except ValueError as error:
-        raise BadReplyError(f"the replies about parts do not fit together: {error}") from error
-    return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
+    @abstractmethod
+    async def _work(self, job: Callable[[Run], Any]) -> Any:
+        """What ``job`` returns."""
 
 
-def origin_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """An origin [3] among points [N, 3], from which they travel in single precision."""
-    # The median, so that a few far points do not cost the others their precision; of a sample,
-    # as it takes longer than all the rest.
-    some = points[:: max(1, len(points) // _ORIGIN_SAMPLE)]
-    return np.asarray(np.median(some, axis=0)) if len(points) else np.zeros(3)
+class BlockingDriver(Driver):
+    """Takes the steps in the thread that makes the call. None of its coroutines ever waits."""
+
+    def run(self, call: Call[ResultT]) -> ResultT:
+        """What the call returns; raises what it raises."""
+        coroutine = self.run_call(call)
+        try:
+            coroutine.send(None)  # to its end: it waits for nothing, so it needs no event loop
+        except StopIteration as end:
+            result: ResultT = end.value
+            return result
+        coroutine.close()
+        raise AssertionError("a blocking driver waited for an event loop")
+
+    async def _pause(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    async def _work(self, job: Callable[[Run], Any]) -> Any:
+        return job(self.run)
 
 
-def offsets(points: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Points [N, 3] as they travel: relative to an origin [3]."""
-    return (points - origin).astype(np.float32)
+async def exchange(
+    batch: Batch,
+    send: Callable[[Ask[Any]], Awaitable[PendingT]],
+    receive: Callable[[Ask[Any], PendingT], Awaitable[Any]],
+) -> list[Any]:
+    """The replies to a batch, of which ``batch.at_once`` requests are under way at a time."""
+    waiting: deque[tuple[Ask[Any], PendingT]] = deque()
+    replies = []
+    for item in batch.items:
+        request = batch.request(item)
+        waiting.append((request, await send(request)))
+        if len(waiting) >= batch.at_once:
+            replies.append(await receive(*waiting.popleft()))
+    while waiting:
+        replies.append(await receive(*waiting.popleft()))
+    return replies

@@ -1,4 +1,4 @@
-"""The Zenoh session of a client, and requests over it."""
+"""The Zenoh session of a client, requests over it, and the driver that makes them."""
 
 import json
 import weakref
@@ -21,7 +21,7 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
-from triquad_client.net.call import Ask, ReplyT
+from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
 
 _LIVELINESS_TIMEOUT_S = 3.0
 
@@ -40,11 +40,6 @@ class Connection:
         self.map_name = map_name
         self.timeout_s = timeout_s
 
-    @property
-    def closed(self) -> bool:
-        """Whether the session was closed."""
-        return self._session.is_closed()
-
     def close(self) -> None:
         """Close the session; closing twice does no harm. What is under way ends unanswered."""
         self._close()
@@ -55,7 +50,12 @@ class Connection:
         receiver: Receiver = None,
         cancellation: zenoh.CancellationToken | None = None,
     ) -> Iterable[zenoh.Reply]:
-        """Send a request; its reply comes from what is returned, or to ``receiver``."""
+        """Send a request; its reply comes from what is returned, or to ``receiver``.
+
+        Raises:
+            ClosedError: the session was closed.
+            ConnectError: it is broken.
+        """
         try:
             replies: Iterable[zenoh.Reply] = self._session.get(
                 self._key(ask),
@@ -95,7 +95,7 @@ class Connection:
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
-        if self.closed:
+        if self._session.is_closed():
             return closed_error()
         info = self._session.info
         if not (info.routers_zid() or info.peers_zid()):
@@ -110,7 +110,10 @@ class Connection:
         )
 
     def put(self, key: str, message: Message) -> None:
-        """Publish a message; blocks where the network is slower than the publisher."""
+        """Publish a message; blocks where the network is slower than the publisher.
+
+        Raises as :meth:`send`.
+        """
         try:
             self._session.put(
                 key,
@@ -126,7 +129,7 @@ class Connection:
     def look_for_maps(
         self, receiver: Receiver = None, cancellation: zenoh.CancellationToken | None = None
     ) -> Iterable[zenoh.Reply]:
-        """Ask all servers that can be reached for their maps; replies as of :meth:`send`."""
+        """Ask all servers in reach for their maps; replies and errors as of :meth:`send`."""
         try:
             replies: Iterable[zenoh.Reply] = self._session.liveliness().get(
                 keys.alive_key("*", "*"),
@@ -145,9 +148,35 @@ class Connection:
         return max(self.timeout_s, ask.min_timeout_s) + ask.server_wait_s
 
     def _broken(self, error: Exception) -> Exception:
-        if self.closed:
+        if self._session.is_closed():
             return closed_error()
         return ConnectError(f"the connection is broken: {error}")
+
+
+class RemoteDriver(BlockingDriver):
+    """Runs calls over a connection, in the threads that make them."""
+
+    def __init__(
+        self, connection: Connection, cancellation: zenoh.CancellationToken | None = None
+    ) -> None:
+        """Once ``cancellation`` is cancelled, every call ends with an error."""
+        self._connection = connection
+        self._cancellation = cancellation
+
+    def maps(self) -> list[str]:
+        """Names of the maps of all servers that can be reached."""
+        return map_names(self._connection.look_for_maps(cancellation=self._cancellation))
+
+    async def _replies(self, batch: Batch) -> list[Any]:
+        return await exchange(batch, self._send, self._receive)
+
+    async def _send(self, ask: Ask[Any]) -> Iterable[zenoh.Reply]:
+        return self._connection.send(ask, cancellation=self._cancellation)
+
+    async def _receive(self, ask: Ask[Any], replies: Iterable[zenoh.Reply]) -> Any:
+        for reply in replies:
+            return self._connection.read(ask, reply)
+        raise self._connection.no_reply_error(ask, self.maps())
 
 
 def closed_error() -> ClosedError:

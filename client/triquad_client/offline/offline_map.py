@@ -15,8 +15,7 @@ from triquad_map.view import MapView
 
 from triquad_client.calls.queries import MapQueries
 from triquad_client.errors import ClosedError
-from triquad_client.net.call import Batch, Call, ResultT
-from triquad_client.net.driver import BlockingDriver
+from triquad_client.net.call import Batch, BlockingDriver, Call, ResultT
 
 _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
 """Nobody else waits."""

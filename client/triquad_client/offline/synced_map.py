@@ -120,7 +120,7 @@ class LocalCopy:
                 parts_received=len(wanted) - len(kept),
                 parts_kept=len(kept),
             )
-            self._state = _State(info.sha256, LocalDriver(record), asked_s, report)
+            self._state = _State(info.sha256, LocalDriver(record), checked_s=asked_s, report=report)
             if known is not None:
                 known.driver.close()
             return report

@@ -5,13 +5,13 @@ A checkpoint is complete, or holds what changed and names the files that hold th
 
 import re
 from collections.abc import Iterable
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 from triquad_format.errors import MapFileError
-from triquad_format.mapfile.files import FileBytes, named
-from triquad_format.mapfile.index import DAMAGED_SUFFIX, MapIndex, files_in
+from triquad_format.mapfile.index import DAMAGED_SUFFIX, FileBytes, MapIndex, named
 from triquad_format.mapfile.manifest import Manifest
 
 _NAME = re.compile(r"epoch-([0-9]{9,19})(\.delta)?\.triquad")
@@ -74,6 +74,7 @@ def map_folder(store: Path) -> Path:
 
     Raises:
         MapFileError: there is none, or there are several; the text names them.
+        OSError: the folder cannot be read.
     """
     if checkpoint_files(store):
         return store
@@ -92,12 +93,8 @@ def open_manifest(file: CheckpointFile) -> Manifest:
         MapFileError: the file is damaged, or needs a newer reader.
         OSError: it cannot be read.
     """
-    source = FileBytes(file.path)
-    try:
-        with named(str(file.path)):
-            return MapIndex(source, files_in(file.path.parent)).manifest
-    finally:
-        source.close()
+    with closing(FileBytes(file.path)) as source, named(str(file.path)):
+        return MapIndex(source).manifest
 
 
 def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
@@ -110,6 +107,7 @@ def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
     Raises:
         MapFileError: ``when`` is neither, or there is no such checkpoint; the text tells which
             there are.
+        OSError: the folder or a file cannot be read.
     """
     files = newest_of_each(checkpoint_files(folder))
     found = [file for file in files if _is_by(file, when)]

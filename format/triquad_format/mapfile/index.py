@@ -1,7 +1,11 @@
 """A map file opened by its index: its manifest at once, each part when it is asked for."""
 
+import contextlib
 import hashlib
-from collections.abc import Callable
+import io
+import os
+import stat
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from triquad_format.errors import (
@@ -9,10 +13,10 @@ from triquad_format.errors import (
     FormatError,
     MapFileError,
     NoIndexError,
+    TooLargeMapFileError,
 )
-from triquad_format.mapfile.files import FileBytes, RandomAccess
 from triquad_format.mapfile.manifest import Entry, FileRef, unpack_manifest
-from triquad_format.mapfile.mcap.reader import McapIndex
+from triquad_format.mapfile.mcap.reader import McapIndex, RandomAccess
 from triquad_format.mapfile.metadata import (
     METADATA_NAME,
     check_agreement,
@@ -24,8 +28,74 @@ from triquad_format.mapfile.parts.part import MANIFEST, MAP, PartKey
 DAMAGED_SUFFIX = ".damaged"
 """Added to the names of files that are set aside."""
 
+_REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be intact"
+
 OpenFile = Callable[[FileRef], RandomAccess]
 """Opens another file of the same folder."""
+
+
+@contextlib.contextmanager
+def named(name: str) -> Iterator[None]:
+    """Put the file's name and, for damage, the remedy into what is raised.
+
+    Raises:
+        MapFileError: instead of any :class:`FormatError`, and where memory does not suffice.
+    """
+    try:
+        yield
+    except FormatError as error:
+        if isinstance(error, MapFileError) and not isinstance(error, DamagedMapFileError):
+            raise type(error)(f"{name}: {error}") from error
+        raise DamagedMapFileError(f"{name} is damaged: {error}; {_REMEDY}") from error
+    except MemoryError as error:
+        raise TooLargeMapFileError(f"{name}: the map does not fit into memory") from error
+
+
+def open_regular(path: Path) -> io.FileIO:
+    """A file for reading; a pipe or device, which could keep its reader waiting, is refused.
+
+    Raises:
+        MapFileError: it is no regular file.
+        OSError: it cannot be opened.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise MapFileError(f"{path} is not a regular file")
+    return io.FileIO(descriptor)
+
+
+class FileBytes:
+    """The bytes of a file; they stay readable while it is open, even where it is deleted."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a file; errors are those of :func:`open_regular`."""
+        self.name = str(path)
+        self._stream = open_regular(path)
+        self.size = os.fstat(self._stream.fileno()).st_size
+
+    def read(self, offset: int, length: int) -> bytes:
+        """As :meth:`RandomAccess.read`; threads may read at the same time."""
+        check_range(offset, length, self.size)
+        data = os.pread(self._stream.fileno(), length, offset)
+        while len(data) < length:
+            more = os.pread(self._stream.fileno(), length - len(data), offset + len(data))
+            if not more:
+                raise DamagedMapFileError(f"it was cut to {offset + len(data)} bytes meanwhile")
+            data += more
+        return data
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+
+def check_range(offset: int, length: int, size: int) -> None:
+    """Raise :class:`DamagedMapFileError` unless the file's ``size`` bytes hold that range."""
+    if offset < 0 or length < 0 or offset + length > size:
+        raise DamagedMapFileError(
+            f"bytes {offset} to {offset + length} are needed, but it has {size}: it is incomplete"
+        )
 
 
 def files_in(folder: Path) -> OpenFile:
@@ -67,7 +137,7 @@ class OtherFiles:
             raise DamagedMapFileError(f"{entry.file.name}, which holds parts: {error}") from error
 
     def close(self) -> None:
-        """Close them."""
+        """Close those that were opened."""
         for index in self._indices.values():
             index.close()
 
@@ -139,6 +209,7 @@ class MapIndex:
 
         Raises:
             MapFileError: the part is damaged, or the file that holds it is missing or another.
+            OSError: a file cannot be read.
         """
         if entry.file is not None:
             return self._others.payload(entry)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError, FormatError
 from triquad_format.mapfile.metadata import MapFacts, pack_facts, unpack_facts
-from triquad_format.mapfile.parts.body import PartBody, pack_part, unpack_body
+from triquad_format.mapfile.parts.body import PartBody, unpack_body
+from triquad_format.mapfile.parts.pack import pack_part
 from triquad_format.mapfile.parts.part import (
     MANIFEST,
     MAP,

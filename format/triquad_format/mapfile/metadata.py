@@ -90,12 +90,9 @@ def _unpack_settings(body: Mapping[str, object]) -> FieldSettings:
 def pack_metadata(
     facts: MapFacts, *, stamp_ns: int | None, needs_other_files: bool
 ) -> dict[str, str]:
-    """The metadata of a file.
+    """The metadata of a file, parts of which may lie in other files.
 
-    Args:
-        facts: of its map.
-        stamp_ns: time of its epoch, nanoseconds since 1970; ``None``: not known.
-        needs_other_files: whether parts may lie in other files.
+    ``stamp_ns`` is the time of its epoch, nanoseconds since 1970; ``None``: not known.
     """
     entries = {
         "format_version": str(FORMAT_VERSION),
@@ -171,10 +168,7 @@ def _required(metadata: dict[str, str]) -> set[str]:
 def check_agreement(metadata: dict[str, str], facts: MapFacts, *, needs_other_files: bool) -> None:
     """Raise :class:`DamagedMapFileError` unless metadata and manifest tell the same.
 
-    Args:
-        metadata: of the file.
-        facts: what its parts tell of the map.
-        needs_other_files: whether its manifest lists parts that lie in other files.
+    ``facts`` and ``needs_other_files`` are the manifest's: whether it lists parts of other files.
     """
     for key, value in _facts_in_metadata(facts).items():
         if metadata.get(key) != value:

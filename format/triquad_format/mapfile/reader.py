@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from triquad_format.errors import DamagedMapFileError, TooLargeMapFileError
-from triquad_format.mapfile.files import named, open_regular
-from triquad_format.mapfile.index import OtherFiles, files_in
+from triquad_format.mapfile.index import OtherFiles, files_in, named, open_regular
 from triquad_format.mapfile.manifest import DIGEST_BYTES, Entry, Manifest, unpack_manifest
 from triquad_format.mapfile.mcap.reader import McapFile
 from triquad_format.mapfile.mcap.records import Message, total_limit
@@ -185,4 +184,5 @@ def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRec
         for entry in entries:
             parts.add(entry.key, payload_of(entry))
         regions.append(parts.region())
-    return MapRecord(manifest.facts.name, manifest.facts.epoch, settings, tuple(regions))
+    facts = manifest.facts
+    return MapRecord(facts.name, facts.epoch, settings, regions=tuple(regions))

@@ -1,8 +1,10 @@
 """Writing map files: the same record gives the same bytes, and a path gets all of them or none."""
 
+import contextlib
 import hashlib
-from collections.abc import Iterable, Mapping
-from contextlib import nullcontext
+import os
+import secrets
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +13,6 @@ from typing import BinaryIO
 from mcap.records import Channel, Schema
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.files import replacing
 from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
 from triquad_format.mapfile.mcap.records import total_limit
 from triquad_format.mapfile.mcap.writer import McapWriter
@@ -22,9 +23,7 @@ from triquad_format.mapfile.metadata import (
     pack_facts,
     pack_metadata,
 )
-from triquad_format.mapfile.parts.body import pack_part, seams
-from triquad_format.mapfile.parts.columns import FLOATS
-from triquad_format.mapfile.parts.pack import pack_record
+from triquad_format.mapfile.parts.pack import pack_part, pack_record, seams
 from triquad_format.mapfile.parts.part import (
     ENCODINGS,
     EVIDENCE,
@@ -44,7 +43,7 @@ from triquad_format.mapfile.parts.part import (
 )
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import FLOATS, MapRecord
 
 # Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
 # good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
@@ -161,11 +160,44 @@ def write_parts(
     # Where parts of other files are known, some of them are nearly always needed.
     needs_others = any(entry.file is not None for entry in known.values())
     metadata = pack_metadata(facts, stamp_ns=stamp_ns, needs_other_files=needs_others)
-    opened = replacing(Path(file)) if isinstance(file, (str, Path)) else nullcontext(file)
+    opened = (
+        replacing(Path(file)) if isinstance(file, (str, Path)) else contextlib.nullcontext(file)
+    )
     with opened as stream:
         mcap = _mcap_writer(stream, metadata["producer"], preview_schema)
         mcap.add_metadata(METADATA_NAME, metadata)
         return _PartsWriter(mcap, facts, stamp_ns=stamp_ns, known=known).write(parts)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A stream whose bytes replace the file at ``path``, durably, where nothing is raised.
+
+    Raises:
+        OSError: the file cannot be written; the one that was there stays.
+    """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("xb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make renames in a folder durable, where the system lets folders be synced."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _mcap_writer(file: BinaryIO, producer: str, preview_schema: bytes | None) -> McapWriter:

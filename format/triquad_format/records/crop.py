@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from triquad_format.errors import FormatError
 from triquad_format.records import morton
+from triquad_format.records.arrays import Bytes, Doubles
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
@@ -43,17 +44,17 @@ class LeafBox:
 
 
 def whole_region(settings: FieldSettings) -> LeafBox:
-    """The region's cube."""
+    """A region's cube."""
     return LeafBox(np.zeros(3), np.full(3, float(1 << settings.depth)))
 
 
 def leaf_box(
     settings: FieldSettings,
     index: RegionIndex,
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
+    low: Doubles,
+    high: Doubles,
 ) -> LeafBox:
-    """The box between two corners [3] of the map frame, grown by what rounding may need."""
+    """The box between corners [3], metres, map frame, grown by what rounding may need."""
     centre = settings.region_centre(index)
     return LeafBox(
         settings.leaf_coordinates(low - centre) - SLACK_LEAVES,
@@ -61,10 +62,12 @@ def leaf_box(
     )
 
 
-def check_box(
-    minimum: ArrayLike, maximum: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The corners [3] of a box; a :class:`FormatError` where they are not finite or in order."""
+def check_box(minimum: ArrayLike, maximum: ArrayLike) -> tuple[Doubles, Doubles]:
+    """The corners [3] of a box, metres, as arrays.
+
+    Raises:
+        FormatError: they are not finite, or not in order.
+    """
     low, high = np.asarray(minimum, np.float64), np.asarray(maximum, np.float64)
     if not (np.isfinite([low, high]).all() and (low < high).all()):
         raise FormatError(f"a box from {low.tolist()} to {high.tolist()} holds nothing")
@@ -88,7 +91,7 @@ def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> Ma
     low, high = check_box(minimum, maximum)
     regions = []
     for region in record.regions:
-        box = leaf_box(record.settings, region.index, low, high)
+        box = leaf_box(record.settings, region.index, low=low, high=high)
         if box.meets(whole_region(record.settings)):
             regions.append(_crop_region(record.settings, region, box))
     return dataclasses.replace(record, regions=tuple(regions))
@@ -108,7 +111,7 @@ def _crop_region(settings: FieldSettings, region: Region, box: LeafBox) -> Regio
     )
     training = region.training
     if training is not None:
-        training = _crop_training(settings, training, kept, box)
+        training = _crop_training(settings, training, kept, box=box)
     evidence = masked(region.evidence, status_voxels(region.evidence, box))
     return dataclasses.replace(region, tables=tables, evidence=evidence, training=training)
 
@@ -127,6 +130,7 @@ def _crop_training(
     settings: FieldSettings,
     training: TrainingState,
     kept: list[NDArray[np.intp]],
+    *,
     box: LeafBox,
 ) -> TrainingState:
     leaves = settings.leaf_coordinates(training.sample_points)
@@ -149,7 +153,7 @@ def _rows(
     return tuple(column[rows] for column, rows in zip(columns, kept, strict=True))
 
 
-def status_voxels(evidence: Evidence, box: LeafBox) -> NDArray[np.uint8]:
+def status_voxels(evidence: Evidence, box: LeafBox) -> Bytes:
     """Bits [B, BLOCK_BYTES] of the voxels that decide the status in a box."""
     first = morton.decode(evidence.codes, 3) * BLOCK_VOXELS
     voxels = first[:, :, None] + np.arange(BLOCK_VOXELS)  # [B, 3, 8]

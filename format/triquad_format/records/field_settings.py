@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import SettingsError
+from triquad_format.records.arrays import Doubles
 
 Encoding = Literal["both", "features", "fourier"]
 """The parts of the MLP's input."""
@@ -45,7 +46,11 @@ def _ranged(default: float, low: float, high: float) -> Any:
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """Shape of a tri-quadtree field; the defaults are those of 3QFP (ICRA 2024, section IV)."""
+    """Shape of a tri-quadtree field; the defaults are those of 3QFP (ICRA 2024, section IV).
+
+    Raises:
+        SettingsError: a value is out of its range.
+    """
 
     leaf_m: float = _ranged(0.2, 0.01, 10.0)
     """r: side of a leaf."""
@@ -82,7 +87,7 @@ class FieldSettings:
         for entry in dataclasses.fields(self):
             if entry.metadata:
                 low, high = entry.metadata["ge"], entry.metadata["le"]
-                check_range(entry.name, getattr(self, entry.name), low, high)
+                check_range(entry.name, getattr(self, entry.name), low=low, high=high)
         if self.encoding not in ENCODINGS:
             raise SettingsError(f"encoding = {self.encoding!r} is not one of {ENCODINGS}")
 
@@ -122,11 +127,11 @@ class FieldSettings:
         fourier = 6 * self.frequencies if self.encoding != "features" else 0
         return features + fourier
 
-    def region_centre(self, index: RegionIndex) -> NDArray[np.float64]:
+    def region_centre(self, index: RegionIndex) -> Doubles:
         """Centre [3] of a region in the map frame, metres."""
         return np.asarray(index, np.float64) * self.region_pitch_m
 
-    def region_corner(self, index: RegionIndex) -> NDArray[np.float64]:
+    def region_corner(self, index: RegionIndex) -> Doubles:
         """Least corner [3] of a region's cube in the map frame, metres."""
         return self.region_centre(index) - self.region_side_m / 2
 

@@ -7,8 +7,7 @@ Bit ``i`` of the first coordinate lands at bit ``i * D`` of the code, of the sec
 import numpy as np
 from numpy.typing import NDArray
 
-BITS_2D = 31
-BITS_3D = 20
+from triquad_format.records.arrays import Longs
 
 _SPREAD_2D = (
     (16, 0x0000FFFF0000FFFF),
@@ -26,7 +25,7 @@ _SPREAD_3D = (
 )
 
 
-def encode(cells: NDArray[np.integer]) -> NDArray[np.int64]:
+def encode(cells: NDArray[np.integer]) -> Longs:
     """Morton codes of integer cells.
 
     Args:
@@ -46,7 +45,7 @@ def encode(cells: NDArray[np.integer]) -> NDArray[np.int64]:
     return code
 
 
-def decode(codes: NDArray[np.integer], dimensions: int) -> NDArray[np.int64]:
+def decode(codes: NDArray[np.integer], dimensions: int) -> Longs:
     """Integer cells ``[..., D]`` of Morton codes ``[...]``; the inverse of :func:`encode`."""
     spread = _SPREAD_2D if dimensions == 2 else _SPREAD_3D
     shifts = [shift for shift, _ in spread]

@@ -7,10 +7,12 @@ from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError
 from triquad_format.records import morton
+from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
+    FLOATS,
     MAX_INTEGER,
     MAX_LEVEL,
     MAX_SEEN_S,
@@ -24,8 +26,6 @@ from triquad_format.records.region import (
 )
 from triquad_format.wire.codec import ArraySpec
 from triquad_format.wire.keys import check_name
-
-_FLOATS = ("<f2", "<f4")
 
 
 def check_record(record: MapRecord) -> None:
@@ -80,7 +80,7 @@ def _check_table(settings: FieldSettings, table: VertexTable) -> None:
         raise FormatError(f"{name} codes: a vertex lies outside the level")
     shape = (len(table.codes), settings.feature_size)
     if table.scale is None:
-        _check_floats(f"{name} features", table.features, shape, dtypes=_FLOATS)
+        _check_floats(f"{name} features", table.features, shape, dtypes=FLOATS)
         return
     ArraySpec("<i2", shape).check(f"{name} features", table.features)
     in_range = 0 < table.scale <= float(np.finfo(np.float32).max)
@@ -120,8 +120,8 @@ def _check_training(settings: FieldSettings, region: Region, training: TrainingS
         raise FormatError("the training state does not have one entry per vertex table")
     for table, mean, variance, steps in zip(region.tables, *columns, strict=True):
         shape = (len(table.codes), settings.feature_size)
-        _check_floats("table means", mean, shape, dtypes=_FLOATS)
-        _check_floats("table variances", variance, shape, dtypes=_FLOATS, low=0.0)
+        _check_floats("table means", mean, shape, dtypes=FLOATS)
+        _check_floats("table variances", variance, shape, dtypes=FLOATS, low=0.0)
         ArraySpec("<i4", shape[:1]).check("table steps", steps)
         if steps.min(initial=0) < 0:
             raise FormatError("table steps: a number is negative")
@@ -133,7 +133,7 @@ def _check_training(settings: FieldSettings, region: Region, training: TrainingS
     _check_floats("sample points", training.sample_points, (samples, 3))
     if np.abs(training.sample_points).max(initial=0) > settings.region_side_m:
         raise FormatError("sample points: one lies far outside its region")
-    _check_floats("sample labels", training.sample_labels, (samples,), dtypes=_FLOATS)
+    _check_floats("sample labels", training.sample_labels, (samples,), dtypes=FLOATS)
 
 
 def _check_count(name: str, count: int, limit: int = 2**63) -> None:
@@ -141,7 +141,7 @@ def _check_count(name: str, count: int, limit: int = 2**63) -> None:
         raise FormatError(f"{name} = {count} is not a count")
 
 
-def _check_codes(name: str, codes: NDArray[np.int64]) -> None:
+def _check_codes(name: str, codes: Longs) -> None:
     ArraySpec("<i8", (None,)).check(name, codes)
     if len(codes) and (codes[0] < 0 or (codes[1:] <= codes[:-1]).any()):
         raise FormatError(f"{name}: not strictly increasing from 0 on")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.records import morton
+from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 
 AXES = ((0, 1), (0, 2), (1, 2))
@@ -30,6 +31,9 @@ MAX_INTEGER = 32_639
 
 MLP_LAYERS = 3
 
+FLOATS = ("<f2", "<f4")
+"""Precisions of long columns of floats."""
+
 _BITS_SET = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype="u1")
 
 
@@ -39,11 +43,11 @@ class VertexTable:
 
     plane: int
     level: int
-    codes: NDArray[np.int64]  # [V] Morton codes of (a, b), strictly increasing
+    codes: Longs  # [V] Morton codes of (a, b), strictly increasing
     features: NDArray[np.floating | np.int16]  # [V, feature_size]
     scale: float | None = None  # of integer features: one step, in single precision
 
-    def vectors(self) -> NDArray[np.float32]:
+    def vectors(self) -> Floats:
         """The feature vectors [V, feature_size] themselves: integers count steps of ``scale``."""
         vectors = self.features.astype(np.float32)
         return vectors if self.scale is None else vectors * np.float32(self.scale)
@@ -53,24 +57,24 @@ class VertexTable:
 class Mlp:
     """Weights of the decoder: three dense layers, ``y = x @ weight + bias``, ReLU between."""
 
-    weights: tuple[NDArray[np.float32], ...]  # [input, hidden], [hidden, hidden], [hidden, 1]
-    biases: tuple[NDArray[np.float32], ...]  # [hidden], [hidden], [1]
+    weights: tuple[Floats, ...]  # [input, hidden], [hidden, hidden], [hidden, 1]
+    biases: tuple[Floats, ...]  # [hidden], [hidden], [1]
 
 
 @dataclass(frozen=True)
 class Evidence:
     """What rays have shown, as bit masks of voxels with the side of a leaf, in sparse blocks."""
 
-    codes: NDArray[np.int64]  # [B] 3-D Morton codes of blocks, strictly increasing
-    surface: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray ended in the voxel
-    free: NDArray[np.uint8]  # [B, BLOCK_BYTES] a ray passed through the voxel
-    levels: NDArray[np.uint8] | None = None
+    codes: Longs  # [B] 3-D Morton codes of blocks, strictly increasing
+    surface: Bytes  # [B, BLOCK_BYTES] a ray ended in the voxel
+    free: Bytes  # [B, BLOCK_BYTES] a ray passed through the voxel
+    levels: Bytes | None = None
     """[S] How well each surface voxel is supported, from 0 to ``MAX_LEVEL``; ``None``: not known.
 
     In the order of :func:`seen_voxels`. What a level
     stands for is up to those who set and read it; a higher one is better supported.
     """
-    seen_s: NDArray[np.int64] | None = None
+    seen_s: Longs | None = None
     """[B] When a ray last ended in the block: whole seconds since 1970, by the stamps of scans.
 
     0 where none did or it is not known; ``None``: nowhere known.
@@ -86,11 +90,11 @@ class TrainingState:
 
     table_means: tuple[NDArray[np.floating], ...]  # per table [V, feature_size]
     table_variances: tuple[NDArray[np.floating], ...]  # per table [V, feature_size]
-    table_steps: tuple[NDArray[np.int32], ...]  # per table [V] steps that each row took
-    mlp_means: tuple[NDArray[np.float32], ...]  # weights, then biases
-    mlp_variances: tuple[NDArray[np.float32], ...]
+    table_steps: tuple[Ints, ...]  # per table [V] steps that each row took
+    mlp_means: tuple[Floats, ...]  # weights, then biases
+    mlp_variances: tuple[Floats, ...]
     mlp_steps: int
-    sample_points: NDArray[np.float32]  # [S, 3] replay samples, metres from the region's centre
+    sample_points: Floats  # [S, 3] replay samples, metres from the region's centre
     sample_labels: NDArray[np.floating]  # [S] signed distance, metres
     budget_samples: int  # training budget: samples still to be trained on; 0: all is learnt
 
@@ -100,7 +104,7 @@ class Region:
     """One region of a map, complete."""
 
     index: RegionIndex
-    frequencies: NDArray[np.float32]  # [m] Fourier frequencies s_i
+    frequencies: Floats  # [m] Fourier frequencies s_i
     mlp: Mlp
     tables: tuple[VertexTable, ...]  # plane-major: (plane 0, coarsest level), ...
     evidence: Evidence
@@ -128,22 +132,22 @@ class MapRecord:
         return any(len(region.evidence.codes) for region in self.regions)
 
 
-def seen_voxels(evidence: Evidence, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
+def seen_voxels(evidence: Evidence, masks: Bytes) -> Longs:
     """Voxels [N, 3] of a region whose bit is set in ``masks`` [B, BLOCK_BYTES] of its evidence."""
     bits = np.unpackbits(masks, axis=1, bitorder="little")
     rows, voxel = np.nonzero(bits)
     inner = np.stack(np.unravel_index(voxel, (BLOCK_VOXELS,) * 3), axis=1)
-    blocks: NDArray[np.int64] = morton.decode(evidence.codes, 3)[rows] * BLOCK_VOXELS
+    blocks: Longs = morton.decode(evidence.codes, 3)[rows] * BLOCK_VOXELS
     return blocks + inner
 
 
-def surface_counts(surface: NDArray[np.uint8]) -> NDArray[np.int64]:
+def surface_counts(surface: Bytes) -> Longs:
     """Numbers [B] of surface voxels in blocks with these masks [B, BLOCK_BYTES]."""
-    counts: NDArray[np.int64] = _BITS_SET[surface].sum(axis=1, dtype=np.int64)
+    counts: Longs = _BITS_SET[surface].sum(axis=1, dtype=np.int64)
     return counts
 
 
-def masked(evidence: Evidence, mask: NDArray[np.uint8]) -> Evidence:
+def masked(evidence: Evidence, mask: Bytes) -> Evidence:
     """The evidence of the voxels whose bit is set in ``mask`` [B, BLOCK_BYTES]."""
     surface, free = evidence.surface & mask, evidence.free & mask
     rows = np.flatnonzero((surface | free).any(axis=1))

@@ -19,8 +19,7 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.files import FileBytes
-from triquad_format.mapfile.index import file_in
+from triquad_format.mapfile.index import FileBytes, file_in
 from triquad_format.mapfile.manifest import Manifest, unpack_manifest
 from triquad_format.mapfile.mcap.records import (
     Channel,

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.files import named
+from triquad_format.mapfile.index import named
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
@@ -28,6 +27,7 @@ from triquad_format.mapfile.parts.part import (
     vertex_reach,
 )
 from triquad_format.mapfile.parts.region_parts import RegionParts
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import LeafBox, status_voxels
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.record_check import check_record
@@ -49,11 +49,11 @@ class Loss:
     """
 
     key: PartKey
-    minimum: NDArray[np.float64]  # [3] metres, map frame
-    maximum: NDArray[np.float64]  # [3]
+    minimum: Doubles  # [3] metres, map frame
+    maximum: Doubles  # [3]
 
-    def meets(self, centre: NDArray[np.float64], side_m: float) -> bool:
-        """Whether the box meets a cube around ``centre`` [3], metres, map frame."""
+    def meets(self, centre: Doubles, side_m: float) -> bool:
+        """Whether the box meets a cube of side ``side_m`` around ``centre`` [3] m, map frame."""
         low, high = centre - side_m / 2, centre + side_m / 2
         return bool(((self.minimum <= high) & (self.maximum >= low)).all())
 
@@ -113,9 +113,11 @@ def _recovered(found: IntactParts) -> RecoveredMap:
         if had_training and region.training is None:
             lost.add(PartKey(TRAINING, index))
         regions.append(region)
-    losses = tuple(loss_of(key, settings) for key in sorted(lost, key=_place))
+    losses = tuple(
+        loss_of(key, settings) for key in sorted(lost, key=lambda key: (key.region, key))
+    )
     regions = [_masked_where_lost(settings, region, losses) for region in regions]
-    record = MapRecord(found.facts.name, found.facts.epoch, settings, tuple(regions))
+    record = MapRecord(found.facts.name, found.facts.epoch, settings, regions=tuple(regions))
     return RecoveredMap(
         record,
         losses,
@@ -123,10 +125,6 @@ def _recovered(found: IntactParts) -> RecoveredMap:
         parts_listed=found.parts_listed,
         stamp_ns=found.stamp_ns,
     )
-
-
-def _place(key: PartKey) -> tuple[RegionIndex, PartKey]:
-    return key.region, key
 
 
 def _region(
@@ -147,7 +145,7 @@ def _region(
                 if key.topic in topics:
                     parts.add(key, payload)
             region = parts.region()
-            check_record(MapRecord("recovered", 0, settings, (region,)))
+            check_record(MapRecord("recovered", 0, settings, regions=(region,)))
         except FormatError:
             continue
         return region
@@ -186,13 +184,13 @@ def _masked_where_lost(settings: FieldSettings, region: Region, losses: Iterable
 
 
 def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
-    """The loss of a part."""
+    """The loss of a part; its box reaches as far as a status may change."""
     low, high = effect_box(key, settings)
     reach_m = STATUS_REACH_LEAVES * settings.leaf_m
     return Loss(key, low - reach_m, high + reach_m)
 
 
-def effect_box(key: PartKey, settings: FieldSettings) -> NDArray[np.float64]:
+def effect_box(key: PartKey, settings: FieldSettings) -> Doubles:
     """Corners [2, 3] of the box in which a part has an effect itself, metres, map frame."""
     box = extent(settings, key)
     if key.topic == VERTICES:

@@ -4,13 +4,18 @@ A message is a msgpack map that holds ``triquad`` (the protocol version), ``kind
 its class) and its fields; an array is one of its dtype, shape and raw little-endian bytes. The
 messages themselves are in :mod:`triquad_format.wire.messages`; ``docs/wire-protocol.md`` is the
 specification.
+
+Before a message is unpacked, its structure is checked. A few megabytes can hold millions of tiny
+objects, or nest thousands deep; unpacking them would hold up everything else for seconds and take
+a hundred times their size. The headers alone tell, whose bytes are those of
+https://github.com/msgpack/msgpack/blob/master/spec.md
 """
 
 import functools
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -19,15 +24,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import ProtocolVersionError, WireError
-from triquad_format.wire.structure import check_structure
 
 PROTOCOL_VERSION = 1
 MAX_MESSAGE_BYTES = 256 * 2**20
 _MAX_WIRE_STRING_BYTES = 65_536
 _MAX_ITEMS = 65_536
+MAX_OBJECTS = 20_000
+_MAX_DEPTH = 16
 
 _DTYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"})
 _MAX_DIMENSIONS = 4
+
+# How many bytes follow the first of a header: a number itself, a length, or a count.
+_NUMBER_BYTES = dict(zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True))
+_LENGTH_BYTES = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}  # binaries and strings
+_COUNT_BYTES = {0xDC: 2, 0xDD: 4, 0xDE: 2, 0xDF: 4}  # arrays and maps
 
 MessageT = TypeVar("MessageT", bound="Message")
 
@@ -93,14 +104,7 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
         )
     if body.get("kind") != expected.__name__:
         raise WireError(f"expected a {expected.__name__}, got {body.get('kind')!r}")
-    fields: dict[str, object] = {}
-    for name, annotation in expected.annotations().items():
-        if name not in body:
-            if hasattr(expected, name):  # it has a default, for those who speak as before it came
-                continue
-            raise WireError(f"{expected.__name__}.{name}: missing")
-        fields[name] = _unpack(f"{expected.__name__}.{name}", annotation, body[name])
-    return expected(**fields)
+    return _unpack_fields(expected.__name__, expected, body)
 
 
 def pack_array(array: NDArray[np.generic]) -> dict[str, object]:
@@ -134,6 +138,44 @@ def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
     return np.frombuffer(data, dtype).reshape(shape)
 
 
+def check_structure(payload: bytes, max_objects: int = MAX_OBJECTS) -> None:
+    """Refuse a msgpack object that is incomplete, too deep, or made of too many objects.
+
+    Raises:
+        WireError: the text says which.
+    """
+    at = objects = 0
+    open_items = [1]
+    while open_items:
+        if open_items[-1] == 0:
+            open_items.pop()
+            continue
+        open_items[-1] -= 1
+        objects += 1
+        if at >= len(payload):
+            raise WireError("not a triquad message: it is incomplete")
+        at, children = _header(payload, at)
+        if objects + children > max_objects:
+            raise WireError(f"not a triquad message: more than {max_objects} objects")
+        if children:
+            open_items.append(children)
+        if len(open_items) > _MAX_DEPTH:
+            raise WireError(f"not a triquad message: nested more than {_MAX_DEPTH} deep")
+    if at != len(payload):
+        raise WireError("not a triquad message: it is incomplete, or something follows it")
+
+
+def binary_offsets(payload: bytes) -> Iterator[range]:
+    """Where the bytes of each binary lie in a valid msgpack object, in their order."""
+    at, objects = 0, 1
+    while objects:
+        code = payload[at]
+        end, children = _header(payload, at)
+        if 0xC4 <= code <= 0xC6:
+            yield range(at + 1 + _LENGTH_BYTES[code], end)
+        at, objects = end, objects - 1 + children
+
+
 def _unpack_map(payload: bytes) -> dict[str, object]:
     if len(payload) > MAX_MESSAGE_BYTES:
         raise WireError(f"message of {len(payload)} bytes exceeds {MAX_MESSAGE_BYTES}")
@@ -145,11 +187,35 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
             max_array_len=_MAX_ITEMS,
             max_map_len=_MAX_ITEMS,
         )
-    except (ValueError, msgpack.exceptions.UnpackException, RecursionError) as error:
+    except (ValueError, msgpack.exceptions.UnpackException) as error:
         raise WireError(f"not a triquad message: {error}") from error
     if not isinstance(body, dict):
         raise WireError(f"not a triquad message: a {type(body).__name__}, not a map")
     return body
+
+
+def _header(payload: bytes, at: int) -> tuple[int, int]:
+    """Where the next header is, and how many objects the one at ``at`` announces."""
+    code = payload[at]
+    at += 1
+    if code <= 0x7F or code >= 0xE0 or code in (0xC0, 0xC2, 0xC3):  # small numbers, nil, booleans
+        return at, 0
+    if code <= 0x8F:
+        return at, 2 * (code & 0x0F)
+    if code <= 0x9F:
+        return at, code & 0x0F
+    if code <= 0xBF:
+        return at + (code & 0x1F), 0
+    if code in _NUMBER_BYTES:
+        return at + _NUMBER_BYTES[code], 0
+    if code in _LENGTH_BYTES:
+        size = _LENGTH_BYTES[code]
+        return at + size + int.from_bytes(payload[at : at + size], "big"), 0
+    if code in _COUNT_BYTES:
+        size = _COUNT_BYTES[code]
+        count = int.from_bytes(payload[at : at + size], "big")
+        return at + size, count if code <= 0xDD else 2 * count
+    raise WireError(f"not a triquad message: type {code:#x} does not occur in one")
 
 
 def _pack_fields(name: str, message: Message) -> dict[str, object]:
@@ -159,6 +225,16 @@ def _pack_fields(name: str, message: Message) -> dict[str, object]:
     }
 
 
+def _unpack_fields(name: str, kind: type[MessageT], body: Mapping[str, object]) -> MessageT:
+    fields = {}
+    for field, annotation in kind.annotations().items():
+        if field in body:
+            fields[field] = _unpack(f"{name}.{field}", annotation, body[field])
+        elif not hasattr(kind, field):  # without a default, for those who speak as before it came
+            raise WireError(f"{name}.{field}: missing")
+    return kind(**fields)
+
+
 def _pack(name: str, annotation: Any, value: object) -> object:
     spec = _array_spec(annotation)
     if spec is not None:
@@ -166,20 +242,11 @@ def _pack(name: str, annotation: Any, value: object) -> object:
             raise WireError(f"{name}: expected an array, got {type(value).__name__}")
         spec.check(name, value)
         return pack_array(value)
-    origin = get_origin(annotation)
-    if origin in (types.UnionType, typing.Union):
-        return None if value is None else _pack(name, _required(annotation), value)
     if isinstance(annotation, type) and issubclass(annotation, Message):
         if not isinstance(value, annotation):
             raise WireError(f"{name}: expected {annotation.__name__}, got {value!r}")
         return _pack_fields(name, value)
-    if origin is dict and isinstance(value, dict):
-        key_type, item = get_args(annotation)
-        return {
-            _scalar(f"{name} key", key_type, key): _pack(f"{name}[{key!r}]", item, entry)
-            for key, entry in value.items()
-        }
-    return _scalar(name, annotation, value)
+    return _converted(name, annotation, value, by=_pack)
 
 
 def _unpack(name: str, annotation: Any, value: object) -> object:
@@ -188,20 +255,25 @@ def _unpack(name: str, annotation: Any, value: object) -> object:
         array = unpack_array(name, value)
         spec.check(name, array)
         return array
+    if isinstance(annotation, type) and issubclass(annotation, Message):
+        if not isinstance(value, dict):
+            raise WireError(f"{name}: expected a map with {', '.join(annotation.annotations())}")
+        return _unpack_fields(name, annotation, value)
+    return _converted(name, annotation, value, by=_unpack)
+
+
+def _converted(
+    name: str, annotation: Any, value: object, by: Callable[[str, Any, object], object]
+) -> object:
+    """What ``by`` makes of a value that may be ``None``, or of a map's entries; else a scalar."""
     origin = get_origin(annotation)
     if origin in (types.UnionType, typing.Union):
-        return None if value is None else _unpack(name, _required(annotation), value)
-    if isinstance(annotation, type) and issubclass(annotation, Message):
-        hints = annotation.annotations()
-        if not isinstance(value, dict) or not hints.keys() <= value.keys():
-            raise WireError(f"{name}: expected a map with {', '.join(hints)}")
-        return annotation(
-            **{key: _unpack(f"{name}.{key}", hint, value[key]) for key, hint in hints.items()}
-        )
+        (inner,) = (arg for arg in get_args(annotation) if arg is not type(None))
+        return None if value is None else by(name, inner, value)
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)
         return {
-            _scalar(f"{name} key", key_type, key): _unpack(f"{name}[{key!r}]", item, entry)
+            _scalar(f"{name} key", key_type, key): by(f"{name}[{key!r}]", item, entry)
             for key, entry in value.items()
         }
     return _scalar(name, annotation, value)
@@ -212,11 +284,6 @@ def _array_spec(annotation: Any) -> ArraySpec | None:
         if isinstance(extra, ArraySpec):
             return extra
     return None
-
-
-def _required(annotation: Any) -> Any:
-    (inner,) = (arg for arg in get_args(annotation) if arg is not type(None))
-    return inner
 
 
 def _scalar(name: str, annotation: Any, value: object) -> Any:

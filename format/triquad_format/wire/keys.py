@@ -1,4 +1,7 @@
-"""Zenoh key expressions: one key per operation, so that access control can tell them apart."""
+"""Zenoh key expressions: one key per operation, so that access control can tell them apart.
+
+A map or source whose name cannot stand in a key is refused with a :class:`FormatError`.
+"""
 
 import re
 
@@ -30,7 +33,7 @@ RESET = "admin/reset"
 
 
 def check_name(kind: str, name: str) -> str:
-    """``name`` where it can stand in a key; a :class:`FormatError` names it otherwise."""
+    """``name``, where it can stand in a key."""
     if not _NAME.fullmatch(name):
         raise FormatError(
             f"{kind} name {name!r} is not allowed: use 1 to 64 letters, digits, '_', '.', '-', "

@@ -19,8 +19,7 @@ StatusCodes = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
 Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
-Epochs = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
-Sizes = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
+Integers = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 Faces = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 
 
@@ -83,7 +82,7 @@ class TileList(MapReply):
 
     tile_side_m: float
     tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
-    changed: Epochs  # [T] the surface of each tile last changed in this epoch
+    changed: Integers  # [T] the surface of each tile last changed in this epoch
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ class TileUpdatesRequest(Message):
     server: str  # of the reply before, to which revision and known belong; empty at first
     revision: int  # of the reply before: everything up to it is known; 0 at first
     known: TileIndices  # [H, 3] tiles that are known whatever the revision
-    known_versions: Epochs  # [H]
+    known_versions: Integers  # [H]
     max_bytes: int  # of the reply's tiles; a single tile may have more
     timeout_s: float
     client: str  # a name, on which max_bytes_per_s is counted
@@ -136,8 +135,8 @@ class TileUpdates(Message):
     tile_side_m: float
     cell_m: float
     tiles: TileIndices  # [T, 3] that changed
-    versions: Epochs  # [T] epoch of which each is
-    sizes: Sizes  # [T] bytes of each
+    versions: Integers  # [T] epoch of which each is
+    sizes: Integers  # [T] bytes of each
     data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
     removed: TileIndices  # [R, 3] that have no faces any more
 

@@ -32,13 +32,13 @@ def open_session(options: NetworkOptions) -> zenoh.Session:
     try:
         config = _configuration(options)
     except (zenoh.ZError, ValueError, OSError) as error:
-        raise ServerError(f"Zenoh configuration: {first_line(error)}") from error
+        raise ServerError(f"Zenoh configuration: {_first_line(error)}") from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
         endpoints = ", ".join(listen_endpoints(options)) or "the configured endpoints"
         raise ListenError(
-            f"cannot open {endpoints}: {first_line(error)} (is another server running there? "
+            f"cannot open {endpoints}: {_first_line(error)} (is another server running there? "
             "choose another endpoint with --listen)"
         ) from error
 
@@ -48,11 +48,6 @@ def listen_endpoints(options: NetworkOptions) -> tuple[str, ...]:
     if options.listen or options.config_file is not None or options.mode == "client":
         return options.listen
     return (DEFAULT_LISTEN,)
-
-
-def first_line(error: Exception) -> str:
-    """The text of an error without Zenoh's source locations."""
-    return str(error).split(" at /", 1)[0].strip()
 
 
 def _configuration(options: NetworkOptions) -> zenoh.Config:
@@ -75,3 +70,8 @@ def _configuration(options: NetworkOptions) -> zenoh.Config:
     if options.multicast_scouting is not None:
         config.insert_json5("scouting/multicast/enabled", json.dumps(options.multicast_scouting))
     return config
+
+
+def _first_line(error: Exception) -> str:
+    """The text of an error without Zenoh's source locations."""
+    return str(error).split(" at /", 1)[0].strip()

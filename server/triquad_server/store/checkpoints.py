@@ -60,7 +60,11 @@ class Checkpoints:
             self._write_if_changed()
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
-        """A checkpoint of the map as it is now; the last one where nothing changed."""
+        """A checkpoint of the map as it is now; the last one where nothing changed.
+
+        Raises:
+            RefusedError: there is no store, or it cannot be written.
+        """
         if self._store is None:
             raise RefusedError("store", _NO_STORE)
         asked: Future[CheckpointInfo] = Future()

@@ -35,7 +35,7 @@ class MapDownloads:
         self._files: OrderedDict[str, _MapBytes] = OrderedDict()
 
     def info(self, request: MapInfoRequest) -> MapInfo:
-        """Make the newest epoch's file, unless it is there."""
+        """Size and digest of the newest epoch's file, which is made unless it is there."""
         newest = self._mapper.epochs.newest
         with self._lock:
             for file in self._files.values():
@@ -60,7 +60,11 @@ class MapDownloads:
         return info
 
     def chunk(self, request: MapChunkRequest) -> MapChunk:
-        """Bytes of a file that is kept."""
+        """Bytes of a file, at most ``CHUNK_BYTES``.
+
+        Raises:
+            RefusedError: the file is not kept, or the bytes do not lie in it.
+        """
         with self._lock:
             file = self._files.get(request.sha256)
         if file is None:

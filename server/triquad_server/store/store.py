@@ -4,35 +4,91 @@ A checkpoint holds what changed since the one before and refers to older files f
 and then all is folded into one file. How far back they reach, the settings decide.
 """
 
+import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_name, open_manifest
 from triquad_format.mapfile.index import OtherFiles, files_in
-from triquad_format.mapfile.manifest import FileRef
+from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
 from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.parts.pack import pack_region
+from triquad_format.mapfile.parts.part import MAP, Part, PartKey
 from triquad_format.mapfile.writer import WrittenMap, write_parts
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
 from triquad_format.wire.messages import CheckpointInfo
 
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges
-from triquad_server.mesh.preview import preview_schema
+from triquad_server.mesh.preview import preview_part, preview_schema
 from triquad_server.settings import StoreSettings
-from triquad_server.store.checkpoint_folder import CheckpointFolder
-from triquad_server.store.checkpoint_parts import (
-    KnownParts,
-    StoppedError,
-    abortable,
-    checkpoint_parts,
-    copied_parts,
-    known_parts,
-    own_bytes,
-)
+from triquad_server.store.locked_folder import LockedFolder
 from triquad_server.store.restore import ValidCheckpoint, newest_valid
+
+_FEATURE_DTYPE = "<f2"
+_MAX_FILES = 8
+_MAX_STORED_RATIO = 1.5  # of the bytes that are needed
+_LARGE_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class KnownParts:
+    """The parts of the newest checkpoint, wherever they lie: what need not be written again.
+
+    Each entry names the file with the part, as any later file sees it.
+    """
+
+    facts: MapFacts
+    stamp_ns: int
+    entries: Mapping[PartKey, Entry]
+    stored: Mapping[FileRef, int]  # bytes of the parts in each of its files, needed or not
+
+    @classmethod
+    def after(
+        cls, manifest: Manifest, file: FileRef, stored_before: Mapping[FileRef, int]
+    ) -> "KnownParts":
+        """What is known once ``file`` with this manifest is on the disk.
+
+        ``stored_before`` gives the bytes of the parts in each of the other files.
+        """
+        stored = {other: stored_before.get(other, 0) for other in manifest.files}
+        stored[file] = _own_bytes(manifest)
+        return cls(
+            manifest.facts, manifest.stamp_ns, entries=manifest.elsewhere(file), stored=stored
+        )
+
+    @property
+    def files(self) -> frozenset[str]:
+        """Names of all its files."""
+        return frozenset(file.name for file in self.stored)
+
+    @property
+    def worth_folding(self) -> bool:
+        """Whether the files are many, or a third of their bytes is no longer needed."""
+        needed = sum(entry.size for entry in self.entries.values())
+        stored = sum(self.stored.values())
+        return len(self.stored) > _MAX_FILES or stored > _MAX_STORED_RATIO * needed
+
+    def of_region(self, index: RegionIndex) -> list[Entry]:
+        """The parts of a region, in their order."""
+        return [
+            entry for key, entry in self.entries.items() if key.region == index and key.topic != MAP
+        ]
+
+    def is_small(self, regions: Collection[RegionIndex]) -> bool:
+        """Whether these regions take so little that the others are better not written again."""
+        sizes = [(key.region, e.size) for key, e in self.entries.items() if key.topic != MAP]
+        changed = sum(size for region, size in sizes if region in regions)
+        return changed < _LARGE_SHARE * sum(size for _, size in sizes)
+
+    def stored_here(self) -> dict[PartKey, Entry]:
+        """The entries as a file lists them that holds all parts itself."""
+        return {key: dataclasses.replace(e, file=None) for key, e in self.entries.items()}
 
 
 class Store:
@@ -47,7 +103,7 @@ class Store:
         self.folder = root / map_name
         self._known: KnownParts | None = None
         try:
-            self._files = CheckpointFolder(self.folder, settings)
+            self._files = LockedFolder(self.folder, settings)
         except OSError as error:
             raise StoreError(f"store {self.folder} cannot be written to: {error}") from error
 
@@ -74,7 +130,7 @@ class Store:
             manifest = newest.file.manifest
             own = FileRef(newest.path.name, newest.file.manifest_sha256)
             stored = {other: self._stored_bytes(other) for other in manifest.files}
-            self._known = known_parts(manifest, own, stored)
+            self._known = KnownParts.after(manifest, own, stored)
             self._files.record(self._known.files)
         return newest
 
@@ -96,7 +152,7 @@ class Store:
             written = write_parts(
                 path,
                 MapFacts(record.name, record.epoch, record.settings),
-                checkpoint_parts(changes, known, None if delta else others, stamp_ns),
+                _changed_parts(changes, known, None if delta else others, stamp_ns=stamp_ns),
                 stamp_ns=stamp_ns,
                 known={} if known is None else known.entries if delta else known.stored_here(),
                 preview_schema=preview_schema(),
@@ -120,7 +176,7 @@ class Store:
         path = self.folder / checkpoint_name(known.facts.epoch, complete=True)
         try:
             with self._writing(f"{path} cannot be folded") as others:
-                parts = abortable(stopping, copied_parts(known.entries.values(), others))
+                parts = _abortable(stopping, _copied_parts(known.entries.values(), others))
                 written = write_parts(
                     path,
                     known.facts,
@@ -130,7 +186,7 @@ class Store:
                     preview_schema=preview_schema(),
                 )
                 info = _info(path, written)
-        except StoppedError:
+        except _StoppedError:
             return None
         self._set_newest(path, written, {})
         return info
@@ -153,14 +209,19 @@ class Store:
     def _set_newest(self, path: Path, written: WrittenMap, stored: Mapping[FileRef, int]) -> None:
         """Record what was written; delete the oldest."""
         file = FileRef(path.name, written.manifest_sha256)
-        self._known = known_parts(written.manifest, file, stored)
-        self._files.record([path.name])
+        self._known = KnownParts.after(written.manifest, file, stored)
+        self._files.add(path, self._known.files)
         self._files.delete_old(self._known.facts.epoch)
 
     def _stored_bytes(self, file: FileRef) -> int:
         """Bytes of the parts in a file, needed or not."""
         checkpoint = checkpoint_file(self.folder / file.name)
-        return 0 if checkpoint is None else own_bytes(open_manifest(checkpoint))
+        return 0 if checkpoint is None else _own_bytes(open_manifest(checkpoint))
+
+
+def _own_bytes(manifest: Manifest) -> int:
+    """Bytes of the parts in the manifest's own file."""
+    return sum(entry.size for entry in manifest.own)
 
 
 def _info(path: Path, written: WrittenMap) -> CheckpointInfo:
@@ -177,3 +238,51 @@ def _info(path: Path, written: WrittenMap) -> CheckpointInfo:
 def stamp_now_ns() -> int:
     """Nanoseconds since 1970; within what a file can hold, whatever the clock says."""
     return min(max(time.time_ns(), 0), 2**63 - 1)
+
+
+class _StoppedError(Exception):
+    """Something is more urgent: what is left of the parts is not asked for."""
+
+
+def _changed_parts(
+    changes: MapChanges, known: KnownParts | None, others: OtherFiles | None, *, stamp_ns: int
+) -> Iterator[Part | Entry]:
+    """The parts of a checkpoint; those that did not change are copied from ``others``, if given."""
+    changed = {region.index: region for region in changes.record.regions}
+    settings = changes.record.settings
+    for index in changes.regions:
+        region = changed.get(index)
+        if region is not None:
+            yield from pack_region(region, settings, _FEATURE_DTYPE)
+            yield preview_part(region, settings, changes.epoch.distances, stamp_ns=stamp_ns)
+        elif known is not None:
+            entries = known.of_region(index)
+            yield from entries if others is None else _copied_parts(entries, others)
+
+
+def _copied_parts(entries: Iterable[Entry], others: OtherFiles) -> Iterator[Part]:
+    """Parts that other files hold, read and checked; the map's own part is made anew.
+
+    Raises:
+        MapFileError: one of the files cannot be read, or is damaged.
+    """
+    for entry in entries:
+        if entry.key.topic == MAP:
+            continue
+        try:
+            payload = others.payload(entry)
+        except OSError as error:  # of reading: the file that is written is another
+            raise MapFileError(f"a file that holds parts cannot be read: {error}") from error
+        yield Part(entry.key, payload)
+
+
+def _abortable(stopping: Callable[[], bool], parts: Iterator[Part]) -> Iterator[Part]:
+    """The parts, until ``stopping()``.
+
+    Raises:
+        _StoppedError: it says so.
+    """
+    for part in parts:
+        if stopping():
+            raise _StoppedError
+        yield part

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.mapfile.files import replacing
+from triquad_format.mapfile.writer import replacing
 from triquad_format.records.region import MapRecord
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView

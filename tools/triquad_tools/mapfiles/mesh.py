@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 from triquad_client import Mesh
 from triquad_client.mesh.mesh import Triangles, joined
-from triquad_format.mapfile.files import replacing
+from triquad_format.mapfile.writer import replacing
 from triquad_format.records.region import MapRecord
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView

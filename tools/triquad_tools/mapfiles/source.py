@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import NoIndexError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
-from triquad_format.mapfile.files import FileBytes, named
-from triquad_format.mapfile.index import MapIndex, file_in
+from triquad_format.mapfile.index import FileBytes, MapIndex, file_in, named
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile, read_map_file
 from triquad_format.records.crop import crop_record, without_training

@@ -11,8 +11,7 @@ from triquad_format.mapfile.checkpoint_folder import (
     map_folder,
     set_aside,
 )
-from triquad_format.mapfile.files import FileBytes
-from triquad_format.mapfile.index import MapIndex
+from triquad_format.mapfile.index import FileBytes, MapIndex
 from triquad_format.mapfile.manifest import FileRef, Manifest
 from triquad_format.mapfile.parts.part import REGION_TOPICS
 from triquad_format.records.field_settings import RegionIndex

@@ -7,6 +7,7 @@ there is one. Unknown records are skipped, as the specification demands.
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 from triquad_format.errors import (
     DamagedMapFileError,
@@ -14,7 +15,6 @@ from triquad_format.errors import (
     NoIndexError,
     TooLargeMapFileError,
 )
-from triquad_format.mapfile.files import RandomAccess
 from triquad_format.mapfile.mcap.records import (
     CHANNEL,
     CHUNK,
@@ -115,6 +115,26 @@ def _check_tail(data: memoryview, summary_start: int, following: Iterator[Record
     if declared_start not in (0, summary_start):
         raise DamagedMapFileError(f"its footer names byte {declared_start} as the summary's start")
     check_crc("the summary", data[summary_start : footer.end - 4], crc)
+
+
+class RandomAccess(Protocol):
+    """Where a file's bytes come from."""
+
+    name: str
+    size: int  # bytes
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Exactly ``length`` bytes from ``offset`` on.
+
+        Raises:
+            DamagedMapFileError: there are not so many.
+            OSError: they cannot be read.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close the source."""
+        ...
 
 
 @dataclass(frozen=True)

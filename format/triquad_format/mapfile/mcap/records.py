@@ -251,7 +251,7 @@ def read_chunk(record: Record) -> Chunk:
     stored = fields.take(fields.number(8))
     if fields.left:
         raise DamagedMapFileError(f"the chunk at byte {record.start} does not fill its record")
-    return Chunk(record, size, crc, compression, stored)
+    return Chunk(record, size, crc, compression=compression, stored=stored)
 
 
 def chunk_limit(stored_size: int) -> int:

@@ -82,7 +82,7 @@ class McapWriter:
         Args:
             topic: of one of the channels.
             payload: what the message holds.
-            time_ns: of the message, nanoseconds since 1970.
+            time_ns: nanoseconds since 1970.
             level: of zstd.
             seams: offsets in the payload where bytes of another kind begin.
 
@@ -100,13 +100,15 @@ class McapWriter:
             )
         )
         shift = len(message) - len(payload)
-        chunk = _chunk(
-            message, _compress(message, [shift + seam for seam in seams], level), time_ns
-        )
-        start = self.size
+        compressed = _compress(message, [shift + seam for seam in seams], level)
+        self._add_chunk(_chunk(message, compressed, time_ns), number)
+
+    def _add_chunk(self, chunk: Chunk, channel: int) -> None:
+        """Write a chunk of one message of a channel, and its index."""
+        time_ns, start = chunk.message_start_time, self.size
         self._record(chunk)
         index_start = self.size
-        self._record(MessageIndex(number, [(time_ns, 0)]))
+        self._record(MessageIndex(channel, [(time_ns, 0)]))
         self._chunks.append(
             ChunkIndex(
                 chunk_length=index_start - start,
@@ -115,7 +117,7 @@ class McapWriter:
                 compressed_size=len(chunk.data),
                 message_end_time=time_ns,
                 message_index_length=self.size - index_start,
-                message_index_offsets={number: index_start},
+                message_index_offsets={channel: index_start},
                 message_start_time=time_ns,
                 uncompressed_size=chunk.uncompressed_size,
             )

@@ -1,8 +1,7 @@
-"""The msgpack map of a part: packed, and read back with every field checked."""
+"""The msgpack map of a part, read with every field checked."""
 
 import reprlib
-import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgpack
@@ -10,64 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError, WireError
-from triquad_format.mapfile.parts.columns import (
+from triquad_format.mapfile.parts.part import (
     MAX_CODE_BYTES,
     Column,
     join_integers,
     unshuffle,
     unshuffle_codes,
 )
-from triquad_format.mapfile.parts.part import PREFIX, Part, PartKey
+from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.wire.codec import ArraySpec, unpack_array
-from triquad_format.wire.structure import MAX_OBJECTS, binary_offsets, check_structure
+from triquad_format.wire.codec import MAX_OBJECTS, ArraySpec, check_structure, unpack_array
 
 _MAX_REGION_INDEX = 2**31 - 1
 _MAX_ITEMS = 64
 _OBJECTS_PER_ITEM = 8  # of a manifest's longest list
 _MAX_STRING_BYTES = 4096
-_MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
-
-
-def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
-    """A part of this body: numbers, strings, lists, maps and packed arrays."""
-    return Part(key, typing.cast(bytes, msgpack.packb(body)))
-
-
-def seams(part: Part) -> list[int]:
-    """Offsets in a valid part's payload at which byte planes of its arrays begin and end."""
-    if not part.key.topic.startswith(PREFIX):
-        return []
-    binaries = list(_binaries(msgpack.unpackb(part.payload, max_ext_len=0)))
-    if all(size < _MIN_SEAM_BYTES for size, _ in binaries):
-        return []
-    offsets: list[int] = []
-    for place, (size, planes) in zip(binary_offsets(part.payload), binaries, strict=True):
-        if size >= _MIN_SEAM_BYTES:
-            step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
-            offsets.extend(range(place.start, place.stop + 1, step))
-    return offsets
-
-
-def _binaries(value: object) -> Iterator[tuple[int, int]]:
-    """Size and number of byte planes of each binary in a body, in the order of the payload."""
-    if isinstance(value, bytes):
-        yield len(value), 1
-    elif isinstance(value, dict) and isinstance(value.get("data"), bytes):
-        shuffled = value["dtype"] in ("|u1", "|i1") and value["shape"]
-        yield len(value["data"]), value["shape"][0] if shuffled else 1
-    elif isinstance(value, (dict, list)):
-        for item in value.values() if isinstance(value, dict) else value:
-            yield from _binaries(item)
 
 
 def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "PartBody":
-    """The body of a part.
-
-    Args:
-        topic: of the part.
-        payload: of the part.
-        max_items: limit on the length of its lists.
+    """The body of a part, whose lists have at most ``max_items`` items.
 
     Raises:
         DamagedMapFileError: it is not a msgpack map, or exceeds a limit.
@@ -166,7 +126,7 @@ class PartBody:
         """``count`` nested maps."""
         return tuple(PartBody(self.topic, item) for item in self._items(key, count))
 
-    def codes(self, key: str, most: int) -> NDArray[np.int64]:
+    def codes(self, key: str, most: int) -> Longs:
         """Morton codes [V], of which no more than ``most`` are decoded: each takes eight bytes."""
         planes = self.array(key, "|u1", (None, None))
         self._limit(key, planes.shape[1], most)

@@ -3,16 +3,27 @@
 :mod:`triquad_format.mapfile.parts.region_parts` is the way back.
 """
 
+import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.parts.body import pack_part
-from triquad_format.mapfile.parts.columns import (
+from triquad_format.mapfile.parts.part import (
+    EVIDENCE,
+    MOMENTS,
+    PREFIX,
+    REGION,
     SAMPLE_COLUMNS,
+    SAMPLES,
+    TRAINING,
+    VERTICES,
     Column,
+    Part,
+    PartKey,
+    cube_shift,
     feature_column,
     moment_columns,
     shuffle,
@@ -20,19 +31,9 @@ from triquad_format.mapfile.parts.columns import (
     shuffle_counts,
     split_integers,
     split_levels,
-)
-from triquad_format.mapfile.parts.part import (
-    EVIDENCE,
-    MOMENTS,
-    REGION,
-    SAMPLES,
-    TRAINING,
-    VERTICES,
-    Part,
-    PartKey,
-    cube_shift,
     square_shift,
 )
+from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
@@ -42,9 +43,16 @@ from triquad_format.records.region import (
     VertexTable,
     surface_counts,
 )
-from triquad_format.wire.codec import pack_array
+from triquad_format.wire.codec import binary_offsets, pack_array
 
 SAMPLES_PER_PART = 1 << 17
+
+_MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
+
+
+def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
+    """A part of this body: numbers, strings, lists, maps and packed arrays."""
+    return Part(key, typing.cast(bytes, msgpack.packb(body)))
 
 
 def pack_record(
@@ -64,10 +72,7 @@ def pack_record(
 def pack_region(region: Region, settings: FieldSettings, feature_dtype: str) -> Iterator[Part]:
     """The parts of a checked region, in the order of the file.
 
-    Args:
-        region: as :func:`triquad_format.records.record_check.check_record` accepts it.
-        settings: of its map.
-        feature_dtype: one of ``FLOATS``, for features that are not integers.
+    ``feature_dtype``, one of ``FLOATS``, is for features that are not integers.
 
     Raises:
         FormatError: features do not fit ``feature_dtype``; the text names the region.
@@ -79,7 +84,7 @@ def pack_region(region: Region, settings: FieldSettings, feature_dtype: str) -> 
         yield from _pack_training(region, region.training, settings)
 
 
-def _pack_part(key: PartKey, fields: Mapping[str, object]) -> Part:
+def _region_part(key: PartKey, fields: Mapping[str, object]) -> Part:
     """A part of a region, with what tells its place."""
     place: dict[str, object] = {"region": list(key.region)}
     if key.topic not in (REGION, TRAINING):
@@ -104,13 +109,14 @@ def _pack_head(region: Region) -> Part:
         "biases": [pack_array(bias) for bias in region.mlp.biases],
         "scales": pack_array(np.array([s for s in scales if s is not None], np.float32)),
     }
-    return _pack_part(PartKey(REGION, region.index), body)
+    return _region_part(PartKey(REGION, region.index), body)
 
 
 def _pack_squares(
     topic: str,
     region: Region,
     settings: FieldSettings,
+    *,
     fields_of: Callable[[int, slice], Mapping[str, object]],
 ) -> Iterator[Part]:
     """A part for each square that holds vertices.
@@ -126,10 +132,10 @@ def _pack_squares(
         for cell in np.unique(np.concatenate(list(cells.values()))).tolist():
             levels = [fields_of(number, _rows_of(of, cell)) for number, of in cells.items()]
             key = PartKey(topic, region.index, plane=plane, cell=cell)
-            yield _pack_part(key, {"levels": levels})
+            yield _region_part(key, {"levels": levels})
 
 
-def _rows_of(cells: NDArray[np.int64], cell: int) -> slice:
+def _rows_of(cells: Longs, cell: int) -> slice:
     first, last = np.searchsorted(cells, [cell, cell + 1])
     return slice(int(first), int(last))
 
@@ -140,15 +146,15 @@ def _pack_vertices(region: Region, settings: FieldSettings, dtype: str) -> Itera
         within = (1 << square_shift(settings, table.level)) - 1
         codes = pack_array(shuffle_codes(table.codes[rows] & within))
         try:
-            return {"codes": codes, **_pack_features(table, rows, dtype, settings)}
+            return {"codes": codes, **_pack_features(table, rows, settings, dtype=dtype)}
         except FormatError as error:
             raise FormatError(f"region {region.index}: {error}") from error
 
-    return _pack_squares(VERTICES, region, settings, fields_of)
+    return _pack_squares(VERTICES, region, settings, fields_of=fields_of)
 
 
 def _pack_features(
-    table: VertexTable, rows: slice, dtype: str, settings: FieldSettings
+    table: VertexTable, rows: slice, settings: FieldSettings, *, dtype: str
 ) -> dict[str, object]:
     features = table.features[rows]
     if table.scale is not None:
@@ -180,10 +186,10 @@ def _pack_evidence(region: Region) -> Iterator[Part]:
             fields["levels"] = pack_array(split_levels(levels))
         if evidence.seen_s is not None:
             fields |= _seen_fields(evidence.seen_s[rows][surface.any(axis=1)])
-        yield _pack_part(PartKey(EVIDENCE, region.index, cell=cell), fields)
+        yield _region_part(PartKey(EVIDENCE, region.index, cell=cell), fields)
 
 
-def _seen_fields(seen_s: NDArray[np.int64]) -> dict[str, object]:
+def _seen_fields(seen_s: Longs) -> dict[str, object]:
     """Times of the blocks with surface, as seconds since shortly before the first of them."""
     known = seen_s[seen_s > 0]
     start = int(known.min()) - 1 if len(known) else 0
@@ -201,17 +207,46 @@ def _pack_training(
         "training_budget": training.budget_samples,
         "samples": len(training.sample_points),
     }
-    yield _pack_part(PartKey(TRAINING, region.index), fields)
+    yield _region_part(PartKey(TRAINING, region.index), fields)
     moments = (training.table_means, training.table_variances, training.table_steps)
     columns = moment_columns(settings)
     yield from _pack_squares(
         MOMENTS,
         region,
         settings,
-        lambda number, rows: _pack_columns(columns, [moment[number][rows] for moment in moments]),
+        fields_of=lambda number, rows: _pack_columns(
+            columns, [moment[number][rows] for moment in moments]
+        ),
     )
     for number, first in enumerate(range(0, len(training.sample_points), SAMPLES_PER_PART)):
         rows = slice(first, first + SAMPLES_PER_PART)
         samples = [training.sample_points[rows], training.sample_labels[rows]]
         key = PartKey(SAMPLES, region.index, cell=number)
-        yield _pack_part(key, _pack_columns(SAMPLE_COLUMNS, samples))
+        yield _region_part(key, _pack_columns(SAMPLE_COLUMNS, samples))
+
+
+def seams(part: Part) -> list[int]:
+    """Offsets in a valid part's payload at which byte planes of its arrays begin and end."""
+    if not part.key.topic.startswith(PREFIX):
+        return []
+    binaries = list(_binaries(msgpack.unpackb(part.payload, max_ext_len=0)))
+    if all(size < _MIN_SEAM_BYTES for size, _ in binaries):
+        return []
+    offsets: list[int] = []
+    for place, (size, planes) in zip(binary_offsets(part.payload), binaries, strict=True):
+        if size >= _MIN_SEAM_BYTES:
+            step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
+            offsets.extend(range(place.start, place.stop + 1, step))
+    return offsets
+
+
+def _binaries(value: object) -> Iterator[tuple[int, int]]:
+    """Size and number of byte planes of each binary in a body, in the order of the payload."""
+    if isinstance(value, bytes):
+        yield len(value), 1
+    elif isinstance(value, dict) and isinstance(value.get("data"), bytes):
+        shuffled = value["dtype"] in ("|u1", "|i1") and value["shape"]
+        yield len(value["data"]), value["shape"][0] if shuffled else 1
+    elif isinstance(value, (dict, list)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _binaries(item)

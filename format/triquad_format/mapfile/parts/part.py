@@ -1,7 +1,8 @@
-"""The parts of a map file: their topics and keys, and the cells into which a region is split.
+"""The parts of a map file: topics and keys, cells of a region, and columns as bytes.
 
 The field and the evidence of a region are split into cells, so that few of its parts change from
-checkpoint to checkpoint: vertices into squares of a plane, evidence into cubes.
+checkpoint to checkpoint: vertices into squares of a plane, evidence into cubes. Columns of numbers
+are stored as they compress well: in byte planes, bit planes, and differences of codes.
 """
 
 from dataclasses import dataclass
@@ -10,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.records import morton
+from triquad_format.records.arrays import Bytes, Longs
 from triquad_format.records.crop import LeafBox, whole_region
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
-from triquad_format.records.region import AXES
+from triquad_format.records.region import AXES, FLOATS, MAX_LEVEL
 
 PREFIX = "/triquad/"
 MAP = "/triquad/map"
@@ -50,6 +52,12 @@ _LEAVES_LOG2 = 8
 CELL_LEAVES = 1 << _LEAVES_LOG2
 """Side of a cell in leaves: 51.2 m at the default leaf."""
 
+LEVEL_BITS = MAX_LEVEL.bit_length()
+"""Planes of bits that hold levels of evidence."""
+
+MAX_CODE_BYTES = 6
+"""Bytes of the widest difference between two neighbouring Morton codes."""
+
 
 @dataclass(frozen=True, order=True)
 class PartKey:
@@ -85,7 +93,7 @@ def vertex_reach(settings: FieldSettings) -> int:
 
 
 def extent(settings: FieldSettings, key: PartKey) -> LeafBox:
-    """The column over a square, or the cube, that a part is of; else all of its region."""
+    """The column over a square, or the cube, that a part is of; else all of its region: leaves."""
     box = whole_region(settings)
     axes = {VERTICES: list(AXES[key.plane]), EVIDENCE: [0, 1, 2]}.get(key.topic, [])
     if axes:
@@ -95,7 +103,7 @@ def extent(settings: FieldSettings, key: PartKey) -> LeafBox:
     return box
 
 
-def cells_at(leaves: NDArray[np.int64]) -> set[int]:
+def cells_at(leaves: Longs) -> set[int]:
     """Codes of the squares or cubes that hold places [N, 2 or 3], in leaf coordinates."""
     return set(np.unique(morton.encode(leaves >> _LEAVES_LOG2)).tolist())
 
@@ -107,3 +115,113 @@ def cells_near(leaves: NDArray[np.floating], reach: float) -> set[int]:
         near = np.floor(leaves + (2 * np.array(corner) - 1) * reach).astype(np.int64)
         cells |= cells_at(np.maximum(near, 0))
     return cells
+
+
+@dataclass(frozen=True)
+class Column:
+    """A shuffled column ``[N, *row]`` of a part, in one of several dtypes."""
+
+    name: str
+    dtypes: tuple[str, ...]  # of different sizes; where there are no rows, the first
+    row: tuple[int, ...] = ()
+
+
+SAMPLE_COLUMNS = (Column("points", ("<f4",), (3,)), Column("labels", FLOATS))
+
+
+def feature_column(settings: FieldSettings) -> Column:
+    """Feature vectors of vertices that are not integers."""
+    return Column("features", FLOATS, (settings.feature_size,))
+
+
+def moment_columns(settings: FieldSettings) -> tuple[Column, ...]:
+    """Adam's state of vertices: first and second moments, and steps."""
+    floats, row = ("<f4", "<f2"), (settings.feature_size,)
+    return Column("means", floats, row), Column("variances", floats, row), Column("steps", ("<i4",))
+
+
+def shuffle(array: NDArray[np.generic]) -> Bytes:
+    """Bytes ``[B, ...]`` of an array ``[...]`` of ``B``-byte values, little endian.
+
+    Row ``k`` holds byte ``k`` of every value: bytes of one significance resemble each other, so
+    they compress better side by side.
+    """
+    little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
+    size = little.dtype.itemsize
+    values = np.frombuffer(little.tobytes(), np.uint8).reshape(*array.shape, size)
+    return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+
+
+def unshuffle(planes: Bytes, dtype: str) -> NDArray[np.generic]:
+    """The array ``[...]`` of this dtype; the inverse of :func:`shuffle`."""
+    values = np.ascontiguousarray(np.moveaxis(planes, 0, -1))
+    return np.frombuffer(values.data, dtype).reshape(planes.shape[1:])
+
+
+def shuffle_codes(codes: Longs) -> Bytes:
+    """Shuffled differences ``[B, V]`` of increasing codes ``[V]``, in as few bytes as hold them."""
+    return shuffle_counts(np.diff(codes, prepend=np.int64(0)))
+
+
+def unshuffle_codes(planes: Bytes) -> Longs:
+    """The inverse of :func:`shuffle_codes`; it takes at most ``MAX_CODE_BYTES`` rows.
+
+    Differences this small cannot pass over the negative numbers, so that codes which overflow
+    are seen to decrease.
+    """
+    return np.cumsum(unshuffle_counts(planes), dtype=np.int64)
+
+
+def shuffle_counts(counts: Longs) -> Bytes:
+    """Shuffled numbers ``[B, V]`` that are not negative, in as few bytes as hold them all."""
+    width = (int(counts.max(initial=1)).bit_length() + 7) // 8
+    return shuffle(counts)[:width]
+
+
+def unshuffle_counts(planes: Bytes) -> Longs:
+    """The inverse of :func:`shuffle_counts`; it takes at most seven rows."""
+    wide = np.zeros((8, planes.shape[1]), np.uint8)
+    wide[: len(planes)] = planes
+    return unshuffle(wide, "<i8").astype(np.int64)
+
+
+def split_integers(integers: NDArray[np.int16]) -> NDArray[np.int8]:
+    """Signed bytes ``[W, S, V]`` of integers ``[V, S]``, ``W`` being 1 where one byte holds all.
+
+    Row 0 is the integer's remainder in -128 to 127, row 1 the multiple of 256 without it: unlike
+    the upper byte of the two's complement, it is 0 for all small integers.
+    """
+    high = (integers.astype(np.int32) + 128) >> 8
+    low = integers.astype(np.int32) - (high << 8)
+    planes = [low, high] if high.any() else [low]
+    return np.stack([plane.T for plane in planes]).astype(np.int8)
+
+
+def join_integers(planes: NDArray[np.int8]) -> NDArray[np.int16]:
+    """Integers ``[V, S]``; the inverse of :func:`split_integers`."""
+    integers = planes[0].astype(np.int32)
+    for plane in planes[1:]:
+        integers += plane.astype(np.int32) << 8
+    return np.ascontiguousarray(integers.T).astype(np.int16)
+
+
+def split_levels(levels: Bytes) -> Bytes:
+    """Bits [LEVEL_BITS, N] of levels [S], highest bits first, ``N`` being ``S / 8`` rounded up.
+
+    Each plane but the first is stored as its difference (xor) from the one above. Levels of
+    neighbours are alike: two that differ by one differ in one stored bit, so that the planes shrink
+    to a tenth less than bytes of one level each do.
+    """
+    bits = np.arange(LEVEL_BITS, dtype=np.uint8)[::-1, None]
+    planes = np.packbits(levels >> bits & 1, axis=1, bitorder="little")
+    planes[1:] ^= planes[:-1].copy()
+    return planes
+
+
+def join_levels(planes: Bytes, count: int) -> Bytes:
+    """``count`` levels; the inverse of :func:`split_levels`."""
+    levels = np.zeros(count, np.uint8)
+    for plane in np.bitwise_xor.accumulate(planes, axis=0):
+        levels <<= 1
+        levels |= np.unpackbits(plane, count=count, bitorder="little")
+    return levels

@@ -11,27 +11,26 @@ from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
-from triquad_format.mapfile.parts.columns import (
-    LEVEL_BITS,
-    SAMPLE_COLUMNS,
-    Column,
-    feature_column,
-    join_levels,
-    moment_columns,
-    unshuffle_counts,
-)
 from triquad_format.mapfile.parts.pack import SAMPLES_PER_PART
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
+    LEVEL_BITS,
     MOMENTS,
     REGION,
+    SAMPLE_COLUMNS,
     SAMPLES,
     TRAINING,
     VERTICES,
+    Column,
     PartKey,
     cube_shift,
+    feature_column,
+    join_levels,
+    moment_columns,
     square_shift,
+    unshuffle_counts,
 )
+from triquad_format.records.arrays import Bytes, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
@@ -134,7 +133,7 @@ class RegionParts:
             scale = scales[number] if scales else None
             if scale is not None and not len(codes):
                 features = features.astype(np.int16)  # no part tells of what dtype no rows are
-            tables.append(VertexTable(plane, level, codes, features, scale))
+            tables.append(VertexTable(plane, level, codes, features=features, scale=scale))
         return tuple(tables)
 
     def _levels(self, topic: str, empty: _Columns) -> list[_Columns]:
@@ -176,7 +175,7 @@ class RegionParts:
         )
 
 
-def _read_codes(body: PartBody, key: PartKey, shift: int) -> NDArray[np.int64]:
+def _read_codes(body: PartBody, key: PartKey, shift: int) -> Longs:
     """Codes [V] within the region of those within a square or cube."""
     codes = body.codes("codes", 1 << shift)
     if len(codes) and not 0 <= codes.max() < 1 << shift:
@@ -201,7 +200,7 @@ def _read_evidence(body: PartBody, key: PartKey) -> Evidence:
     return Evidence(codes, surface, free, levels=levels, seen_s=seen_s)
 
 
-def _read_seen(body: PartBody, surface: NDArray[np.uint8]) -> NDArray[np.int64]:
+def _read_seen(body: PartBody, surface: Bytes) -> Longs:
     touched = surface.any(axis=1)
     planes = body.array("seen_s", "|u1", (None, int(touched.sum())))
     if not 1 <= len(planes) <= _MAX_SEEN_BYTES:
@@ -252,11 +251,11 @@ def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
     )
 
 
-def _levels_of(evidence: Evidence) -> NDArray[np.uint8]:
+def _levels_of(evidence: Evidence) -> Bytes:
     if evidence.levels is not None:
         return evidence.levels
     return np.zeros(int(surface_counts(evidence.surface).sum()), np.uint8)
 
 
-def _seen_of(evidence: Evidence) -> NDArray[np.int64]:
+def _seen_of(evidence: Evidence) -> Longs:
     return np.zeros(len(evidence.codes), np.int64) if evidence.seen_s is None else evidence.seen_s

@@ -49,7 +49,7 @@ class _Checkpoint:
     files: frozenset[str]  # that it consists of
 
 
-class CheckpointFolder:
+class LockedFolder:
     """The folder in which the checkpoints of one map lie; one process at a time may write to it.
 
     A locked file in it sees to that; the system lets go of it however the process ends.
@@ -71,7 +71,7 @@ class CheckpointFolder:
         _delete(path.glob(_UNFINISHED))
 
     def close(self) -> None:
-        """Let go."""
+        """Let others have the folder."""
         self._lock.close()
 
     def renew_lock(self) -> None:
@@ -93,6 +93,11 @@ class CheckpointFolder:
         """Record files as they are now: they are valid."""
         for name in names:
             self._identities[name] = _file_identity(self.path / name)
+
+    def add(self, path: Path, files: frozenset[str]) -> None:
+        """Record a checkpoint that was just written and consists of ``files``."""
+        self._needed[path] = files
+        self.record([path.name])
 
     def unchanged(self, names: Iterable[str]) -> bool:
         """Whether files are there, and as they were when they were recorded."""
