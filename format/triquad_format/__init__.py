@@ -1,4 +1,4 @@
-"""Every byte that leaves a triquad process: wire messages, the map file, and its evaluator.
+"""Every byte that leaves a triquad process: wire messages and the map file.
 
 This package needs numpy, msgpack and mcap only; it imports neither the server nor the client.
 """

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.region import MAX_LEVEL
 
@@ -54,9 +53,6 @@ SECTORS_COUNTED = 5
 
 LEAST_STRENGTH = 0.25
 """Of level 1; each further level is twice as strong."""
-
-HALF_LIFE_S = 86_400.0
-"""While the rest of the map was seen again, confidence in what was not halves in this time."""
 
 POINT_SHARE = 0.5
 """Of the confidence, where rays ended but the field shows no surface."""
@@ -135,8 +131,3 @@ def level_confidence() -> Floats:
     """The confidence [LEVELS] of each level, just seen."""
     strength = LEAST_STRENGTH * 2.0 ** (np.arange(LEVELS) - 0.5)
     return np.asarray(strength / (strength + 1.0), np.float32)
-
-
-def faded(age_s: NDArray[np.floating]) -> Floats:
-    """The share [N] of its confidence that a surface keeps, seen last so many seconds ago."""
-    return np.asarray(0.5 ** (np.maximum(age_s, 0.0) / HALF_LIFE_S), np.float32)

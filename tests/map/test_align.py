@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.exact_view import ExactView
 from support.small_world import settings, settled_mapper, world
+from triquad_format.records.status import Status
 from triquad_map.questions.align import Alignment, AlignOptions, align, thinned
 from triquad_tools.benchmarks.align import Offset, attempts, displaced, recorded
 from triquad_tools.simulation.lidar import Lidar
@@ -145,6 +146,17 @@ def test_nothing_is_found_in_unknown_space() -> None:
     assert found.inlier_share == 0
     np.testing.assert_allclose(found.world_from_sensor, guess, atol=1e-12)
     assert np.sqrt(np.diag(found.covariance)[:3]).min() >= 100
+
+
+def test_unknown_space_of_an_exact_view_begins_where_it_says() -> None:
+    seen = ExactView(PLAIN, TRUE, np.full(3, -5.0), np.full(3, 5.0))
+    local = np.random.default_rng(0).uniform((-5, -5, 0), 5, (500, 3))
+    points = local @ TRUE[:3, :3].T + TRUE[:3, 3]
+    nearest = seen.nearest_unknown(points, 20.0)
+    np.testing.assert_allclose(np.linalg.norm(nearest.point - points, axis=1), nearest.distance)
+    way = (nearest.point - points) / nearest.distance[:, None]
+    assert (seen.status(nearest.point + 1e-6 * way) == Status.UNKNOWN).all()
+    assert (seen.status(nearest.point - 1e-6 * way) != Status.UNKNOWN).all()
 
 
 def test_a_scan_that_sees_beyond_the_map_is_aligned_by_what_the_map_has_seen() -> None:

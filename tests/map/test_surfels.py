@@ -5,7 +5,8 @@ import pytest
 from support import small_world
 from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.surfels.surfel_map import first_surfels
-from triquad_map.composition.region import field_samples, in_one, no_surfels
+from triquad_map.composition.composed_view import no_surfels
+from triquad_map.composition.field_view import field_samples, in_one
 from triquad_map.surface import FieldSample, SurfelKind, fit_surfels
 from triquad_server.mapping.mapper import Mapper
 

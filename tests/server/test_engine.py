@@ -7,8 +7,8 @@ from support import small_world
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.encoding import load, locate, new_batch
 from triquad_map.compiled.field.field import make_field
-from triquad_server.engine.compiled_trainer import Batch, CompiledTrainer, GradientSums, Rates
-from triquad_server.engine.live_field import LiveField, Parameter, initial_field
+from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
+from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
 from triquad_server.engine.tensor_field import TensorField
 from triquad_server.engine.tensor_trainer import TensorTrainer, step_rows, step_where
 from triquad_server.threads import Teams

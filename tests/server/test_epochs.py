@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.composition.region import in_one
+from triquad_map.composition.field_view import in_one
 from triquad_server.epochs import Epoch, EpochHistory
 from triquad_server.settings import ServiceSettings
 

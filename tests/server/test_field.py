@@ -9,9 +9,10 @@ from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.evidence.evidence import LiveEvidence
-from triquad_server.engine.compiled_trainer import Batch, Rates
 from triquad_server.engine.live_field import (
+    Batch,
     LiveField,
+    Rates,
     field_from_record,
     initial_field,
     region_record,

@@ -29,7 +29,7 @@ def newest_file(training: bool) -> Call[MapInfo]:
 
 
 class RemoteBytes:
-    """The bytes of one map file on the server; see :class:`triquad_format.RandomAccess`."""
+    """The bytes of one map file on the server; see :class:`RandomAccess`."""
 
     def __init__(self, run: Run, info: MapInfo) -> None:
         self.name = f"the map of epoch {info.epoch}"

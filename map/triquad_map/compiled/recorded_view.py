@@ -7,7 +7,8 @@ from triquad_map.compiled.field.field import recorded_field
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.team import Team
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.composition.region import RecordedRegion, Split, field_samples
+from triquad_map.composition.field_view import field_samples
+from triquad_map.composition.region import RecordedRegion, Split
 
 
 class RecordedView(ComposedView):
@@ -16,7 +17,7 @@ class RecordedView(ComposedView):
     def __init__(self, record: MapRecord) -> None:
         self._team = Team("triquad-questions")
         regions = [_recorded(record, region, self._team.split) for region in record.regions]
-        super().__init__(record.epoch, record.settings, regions, self._team.split)
+        super().__init__(record.epoch, record.settings, regions, split=self._team.split)
 
     def close(self) -> None:
         """End the threads; later questions are answered on the caller's alone."""
@@ -32,4 +33,4 @@ def _recorded(record: MapRecord, region: Region, split: Split) -> RecordedRegion
     def fit() -> SurfelMap:
         return first_surfels(evidence, samples, record.epoch)
 
-    return RecordedRegion(settings, region.index, engine, evidence, fit)
+    return RecordedRegion(settings, region.index, engine=engine, evidence=evidence, fit=fit)

@@ -1,13 +1,16 @@
-"""A hash index of voxels in compiled code: 3-D cells of an unbounded lattice to row numbers.
+"""Sparse voxels in compiled code: a hash index of 3-D cells, and bits of voxels in blocks.
 
-Everything that is sparse in space is kept in rows that such an index finds.
+Everything that is sparse in space is kept in rows that such an index finds by the cells of an
+unbounded lattice. What is one bit a voxel is kept in masks of blocks, cubes of 8 x 8 x 8 voxels:
+a byte holds the 8 voxels of one column along z.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
+from triquad_format.records.field_settings import BLOCK_VOXELS
 
 from triquad_map.compiled.kernel import kernel
 
@@ -16,7 +19,11 @@ MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed
 CELL_LIMIT = 1 << 20
 """Cells lie in ``[-CELL_LIMIT, CELL_LIMIT)`` on each axis."""
 
-_LOW = (1 << 21) - 1  # the bits of a key that tell one coordinate
+SHIFT = BLOCK_VOXELS.bit_length() - 1
+LOW = BLOCK_VOXELS - 1
+"""The bits of a voxel's coordinates that tell its place in its block."""
+
+_KEY_LOW = (1 << 21) - 1  # the bits of a key that tell one coordinate
 
 
 class Index(NamedTuple):
@@ -41,7 +48,11 @@ def pack(x: int, y: int, z: int) -> int:
 @kernel()
 def unpack(key: int) -> tuple[int, int, int]:
     """The cell of a key."""
-    return (key >> 42) - CELL_LIMIT, (key >> 21 & _LOW) - CELL_LIMIT, (key & _LOW) - CELL_LIMIT
+    return (
+        (key >> 42) - CELL_LIMIT,
+        (key >> 21 & _KEY_LOW) - CELL_LIMIT,
+        (key & _KEY_LOW) - CELL_LIMIT,
+    )
 
 
 @kernel(inline="always")
@@ -96,7 +107,7 @@ def longest_probe(index: Index) -> int:
 
 def cells_of(keys: Longs) -> Longs:
     """The cells [N, 3] of ``keys`` [N]."""
-    return np.stack([keys >> 42, keys >> 21 & _LOW, keys & _LOW], axis=1) - CELL_LIMIT
+    return np.stack([keys >> 42, keys >> 21 & _KEY_LOW, keys & _KEY_LOW], axis=1) - CELL_LIMIT
 
 
 class VoxelIndex:
@@ -162,15 +173,49 @@ def enter(keys: Longs, x: float, y: float, z: float, cell_m: float) -> bool:
 
 
 @kernel()
-def _first_per_cell(points: NDArray[np.floating], cell_m: float, keys: Longs) -> Bools:
+def thin(points: Doubles, cell_m: float, keys: Longs) -> Bools:
+    """Mask [N] of the first of the points [N, 3] in each cell that is not in the set yet."""
     chosen = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         chosen[i] = enter(keys, points[i, 0], points[i, 1], points[i, 2], cell_m)
     return chosen
 
 
-def thin(points: NDArray[np.floating], cell_m: float) -> Bools:
-    """Mask [N] that keeps one of the points [N, 3] per cell of side ``cell_m``, the first."""
-    return np.asarray(
-        _first_per_cell(np.ascontiguousarray(points), cell_m, empty_keys(len(points)))
-    )
+@kernel(inline="always")
+def is_inside(x: int, y: int, z: int, side: int) -> bool:
+    """Whether a voxel lies in a region of ``side`` voxels."""
+    return min(x, y, z) >= 0 and max(x, y, z) < side
+
+
+@kernel(inline="always")
+def block_key(x: int, y: int, z: int) -> int:
+    """Key of the block that holds a voxel."""
+    return int(pack(x >> SHIFT, y >> SHIFT, z >> SHIFT))
+
+
+@kernel(inline="always")
+def byte_of(x: int, y: int) -> int:
+    """The byte of the mask in which a voxel's bit stands."""
+    return ((x & LOW) << SHIFT) | (y & LOW)
+
+
+@kernel(inline="always")
+def bit_of(z: int) -> int:
+    """The byte in which a voxel's bit alone is set, as a ``uint8``."""
+    bit: int = np.uint8(1 << (z & LOW))
+    return bit
+
+
+@kernel(inline="always")
+def find_block(index: Index, x: int, y: int, z: int, side: int) -> int:
+    """Row of the block that holds a voxel, -1 where there is none."""
+    if not is_inside(x, y, z, side):
+        return -1
+    return find_row(index, block_key(x, y, z))
+
+
+@kernel(inline="always")
+def is_set(masks: Bytes, row: int, x: int, y: int, z: int) -> int:
+    """Whether the bit of a voxel is set in the block ``row``: 0 or 1."""
+    bit: int = (masks[row, byte_of(x, y)] >> (z & LOW)) & 1
+    return bit

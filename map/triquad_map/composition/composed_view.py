@@ -4,17 +4,19 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
-from triquad_map.composition.field_view import FieldView
-from triquad_map.composition.region import MapRegion, Split, in_one, no_surfels
-from triquad_map.surface import faded
+from triquad_map.composition.field_view import FieldView, in_one
+from triquad_map.composition.region import MapRegion, NearestSurfels, Split
 from triquad_map.view import NearestSurface, NearestUnknown
 
 _FARTHEST_CELL = 1 << 20
 _LEAST_SEARCHES = 1024
 """Points for which it is worth while to start another thread that searches."""
+
+_HALF_LIFE_S = 86_400.0
+"""While the rest of the map was seen again, confidence in what was not halves in this time."""
 
 
 class ComposedView(FieldView):
@@ -56,7 +58,7 @@ class ComposedView(FieldView):
 
         def work(first: int, last: int) -> None:
             for region in near:
-                self._improve_surface(nearest, points, range(first, last), region)
+                self._improve_surface(nearest, points, part=range(first, last), region=region)
 
         self._split(count, work, _LEAST_SEARCHES)
         return nearest
@@ -108,7 +110,7 @@ class ComposedView(FieldView):
         nearest.point[to] = corner + found.closest[hits] * leaf_m
         nearest.mean[to] = corner + found.means[hits] * leaf_m
         age_s = (self._newest_s - surfels.seen_s[rows]).astype(np.float64)
-        nearest.confidence[to] = surfels.confidence[rows] * faded(age_s)
+        nearest.confidence[to] = surfels.confidence[rows] * _faded(age_s)
 
     def _improve_unknown(self, found: NearestUnknown, points: Doubles) -> None:
         """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""
@@ -166,8 +168,23 @@ class ComposedView(FieldView):
         distances = found.distance / leaf_m
         before = distances.copy()
         nearest = np.empty((len(points), 3))
-        region.evidence.find_unknown(voxels, self._settings.owned_blocks, distances, nearest)
+        region.evidence.find_unknown(
+            voxels, self._settings.owned_blocks, distances=distances, nearest=nearest
+        )
         nearer = distances < before
         found.distance[nearer] = distances[nearer] * leaf_m
         corner = region.centre - self._settings.region_side_m / 2
         found.point[nearer] = corner + nearest[nearer] * leaf_m
+
+
+def no_surfels(limits: Doubles) -> NearestSurfels:
+    """What is known of points before surfels less than ``limits`` [N] voxels away are found."""
+    count = len(limits)
+    return NearestSurfels(
+        limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.int32)
+    )
+
+
+def _faded(age_s: Doubles) -> Floats:
+    """The share [N] of its confidence that a surface keeps, seen last so many seconds ago."""
+    return np.asarray(0.5 ** (np.maximum(age_s, 0.0) / _HALF_LIFE_S), np.float32)

@@ -14,7 +14,14 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.status import Status
 
-from triquad_map.composition.region import FieldRegion, FieldValues, Split, in_one
+from triquad_map.composition.region import (
+    FieldEngine,
+    FieldRegion,
+    FieldValues,
+    Split,
+    Work,
+)
+from triquad_map.surface import FieldSample, SampleField
 from triquad_map.view import FieldAnswer
 
 _REACH_VOXELS = 0.5
@@ -35,6 +42,11 @@ class _Owners:
 
     groups: Sequence[_Owned]  # the points that have an owner, region by region
     shared: Bools  # [N] whether other regions may cover each point, too
+
+
+def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
+    """A :class:`Split` for the caller's thread alone."""
+    work(0, count)
 
 
 class FieldView:
@@ -194,3 +206,23 @@ def _ramp_gradient(offsets: Doubles, ramps: Doubles, overlap_m: float) -> Double
         [ramps[:, 1] * ramps[:, 2], ramps[:, 0] * ramps[:, 2], ramps[:, 0] * ramps[:, 1]], axis=1
     )
     return slopes * others
+
+
+def field_samples(engine: FieldEngine, settings: FieldSettings, split: Split) -> SampleField:
+    """The field of a region in voxels, at its leaf coordinates."""
+    middle = 1 << (settings.depth - 1)
+
+    def sample(voxels: Doubles) -> FieldSample:
+        local = ((voxels - middle) * settings.leaf_m).astype(np.float32)
+        values = np.empty(len(local), np.float32)
+        gradients = np.empty((len(local), 3), np.float32)
+
+        def work(first: int, last: int) -> None:
+            part = engine.evaluate(local[first:last], True)
+            values[first:last] = part.sdf / settings.leaf_m
+            gradients[first:last] = part.gradient
+
+        split(len(local), work)
+        return FieldSample(values, gradients)
+
+    return sample

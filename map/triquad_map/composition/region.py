@@ -5,11 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
-
-from triquad_map.surface import FieldSample, SampleField
 
 
 @dataclass(frozen=True)
@@ -57,14 +54,6 @@ class NearestSurfels(NamedTuple):
     closest: Doubles  # [N, 3] their points that are nearest
     means: Doubles  # [N, 3] about the same, over all that is nearly as near
     rows: Ints  # [N] number of the surfel, -1 where there is none
-
-
-def no_surfels(limits: Doubles) -> NearestSurfels:
-    """What is known of points before surfels less than ``limits`` [N] voxels away are found."""
-    count = len(limits)
-    return NearestSurfels(
-        limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.int32)
-    )
 
 
 class RegionSurfels(Protocol):
@@ -121,31 +110,6 @@ class Split(Protocol):
 
     def __call__(self, count: int, work: Work, least: int = ...) -> None:
         """``least`` is how many a part has at least, where the default is too many."""
-
-
-def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
-    """A :class:`Split` for the caller's thread alone."""
-    work(0, count)
-
-
-def field_samples(engine: FieldEngine, settings: FieldSettings, split: Split) -> SampleField:
-    """The field of a region in voxels, at its leaf coordinates."""
-    middle = 1 << (settings.depth - 1)
-
-    def sample(voxels: Doubles) -> FieldSample:
-        local = ((voxels - middle) * settings.leaf_m).astype(np.float32)
-        values = np.empty(len(local), np.float32)
-        gradients = np.empty((len(local), 3), np.float32)
-
-        def work(first: int, last: int) -> None:
-            part = engine.evaluate(local[first:last], True)
-            values[first:last] = part.sdf / settings.leaf_m
-            gradients[first:last] = part.gradient
-
-        split(len(local), work)
-        return FieldSample(values, gradients)
-
-    return sample
 
 
 class RecordedRegion:

@@ -108,8 +108,8 @@ def align(view: MapView, points: Doubles, guess: Doubles, options: AlignOptions)
     """
     pose = orthonormal(guess)
     fine = thinned(points, FINE_POINTS)
-    found = _descend(view, fine, pose, options)
-    return _judged(view, fine, found, options)
+    found = _descend(view, fine, pose, options=options)
+    return _judged(view, fine, found, options=options)
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def _descend(view: MapView, fine: Doubles, pose: Doubles, options: AlignOptions)
     scale = max(options.max_distance_m, final)
     overshoot, last = _OVERSHOOT, np.zeros(6)
     for iteration in range(1, options.max_iterations + 1):
-        normal = _normal(view, points, pose, scale, options, is_final=scale == final)
+        normal = _normal(view, points, pose, scale=scale, options=options, is_final=scale == final)
         if normal is None:
             return _Found(pose, iteration, False)
         step = normal.step()
@@ -208,7 +208,11 @@ def _normal(
     rows = np.hstack([slope, np.cross(turned, slope) / arm_m])
     weighted = share[:, None] * rows
     return _Normal(
-        weighted.T @ rows, weighted.T @ distance, arm_m, weight, float(share @ distance**2)
+        matrix=weighted.T @ rows,
+        vector=weighted.T @ distance,
+        arm_m=arm_m,
+        weight=weight,
+        variance=float(share @ distance**2),
     )
 
 
@@ -223,7 +227,7 @@ def _judged(view: MapView, points: Doubles, found: _Found, options: AlignOptions
     share = count / max(int((answer.found | known).sum()), 1)
     squares = answer.distance_m[inliers].astype(np.float64) ** 2
     rms_m = math.sqrt(float(squares.sum()) / max(count, 1))
-    normal = _normal(view, points, found.pose, final, options, is_final=True)
+    normal = _normal(view, points, found.pose, scale=final, options=options, is_final=True)
     covariance = np.diag(np.repeat([_UNSEEN_M**2, _UNSEEN_RAD**2], 3))
     all_seen = False
     if normal is not None:
@@ -250,7 +254,8 @@ _MARGIN = 1.1
 def thinned(points: Doubles, most: int) -> Doubles:
     """Some ``most`` of points [N, 3], evenly in space: the first of each cell of a grid.
 
-    Points that are not finite are left out. What was thinned before stays as it is.
+    Points that are not finite are left out. What was thinned before stays as it is. With numpy
+    alone: clients thin scans with it before they send them, and they may be without numba.
 
     Raises:
         ValueError: ``points`` are not of this shape.

@@ -59,7 +59,10 @@ Views = Callable[[int], AbstractContextManager[MapView]]
 
 
 class Answers:
-    """Answers questions; as many threads may ask as the views allow."""
+    """Answers questions; as many threads may ask as the views allow.
+
+    Whatever is asked for, :class:`RefusedError` tells which argument is out of bounds.
+    """
 
     def __init__(self, views: Views, limits: QuestionLimits) -> None:
         self._view = views
@@ -69,14 +72,14 @@ class Answers:
         """The answer to a question of any kind.
 
         Raises:
-            RefusedError: it is not answered.
+            RefusedError: an argument is out of bounds, or its epoch is not kept.
             KeyError: it is no question about the map.
         """
         return _ANSWERS[type(request)](self, request)
 
     def sdf(self, request: SdfRequest) -> SdfReply:
         """The trained field, and status."""
-        points = _points("point", request.origin, request.points, self._limits.points)
+        points = _points("point", request.origin, request.points, most=self._limits.points)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
             return SdfReply(
@@ -130,7 +133,7 @@ class Answers:
         with self._view(request.epoch) as view:
             steps = steps_at_most(view, starts, ends)
             self._check_count(steps / _STEPS_EACH, f"segments of {steps} steps")
-            answer = segments(view, starts, ends, options)
+            answer = segments(view, starts, ends, options=options)
         return SegmentsReply(
             epoch=answer.epoch,
             length_m=answer.length_m,
@@ -160,7 +163,7 @@ class Answers:
         )
         options = RayOptions(reach_m, request.through_unknown)
         with self._view(request.epoch) as view:
-            answer = rays(view, starts, directions / lengths[:, None], options)
+            answer = rays(view, starts, directions / lengths[:, None], options=options)
         return RaysReply(answer.epoch, answer.range_m, answer.status)
 
     def grid(self, request: GridRequest) -> GridReply:
@@ -192,7 +195,7 @@ class Answers:
         )
         with self._view(request.epoch) as view:
             answer = align(
-                view, request.points.astype(np.float64), request.world_from_sensor, options
+                view, request.points.astype(np.float64), request.world_from_sensor, options=options
             )
         return AlignReply(
             epoch=answer.epoch,
@@ -206,7 +209,7 @@ class Answers:
         )
 
     def _searched(self, what: str, origin: Doubles, offsets: Floats) -> Doubles:
-        return _points(what, origin, offsets, self._limits.searches)
+        return _points(what, origin, offsets, most=self._limits.searches)
 
     def _check_count(self, count: float, what: str) -> None:
         if count > self._limits.searches:

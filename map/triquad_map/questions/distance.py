@@ -70,7 +70,7 @@ class Distances:
 
 
 def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
-    """Distances from ``points`` [N, 3] to the nearest seen surface."""
+    """Distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface."""
     nearest = view.nearest_surface(points, options.max_distance_m)
     status = view.status(points)
     away = points - nearest.mean
@@ -79,7 +79,7 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
     gradient = np.zeros((len(points), 3))
     gradient[clear] = away[clear] / lengths[clear, None]
     distance = nearest.distance.copy()
-    _join_field(view, points, nearest, status, distance, gradient)
+    _join_field(view, points, nearest, status=status, distance=distance, gradient=gradient)
     unknown = None
     if options.unknown_distance:
         unknown = view.nearest_unknown(points, options.max_distance_m)

@@ -40,11 +40,11 @@ class Grid:
 
 
 def grid(view: MapView, shape: GridShape, max_distance_m: float) -> Grid:
-    """Distance and status at all cells."""
+    """Distance, of at most ``max_distance_m``, and status at the middles of all cells."""
     answer = distances(view, shape.middles(), DistanceOptions(max_distance_m))
     return Grid(
         shape,
-        answer.distance_m.reshape(shape.counts),
-        answer.status.reshape(shape.counts),
-        view.epoch,
+        distance_m=answer.distance_m.reshape(shape.counts),
+        status=answer.status.reshape(shape.counts),
+        epoch=view.epoch,
     )

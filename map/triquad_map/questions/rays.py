@@ -41,13 +41,13 @@ class RayRanges:
 
 
 def rays(view: MapView, origins: Doubles, directions: Doubles, options: RayOptions) -> RayRanges:
-    """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach."""
+    """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach, map frame."""
     status = np.full(len(origins), Status.FREE, np.uint8)
     ranges = np.full(len(origins), options.max_range_m)
-    hit = _trace(view, origins, directions, ranges)
+    hit = _trace(view, origins, directions, ranges=ranges)
     status[hit] = Status.SURFACE
     if not options.through_unknown:
-        _stop_at_unknown(view, origins, directions, ranges, status)
+        _stop_at_unknown(view, origins, directions, ranges=ranges, status=status)
     return RayRanges(ranges.astype(np.float32), status, view.epoch)
 
 

@@ -90,10 +90,20 @@ def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOpti
         return view.nearest_unknown(points, reach_m).distance
 
     radius = options.radius_m
-    solid = _march(to_surface, starts, directions, lengths, radius, step_m, clearance=True)
+    solid = _march(
+        to_surface, starts, directions, lengths, radius_m=radius, step_m=step_m, clearance=True
+    )
     # Unknown space is entered, not touched: a ball may touch it from outside.
     inside = np.nextafter(radius, 0.0) if radius > 0 else 0.0
-    unknown = _march(to_unknown, starts, directions, solid.contact, inside, step_m, clearance=False)
+    unknown = _march(
+        to_unknown,
+        starts,
+        directions,
+        solid.contact,
+        radius_m=inside,
+        step_m=step_m,
+        clearance=False,
+    )
     return Segments(
         length_m=lengths.astype(np.float32),
         blocked=solid.blocked,
@@ -122,7 +132,10 @@ def _march(
     """
     count = len(starts)
     march = _March(
-        np.zeros(count, np.bool_), lengths.copy(), np.full(count, np.inf), np.zeros(count)
+        blocked=np.zeros(count, np.bool_),
+        contact=lengths.copy(),
+        clearance=np.full(count, np.inf),
+        clearance_at=np.zeros(count),
     )
     at = np.zeros(count)
     going = np.arange(count)

@@ -36,7 +36,7 @@ class Spheres:
 
 
 def spheres(view: MapView, centres: Doubles, radii: Doubles) -> Spheres:
-    """What the spheres around ``centres`` [N, 3] of ``radii`` [N] hold, metres."""
+    """What the spheres around ``centres`` [N, 3] of ``radii`` [N] hold, metres, map frame."""
     # A little beyond the largest, so that what touches it is found.
     reach_m = float(radii.max(initial=0.0)) + view.voxel_m
     answer = distances(view, centres, DistanceOptions(reach_m, unknown_distance=True))

@@ -12,7 +12,8 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord, Region
 
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.composition.region import RecordedRegion, Work, field_samples
+from triquad_map.composition.field_view import field_samples
+from triquad_map.composition.region import RecordedRegion, Work
 from triquad_map.reference.region_field import RegionField
 from triquad_map.reference.seen_blocks import SeenBlocks
 from triquad_map.reference.surfel_cloud import fitted_surfels
@@ -49,9 +50,9 @@ def _recorded(settings: FieldSettings, region: Region) -> RecordedRegion:
     return RecordedRegion(
         settings,
         region.index,
-        engine,
-        evidence,
-        lambda: fitted_surfels(region.evidence, evidence, field),
+        engine=engine,
+        evidence=evidence,
+        fit=lambda: fitted_surfels(region.evidence, evidence, field),
     )
 
 

@@ -62,7 +62,9 @@ class SeenBlocks:
             for step in _steps(shell):
                 cells = homes[going] + step
                 mine = ((cells >= blocks.start) & (cells < blocks.stop)).all(axis=1)
-                self._search_blocks(voxels, cells[mine], going[mine], squares, nearest)
+                self._search_blocks(
+                    voxels, cells[mine], going[mine], squares=squares, nearest=nearest
+                )
         found = squares < distances**2
         distances[found] = np.sqrt(squares[found])
 
@@ -88,7 +90,10 @@ class SeenBlocks:
         for first in range(0, len(there), _BLOCKS_AT_ONCE):
             some = there[first : first + _BLOCKS_AT_ONCE]
             bits = np.unpackbits(masks[first : first + _BLOCKS_AT_ONCE], axis=1, bitorder="little")
-            _search_inside(voxels, low[some], going[some], bits.astype(np.bool_), squares, nearest)
+            seen = bits.astype(np.bool_)
+            _search_inside(
+                voxels, low[some], going[some], seen=seen, squares=squares, nearest=nearest
+            )
 
     def _holds(self, masks: CodedRows, voxels: Longs) -> Bools:
         """Whether the bits of voxels [N, 3] are set."""

@@ -63,9 +63,9 @@ class SurfelCloud:
             nearest = np.zeros(gaps.shape, np.bool_)
             nearest[np.arange(len(part)), gaps.argmin(axis=1)] = True
             limits = found.distances[part, None]
-            self._improve(found, points, part, nearest & (gaps < limits))
+            self._improve(found, points, part, chosen=nearest & (gaps < limits))
             reach = found.distances[part, None] + SMOOTHING
-            self._improve(found, points, part, gaps <= reach)
+            self._improve(found, points, part, chosen=gaps <= reach)
 
     def _block_gaps(self, points: Doubles) -> Doubles:
         """How far [N, B] the surfels of each block are at least from each point."""
@@ -89,7 +89,7 @@ class SurfelCloud:
             ends = np.cumsum(sizes[blocks])
             within = np.arange(ends[-1]) - np.repeat(ends - sizes[blocks], sizes[blocks])
             surfels = np.repeat(self._starts[blocks], sizes[blocks]) + within
-            self._take(found, points, owners, surfels)
+            self._take(found, points, owners=owners, surfels=surfels)
 
     def _take(
         self,

@@ -12,21 +12,28 @@ Steps are counted row by row, so that the moments of a row that is new or seldom
 corrected for its own age.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 from triquad_format.records.arrays import Floats, Ints
+from triquad_map.compiled.field.encoding import BATCH, PointBatch, add_feature_gradient, load
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
-from triquad_map.compiled.field.field import Touched, accumulate, make_field
-from triquad_map.compiled.field.mlp import Mlp
+from triquad_map.compiled.field.field import (
+    CompiledField,
+    Mlp,
+    add_weight_gradient,
+    backward,
+    batch_for,
+    forward,
+    make_field,
+    transposed,
+)
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import THREADS, Team, share
 
-from triquad_server.engine.live_field import LiveField, Parameter
+from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates
 
 EPSILON = 1e-10
 
@@ -36,21 +43,11 @@ _AHEAD = 12  # rows that are brought into the cache before their turn
 _LAST_STEP = 2**31 - 1
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Samples that one step of training learns from."""
+class Touched(NamedTuple):
+    """Which feature rows a thread has added a gradient to."""
 
-    points: Tensor  # [B, 3] metres from the region's centre
-    labels: Tensor  # [B] signed distances, metres
-
-
-@dataclass(frozen=True)
-class Rates:
-    """How fast values and moments follow the gradients."""
-
-    learning_rate: float
-    mean_decay: float  # in [0, 1), as is the next
-    variance_decay: float
+    stamps: Ints  # [rows] the step in which each row was touched last
+    rows: Ints  # [rows] those touched in this step, in the order in which they were
 
 
 class ParameterRows(NamedTuple):
@@ -180,6 +177,77 @@ class GradientSums:
             )
 
 
+@kernel(fastmath=True)
+def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, known: int) -> int:
+    """Add the rows of the first ``count`` points to the ``known`` ones; returns how many now."""
+    for t in range(count):
+        for i in range(batch.rows.shape[1]):
+            row = batch.rows[t, i]
+            if touched.stamps[row] != step and row != 0:  # absent vertices learn nothing
+                touched.stamps[row] = step
+                touched.rows[known] = row
+                known += 1
+    return known
+
+
+@kernel(fastmath=True)
+def _cross_entropy(batch: PointBatch, targets: Floats, share: float) -> float:
+    """Set the slopes of the batch's logits; returns the sum of the losses."""
+    loss = 0.0
+    batch.slopes[:] = 0
+    for t in range(len(targets)):
+        logit = batch.logits[t]
+        tail = np.exp(-abs(logit))  # never overflows
+        squashed = (np.float32(1) if logit >= 0 else tail) / (np.float32(1) + tail)
+        loss += max(logit, np.float32(0)) - logit * targets[t] + np.log1p(tail)
+        batch.slopes[t] = (squashed - targets[t]) * np.float32(share)
+    return loss
+
+
+@kernel(fastmath=True)
+def _add_loss_gradient(
+    points: Floats,
+    targets: Floats,
+    share: float,
+    field: CompiledField,
+    mlp_sums: Mlp,
+    feature_sums: Floats,
+    touched: Touched,
+    step: int,
+) -> tuple[int, float]:
+    """Add the gradient of the cross entropy between ``targets`` [N] and the squashed logits.
+
+    Args:
+        points: [N, 3] metres from the region's centre.
+        targets: [N] in [0, 1].
+        share: weight of each sample.
+        field: the field.
+        mlp_sums: gradients of the MLP.
+        feature_sums: gradients of the features, shaped as they; row 0 collects what is for
+            vertices that do not exist.
+        touched: the rows that a gradient was added to.
+        step: differs from that of all other steps with the same ``touched``.
+
+    Returns:
+        How many rows were touched, and the sum of the samples' losses times ``share``.
+    """
+    levels = field.geometry.levels
+    batch = batch_for(field)
+    w1_transposed, w2_transposed = transposed(field.mlp, levels * field.features.shape[1])
+    known = 0
+    loss = 0.0
+    for first in range(0, len(points), BATCH):
+        count = load(batch, points, first)
+        forward(batch, field)
+        loss += _cross_entropy(batch, targets[first : first + count], share)
+        backward(batch, field.mlp, w1_transposed, w2_transposed)
+        add_weight_gradient(batch, mlp_sums)
+        if levels > 0:
+            add_feature_gradient(batch, count, levels, feature_sums)
+            known = _record_touched(batch, count, touched, step, known)
+    return known, float(loss * share)
+
+
 class CompiledTrainer:
     """Trains a field in compiled code, in its own memory, which is the CPU's."""
 
@@ -201,15 +269,15 @@ class CompiledTrainer:
 
         def work(part: int) -> None:
             mine = slice(*share(len(points), part))
-            counts[part], losses[part] = accumulate(
+            counts[part], losses[part] = _add_loss_gradient(
                 points[mine],
                 targets[mine],
                 1.0 / len(points),
                 field,
-                mlp_sums[part],
-                sums.features[part],
-                sums.touched[part],
-                sums.step,
+                mlp_sums=mlp_sums[part],
+                feature_sums=sums.features[part],
+                touched=sums.touched[part],
+                step=sums.step,
             )
 
         self._team.each(work)

@@ -1,6 +1,7 @@
 """The field of one region while it grows and is trained, and the plain arrays of its record."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,23 @@ def _with_room(rows: Tensor, capacity: int) -> Tensor:
     roomy = rows.new_empty((capacity, *rows.shape[1:]))
     roomy[: len(rows)] = rows
     return roomy
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples that one step of training learns from."""
+
+    points: Tensor  # [B, 3] metres from the region's centre
+    labels: Tensor  # [B] signed distances, metres
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How fast values and moments follow the gradients."""
+
+    learning_rate: float
+    mean_decay: float  # in [0, 1), as is the next
+    variance_decay: float
 
 
 class LiveField:

@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from triquad_server.engine.compiled_trainer import EPSILON, Batch, Rates
-from triquad_server.engine.live_field import LiveField, Parameter
+from triquad_server.engine.compiled_trainer import EPSILON
+from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates
 from triquad_server.engine.tensor_field import Corners, TensorField
 
 

@@ -13,12 +13,13 @@ from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.compiled.surfels.surfel_map import first_surfels
 from triquad_map.compiled.team import Team
-from triquad_map.compiled.voxel_index import thin
-from triquad_map.composition.region import field_samples
+from triquad_map.compiled.voxel_index import empty_keys, thin
+from triquad_map.composition.field_view import field_samples
 
-from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums, Rates
+from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
 from triquad_server.engine.live_field import (
     LiveField,
+    Rates,
     field_from_record,
     initial_field,
     region_record,
@@ -127,7 +128,9 @@ class LiveRegion:
         self.field.grow(new)
         self.changed = True
         short = _CARVE_SHORT_M / self._settings.leaf_m
-        return lambda: self.evidence.carve(origin, ends[thin(ends, 1.0)], short)
+        return lambda: self.evidence.carve(
+            origin, ends[thin(ends, 1.0, empty_keys(len(ends)))], short
+        )
 
     def learn(self, rays: ScanRays, normals: Doubles) -> None:
         """Keep what the rays teach, to be trained on.

@@ -22,7 +22,7 @@ from triquad_map.compiled.field.quadtree import morton_code
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 
-from triquad_server.engine.compiled_trainer import Batch
+from triquad_server.engine.live_field import Batch
 from triquad_server.intake.scan import ScanRays
 from triquad_server.settings import ScanSettings
 

@@ -16,7 +16,7 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import with_room
 
-from triquad_server.engine.compiled_trainer import Batch
+from triquad_server.engine.live_field import Batch
 from triquad_server.mapping.ray_intervals import (
     COLUMNS,
     END,

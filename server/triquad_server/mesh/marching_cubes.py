@@ -7,7 +7,7 @@ six faces join into loops, and each loop is filled by a fan.
 
 Vertices lie on lattice edges, so each is named by the edge's lower lattice point and its axis.
 
-:func:`skimage.measure.marching_cubes` finds the same vertices (a test holds them equal); this one
+``skimage.measure.marching_cubes`` finds the same vertices (a test holds them equal); this one
 searches only the cells it is given, names the edges, on which neighbouring tiles meet exactly, and
 takes 4 ms for a tile of 64^3 cells, without Python's lock: the other takes 8 ms and holds it.
 """

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
-from triquad_server.engine.compiled_trainer import Batch, Rates
+from triquad_server.engine.live_field import Batch, Rates
 from triquad_server.engine.tensor_field import TensorField
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs import Epoch

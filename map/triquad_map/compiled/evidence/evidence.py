@@ -14,14 +14,74 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
+from triquad_format.records.status import Status
 
-from triquad_map.compiled.evidence.marking import mark_crossed, mark_ends
 from triquad_map.compiled.evidence.observations import Observations, Sighting
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, find_ends, find_status
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_crossed, mark_ends
 from triquad_map.compiled.evidence.unknown_search import find_unknown
-from triquad_map.compiled.voxel_index import VoxelIndex, cells_of, with_room
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.voxel_index import (
+    SHIFT,
+    VoxelIndex,
+    cells_of,
+    find_block,
+    is_set,
+    with_room,
+)
 
 _SEEN_STEP_S = 60
+_MIN_CAPACITY = 256
+
+_SURFACE = np.uint8(Status.SURFACE)
+_FREE = np.uint8(Status.FREE)
+_UNKNOWN = np.uint8(Status.UNKNOWN)
+
+
+@kernel()
+def _status(voxels: Doubles, reach: float, seen: SeenVoxels) -> Bytes:
+    """Status [N] at ``voxels`` [N, 3]; surfaces reach ``reach`` beyond theirs."""
+    status = np.empty(len(voxels), np.uint8)
+    side, blocks, surface, free = seen
+    for i in range(len(voxels)):
+        x0, x1 = int(np.floor(voxels[i, 0] - reach)), int(np.floor(voxels[i, 0] + reach))
+        y0, y1 = int(np.floor(voxels[i, 1] - reach)), int(np.floor(voxels[i, 1] + reach))
+        z0, z1 = int(np.floor(voxels[i, 2] - reach)), int(np.floor(voxels[i, 2] + reach))
+        found = 0
+        row = find_block(blocks, x0, y0, z0, side)
+        block = (x0 >> SHIFT, y0 >> SHIFT, z0 >> SHIFT)
+        for x in range(x0, x1 + 1):
+            for y in range(y0, y1 + 1):
+                for z in range(z0, z1 + 1):
+                    here = (x >> SHIFT, y >> SHIFT, z >> SHIFT)
+                    if here != block:
+                        row = find_block(blocks, x, y, z, side)
+                        block = here
+                    if row >= 0:
+                        found |= is_set(surface, row, x, y, z)
+            if found:
+                break
+        status[i] = _UNKNOWN
+        if found:
+            status[i] = _SURFACE
+            continue
+        x = int(np.floor(voxels[i, 0]))
+        y = int(np.floor(voxels[i, 1]))
+        z = int(np.floor(voxels[i, 2]))
+        row = find_block(blocks, x, y, z, side)
+        if row >= 0 and is_set(free, row, x, y, z):
+            status[i] = _FREE
+    return status
+
+
+@kernel()
+def _ended_in(voxels: Longs, seen: SeenVoxels) -> Bools:
+    """Whether rays ended [N] in ``voxels`` [N, 3]."""
+    ended = np.empty(len(voxels), np.bool_)
+    for i in range(len(voxels)):
+        x, y, z = voxels[i, 0], voxels[i, 1], voxels[i, 2]
+        row = find_block(seen.blocks, x, y, z, seen.side)
+        ended[i] = row >= 0 and is_set(seen.surface, row, x, y, z) == 1
+    return ended
 
 
 @dataclass(frozen=True)
@@ -49,15 +109,11 @@ class FrozenEvidence:
 
     def status(self, voxels: Doubles, reach: float = 0.5) -> Bytes:
         """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
-        status = np.empty(len(voxels), np.uint8)
-        find_status(voxels, reach, self.seen, status)
-        return status
+        return _status(voxels, reach, self.seen)
 
     def ended_in(self, voxels: Longs) -> Bools:
         """Whether rays ended in ``voxels`` [N, 3]."""
-        ended = np.empty(len(voxels), np.bool_)
-        find_ends(voxels, self.seen, ended)
-        return ended
+        return _ended_in(voxels, self.seen)
 
     def find_unknown(
         self, voxels: Doubles, blocks: range, distances: Doubles, nearest: Doubles
@@ -96,9 +152,6 @@ class FrozenEvidence:
             seen_s = np.zeros(len(record.codes), np.int64)
         masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
         return cls(SeenVoxels(side, index, *masks), levels, seen_s)
-
-
-_MIN_CAPACITY = 256
 
 
 class LiveEvidence:

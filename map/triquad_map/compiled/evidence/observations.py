@@ -8,16 +8,9 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
-from triquad_map.compiled.evidence.seen_voxels import (
-    LOW,
-    SHIFT,
-    SeenVoxels,
-    block_key,
-    byte_of,
-    is_inside,
-)
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import find_row, with_room
+from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, with_room
 from triquad_map.surface import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
 
 _VOXELS = BLOCK_VOXELS**3
@@ -65,9 +58,9 @@ def _record(
         x = int(np.floor(voxels[i, 0]))
         y = int(np.floor(voxels[i, 1]))
         z = int(np.floor(voxels[i, 2]))
-        if not is_inside(x, y, z, seen.side):
+        row = find_block(seen.blocks, x, y, z, seen.side)
+        if row < 0:  # outside the region
             continue
-        row = find_row(seen.blocks, block_key(x, y, z))
         place = observed.places[row]
         if place == 0:
             if count == len(observed.seen_s):
@@ -171,13 +164,11 @@ class Observations:
         return observations
 
     def _grow(self) -> None:
-        places, weights, sectors, seen_s = self._observed
-        capacity = 2 * len(seen_s)
-        self._observed = Observed(
-            places,
-            with_room(weights, capacity),
-            with_room(sectors, capacity),
-            with_room(seen_s, capacity),
+        old, capacity = self._observed, 2 * len(self._observed.seen_s)
+        self._observed = old._replace(
+            weights=with_room(old.weights, capacity),
+            sectors=with_room(old.sectors, capacity),
+            seen_s=with_room(old.seen_s, capacity),
         )
 
 

@@ -5,9 +5,9 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 
-from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT, SeenVoxels
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import CELL_LIMIT, find_row, pack
+from triquad_map.compiled.voxel_index import CELL_LIMIT, LOW, SHIFT, find_row, pack
 
 _SIDE = float(BLOCK_VOXELS)
 _ALL = 0xFF

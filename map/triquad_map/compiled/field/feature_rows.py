@@ -155,15 +155,13 @@ def _move_row_of_8(
         deviation = builder.call(root, [builder.fmul(variance, scale, **fast)])
         deviation = builder.fadd(deviation, _spread(builder, args[7]), **fast)
         rate = builder.fneg(builder.extract_value(args[6], 0))
-        move = builder.fdiv(mean, deviation, **fast)
-        value = _multiply_add(builder, value, rate, move)
+        value = _multiply_add(builder, value, rate, builder.fdiv(mean, deviation, **fast))
         results = (ir.Constant(_VECTOR, None), value, mean, variance)
         for address, result in zip(addresses, results, strict=True):
             builder.store(result, address, align=4)
         return context.get_dummy_value()
 
-    arrays = (gradients, values, means, variances)
-    return types.void(*arrays, row, blends, scales, epsilon), generate
+    return types.void(gradients, values, means, variances, row, blends, scales, epsilon), generate
 
 
 @kernel(fastmath=True, inline="always")

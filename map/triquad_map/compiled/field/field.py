@@ -1,14 +1,14 @@
-"""The field's arithmetic in compiled code, for the CPU.
+"""The field's arithmetic in compiled code: encoding, MLP, and backward through both by hand.
 
 The same field as the tensors of :mod:`triquad_server.engine.tensor_field` compute, which are its
-reference: values, gradients with respect to the points and to the parameters. A kernel
-runs on one thread and holds no Python lock; callers split the work. Arrays are float32.
+reference. A kernel runs on one thread and holds no Python lock; callers split the work. Arrays are
+float32.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Floats, Ints
+from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Region
 
@@ -16,7 +16,6 @@ from triquad_map.compiled.field.encoding import (
     BATCH,
     Geometry,
     PointBatch,
-    add_feature_gradient,
     add_feature_slopes,
     add_wave_slopes,
     interpolate,
@@ -25,10 +24,22 @@ from triquad_map.compiled.field.encoding import (
     new_batch,
     wave,
 )
-from triquad_map.compiled.field.mlp import Mlp, add_weight_gradient, backward, forward, transposed
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree, Vertices
 from triquad_map.compiled.kernel import kernel
 from triquad_map.composition.region import FieldValues
+
+_ZERO = np.float32(0)
+
+
+class Mlp(NamedTuple):
+    """Weights of the MLP, or gradients of them."""
+
+    w1: Floats  # [input, hidden]
+    b1: Floats  # [hidden]
+    w2: Floats  # [hidden, hidden]
+    b2: Floats  # [hidden]
+    w3: Floats  # [hidden]
+    b3: Floats  # [1]
 
 
 class CompiledField(NamedTuple):
@@ -41,39 +52,181 @@ class CompiledField(NamedTuple):
     turns_per_m: Floats  # [m] Fourier frequencies, empty where the field has none
 
 
-class Touched(NamedTuple):
-    """Which feature rows a thread has added a gradient to."""
+class FieldArrays(NamedTuple):
+    """The numbers of a field."""
 
-    stamps: Ints  # [rows] the step in which each row was touched last
-    rows: Ints  # [rows] those touched in this step, in the order in which they were
+    features: Floats  # [rows of the tree, feature_size]; row 0 is zero: absent vertices
+    mlp: tuple[Floats, ...]  # weights [in, out] and bias [out] of each layer in turn
+    frequencies: Floats  # [m] of Fourier features, on coordinates normalised to [-1, 1]
+
+
+@kernel(fastmath=True)
+def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
+    """``out += weights.T @ x`` for weights [K, J], x [K, T], out [J, T]."""
+    inputs, outputs = weights.shape
+    k = 0
+    while k + 8 <= inputs:  # so many at once that reading and writing ``out`` costs little
+        for j in range(outputs):
+            w0, w1, w2, w3 = weights[k, j], weights[k + 1, j], weights[k + 2, j], weights[k + 3, j]
+            w4, w5 = weights[k + 4, j], weights[k + 5, j]
+            w6, w7 = weights[k + 6, j], weights[k + 7, j]
+            for t in range(BATCH):
+                out[j, t] += (
+                    w0 * x[k, t]
+                    + w1 * x[k + 1, t]
+                    + w2 * x[k + 2, t]
+                    + w3 * x[k + 3, t]
+                    + w4 * x[k + 4, t]
+                    + w5 * x[k + 5, t]
+                    + w6 * x[k + 6, t]
+                    + w7 * x[k + 7, t]
+                )
+        k += 8
+    while k < inputs:
+        for j in range(outputs):
+            for t in range(BATCH):
+                out[j, t] += weights[k, j] * x[k, t]
+        k += 1
+
+
+@kernel(fastmath=True)
+def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
+    """``sums += x @ g.T`` for x [K, T], g [J, T], sums [K, J]."""
+    inputs, outputs = sums.shape
+    even, fourth = inputs - inputs % 2, outputs - outputs % 4
+    for k in range(0, even, 2):  # 2 rows by 4, so that what is read serves several products
+        for j in range(0, fourth, 4):
+            s0, s1, s2, s3 = _ZERO, _ZERO, _ZERO, _ZERO
+            t0, t1, t2, t3 = _ZERO, _ZERO, _ZERO, _ZERO
+            for t in range(BATCH):
+                s0 += x[k, t] * g[j, t]
+                s1 += x[k, t] * g[j + 1, t]
+                s2 += x[k, t] * g[j + 2, t]
+                s3 += x[k, t] * g[j + 3, t]
+                t0 += x[k + 1, t] * g[j, t]
+                t1 += x[k + 1, t] * g[j + 1, t]
+                t2 += x[k + 1, t] * g[j + 2, t]
+                t3 += x[k + 1, t] * g[j + 3, t]
+            sums[k, j] += s0
+            sums[k, j + 1] += s1
+            sums[k, j + 2] += s2
+            sums[k, j + 3] += s3
+            sums[k + 1, j] += t0
+            sums[k + 1, j + 1] += t1
+            sums[k + 1, j + 2] += t2
+            sums[k + 1, j + 3] += t3
+    for k in range(inputs):
+        for j in range(fourth if k < even else 0, outputs):
+            sums[k, j] += _dot(x[k], g[j])
+
+
+@kernel(fastmath=True)
+def _dot(a: Floats, b: Floats) -> float:
+    total: float = _ZERO
+    for t in range(BATCH):
+        total += a[t] * b[t]
+    return total
+
+
+@kernel(fastmath=True)
+def _add_row_sums(g: Floats, sums: Floats) -> None:
+    """``sums += g.sum(1)`` for g [J, T]."""
+    for j in range(len(g)):
+        total = _ZERO
+        for t in range(BATCH):
+            total += g[j, t]
+        sums[j] += total
+
+
+@kernel(fastmath=True)
+def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
+    for j in range(len(biases)):
+        for t in range(BATCH):
+            out[j, t] = biases[j]
+    _add_product(weights, x, out)
+    for j in range(len(biases)):
+        for t in range(BATCH):
+            out[j, t] = max(out[j, t], _ZERO)
+
+
+@kernel(fastmath=True)
+def _decode(batch: PointBatch, mlp: Mlp) -> None:
+    """Both hidden layers and the logits of the batch's inputs."""
+    _layer(mlp.w1, mlp.b1, batch.x, batch.h1)
+    _layer(mlp.w2, mlp.b2, batch.h1, batch.h2)
+    for t in range(BATCH):
+        batch.logits[t] = mlp.b3[0]
+    for j in range(len(mlp.w3)):
+        for t in range(BATCH):
+            batch.logits[t] += mlp.w3[j] * batch.h2[j, t]
 
 
 @kernel()
-def _batch_for(field: CompiledField) -> PointBatch:
+def transposed(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
+    """The first two layers' weights as :func:`backward` needs them.
+
+    Those of the first layer reach the first ``inputs`` inputs only.
+    """
+    return np.ascontiguousarray(mlp.w1[:inputs].T), np.ascontiguousarray(mlp.w2.T)
+
+
+@kernel(fastmath=True)
+def backward(batch: PointBatch, mlp: Mlp, w1_transposed: Floats, w2_transposed: Floats) -> None:
+    """Gradients of the hidden layers and of the inputs, from ``batch.slopes``."""
+    for j in range(len(mlp.w3)):
+        for t in range(BATCH):
+            batch.g2[j, t] = batch.slopes[t] * mlp.w3[j] if batch.h2[j, t] > 0 else _ZERO
+    batch.g1[:] = 0
+    _add_product(w2_transposed, batch.g2, batch.g1)
+    for j in range(len(mlp.b1)):
+        for t in range(BATCH):
+            batch.g1[j, t] = batch.g1[j, t] if batch.h1[j, t] > 0 else _ZERO
+    gx = batch.gx[: w1_transposed.shape[1]]
+    gx[:] = 0
+    _add_product(w1_transposed, batch.g1, gx)
+
+
+@kernel(fastmath=True)
+def add_weight_gradient(batch: PointBatch, sums: Mlp) -> None:
+    """Add the gradient of the weights, after :func:`backward`; points of no slope add nothing."""
+    _add_outer_product(batch.x, batch.g1, sums.w1)
+    _add_row_sums(batch.g1, sums.b1)
+    _add_outer_product(batch.h1, batch.g2, sums.w2)
+    _add_row_sums(batch.g2, sums.b2)
+    for j in range(len(sums.w3)):
+        sums.w3[j] += _dot(batch.slopes, batch.h2[j])
+    for t in range(BATCH):
+        sums.b3[0] += batch.slopes[t]
+
+
+@kernel()
+def batch_for(field: CompiledField) -> PointBatch:
+    """Room for a batch of points of a field."""
     inputs, hidden = field.mlp.w1.shape
     return new_batch(field.geometry.levels, field.features.shape[1], inputs, hidden)
 
 
 @kernel(fastmath=True)
-def _forward(batch: PointBatch, field: CompiledField) -> None:
+def forward(batch: PointBatch, field: CompiledField) -> None:
+    """The logits of a batch, and what :func:`backward` needs of the layers before."""
     levels = field.geometry.levels
     if levels > 0:
         locate(batch, field.geometry, field.vertices, field.features)
         interpolate(batch, levels, field.features)
     wave(batch, levels * field.features.shape[1], field.turns_per_m)
-    forward(batch, field.mlp)
+    _decode(batch, field.mlp)
 
 
 @kernel(fastmath=True)
 def evaluate(points: Floats, field: CompiledField, logits: Floats, gradients: Floats) -> None:
     """Fill ``logits`` [N] and, where not empty, ``gradients`` [N, 3] (per metre)."""
     learnt = field.geometry.levels * field.features.shape[1]
-    batch = _batch_for(field)
+    batch = batch_for(field)
     batch.slopes[:] = 1
     w1_transposed, w2_transposed = transposed(field.mlp, len(batch.x))
     for first in range(0, len(points), BATCH):
         count = load(batch, points, first)
-        _forward(batch, field)
+        forward(batch, field)
         for t in range(count):
             logits[first + t] = batch.logits[t]
         if len(gradients) == 0:
@@ -86,87 +239,6 @@ def evaluate(points: Floats, field: CompiledField, logits: Floats, gradients: Fl
         for t in range(count):
             for axis in range(3):
                 gradients[first + t, axis] = batch.gradient[axis, t]
-
-
-@kernel(fastmath=True)
-def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, known: int) -> int:
-    """Add the rows of the first ``count`` points to the ``known`` ones; returns how many now."""
-    for t in range(count):
-        for i in range(batch.rows.shape[1]):
-            row = batch.rows[t, i]
-            if touched.stamps[row] != step and row != 0:  # absent vertices learn nothing
-                touched.stamps[row] = step
-                touched.rows[known] = row
-                known += 1
-    return known
-
-
-@kernel(fastmath=True)
-def _cross_entropy(batch: PointBatch, targets: Floats, share: float) -> float:
-    """Sets the slopes of the batch's logits; returns the sum of the losses."""
-    loss = 0.0
-    batch.slopes[:] = 0
-    for t in range(len(targets)):
-        logit = batch.logits[t]
-        tail = np.exp(-abs(logit))  # never overflows
-        squashed = (np.float32(1) if logit >= 0 else tail) / (np.float32(1) + tail)
-        loss += max(logit, np.float32(0)) - logit * targets[t] + np.log1p(tail)
-        batch.slopes[t] = (squashed - targets[t]) * np.float32(share)
-    return loss
-
-
-@kernel(fastmath=True)
-def accumulate(
-    points: Floats,
-    targets: Floats,
-    share: float,
-    field: CompiledField,
-    mlp_sums: Mlp,
-    feature_sums: Floats,
-    touched: Touched,
-    step: int,
-) -> tuple[int, float]:
-    """Add the gradient of the cross entropy between ``targets`` [N] and the squashed logits.
-
-    Args:
-        points: [N, 3] metres from the region's centre.
-        targets: [N] in [0, 1].
-        share: weight of each sample.
-        field: the field.
-        mlp_sums: gradients of the MLP.
-        feature_sums: gradients of the features, shaped as they; row 0 collects what is for
-            vertices that do not exist.
-        touched: the rows that a gradient was added to.
-        step: differs from that of all other steps with the same ``touched``.
-
-    Returns:
-        How many rows were touched, and the sum of the samples' losses times ``share``.
-    """
-    levels = field.geometry.levels
-    batch = _batch_for(field)
-    w1_transposed, w2_transposed = transposed(field.mlp, levels * field.features.shape[1])
-    known = 0
-    loss = 0.0
-    for first in range(0, len(points), BATCH):
-        count = load(batch, points, first)
-        _forward(batch, field)
-        loss += _cross_entropy(batch, targets[first : first + count], share)
-        backward(batch, field.mlp, w1_transposed, w2_transposed)
-        add_weight_gradient(batch, mlp_sums)
-        if levels > 0:
-            add_feature_gradient(batch, count, levels, feature_sums)
-            known = _record_touched(batch, count, touched, step, known)
-    return known, float(loss * share)
-
-
-class FieldArrays(NamedTuple):
-    """The numbers of a field."""
-
-    features: (
-        Floats  # [rows, feature_size] by the rows of its tree; row 0, absent vertices, is zero
-    )
-    mlp: tuple[Floats, ...]  # weights [in, out] and bias [out] of each layer in turn
-    frequencies: Floats  # [m] of Fourier features, on coordinates normalised to [-1, 1]
 
 
 class FrozenCompiledField:
@@ -209,17 +281,17 @@ def make_field(
 ) -> CompiledField:
     """The form of a field that kernels take; it shares memory with the arrays and the tree."""
     geometry = Geometry(
-        np.float32(settings.leaf_m),
-        np.float32(1 << (settings.depth - 1)),
-        settings.feature_levels if settings.encoding != "fourier" else 0,
-        tree.shape,
+        leaf_m=np.float32(settings.leaf_m),
+        half_side=np.float32(1 << (settings.depth - 1)),
+        levels=settings.feature_levels if settings.encoding != "fourier" else 0,
+        shape=tree.shape,
     )
     w1, b1, w2, b2, w3, b3 = arrays.mlp
     turns = arrays.frequencies / np.float32(settings.region_side_m / 2)
     return CompiledField(
-        geometry,
-        tree.vertices,
-        arrays.features,
-        Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
-        turns if settings.encoding != "features" else turns[:0],
+        geometry=geometry,
+        vertices=tree.vertices,
+        features=arrays.features,
+        mlp=Mlp(w1, b1, w2, b2, w3.reshape(-1), b3),
+        turns_per_m=turns if settings.encoding != "features" else turns[:0],
     )

@@ -160,7 +160,7 @@ class FrozenQuadtree:
     count: int  # rows of the feature table
 
     def table(self, plane: int, h: int) -> tuple[Longs, Longs]:
-        """Sorted Morton codes and rows of the vertices on a plane and the ``h``-th level."""
+        """Sorted Morton codes [V] and rows [V] of the vertices on a plane and level ``h``."""
         owner = 1 + plane * self.shape.levels + h
         rows = np.flatnonzero(self.vertices.owners[: self.count] == owner)
         codes = self.vertices.codes[rows]
@@ -201,7 +201,7 @@ class LiveQuadtree:
         return self._frozen
 
     def table(self, plane: int, h: int) -> tuple[Longs, Longs]:
-        """Sorted Morton codes and rows of the vertices on a plane and the ``h``-th level."""
+        """Sorted Morton codes [V] and rows [V] of the vertices on a plane and level ``h``."""
         return self.freeze().table(plane, h)
 
     def grow(self, leaves: Longs) -> int:

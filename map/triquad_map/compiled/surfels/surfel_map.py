@@ -12,7 +12,6 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.seen_voxels import LOW, SHIFT
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.surfels.surfel_search import (
     GROUP_SHIFT,
@@ -20,7 +19,7 @@ from triquad_map.compiled.surfels.surfel_search import (
     SurfelIndex,
     find_nearest,
 )
-from triquad_map.compiled.voxel_index import VoxelIndex
+from triquad_map.compiled.voxel_index import LOW, SHIFT, VoxelIndex
 from triquad_map.composition.region import NearestSurfels
 from triquad_map.surface import SampleField, SurfelKind, Surfels, fit_surfels, support_confidence
 
@@ -51,11 +50,11 @@ def surfel_index(places: SurfelPlaces, surfels: Surfels) -> SurfelIndex:
     positions += surfels.offsets + np.float32(0.5)
     positions[surfels.kinds == SurfelKind.NONE] = _FAR
     return SurfelIndex(
-        places.groups,
-        places.starts,
-        np.ascontiguousarray(positions.T),
-        surfels.normals,
-        surfels.kinds,
+        groups=places.groups,
+        starts=places.starts,
+        positions=np.ascontiguousarray(positions.T),
+        normals=surfels.normals,
+        kinds=surfels.kinds,
     )
 
 
@@ -129,11 +128,11 @@ def block_groups(cells: Longs, surface: Bytes) -> BlockGroups:
         around[:, :3] = np.minimum.reduceat(boxes[:, :3], starts[:-1])
         around[:, 3:] = np.maximum.reduceat(boxes[:, 3:], starts[:-1])
     return BlockGroups(
-        VoxelIndex.of_cells(morton.decode(codes, 3)).arrays,
-        around,
-        starts.astype(np.int32),
-        used[order].astype(np.int32),
-        np.ascontiguousarray(boxes.T, np.float32),
+        places=VoxelIndex.of_cells(morton.decode(codes, 3)).arrays,
+        boxes=around,
+        starts=starts.astype(np.int32),
+        members=used[order].astype(np.int32),
+        member_boxes=np.ascontiguousarray(boxes.T, np.float32),
     )
 
 
@@ -170,13 +169,15 @@ class SurfelMap:
 
         At most so many of the others are fitted; ``None``: all.
         """
-        return _fitted_again(evidence, _carried(self._fitted, evidence), field, epoch, most)
+        return _fitted_again(
+            evidence, _carried(self._fitted, evidence), field, epoch=epoch, most=most
+        )
 
 
 def first_surfels(evidence: FrozenEvidence, field: SampleField, epoch: int) -> SurfelMap:
     """The surfels of all seen voxels, for an epoch."""
     places = surfel_places(evidence.cells, evidence.surface)
-    return _fitted_again(evidence, _nothing_in(places), field, epoch, most=None)
+    return _fitted_again(evidence, _nothing_in(places), field, epoch=epoch, most=None)
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
@@ -203,7 +204,7 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
 
 
 def _fitted_again(
-    evidence: FrozenEvidence, fitted: _Fitted, field: SampleField, epoch: int, most: int | None
+    evidence: FrozenEvidence, fitted: _Fitted, field: SampleField, *, epoch: int, most: int | None
 ) -> SurfelMap:
     """Fit what was never fitted, and at most so many of the rest; changes ``fitted``."""
     known = np.flatnonzero(fitted.epochs != _NEVER)

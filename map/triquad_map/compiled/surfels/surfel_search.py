@@ -13,9 +13,8 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
 
-from triquad_map.compiled.evidence.seen_voxels import LOW
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import CELL_LIMIT, Index, find_row, pack, unpack
+from triquad_map.compiled.voxel_index import CELL_LIMIT, LOW, Index, find_row, pack, unpack
 from triquad_map.composition.region import NearestSurfels
 from triquad_map.surface import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
 

@@ -1,0 +1,62 @@
+"""What docstrings, comments and pages refer to is there."""
+
+import ast
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("format", "map", "client", "server", "tools")
+SOURCES = [
+    (ROOT / package, path) for package in PACKAGES for path in (ROOT / package).rglob("*.py")
+]
+IN_FULL = re.compile(r"\btriquad_(?:format|map|client|server|tools)(?:\.\w+)+")
+BY_ROLE = re.compile(r":(?:mod|func|class|meth|attr|data|exc):`~?([^`]*)`")
+
+
+def defined_in(body: Iterable[ast.stmt]) -> Iterator[str]:
+    """The names that a module or a class has, and those of what its classes have."""
+    for node in body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (target.id for target in targets if isinstance(target, ast.Name))
+        elif isinstance(node, ast.ImportFrom):
+            yield from (alias.asname or alias.name for alias in node.names)
+        if isinstance(node, ast.ClassDef):
+            yield from (f"{node.name}.{name}" for name in defined_in(node.body))
+
+
+@pytest.fixture(scope="module")
+def known() -> set[str]:
+    """All modules, and what they define: by the name in full, and by each of its parts."""
+    names = set()
+    for package, path in SOURCES:
+        module = ".".join(path.relative_to(package).with_suffix("").parts)
+        module = module.removesuffix(".__init__")
+        names.add(module)
+        for name in defined_in(ast.parse(path.read_text()).body):
+            names |= {f"{module}.{name}", *name.split(".")}
+    return names
+
+
+def test_names_in_full_are_there(known: set[str]) -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    texts = {path: path.read_text() for path in [*pages, *(path for _, path in SOURCES)]}
+    used = {(path, name) for path, text in texts.items() for name in IN_FULL.findall(text)}
+    assert len(used) > 1000
+    assert {(path, name) for path, name in used if name not in known} == set()
+
+
+def test_docstrings_refer_to_what_there_is(known: set[str]) -> None:
+    used = {(path, name) for _, path in SOURCES for name in BY_ROLE.findall(path.read_text())}
+    assert len(used) > 100
+    missing = {
+        (path, name)
+        for path, name in used
+        if name not in known and not known.issuperset(name.split("."))
+    }
+    assert missing == set()
