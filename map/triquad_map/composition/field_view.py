@@ -14,13 +14,7 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.status import Status
 
-from triquad_map.composition.region import (
-    FieldEngine,
-    FieldRegion,
-    FieldValues,
-    Split,
-    Work,
-)
+from triquad_map.composition.region import FieldEngine, FieldRegion, FieldValues, Split, Work
 from triquad_map.surface import FieldSample, SampleField
 from triquad_map.view import FieldAnswer
 

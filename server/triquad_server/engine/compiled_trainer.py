@@ -80,13 +80,6 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
     )
 
 
-def _compiled_rates(rates: Rates) -> CompiledRates:
-    """The numbers of a step."""
-    mean_decay, variance_decay = rates.mean_decay, rates.variance_decay
-    scales = _corrections(mean_decay, variance_decay)
-    return CompiledRates(rates.learning_rate, mean_decay, variance_decay, *scales)
-
-
 @lru_cache(maxsize=4)
 def _corrections(mean_decay: float, variance_decay: float) -> tuple[Floats, Floats]:
     """Scales of mean and variance by age, tabulated until they no longer matter."""
@@ -281,17 +274,18 @@ class CompiledTrainer:
             )
 
         self._team.each(work)
-        self._step(counts, mlp_sums, _compiled_rates(rates))
+        self._step(counts, mlp_sums, rates)
         return sum(losses)
 
-    def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: CompiledRates) -> None:
+    def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
         """Adam on the MLP and on the rows that were touched, so many by each thread."""
+        compiled = CompiledRates(*rates, *_corrections(rates.mean_decay, rates.variance_decay))
         for part, parameter in enumerate(self._field.mlp):
             gradient = np.sum([thread[part] for thread in mlp_sums], axis=0).reshape(1, -1)
-            _step_row(0, gradient, _parameter_rows(parameter), rates)
+            _step_row(0, gradient, _parameter_rows(parameter), compiled)
         sums, features = self._sums, _parameter_rows(self._field.features)
         self._team.each(
             lambda part: _step_touched(
-                part, counts[part], sums.step, sums.touched, sums.features, features, rates
+                part, counts[part], sums.step, sums.touched, sums.features, features, compiled
             )
         )

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -71,8 +71,7 @@ class Batch:
     labels: Tensor  # [B] signed distances, metres
 
 
-@dataclass(frozen=True)
-class Rates:
+class Rates(NamedTuple):
     """How fast values and moments follow the gradients."""
 
     learning_rate: float
@@ -131,8 +130,7 @@ class LiveField:
     @property
     def arrays(self) -> FieldArrays:
         """The numbers as arrays, which share memory with the field where it is on the CPU."""
-        mlp = tuple(part.values[0].cpu().numpy() for part in self.mlp)
-        return FieldArrays(self.features.values.cpu().numpy(), mlp, self.frequencies.cpu().numpy())
+        return self.tensors.arrays
 
     def grow(self, leaves: Longs) -> None:
         """Make room for surfaces in ``leaves`` [N, 3]; new feature vectors start at random.
@@ -153,14 +151,12 @@ class LiveField:
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""
         tree = self.tree.freeze()
-        frequencies = self.frequencies  # which never change
-        features = self.features.values.clone()
         mlp = tuple(part.values[0].clone() for part in self.mlp)
+        # Frequencies never change.
+        tensors = FieldTensors(self.features.values.clone(), mlp, self.frequencies)
         if self.device.type != "cpu":
-            return TensorField(self.settings, tree, FieldTensors(features, mlp, frequencies))
-        arrays = tuple(part.numpy() for part in mlp)
-        numbers = FieldArrays(features.numpy(), arrays, frequencies.numpy())
-        return FrozenCompiledField(self.settings, tree, numbers)
+            return TensorField(self.settings, tree, tensors)
+        return FrozenCompiledField(self.settings, tree, tensors.arrays)
 
 
 def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> LiveField:

@@ -6,7 +6,6 @@ times: the later one takes over the values of the earlier one there. Only faces 
 saw a surface are kept: elsewhere the field has zeros that no ray taught it.
 """
 
-import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
+from triquad_format.records.cells import cells_of_boxes
 from triquad_format.records.status import Status
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import STEPS, TileSurface
@@ -59,11 +59,7 @@ class TileLattice:
         """
         first = np.floor((low - margin_m) / self.tile_side_m).astype(np.int64)
         last = np.floor((high + margin_m) / self.tile_side_m).astype(np.int64)
-        tiles = [np.zeros((0, 3), np.int64)]
-        for offset in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
-            tile = first + offset
-            tiles.append(tile[(tile <= last).all(axis=1)])
-        return _each_once(np.concatenate(tiles))
+        return _each_once(cells_of_boxes(first, last)[0])
 
 
 def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
@@ -212,7 +208,8 @@ def mesh_tile(
 def _seen_cells(source: ComposedView, first: Longs, lattice: TileLattice) -> Longs:
     """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
     reach_m = lattice.cell_m / 2 + lattice.reach_m
-    groups = _grid(-(-lattice.cells // lattice.group)) * lattice.group
+    count = -(-lattice.cells // lattice.group)
+    groups = _cells_of(np.zeros((1, 3), np.int64), count, count) * lattice.group
     centres = _positions(groups, lattice.group / 2, first, lattice.cell_m)
     # A group is searched where any of its cells may be such.
     wide = lattice.cell_m * (lattice.group - 1) / 2 + reach_m
@@ -244,14 +241,6 @@ def _positions(cells: Longs, offset: float, first: Longs, cell_m: float) -> Doub
         for axis in range(3):
             positions[i, axis] = (first[axis] + cells[i, axis] + offset) * cell_m
     return positions
-
-
-@functools.lru_cache(maxsize=8)
-def _grid(side: int) -> Longs:
-    """Cells [side**3, 3] of a cube."""
-    axes = [np.arange(side, dtype=np.int64)] * 3
-    cells: Longs = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    return cells.reshape(-1, 3)
 
 
 @kernel()

@@ -15,13 +15,7 @@ from triquad_map.compiled.team import Team
 from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs import Epoch
-from triquad_server.mesh.mesher import (
-    TileBorder,
-    TileIndex,
-    TileLattice,
-    mesh_tile,
-    tile_lattice,
-)
+from triquad_server.mesh.mesher import TileBorder, TileIndex, TileLattice, mesh_tile, tile_lattice
 from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
 from triquad_server.settings import MeshSettings
 
@@ -116,11 +110,7 @@ class _TileLevel:
         known: Mapping[TileIndex, int],
         revision: int,
     ) -> TileDelta:
-        """What is new in a box to somebody who knows everything up to the revision ``known_to``.
-
-        ``known`` are versions of tiles that are known whatever the revision; ``revision`` is that
-        of the newest tile of any level.
-        """
+        """As :meth:`TileCache.delta`; ``revision`` is that of the newest tile of any level."""
         ready: list[CachedTile] = []
         to_make: list[TileIndex] = []
         inside = self._indices[self.lattice.meets(self._indices, low, high)]

@@ -7,13 +7,7 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
 from triquad_server.epochs import Epoch, EpochHistory
-from triquad_server.mesh.mesher import (
-    TileIndex,
-    TileLattice,
-    check_box,
-    check_level,
-    mesh_tile,
-)
+from triquad_server.mesh.mesher import TileLattice, check_box, check_level, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
 
 MAX_TILES = 1_000_000
@@ -61,7 +55,11 @@ class TileQueries:
             RefusedError: a field is out of range, or the epoch is gone.
         """
         index = (request.x, request.y, request.z)
-        _check_index(index)
+        if max(map(abs, index)) > TILE_INDEX_LIMIT:
+            raise RefusedError(
+                "bad_request",
+                f"tile {index} is out of range: use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
+            )
         check_level(request.level)
         epoch = self._epochs.get(request.epoch)
         mesh = mesh_tile(epoch, index, self._cache.lattice(request.level))
@@ -80,19 +78,9 @@ def surface_tiles(epoch: Epoch, lattice: TileLattice) -> Ints:
     """Tiles [T, 3], sorted, that meet a block with seen surface, or what is meshed around it."""
     settings = epoch.field_settings
     side_m = BLOCK_VOXELS * settings.leaf_m
-    tiles: set[TileIndex] = set()
+    corners = [np.zeros((0, 3))]
     for region in epoch.frozen_regions:
-        corner = region.centre - settings.region_side_m / 2
-        low = region.evidence.surface_cells() * side_m + corner
-        around = lattice.tiles_meeting(low, low + side_m, lattice.reach_m)
-        tiles.update((x, y, z) for x, y, z in around.tolist())
-    return np.array(sorted(tiles), np.int32).reshape(-1, 3)
-
-
-def _check_index(index: TileIndex) -> None:
-    """Refuse a tile that is too far away."""
-    if max(map(abs, index)) > TILE_INDEX_LIMIT:
-        raise RefusedError(
-            "bad_request",
-            f"tile {index} is out of range: use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
-        )
+        origin = region.centre - settings.region_side_m / 2
+        corners.append(region.evidence.surface_cells() * side_m + origin)
+    low = np.concatenate(corners)
+    return lattice.tiles_meeting(low, low + side_m, lattice.reach_m).astype(np.int32)
