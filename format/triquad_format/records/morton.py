@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 
 from triquad_format.records.arrays import Longs
 
-_SPREAD_2D = (
+SPREAD_2D = (
     (16, 0x0000FFFF0000FFFF),
     (8, 0x00FF00FF00FF00FF),
     (4, 0x0F0F0F0F0F0F0F0F),
     (2, 0x3333333333333333),
     (1, 0x5555555555555555),
 )
+"""Shifts and masks that move bit ``i`` of a number to bit ``2 * i``."""
+
 _SPREAD_3D = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
@@ -35,7 +37,7 @@ def encode(cells: NDArray[np.integer]) -> Longs:
         ``[...]`` int64 codes, ordered along the Z curve.
     """
     dimensions = cells.shape[-1]
-    spread = _SPREAD_2D if dimensions == 2 else _SPREAD_3D
+    spread = SPREAD_2D if dimensions == 2 else _SPREAD_3D
     code = np.zeros(cells.shape[:-1], np.int64)
     for axis in range(dimensions):
         bits = cells[..., axis].astype(np.int64)
@@ -47,7 +49,7 @@ def encode(cells: NDArray[np.integer]) -> Longs:
 
 def decode(codes: NDArray[np.integer], dimensions: int) -> Longs:
     """Integer cells ``[..., D]`` of Morton codes ``[...]``; the inverse of :func:`encode`."""
-    spread = _SPREAD_2D if dimensions == 2 else _SPREAD_3D
+    spread = SPREAD_2D if dimensions == 2 else _SPREAD_3D
     shifts = [shift for shift, _ in spread]
     top = 0x00000000FFFFFFFF if dimensions == 2 else 0x00000000001FFFFF
     masks = [top, *(mask for _, mask in spread[:-1])]

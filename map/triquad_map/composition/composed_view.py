@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.composition.field_view import FieldView, in_one
@@ -109,8 +109,9 @@ class ComposedView(FieldView):
         nearest.distance[to] = found.distances[hits] * leaf_m
         nearest.point[to] = corner + found.closest[hits] * leaf_m
         nearest.mean[to] = corner + found.means[hits] * leaf_m
-        age_s = (self._newest_s - surfels.seen_s[rows]).astype(np.float64)
-        nearest.confidence[to] = surfels.confidence[rows] * _faded(age_s)
+        age_s = np.maximum(self._newest_s - surfels.seen_s[rows], 0)
+        faded = 0.5 ** (age_s / _HALF_LIFE_S)
+        nearest.confidence[to] = surfels.confidence[rows] * faded.astype(np.float32)
 
     def _improve_unknown(self, found: NearestUnknown, points: Doubles) -> None:
         """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""
@@ -183,8 +184,3 @@ def no_surfels(limits: Doubles) -> NearestSurfels:
     return NearestSurfels(
         limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.int32)
     )
-
-
-def _faded(age_s: Doubles) -> Floats:
-    """The share [N] of its confidence that a surface keeps, seen last so many seconds ago."""
-    return np.asarray(0.5 ** (np.maximum(age_s, 0.0) / _HALF_LIFE_S), np.float32)

@@ -129,7 +129,13 @@ class Answers:
             _within("radius_m", request.radius_m, MAX_DISTANCE_M, least=0.0),
             _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
         )
-        _short("segment", np.linalg.norm(ends - starts, axis=1))
+        lengths = np.linalg.norm(ends - starts, axis=1)
+        if lengths.max(initial=0.0) > MAX_RANGE_M:  # each step waits for the one before
+            worst = int(lengths.argmax())
+            raise RefusedError(
+                "bad_request",
+                f"segment {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
+            )
         with self._view(request.epoch) as view:
             steps = steps_at_most(view, starts, ends)
             self._check_count(steps / _STEPS_EACH, f"segments of {steps} steps")
@@ -253,16 +259,6 @@ def _within(name: str, value: float, most: float, least: float = MIN_LENGTH_M) -
     if not least <= value <= most:
         raise RefusedError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
     return float(value)
-
-
-def _short(what: str, lengths: Doubles) -> None:
-    """Refuse ways [N] that are too long: each of their steps waits for the one before."""
-    if lengths.max(initial=0.0) > MAX_RANGE_M:
-        worst = int(lengths.argmax())
-        raise RefusedError(
-            "bad_request",
-            f"{what} {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
-        )
 
 
 def _same_length(first: Floats, name: str, second: Floats) -> None:

@@ -73,11 +73,7 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
     """Distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface."""
     nearest = view.nearest_surface(points, options.max_distance_m)
     status = view.status(points)
-    away = points - nearest.mean
-    lengths = np.linalg.norm(away, axis=1)
-    clear = nearest.found & (lengths > 1e-6)
-    gradient = np.zeros((len(points), 3))
-    gradient[clear] = away[clear] / lengths[clear, None]
+    gradient = np.where(nearest.found[:, None], _unit(points - nearest.mean, 0.0), 0.0)
     distance = nearest.distance.copy()
     _join_field(view, points, nearest, status=status, distance=distance, gradient=gradient)
     unknown = None
@@ -114,9 +110,7 @@ def with_unknown(answer: Distances, points: Doubles, unknown: Unknown) -> Distan
     nearer = answer.unknown_distance_m < answer.distance_m
     if unknown is Unknown.ERROR:
         refuse_unknown("point", nearer)
-    away = points - answer.unknown_point
-    lengths = np.linalg.norm(away, axis=1, keepdims=True)
-    gradient = np.where(lengths > 1e-6, away / np.maximum(lengths, 1e-6), 0.0)
+    gradient = _unit(points - answer.unknown_point, 0.0)
     surface_point = answer.surface_point
     if surface_point is not None:
         surface_point = np.where(nearer[:, None], answer.unknown_point, surface_point)
@@ -156,6 +150,11 @@ def _join_field(
     # The field is no more than a bound where it saturates.
     value = np.clip(value, -high, distance[rows] + low)
     joined = share[:, None] * side[:, None] * gradient[rows] + (1 - share)[:, None] * slope
-    lengths = np.linalg.norm(joined, axis=1, keepdims=True)
     distance[rows] = share * side * distance[rows] + (1 - share) * value
-    gradient[rows] = np.where(lengths > 1e-6, joined / np.maximum(lengths, 1e-6), slope)
+    gradient[rows] = _unit(joined, slope)
+
+
+def _unit(vectors: Doubles, otherwise: Doubles | float) -> Doubles:
+    """The directions [N, 3] of ``vectors`` [N, 3]; ``otherwise`` where they have no length."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(lengths > 1e-6, vectors / np.maximum(lengths, 1e-6), otherwise)

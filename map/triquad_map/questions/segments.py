@@ -18,9 +18,6 @@ from triquad_map.view import MapView
 STEP_VOXELS = 0.5
 """Between places that are checked, where nothing allows a longer step."""
 
-_Gap = Callable[[Doubles], Doubles]
-"""Distances [N] at points [N, 3]."""
-
 
 @dataclass(frozen=True)
 class SegmentOptions:
@@ -86,9 +83,6 @@ def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOpti
     def to_surface(points: Doubles) -> Doubles:
         return distances(view, points, DistanceOptions(reach_m)).distance_m.astype(np.float64)
 
-    def to_unknown(points: Doubles) -> Doubles:
-        return view.nearest_unknown(points, reach_m).distance
-
     radius = options.radius_m
     solid = _march(
         to_surface, starts, directions, lengths, radius_m=radius, step_m=step_m, clearance=True
@@ -96,7 +90,7 @@ def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOpti
     # Unknown space is entered, not touched: a ball may touch it from outside.
     inside = np.nextafter(radius, 0.0) if radius > 0 else 0.0
     unknown = _march(
-        to_unknown,
+        lambda points: view.nearest_unknown(points, reach_m).distance,
         starts,
         directions,
         solid.contact,
@@ -117,7 +111,7 @@ def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOpti
 
 
 def _march(
-    gap: _Gap,
+    gap: Callable[[Doubles], Doubles],
     starts: Doubles,
     directions: Doubles,
     lengths: Doubles,
@@ -127,8 +121,9 @@ def _march(
 ) -> _March:
     """Walk along the segments as far as the distance allows, until the first contact.
 
-    A distance changes by no more than the way that is gone: the next contact is at least
-    ``distance - radius`` away, and a place with less clearance ``distance - clearance``.
+    ``gap`` gives the distances [N] at points [N, 3]. These change by no more than the way that is
+    gone: the next contact is at least ``distance - radius`` away, and a place with less clearance
+    ``distance - clearance``.
     """
     count = len(starts)
     march = _March(

@@ -21,16 +21,7 @@ from triquad_format.records.region import AXES
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import Index, VoxelIndex, make_row, with_room
 
-_SPREAD = (
-    (16, 0x0000FFFF0000FFFF),
-    (8, 0x00FF00FF00FF00FF),
-    (4, 0x0F0F0F0F0F0F0F0F),
-    (2, 0x3333333333333333),
-    (1, 0x5555555555555555),
-)
-
 CoordinateT = TypeVar("CoordinateT")
-
 
 _AXES = np.array(AXES)
 PLANE_BITS = 40
@@ -71,7 +62,7 @@ def morton_code(first: CoordinateT, second: CoordinateT) -> CoordinateT:
 
 @register_jitable
 def _spread(bits: Any) -> Any:
-    for shift, mask in _SPREAD:
+    for shift, mask in morton.SPREAD_2D:
         bits = (bits | (bits << shift)) & mask
     return bits
 
