@@ -31,6 +31,9 @@ class PendingRequest:
     def refuse(self, code, text):
         self._replies.put(code)
 
+    def fail(self, error):
+        self.refuse("internal", str(error))
+
     @property
     def reply(self):
         return self._replies.get(timeout=servers.WAIT_S)

@@ -1,6 +1,5 @@
 """Flush requests: pending, without holding up any worker, until their scans show in the map."""
 
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -12,8 +11,6 @@ from triquad_format.wire.messages import FlushReply, FlushRequest
 
 from triquad_server.intake.scan_queue import MAX_SEQUENCE, SourceLedger
 from triquad_server.net.requests import Request
-
-_log = logging.getLogger(__name__)
 
 ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived so long after the flush request, which travels the same way behind
@@ -45,8 +42,7 @@ class _Pending:
             else:
                 self.request.answer(outcome)
         except Exception as error:
-            _log.exception("a flush request met an internal error")
-            self.request.refuse("internal", f"{type(error).__name__}: {error}")
+            self.request.fail(error)
 
 
 class FlushHandler:

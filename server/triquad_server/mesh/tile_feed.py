@@ -134,10 +134,9 @@ class TileFeed:
         try:
             return self._serve(follower)
         except Exception as error:
-            _log.exception("a follower of the mesh met an internal error")
             with self._changed:
                 self._pending.remove(follower)
-            follower.request.refuse("internal", f"{type(error).__name__}: {error}")
+            follower.request.fail(error)
             return True
 
     def _serve(self, follower: Follower) -> bool:
@@ -147,17 +146,13 @@ class TileFeed:
             return self._answer_if_late(follower, knows_all=follower.nothing_at == state)
         asks = follower.asks
         delta = self._cache.delta(
-            follower.asks.level,
-            asks.minimum,
-            asks.maximum,
-            known_to=follower.known_to,
-            known=follower.known,
+            asks.level, asks.minimum, asks.maximum, known_to=follower.known_to, known=follower.known
         )
         if delta.ready or (delta.removed and not delta.to_make):
             self._send(follower, self._filled(follower, delta))
             return True
         if delta.to_make:
-            self._make(follower.asks.level, delta.to_make)
+            self._make(asks.level, delta.to_make)
             return True
         if follower.restart and self._is_current_for(follower):
             self._send(follower, TileReply(complete=True, revision=delta.revision))

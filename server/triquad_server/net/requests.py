@@ -72,6 +72,11 @@ class Request:
         payload = codec.encode(ErrorReply(code, text[:4096]))
         self._finish(lambda: self._query.reply_err(payload, encoding=keys.encoding(ErrorReply)))
 
+    def fail(self, error: Exception) -> None:
+        """Reply that handling the request met an internal error, which is being handled."""
+        _log.exception("a request on %s met an internal error", self.key)
+        self.refuse("internal", f"{type(error).__name__}: {error}")
+
     def _finish(self, reply: Callable[[], None]) -> None:
         """Send the reply and end the query, also where the one who asked is gone."""
         try:
@@ -163,5 +168,4 @@ class RequestHandlers:
             except RefusedError as error:
                 request.refuse(error.code, error.message)
             except Exception as error:
-                _log.exception("a request met an internal error")
-                request.refuse("internal", f"{type(error).__name__}: {error}")
+                request.fail(error)
