@@ -209,7 +209,7 @@ class Settings(BaseModel):
     service: ServiceSettings = ServiceSettings()
 
     @model_validator(mode="after")
-    def _regions_hold_scans(self) -> "Settings":
+    def _sections_fit(self) -> "Settings":
         reach_m, most_m = self.scan.range_max_m, 8 * self.field.region_pitch_m
         if reach_m > most_m:
             raise ValueError(
@@ -217,19 +217,11 @@ class Settings(BaseModel):
                 f"{self.field.leaf_m:g} and field.depth = {self.field.depth}: "
                 f"use at most {most_m:g}, or larger regions"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _thinning_fits_range(self) -> "Settings":
         if self.scan.thin_m * 1e6 < self.scan.range_max_m:
             raise ValueError(
                 f"scan.thin_m = {self.scan.thin_m:g} is too fine for scan.range_max_m = "
                 f"{self.scan.range_max_m:g}: use at least {self.scan.range_max_m * 1e-6:g}"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _mesh_fits_leaves(self) -> "Settings":
         if self.mesh.cell_m + self.mesh.reach_m > 4 * self.field.leaf_m:
             raise ValueError(
                 f"mesh.cell_m = {self.mesh.cell_m:g} and mesh.reach_m = {self.mesh.reach_m:g} are "

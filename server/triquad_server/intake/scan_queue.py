@@ -202,9 +202,8 @@ class ScanQueue:
                 self.dropped.add(reason)
                 return
             self._scans.append(scan)
-            pushed_out = self._scans.popleft() if len(self._scans) > self.limit else None
-            if pushed_out is not None:
-                self.ledger.push_out(pushed_out)
+            if len(self._scans) > self.limit:
+                self.ledger.push_out(self._scans.popleft())
 
     def refuse(self, scan: Scan, reason: str, text: str) -> None:
         """Account for a scan that arrived but is not let in."""

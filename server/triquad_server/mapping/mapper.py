@@ -135,9 +135,7 @@ class Mapper:
             return self._epoch
         if self._epoch is not None or not self._number:
             self._number += 1
-        before = (
-            {region.index: region for region in self._epoch.frozen_regions} if self._epoch else {}
-        )
+        before = {old.index: old for old in self._epoch.frozen_regions} if self._epoch else {}
         regions = tuple(self._freeze(region, before) for region in self._regions.values())
         self._epoch = Epoch(
             name=self._name,

@@ -137,8 +137,7 @@ class ReplayPool:
 
     def sample(self, count: int) -> Batch:
         """Samples on at most ``count`` intervals, one on each: what a checkpoint keeps."""
-        places = self._rng.permutation(self._size)[:count]
-        return self._draw_ordered(places)
+        return self._draw_ordered(self._rng.permutation(self._size)[:count])
 
     def _draw_ordered(self, places: Longs) -> Batch:
         return draw_ordered_samples(

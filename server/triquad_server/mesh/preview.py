@@ -32,12 +32,8 @@ CLUSTER_CELLS = 3
 """Side of the cubes of cells whose vertices become one: 1.2 m."""
 
 _CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-_EDGES = tuple(
-    (a, b)
-    for a in range(8)
-    for b in range(8)
-    if a < b and np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1
-)
+_EDGES = [(corner, corner | bit) for corner in range(8) for bit in (1, 2, 4) if not corner & bit]
+"""The two corners of each edge, as rows of ``_CORNERS``."""
 
 Distances = Callable[[Doubles], NDArray[np.floating]]
 """Signed distances [N] at points [N, 3] of the map frame."""
@@ -70,17 +66,12 @@ def previews_of(
         distances: a faster way to the map's signed distances than numpy.
         stamp_ns: time that viewers show, nanoseconds since 1970.
     """
-    shown = distances or _distances_of(record)
+    shown = distances or MapEvaluator(record).distances
     parts = {
         region.index: preview_part(region, record.settings, shown, stamp_ns=stamp_ns or 0)
         for region in record.regions
     }
     return Previews(preview_schema(), parts)
-
-
-def _distances_of(record: MapRecord) -> Distances:
-    evaluator = MapEvaluator(record)
-    return lambda points: evaluator.query(points).sdf
 
 
 def preview_part(
@@ -155,8 +146,7 @@ def _quads(cells: Longs, values: NDArray[np.floating]) -> NDArray[np.intp]:
     quads = [np.zeros((0, 4), np.intp)]
     for axis in range(3):
         u, v = np.eye(3, dtype=np.int64)[[(axis + 1) % 3, (axis + 2) % 3]]
-        top = int("".join("1" if other == axis else "0" for other in range(3)), 2)
-        inside = values[:, 0] > 0, values[:, top] > 0
+        inside = values[:, 0] > 0, values[:, 4 >> axis] > 0
         rows = np.flatnonzero((inside[0] != inside[1]) & (cells.min(axis=1) > 0))
         around = np.stack([cells[rows], cells[rows] - u, cells[rows] - u - v, cells[rows] - v], 1)
         wanted = morton.encode(around)

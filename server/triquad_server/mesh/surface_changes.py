@@ -13,7 +13,6 @@ from triquad_server.epochs import FrozenRegion
 
 _KEY_BITS = 20  # of each coordinate of a voxel, or of a group, in its region
 
-
 _LEFT_SHARE = 0.02
 _LEFT_VOXELS = 4
 """Where the surface left so many voxels of a group, and that share of them, something is gone; of
