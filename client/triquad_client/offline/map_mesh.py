@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
-from triquad_format.records.cells import cells_of_boxes
+from triquad_format.records.cells import cells_of_boxes, rows_by_cell
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_map.view import MapView
@@ -86,11 +86,7 @@ def _blocks(voxels: _Voxels) -> Iterator[tuple[Longs, _Voxels]]:
     """The blocks of cells [3] that voxels reach into, each with these voxels."""
     first, last = voxels.first // _BLOCK_CELLS, voxels.last // _BLOCK_CELLS
     blocks, rows = cells_of_boxes(first, last)
-    each, numbers = np.unique(blocks, axis=0, return_inverse=True)
-    order = np.argsort(numbers.reshape(-1), kind="stable")
-    ends = np.cumsum(np.bincount(numbers.reshape(-1), minlength=len(each)))
-    groups = np.split(rows[order], ends)
-    return ((block, voxels[group]) for block, group in zip(each, groups, strict=False))
+    return ((block, voxels[rows[here]]) for block, here in rows_by_cell(blocks))
 
 
 def _block_mesh(view: MapView, block: Longs, voxels: _Voxels, cell_m: float) -> Mesh:
