@@ -58,7 +58,7 @@ def read_folder(folder: Path) -> KittiFolder:
         raise ToolError(f"{folder}: holds no poses.txt")
     scans = _scan_paths(folder)
     poses = _read_poses(folder / "poses.txt")
-    _check_count(folder / "poses.txt", "poses", len(poses), len(scans))
+    _check_count(folder / "poses.txt", "poses", len(poses), scans=len(scans))
     calibration = folder / "calib.txt"
     if calibration.is_file():
         camera_from_lidar = _read_calibration(calibration)
@@ -67,7 +67,7 @@ def read_folder(folder: Path) -> KittiFolder:
     stamps = np.arange(len(scans), dtype=np.int64) * DEFAULT_PERIOD_NS
     if times.is_file():
         stamps = _read_stamps(times)
-        _check_count(times, "times", len(stamps), len(scans))
+        _check_count(times, "times", len(stamps), scans=len(scans))
     return KittiFolder(scans, poses, stamps)
 
 
