@@ -70,8 +70,12 @@ def read_log(store: Path) -> StoreLog:
     folder = map_folder(store)
     indices = _Indices(folder)
     checkpoints = tuple(_logged(file, indices) for file in checkpoint_files(folder))
-    aside = tuple(path.name for path in set_aside(folder))
-    return StoreLog(str(folder), sum(found.bytes for found in checkpoints), checkpoints, aside)
+    return StoreLog(
+        str(folder),
+        bytes=sum(checkpoint.bytes for checkpoint in checkpoints),
+        checkpoints=checkpoints,
+        set_aside=tuple(path.name for path in set_aside(folder)),
+    )
 
 
 def print_log(log: StoreLog) -> None:

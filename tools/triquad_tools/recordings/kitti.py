@@ -109,13 +109,11 @@ def _parse_pose(place: str, line: str) -> Doubles:
     if len(words) != 12:
         raise ToolError(f"{place}: {len(words)} numbers where a pose has 12")
     pose = np.eye(4)
-    for i, word in enumerate(words):
-        pose[i // 4, i % 4] = _parse_number(place, word)
-    rotation = pose[:3, :3]
+    pose[:3] = np.reshape([_parse_number(place, word) for word in words], (3, 4))
     if not is_rotation(pose):
         raise ToolError(
             f"{place}: not a rotation: off orthonormal by {rotation_error(pose):.3g}, "
-            f"determinant {np.linalg.det(rotation):.3g}"
+            f"determinant {np.linalg.det(pose[:3, :3]):.3g}"
         )
     return orthonormal(pose)
 
