@@ -41,9 +41,8 @@ from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import KnownTiles, MeshTile, MeshUpdate
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.offline.async_synced_map import AsyncSyncedMap
 from triquad_client.offline.offline_map import OfflineMap, open_map
-from triquad_client.offline.synced_map import SyncedMap, SyncReport
+from triquad_client.offline.synced_map import AsyncSyncedMap, SyncedMap, SyncReport
 
 __all__ = [
     "Alignment",

@@ -21,7 +21,7 @@ from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.net.async_driver import AsyncDriver
 from triquad_client.net.connection import Connection, open_connection
-from triquad_client.offline.async_synced_map import AsyncSyncedMap
+from triquad_client.offline.synced_map import AsyncSyncedMap
 
 
 @documented_as(Client)

@@ -7,10 +7,10 @@ def test_vertices_on_a_common_face_become_one():
     left = np.array([[0.5, 0.5, 0.5], [1, 0.2, 0.3], [1, 0.8, 0.3]])
     right = np.array([[1, 0.2, 0.3], [1, 0.8, 0.3], [1.5, 0.5, 0.5]])
     faces = np.array([[0, 1, 2], [3, 5, 4]], np.int32)
-    vertices, joined = welded(np.concatenate([left, right]), faces, 1.0)
-    assert len(vertices) == 4
-    assert len(joined) == 2
-    assert len(set(joined.ravel())) == 4
+    mesh = welded(np.concatenate([left, right]), faces, 1.0)
+    assert len(mesh.vertices) == 4
+    assert len(mesh.faces) == 2
+    assert len(set(mesh.faces.ravel())) == 4
 
 
 def test_rounding_boundaries_do_not_leave_cracks():
@@ -24,28 +24,28 @@ def test_rounding_boundaries_do_not_leave_cracks():
     index = np.arange(count - 1)
     first = np.stack([index, index + 1, np.full(count - 1, 2 * count)], axis=1)
     second = np.stack([index + 1, index, np.full(count - 1, count + 1)], axis=1) + count
-    vertices, _ = welded(
+    mesh = welded(
         np.concatenate([edge, copy, apexes]),
         np.concatenate([first, second]).astype(np.int32),
         6.4,
     )
-    assert len(vertices) == count + 2
+    assert len(mesh.vertices) == count + 2
 
 
 def test_faces_that_become_degenerate_are_left_out():
     vertices = np.array([[1, 0, 0], [1, 1e-6, 0], [0.5, 0.5, 0.5]])
-    _, faces = welded(vertices, np.array([[0, 1, 2]], np.int32), 1.0)
-    assert faces.shape == (0, 3)
+    mesh = welded(vertices, np.array([[0, 1, 2]], np.int32), 1.0)
+    assert mesh.faces.shape == (0, 3)
 
 
 def test_an_empty_mesh_stays_empty():
-    vertices, faces = welded(np.zeros((0, 3)), np.zeros((0, 3), np.int32), 6.4)
-    assert vertices.shape == (0, 3)
-    assert faces.shape == (0, 3)
-    assert faces.dtype == np.int32
+    mesh = welded(np.zeros((0, 3)), np.zeros((0, 3), np.int32), 6.4)
+    assert mesh.vertices.shape == (0, 3)
+    assert mesh.faces.shape == (0, 3)
+    assert mesh.faces.dtype == np.int32
 
 
 def test_unused_vertices_go():
-    vertices, faces = compacted(np.arange(12.0).reshape(4, 3), np.array([[3, 1, 0]]))
-    assert np.array_equal(vertices, [[0, 1, 2], [3, 4, 5], [9, 10, 11]])
-    assert np.array_equal(faces, [[2, 1, 0]])
+    mesh = compacted(np.arange(12.0).reshape(4, 3), np.array([[3, 1, 0]]))
+    assert np.array_equal(mesh.vertices, [[0, 1, 2], [3, 4, 5], [9, 10, 11]])
+    assert np.array_equal(mesh.faces, [[2, 1, 0]])

@@ -75,8 +75,8 @@ def test_a_mesh_is_the_one_that_a_server_gives(map_file, tmp_path):
     lattice = tile_lattice(settings().mesh, 0)
     indices = surface_tiles(epoch, lattice).tolist()
     tiles = [mesh_tile(epoch, tuple(index), lattice) for index in indices]
-    parts = [(tile.origin + tile.vertices, tile.faces) for tile in tiles]
-    served = Mesh(*joined(parts, lattice.tile_side_m, *everywhere))
+    parts = [Mesh(tile.origin + tile.vertices, tile.faces) for tile in tiles]
+    served = joined(parts, lattice.tile_side_m, box=everywhere, epoch=epoch.number)
     written = read_mesh(export(map_file, tmp_path, "mesh.ply"))
     assert len(written.faces) == pytest.approx(len(served.faces), rel=0.01)
     for one, other in ((written, served), (served, written)):

@@ -17,7 +17,7 @@ from triquad_format.wire.tile_codec import decode_tile
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError, InvalidInputError
-from triquad_client.mesh.mesh import Mesh, Triangles, joined
+from triquad_client.mesh.mesh import Mesh, joined
 
 _REPLY_BYTES = 1_000_000
 
@@ -152,9 +152,9 @@ class FollowedMesh:
 
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""
-        tiles = [Triangles(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values()]
-        whole = joined(tiles, self.tile_side_m, minimum=self.minimum, maximum=self.maximum)
-        return Mesh(whole.vertices, whole.faces, self.epoch)
+        tiles = [Mesh(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values()]
+        box = self.minimum, self.maximum
+        return joined(tiles, self.tile_side_m, box=box, epoch=self.epoch)
 
     def known_tiles(self) -> KnownTiles:
         """The tiles to go on with."""

@@ -6,7 +6,7 @@ What is fetched goes in the background of all else.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,13 +81,6 @@ class Mesh:
         return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
 
 
-class Triangles(NamedTuple):
-    """A surface in the map frame."""
-
-    vertices: Doubles  # [V, 3] metres
-    faces: Ints  # [F, 3]
-
-
 def fetch_tiles(bounds: Bounds | None, level: int) -> Call[TileList]:
     """The tiles that meet the bounds."""
     minimum, maximum = checks.box(bounds)
@@ -103,7 +96,7 @@ def fetch_tile(index: Sequence[int], level: int) -> Call[Mesh]:
 
 def fetch_mesh(bounds: Bounds | None, level: int) -> Call[Mesh]:
     """The faces whose centroids lie in the bounds, from one epoch."""
-    minimum, maximum = checks.box(bounds)
+    box = checks.box(bounds)
 
     def fetch() -> Call[Mesh]:
         listed = yield from fetch_tiles(bounds, level)
@@ -111,9 +104,8 @@ def fetch_mesh(bounds: Bounds | None, level: int) -> Call[Mesh]:
         tiles = yield from ask_each(indices, lambda index: _ask_tile(index, listed.epoch, level))
 
         def join(_: Run) -> Mesh:
-            parts = [Triangles(tile.origin + tile.vertices, tile.faces) for tile in tiles]
-            whole = joined(parts, listed.tile_side_m, minimum=minimum, maximum=maximum)
-            return Mesh(whole.vertices, whole.faces, listed.epoch)
+            parts = [Mesh(tile.origin + tile.vertices, tile.faces, tile.epoch) for tile in tiles]
+            return joined(parts, listed.tile_side_m, box=box, epoch=listed.epoch)
 
         return (yield from offload(join))
 
@@ -126,22 +118,22 @@ def _ask_tile(index: Sequence[int], epoch: int, level: int) -> Ask[Tile]:
 
 
 def joined(
-    tiles: Sequence[Triangles], tile_side_m: float, minimum: Doubles, maximum: Doubles
-) -> Triangles:
-    """The tiles' faces whose centroids lie in the box between two corners [3], as one mesh."""
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in tiles)])
-    shifted = [faces + int(start) for (_, faces), start in zip(tiles, starts, strict=False)]
-    vertices, faces = welded(
-        np.concatenate([np.zeros((0, 3)), *(vertices for vertices, _ in tiles)]),
+    tiles: Sequence[Mesh], tile_side_m: float, *, box: tuple[Doubles, Doubles], epoch: int
+) -> Mesh:
+    """The tiles' faces whose centroids lie in a box, given by its corners [3], as one mesh."""
+    starts = np.cumsum([0, *(len(tile.vertices) for tile in tiles)])
+    shifted = [tile.faces + int(start) for tile, start in zip(tiles, starts, strict=False)]
+    whole = welded(
+        np.concatenate([np.zeros((0, 3)), *(tile.vertices for tile in tiles)]),
         np.concatenate([np.zeros((0, 3), np.int32), *shifted]).astype(np.int32),
         tile_side_m,
     )
-    centroids = vertices[faces].mean(axis=1)
-    inside = ((centroids >= minimum) & (centroids <= maximum)).all(axis=1)
-    return compacted(vertices, faces[inside])
+    centroids = whole.vertices[whole.faces].mean(axis=1)
+    inside = ((centroids >= box[0]) & (centroids <= box[1])).all(axis=1)
+    return compacted(whole.vertices, whole.faces[inside], epoch)
 
 
-def welded(vertices: Doubles, faces: Ints, tile_side_m: float) -> Triangles:
+def welded(vertices: Doubles, faces: Ints, tile_side_m: float) -> Mesh:
     """The mesh with one vertex where tiles had several, without faces that this made degenerate.
 
     Of ``vertices`` [V, 3], metres, only those on the sides of tiles, ``tile_side_m`` long, can be
@@ -157,12 +149,12 @@ def welded(vertices: Doubles, faces: Ints, tile_side_m: float) -> Triangles:
     return compacted(vertices, joined[(a != b) & (b != c) & (c != a)])
 
 
-def compacted(vertices: Doubles, faces: NDArray[np.integer]) -> Triangles:
+def compacted(vertices: Doubles, faces: NDArray[np.integer], epoch: int = 0) -> Mesh:
     """The mesh without vertices that no face uses."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     number = np.cumsum(used) - 1
-    return Triangles(vertices[used], number[faces].astype(np.int32).reshape(-1, 3))
+    return Mesh(vertices[used], number[faces].astype(np.int32).reshape(-1, 3), epoch)
 
 
 def _representatives(points: Doubles) -> NDArray[np.intp]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
-from triquad_format.records.cells import cells_of_boxes
+from triquad_format.records.cells import cells_of_boxes, rows_by_cell
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_map.view import MapView
@@ -19,7 +19,7 @@ from triquad_map.view import MapView
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import InvalidInputError
-from triquad_client.mesh.mesh import Mesh, Triangles, joined
+from triquad_client.mesh.mesh import Mesh, joined
 
 CELL_RANGE_M = (0.01, 10.0)
 MAX_FACES = 50_000_000
@@ -51,12 +51,12 @@ def map_mesh(
     ``view`` answers for the field of the map, and ``seen`` holds its evidence; no more is read.
     """
     cell_m = checks.within("cell_m", cell_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
-    low, high = checks.box(bounds)
-    blocks = list(_blocks(_voxels(seen, low, high, cell_m)))
-    tiles: list[Triangles] = []
+    box = checks.box(bounds)
+    blocks = list(_blocks(_voxels(seen, *box, cell_m=cell_m)))
+    tiles: list[Mesh] = []
     faces = 0
     for number, (block, voxels) in enumerate(blocks, start=1):
-        tiles.append(_block_mesh(view, block, voxels, cell_m))
+        tiles.append(_block_mesh(view, block, voxels, cell_m=cell_m))
         faces += len(tiles[-1].faces)
         if faces > MAX_FACES:
             raise InvalidInputError(
@@ -65,8 +65,7 @@ def map_mesh(
             )
         if report is not None:
             report(number, len(blocks))
-    surface = joined(tiles, _BLOCK_CELLS * cell_m, minimum=low, maximum=high)
-    return Mesh(surface.vertices, surface.faces, view.epoch)
+    return joined(tiles, _BLOCK_CELLS * cell_m, box=box, epoch=view.epoch)
 
 
 def _voxels(seen: MapRecord, low: Doubles, high: Doubles, cell_m: float) -> _Voxels:
@@ -87,14 +86,10 @@ def _blocks(voxels: _Voxels) -> Iterator[tuple[Longs, _Voxels]]:
     """The blocks of cells [3] that voxels reach into, each with these voxels."""
     first, last = voxels.first // _BLOCK_CELLS, voxels.last // _BLOCK_CELLS
     blocks, rows = cells_of_boxes(first, last)
-    each, numbers = np.unique(blocks, axis=0, return_inverse=True)
-    order = np.argsort(numbers.reshape(-1), kind="stable")
-    ends = np.cumsum(np.bincount(numbers.reshape(-1), minlength=len(each)))
-    groups = np.split(rows[order], ends)
-    return ((block, voxels[group]) for block, group in zip(each, groups, strict=False))
+    return ((block, voxels[rows[here]]) for block, here in rows_by_cell(blocks))
 
 
-def _block_mesh(view: MapView, block: Longs, voxels: _Voxels, cell_m: float) -> Triangles:
+def _block_mesh(view: MapView, block: Longs, voxels: _Voxels, cell_m: float) -> Mesh:
     origin = block * _BLOCK_CELLS
     cells = _covered(voxels.first - origin, voxels.last - origin)
     asked = np.argwhere(_any_of_eight(np.pad(cells, 1)))  # lattice points at their corners
@@ -107,10 +102,10 @@ def _block_mesh(view: MapView, block: Longs, voxels: _Voxels, cell_m: float) -> 
     surface = _marched(volume, cells)
     vertices = (origin + surface.vertices) * cell_m
     seen = _beside(voxels.places, vertices[surface.faces].mean(axis=1), view.voxel_m)
-    return Triangles(vertices, surface.faces[seen])
+    return Mesh(vertices, surface.faces[seen])
 
 
-def _marched(volume: Floats, cells: Bools) -> Triangles:
+def _marched(volume: Floats, cells: Bools) -> Mesh:
     """Triangles between lattice points, in units of cells, counter-clockwise from free space."""
     try:
         from skimage.measure import marching_cubes
@@ -121,8 +116,8 @@ def _marched(volume: Floats, cells: Bools) -> Triangles:
     try:
         vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=mask, method="lorensen")
     except (ValueError, RuntimeError):  # so it tells that no cell is crossed
-        return Triangles(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    return Triangles(vertices.astype(np.float64), faces)
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    return Mesh(vertices.astype(np.float64), faces)
 
 
 def _covered(first: Longs, last: Longs) -> Bools:

@@ -29,18 +29,13 @@ class LocalDriver(BlockingDriver):
     """Runs calls over the map in a record, as fast as possible here; for several threads."""
 
     def __init__(self, record: MapRecord) -> None:
-        self._open = open_view(record)
-        self.view = self._open.view
+        self.opened = open_view(record)
+        self.view = self.opened.view
         self._answers = Answers(self._epoch, _NO_LIMITS)
-
-    @property
-    def compiled(self) -> bool:
-        """Whether compiled code answers, as in a server; else numpy, which is far slower."""
-        return self._open.compiled
 
     def close(self) -> None:
         """End the threads that compiled code works on; nothing may be asked any more."""
-        self._open.close()
+        self.opened.close()
 
     async def _replies(self, batch: Batch) -> list[Any]:
         return [self._answers.answer(batch.request(item).message) for item in batch.items]
@@ -78,7 +73,7 @@ class OfflineMap(MapQueries):
         self.epoch = record.epoch
         self.stamp_ns = stamp_ns
         """When its epoch was written, nanoseconds since 1970; 0: the file does not tell."""
-        self.compiled = driver.compiled
+        self.compiled = driver.opened.compiled
         """Whether compiled code answers, as in the server; else numpy, which is far slower."""
 
     def __enter__(self) -> "OfflineMap":
@@ -94,10 +89,7 @@ class OfflineMap(MapQueries):
             driver.close()
 
     def mesh(
-        self,
-        bounds: Bounds | None = None,
-        cell_m: float = 0.1,
-        report: Report | None = None,
+        self, bounds: Bounds | None = None, cell_m: float = 0.1, report: Report | None = None
     ) -> Mesh:
         """The surface where rays have seen one, by marching cubes: the faces centred in ``bounds``.
 

@@ -1,5 +1,6 @@
 """A copy of the part of a server's map that a box needs: it answers also while the link is down."""
 
+import asyncio
 import dataclasses
 import threading
 import time
@@ -17,11 +18,13 @@ from triquad_format.records.record_check import check_record
 from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
+from triquad_client.calls.async_queries import AsyncMapQueries
 from triquad_client.calls.download import RemoteBytes, newest_file
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
+from triquad_client.documentation import documented_as
 from triquad_client.errors import DownloadError
-from triquad_client.net.call import Call, ResultT, Run, offload, retried
+from triquad_client.net.call import AsyncRun, Call, ResultT, Run, offload, retried
 from triquad_client.offline.offline_map import LocalDriver
 
 
@@ -168,3 +171,23 @@ class SyncedMap(LocalCopy, MapQueries):
             OSError: the file cannot be written.
         """
         return self._ask_server(self._update())
+
+
+@documented_as(SyncedMap)
+class AsyncSyncedMap(LocalCopy, AsyncMapQueries):
+    """The part of a map that a box needs, copied to this machine.
+
+    It is :class:`SyncedMap` to be awaited: a thread answers the queries.
+    """
+
+    def __init__(self, path: Path, bounds: Bounds, run: AsyncRun) -> None:
+        """Use ``AsyncClient.sync``."""
+        LocalCopy.__init__(self, path, bounds)
+        AsyncMapQueries.__init__(self, self._answer_in_thread)
+        self._ask_server = run
+
+    async def refresh(self) -> SyncReport:  # noqa: D102 - documented as the one above
+        return await self._ask_server(self._update())
+
+    async def _answer_in_thread(self, call: Call[ResultT]) -> ResultT:
+        return await asyncio.to_thread(self._answer, call)

@@ -102,18 +102,17 @@ def pack_metadata(
         **_facts_in_metadata(facts),
     }
     if stamp_ns is not None:
-        created = datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc)
-        entries["created"] = created.strftime("%Y-%m-%dT%H:%M:%SZ")
+        entries["created"] = utc_time(stamp_ns)
     return entries
 
 
+def utc_time(stamp_ns: int) -> str:
+    """A time in nanoseconds since 1970 as in RFC 3339, to the second."""
+    return datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
 def _facts_in_metadata(facts: MapFacts) -> dict[str, str]:
-    return {
-        "map": facts.name,
-        "epoch": str(facts.epoch),
-        "frame_id": FRAME_ID,
-        "units": UNITS,
-    }
+    return {"map": facts.name, "epoch": str(facts.epoch), "frame_id": FRAME_ID, "units": UNITS}
 
 
 def readable_metadata(found: list[dict[str, str]]) -> dict[str, str]:

@@ -48,12 +48,7 @@ def whole_region(settings: FieldSettings) -> LeafBox:
     return LeafBox(np.zeros(3), np.full(3, float(1 << settings.depth)))
 
 
-def leaf_box(
-    settings: FieldSettings,
-    index: RegionIndex,
-    low: Doubles,
-    high: Doubles,
-) -> LeafBox:
+def leaf_box(settings: FieldSettings, index: RegionIndex, low: Doubles, high: Doubles) -> LeafBox:
     """The box between corners [3], metres, map frame, grown by what rounding may need."""
     centre = settings.region_centre(index)
     return LeafBox(
@@ -127,11 +122,7 @@ def _reaching(settings: FieldSettings, table: VertexTable, box: LeafBox) -> NDAr
 
 
 def _crop_training(
-    settings: FieldSettings,
-    training: TrainingState,
-    kept: list[NDArray[np.intp]],
-    *,
-    box: LeafBox,
+    settings: FieldSettings, training: TrainingState, kept: list[NDArray[np.intp]], *, box: LeafBox
 ) -> TrainingState:
     leaves = settings.leaf_coordinates(training.sample_points)
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))

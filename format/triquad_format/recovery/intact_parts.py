@@ -24,10 +24,10 @@ from triquad_format.mapfile.manifest import Manifest, unpack_manifest
 from triquad_format.mapfile.mcap.records import (
     Channel,
     Message,
-    Record,
     metadata_entries,
     read_chunk,
     total_limit,
+    walk,
 )
 from triquad_format.mapfile.metadata import METADATA_NAME, MapFacts, check_readable, unpack_facts
 from triquad_format.mapfile.parts.body import unpack_body
@@ -43,8 +43,6 @@ from triquad_format.mapfile.parts.part import (
 from triquad_format.records.field_settings import RegionIndex
 
 _Content = TypeVar("_Content")
-
-_HEAD_BYTES = 9  # of a record: opcode and length
 
 _LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
 """Bytes of all places that are tried: a constant, and a multiple of the file's size."""
@@ -199,11 +197,11 @@ def intact_messages(data: bytes, max_bytes: int) -> Iterator[Message]:
     at = 0
     while match := _CHUNK.search(data, at):
         at = match.start() + 1
-        record = _record(data, match.start())
-        if record is None or len(record.content) > budget:
-            continue
-        budget -= len(record.content)
         try:
+            record = next(walk(memoryview(data), match.start()))
+            if len(record.content) > budget:
+                continue
+            budget -= len(record.content)
             chunk = read_chunk(record)
             messages = list(chunk.messages(dict(channels)))
         except FormatError:
@@ -218,20 +216,9 @@ def intact_messages(data: bytes, max_bytes: int) -> Iterator[Message]:
 def found_metadata(data: bytes) -> dict[str, str]:
     """The entries of the first metadata record ``triquad`` that can be read; empty: of none."""
     for match in _METADATA.finditer(data):
-        record = _record(data, match.start())
         with contextlib.suppress(FormatError):
-            if record is not None:
-                return metadata_entries(record)[1]
+            return metadata_entries(next(walk(memoryview(data), match.start())))[1]
     return {}
-
-
-def _record(data: bytes, start: int) -> Record | None:
-    """The record that begins at ``start``, if the file has all of it."""
-    first = start + _HEAD_BYTES
-    length = int.from_bytes(data[start + 1 : first], "little")
-    if first + length > len(data):
-        return None
-    return Record(data[start], start, memoryview(data)[first : first + length])
 
 
 def _channels(data: bytes) -> dict[int, Channel]:

@@ -53,15 +53,7 @@ def encode_tile(surface: TileSurface) -> bytes:
     behind = (known - flat).astype(np.uint32)
     moves = np.diff(surface.points, axis=0, prepend=np.zeros((1, 3), np.uint16))
     zigzag = _zigzag(moves.astype(np.int16))
-    body = b"".join(
-        part.tobytes()
-        for part in (
-            *_planes(np.ascontiguousarray(zigzag.T)),
-            surface.axes,
-            surface.steps,
-            *_planes(behind),
-        )
-    )
+    body = _planes(zigzag.T) + surface.axes.tobytes() + surface.steps.tobytes() + _planes(behind)
     header = _HEADER.pack(len(surface.points), len(surface.faces))
     return header + zstandard.ZstdCompressor(level=_LEVEL).compress(body)
 
@@ -93,7 +85,7 @@ def decode_tile(data: bytes) -> TileSurface:
         or (points > MAX_CELLS).any()
     ):
         raise WireError("a tile's vertices and faces do not fit together")
-    return TileSurface(points, axes, steps, flat.astype(np.int32).reshape(-1, 3))
+    return TileSurface(points, axes, steps, faces=flat.astype(np.int32).reshape(-1, 3))
 
 
 def _decompressed(data: bytes, size: int) -> bytes:
@@ -116,11 +108,11 @@ def _unzigzag(values: NDArray[np.uint16]) -> NDArray[np.int16]:
     return ((values >> 1).astype(np.int16)) ^ -((values & 1).astype(np.int16))
 
 
-def _planes(values: NDArray[np.unsignedinteger]) -> list[NDArray[np.uint8]]:
-    """The lowest byte of each value, then the next, and so on."""
+def _planes(values: NDArray[np.unsignedinteger]) -> bytes:
+    """The lowest byte of each value, then the next of each, and so on."""
     little = values.astype(values.dtype.newbyteorder("<"), copy=False)
-    parts = np.frombuffer(little.tobytes(), np.uint8).reshape(-1, values.dtype.itemsize)
-    return [np.ascontiguousarray(parts[:, byte]) for byte in range(parts.shape[1])]
+    planes: bytes = little.reshape(-1, 1).view(np.uint8).T.tobytes()
+    return planes
 
 
 def _joined(planes: NDArray[np.uint8], dtype: str) -> NDArray[np.unsignedinteger]:

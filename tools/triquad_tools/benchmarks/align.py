@@ -117,7 +117,7 @@ def displaced(pose: Doubles, offset: Offset, rng: np.random.Generator) -> Double
 def _attempt(view: MapView, scan: PosedScan, guess: Doubles) -> Attempt:
     points = np.asarray(scan.points, np.float64)
     started = time.perf_counter()
-    alignment = align(view, points, guess, AlignOptions())
+    alignment = align(view, points, guess, options=AlignOptions())
     seconds = time.perf_counter() - started
     found, true = alignment.world_from_sensor, scan.world_from_sensor
     chord = float(np.linalg.norm(found[:3, :3] - true[:3, :3])) / np.sqrt(8.0)

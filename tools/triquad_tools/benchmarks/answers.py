@@ -47,13 +47,13 @@ def measure_answers(street: DrivenStreet, record: MapRecord, view: MapView) -> l
     """Figures of a map of ``street``, its ``record`` and what answers from it."""
     rng = np.random.default_rng(0)
     probes = AnswerProbes(
-        _along_rays(street, rng),
-        _corridor_points(street, rng),
-        _never_seen(street, rng),
-        _ghosts(street, record, rng),
+        seen_free=_along_rays(street, rng),
+        corridor=_corridor_points(street, rng),
+        never_seen=_never_seen(street, rng),
+        ghosts=_ghosts(street, record, rng),
     )
     return (
-        _distances(street.drive.scene, probes, view, rng)
+        _distances(street.drive.scene, probes, view, rng=rng)
         + _unknown(probes, view)
         + _corridor(probes, view)
     )
@@ -75,7 +75,7 @@ def _distances(
     figures = [Figure("points to which a surface is nearer than unknown space",
                       100 * known.mean(), "%")]  # fmt: skip
     figures += _errors("known space", answer, truth, slopes, chosen=known, bounds=(5.0, 12.0, 0.15))
-    figures += _errors("nearest surface seen", answer, truth, slopes, chosen=feet_seen)
+    figures += _errors("nearest surface seen", answer, truth, slopes=slopes, chosen=feet_seen)
     wary = np.minimum(answer.distance_m, answer.unknown_distance_m) - truth
     figures += [
         Figure("all, unknown as an obstacle: too large, 99.9 %", np.quantile(wary, 0.999), "m"),

@@ -49,7 +49,7 @@ def measure_file(made: BenchStreet) -> list[Figure]:
     record = epoch.record()
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         folder = Path(name)
-        figures = _sizes(epoch, record, made, folder)
+        figures = _sizes(epoch, record, made, folder=folder)
         return figures + _opening(record, folder)
 
 

@@ -225,20 +225,16 @@ def changed_tiles(
     cells. Vertices are in the map frame: those of neighbouring tiles count as well, so that nothing
     comes or goes where a surface crosses from one tile to the next.
     """
-    old, new = _Triangles(before), _Triangles(after)
-    return {
-        index
-        for index in before.keys() | after.keys()
-        if (index in before and _left(before[index].vertices, new, tolerance_m, cell_m))
-        or (index in after and _left(after[index].vertices, old, tolerance_m, cell_m))
-    }
 
+    def left(tiles: Mapping[TileIndex, Mesh], triangles: _Triangles) -> set[TileIndex]:
+        found = set()
+        for index, tile in tiles.items():
+            moved = tile.vertices[triangles.farther(tile.vertices, tolerance_m)]
+            if 2 * len(moved) > len(tile.vertices) or triangles.farther(moved, cell_m).any():
+                found.add(index)
+        return found
 
-def _left(
-    points: NDArray[np.floating], triangles: "_Triangles", tolerance_m: float, cell_m: float
-) -> bool:
-    moved = points[triangles.farther(points, tolerance_m)]
-    return 2 * len(moved) > len(points) or bool(triangles.farther(moved, cell_m).any())
+    return left(before, _Triangles(after)) | left(after, _Triangles(before))
 
 
 class _Triangles:

@@ -3,7 +3,6 @@
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -151,17 +150,9 @@ def _samples(endpoint: str) -> Iterator[Callable[[], int]]:
     config.insert_json5("mode", '"client"')
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("connect/endpoints", f'["{endpoint}"]')
-    lock = threading.Lock()
-    received = 0
-
-    def take(_sample: zenoh.Sample) -> None:
-        nonlocal received
-        with lock:
-            received += 1
-
+    received: list[zenoh.Sample] = []
     with zenoh.open(config) as session:
-        subscriber = session.declare_subscriber(
-            keys.status_key(MAP), zenoh.handlers.Callback(take, indirect=False)
-        )
-        yield lambda: received
+        callback = zenoh.handlers.Callback(received.append, indirect=False)
+        subscriber = session.declare_subscriber(keys.status_key(MAP), callback)
+        yield lambda: len(received)
         subscriber.undeclare()

@@ -42,7 +42,7 @@ class Served:
 
     def planner(self, points: Doubles, question: str) -> Probe:
         """A process that asks a question at points [N, 3], for a ``with`` statement."""
-        return Probe(self.endpoint, MAP, points, question)
+        return Probe(self.endpoint, MAP, points, question=question)
 
 
 @contextmanager

@@ -36,7 +36,7 @@ class BenchStreet(DrivenStreet):
     def mesh_scores(self, mesh: Mesh, samples_max: int = STREET_SAMPLES_MAX) -> MeshScores:
         """Scores of a mesh within the scene's bounds, from so many samples at most."""
         settings = ScoreSettings(samples_max=samples_max)
-        return score_against_scene(mesh, self.drive.scene, self.visible, settings)
+        return score_against_scene(mesh, self.drive.scene, self.visible, settings=settings)
 
 
 def bench_street(seed: int) -> BenchStreet:
@@ -47,7 +47,7 @@ def bench_street(seed: int) -> BenchStreet:
     visible = driven.drive.true_hits(STREET_VOXEL_M)
     low, high = scene.bounds  # to which meshes are cut
     visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
-    return BenchStreet(driven.drive, driven.scans, driven.probes, visible)
+    return BenchStreet(driven.drive, driven.scans, driven.probes, visible=visible)
 
 
 def settled_mapper(

@@ -44,8 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    evaluate: Callable[[argparse.Namespace], Results] = options.evaluate
-    results = evaluate(options)
+    results: Results = options.evaluate(options)
     if options.json:
         print(json_text(results))
         return OK
@@ -71,7 +70,7 @@ def evaluate_mesh(options: argparse.Namespace) -> Results:
         return {"mesh": score_against_cloud(mesh, reference, settings)}
     drive = street_drive(options.street, options.scans, options.step)
     visible = drive.true_hits(settings.voxel_m)
-    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings)}
+    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings=settings)}
 
 
 def evaluate_map(options: argparse.Namespace) -> Results:
@@ -228,10 +227,7 @@ def _add_map(parser: argparse.ArgumentParser) -> None:
 
 def _add_street(parser: argparse.ArgumentParser, truth: Any) -> None:
     truth.add_argument("--street", type=seed, metavar="SEED", help="the simulated street")
-    parser.add_argument(
-        "--scans", type=count, default=60, metavar="N", help="of the drive (default: 60)"
-    )
-    parser.add_argument(
-        "--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add = parser.add_argument
+    add("--scans", type=count, default=60, metavar="N", help="of the drive (default: 60)")
+    add("--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)")
+    add("--json", action="store_true", help="print JSON")

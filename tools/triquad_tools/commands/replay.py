@@ -42,14 +42,14 @@ class ReplayReport:
 
     published: int
     skipped: int  # not sent: no point was left of them
-    flush: FlushReport | None  # None: nothing was published
+    flush: FlushReport
     refusals: dict[str, int]  # on the server meanwhile, by reason
     seconds: float  # until the server had taken in all
 
     @property
     def complete(self) -> bool:
         """Whether every scan is in the map."""
-        return self.flush is None or self.flush.lost == self.flush.refused == 0
+        return self.flush.lost == self.flush.refused == 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -64,7 +64,7 @@ def _replay(options: argparse.Namespace) -> int:
     if not indices:
         raise ToolError(f"{options.folder}: --skip-every {options.skip_every} leaves no scan")
     with connect(options.connect, options.map) as client:
-        report = _publish_all(client, folder, indices, options)
+        report = _publish_all(client, folder, indices, options=options)
         print(_summary(report))
         if options.settle:
             status = wait_until_settled(client)
@@ -95,7 +95,7 @@ def _publish_all(
             else:
                 skipped += 1
             report(done + 1, f"{done + 1} of {len(indices)} scans")
-        flush = client.flush(FLUSH_TIMEOUT_S) if published else None
+        flush = client.flush(FLUSH_TIMEOUT_S)
     seconds = time.monotonic() - started
     after = client.status().scans_dropped
     refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
@@ -113,19 +113,18 @@ def due_times(pace: Pace, stamps_ns: Sequence[int]) -> list[float]:
 
 def _summary(report: ReplayReport) -> str:
     flush = report.flush
-    taken, refused, lost = (flush.taken, flush.refused, flush.lost) if flush else (0, 0, 0)
     rate_hz = report.published / max(report.seconds, 1e-9)
     reasons = ", ".join(f"{reason}: {count}" for reason, count in report.refusals.items())
     parts = [
         f"{report.published} scans published",
-        f"{taken} taken",
-        f"{refused} refused" + (f" ({reasons})" if refused and reasons else ""),
-        f"{lost} lost",
+        f"{flush.taken} taken",
+        f"{flush.refused} refused" + (f" ({reasons})" if flush.refused and reasons else ""),
+        f"{flush.lost} lost",
     ]
     if report.skipped:
         parts.append(f"{report.skipped} without points not sent")
     line = f"{', '.join(parts)}, {report.seconds:.1f} s, {rate_hz:.1f} scans/s"
-    if flush and flush.last_refusal:
+    if flush.last_refusal:
         line += f"\nlast refusal: {flush.last_refusal}"
     return line
 

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 Report = Callable[[float, str], None]
 """Takes how much is done, in the units of the total, and a note."""
@@ -11,12 +11,10 @@ Report = Callable[[float, str], None]
 _LINE_PERIOD_S = 10.0
 
 
-@contextmanager
-def progress(title: str, total: float | None = None) -> Iterator[Report]:
+def progress(title: str, total: float | None = None) -> AbstractContextManager[Report]:
     """Show the progress of a step on standard error; without a total, that it goes on."""
     show = _bar if sys.stderr.isatty() else _lines
-    with show(title, total) as report:
-        yield report
+    return show(title, total)
 
 
 @contextmanager

@@ -7,7 +7,6 @@ import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from typing import Any, Literal
 
 from rich.console import Console
@@ -90,13 +89,6 @@ def centimetres(metres: float) -> str:
 def percent(share: float) -> str:
     """A share in percent."""
     return f"{100.0 * share:.2f} %"
-
-
-def utc_time(stamp_ns: int) -> str | None:
-    """A time in nanoseconds since 1970 as in RFC 3339; ``None`` for 0, a time that is not known."""
-    if not stamp_ns:
-        return None
-    return datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def _plain(value: object) -> Any:

@@ -131,7 +131,7 @@ def main(argv: Sequence[str]) -> int:
 
     threading.Thread(target=wait_for_end, daemon=True).start()
     with connect(endpoint, map_name) as client:
-        report = ask_until(stop, client, points, question)
+        report = ask_until(stop, client, points, question=question)
     print(json.dumps(asdict(report)))
     return 0
 

@@ -136,5 +136,5 @@ def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
         report(0.0, picture.name)
         camera = Camera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
         colours = height_colours(surface.vertices)
-        image = render_mesh(surface.vertices, surface.faces, colours, camera)
+        image = render_mesh(surface.vertices, surface.faces, colours, camera=camera)
         imsave(picture, image)

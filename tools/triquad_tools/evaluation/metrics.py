@@ -62,7 +62,7 @@ def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings)
     samples = _samples(mesh, reference, settings)
     cut = settings.accuracy_cut_m
     distances = _tree(reference).query(samples, distance_upper_bound=cut, workers=-1)[0]
-    return _scores(distances, samples, reference, settings)
+    return _scores(distances, samples, reference, settings=settings)
 
 
 def score_against_scene(
@@ -79,7 +79,7 @@ def score_against_scene(
     """
     visible = _thinned_reference(visible, settings)
     samples = _samples(mesh, visible, settings)
-    return _scores(np.abs(scene.sdf(samples)), samples, visible, settings)
+    return _scores(np.abs(scene.sdf(samples)), samples, visible, settings=settings)
 
 
 def score_against_drive(mesh: Mesh, drive: SimulatedDrive) -> MeshScores:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats
+from triquad_format.records.cells import rows_by_cell
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
@@ -38,7 +39,7 @@ class Sighting:
 
     def part(self, rows: NDArray[np.intp]) -> "Sighting":
         """Some of the points."""
-        return Sighting(self.points[rows], self.sdf[rows], self.status[rows], self.leaf_m)
+        return Sighting(self.points[rows], self.sdf[rows], self.status[rows], leaf_m=self.leaf_m)
 
     def having(self, status: Status) -> Doubles:
         """The points of which the other map says ``status``."""
@@ -155,25 +156,17 @@ def print_diff(diff: MapDiff, limit: int) -> None:
 def _sighting(of: MapRecord, by: MapRecord) -> Sighting:
     points = surface_points(of)
     answer = MapEvaluator(by).query(points)
-    return Sighting(points, answer.sdf, answer.status, of.settings.leaf_m)
+    return Sighting(points, answer.sdf, answer.status, leaf_m=of.settings.leaf_m)
 
 
 def _tiles(comparison: Comparison, tile_m: float) -> Iterator[TileChange]:
     old, new = comparison.old, comparison.new
+    count = len(old.points)
     cells = np.floor(np.concatenate([old.points, new.points]) / tile_m).astype(np.int64)
-    tiles, numbers = np.unique(cells, axis=0, return_inverse=True)
-    numbers = numbers.reshape(-1)
-    in_old = _rows_by_number(numbers[: len(old.points)], len(tiles))
-    in_new = _rows_by_number(numbers[len(old.points) :], len(tiles))
-    for cell, rows_old, rows_new in zip(tiles, in_old, in_new, strict=True):
+    for cell, rows in rows_by_cell(cells):
+        change = _change(old.part(rows[rows < count]), new.part(rows[rows >= count] - count))
         low, high = (tuple((end * tile_m).round(6).tolist()) for end in (cell, cell + 1))
-        yield TileChange(low, high, _change(old.part(rows_old), new.part(rows_new)))
-
-
-def _rows_by_number(numbers: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
-    """For each number below ``count``, the rows that have it."""
-    ends = np.cumsum(np.bincount(numbers, minlength=count))
-    return np.split(np.argsort(numbers, kind="stable"), ends)[:count]
+        yield TileChange(low, high, change)
 
 
 def _change(old: Sighting, new: Sighting) -> Change:

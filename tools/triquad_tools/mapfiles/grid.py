@@ -52,7 +52,7 @@ def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool,
     if filled is None:
         raise ToolError("no ray has shown anything of this map: there is no box to fill")
     view = open_view(record).view
-    grid = _sparse(view, record, box, cell_m) if sparse else _dense(view, filled, cell_m)
+    grid = _sparse(view, record, box, cell_m=cell_m) if sparse else _dense(view, filled, cell_m)
     with replacing(path) as stream:
         np.savez(stream, epoch=record.epoch, cell_m=cell_m, **grid)
         size = stream.tell()

@@ -119,7 +119,7 @@ class _RegionProbes:
         alone = dataclasses.replace(
             region, index=(0, 0, 0), evidence=masked(region.evidence, np.uint8(0)), training=None
         )
-        self._record = MapRecord("", 0, settings, (alone,))
+        self._record = MapRecord("", 0, settings, regions=(alone,))
         self.points = draw_probes(settings, region, np.random.default_rng(_SEARCH_SEED))
         self._before = self._distances(region.tables)
 

@@ -13,10 +13,11 @@ from triquad_format.mapfile.checkpoint_folder import (
 )
 from triquad_format.mapfile.index import FileBytes, MapIndex
 from triquad_format.mapfile.manifest import FileRef, Manifest
+from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.parts.part import REGION_TOPICS
 from triquad_format.records.field_settings import RegionIndex
 
-from triquad_tools.console.report import print_columns, utc_time
+from triquad_tools.console.report import print_columns
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,12 @@ def read_log(store: Path) -> StoreLog:
     folder = map_folder(store)
     indices = _Indices(folder)
     checkpoints = tuple(_logged(file, indices) for file in checkpoint_files(folder))
-    aside = tuple(path.name for path in set_aside(folder))
-    return StoreLog(str(folder), sum(found.bytes for found in checkpoints), checkpoints, aside)
+    return StoreLog(
+        str(folder),
+        bytes=sum(checkpoint.bytes for checkpoint in checkpoints),
+        checkpoints=checkpoints,
+        set_aside=tuple(path.name for path in set_aside(folder)),
+    )
 
 
 def print_log(log: StoreLog) -> None:
@@ -129,7 +134,7 @@ class _Indices:
         epoch = manifest.facts.epoch
         new = [entry.key for entry in manifest.entries if entry.epoch == epoch]
         return LoggedParts(
-            time=utc_time(manifest.stamp_ns),
+            time=utc_time(manifest.stamp_ns) if manifest.stamp_ns else None,
             stored=len(manifest.own),
             total=len(manifest.entries),
             changed_regions=tuple(sorted({k.region for k in new if k.topic in REGION_TOPICS})),

@@ -37,7 +37,7 @@ def draw_diff(title: str, comparison: Comparison, path: Path) -> None:
         Plan("Moved from A to B", partial(_draw_movement, grid, comparison)),
         Plan("In only one of the maps", partial(_draw_presence, grid, comparison)),
     ]
-    save_sheet(path, title, grid, plans)
+    save_sheet(path, title, grid, plans=plans)
 
 
 def _draw_movement(grid: PlanGrid, comparison: Comparison, axes: Axes) -> None:

@@ -9,6 +9,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from triquad_format.mapfile.manifest import Manifest
+from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
@@ -18,7 +19,7 @@ from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import owned_evidence
 from triquad_map.reference.evaluator import MapEvaluator
 
-from triquad_tools.console.report import centimetres, utc_time
+from triquad_tools.console.report import centimetres
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
@@ -54,7 +55,7 @@ def draw_map(title: str, file: MapFile, path: Path) -> None:
         _ages_plan(grid, file.manifest, seen),
         _errors_plan(grid, record),
     ]
-    save_sheet(path, title, grid, plans)
+    save_sheet(path, title, grid, plans=plans)
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def _age_layers(epochs: Longs, manifest: Manifest) -> list[Layer]:
     for group, colour in zip(groups, colours, strict=True):
         first, last = int(group[0]), int(group[-1])
         name = f"epoch {last}" if first == last else f"epochs {first} to {last}"
-        label = ", ".join(filter(None, (name, utc_time(stamps_ns[last]))))
+        label = f"{name}, {utc_time(stamps_ns[last])}" if stamps_ns[last] else name
         layers.append(Layer(label, to_hex(colour), (epochs >= first) & (epochs <= last)))
     return layers
 

@@ -9,13 +9,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.stats import binned_statistic_2d
@@ -155,15 +156,7 @@ def draw_values(axes: Axes, values: Values, scale: Scale) -> None:
     known = values[np.isfinite(values)]
     below, above = bool((known < scale.low).any()), bool((known > scale.high).any())
     extend = ("neither", "min", "max", "both")[below + 2 * above]
-    image = axes.imshow(
-        values,
-        cmap=scale.colours,
-        vmin=scale.low,
-        vmax=scale.high,
-        origin="lower",
-        extent=(*axes.get_xlim(), *axes.get_ylim()),
-        interpolation="none",
-    )
+    image = _draw_cells(axes, values, cmap=scale.colours, vmin=scale.low, vmax=scale.high)
     beside = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
     axes.figure.colorbar(image, cax=beside, label=scale.label, extend=extend)
 
@@ -171,19 +164,17 @@ def draw_values(axes: Axes, values: Values, scale: Scale) -> None:
 def draw_layers(axes: Axes, layers: Sequence[Layer]) -> None:
     """Colour cells, later layers over earlier ones, with a legend that has the unknown, too."""
     for layer in layers:
-        axes.imshow(
-            np.where(layer.cells, 0.0, np.nan),
-            cmap=ListedColormap([layer.colour]),
-            origin="lower",
-            extent=(*axes.get_xlim(), *axes.get_ylim()),
-            interpolation="none",
-        )
-    named = [
-        *((layer.colour, layer.label) for layer in layers),
-        (UNKNOWN, "nothing was seen (UNKNOWN)"),
-    ]
+        cells = np.where(layer.cells, 0.0, np.nan)
+        _draw_cells(axes, cells, cmap=ListedColormap([layer.colour]))
+    named = [(layer.colour, layer.label) for layer in layers]
+    named.append((UNKNOWN, "nothing was seen (UNKNOWN)"))
     handles = [Patch(facecolor=colour, edgecolor="black", label=label) for colour, label in named]
     axes.figure.legend(handles=handles, loc="outside lower left", frameon=False, ncols=2)
+
+
+def _draw_cells(axes: Axes, values: Values, **colours: Any) -> AxesImage:
+    extent = (*axes.get_xlim(), *axes.get_ylim())
+    return axes.imshow(values, origin="lower", extent=extent, interpolation="none", **colours)
 
 
 def draw_nothing(axes: Axes, reason: str) -> None:

@@ -108,7 +108,7 @@ def render_mesh(
         points = np.ascontiguousarray(vertices, np.float64)
         rows = np.ascontiguousarray(faces, np.int32)
         raster = rasterise(camera.project(points, wide, high), rows, width=wide, height=high)
-        light = _shade(points, rows, camera, raster, colours)
+        light = _shade(points, rows, camera, raster=raster, colours=colours)
         covered = raster.faces >= 0
         picture[covered] = light * _contact_shadow(raster)[covered, None]
     fine = picture.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3)

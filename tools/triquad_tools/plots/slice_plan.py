@@ -59,7 +59,7 @@ def draw_slice(target: str, map_name: str, options: SliceOptions, path: Path) ->
         Plan("Distance", partial(_draw_distance, answer)),
         Plan("Status", partial(_draw_status, answer)),
     ]
-    save_sheet(path, f"{target} at z = {height:g} m, epoch {answer.epoch}", grid, plans)
+    save_sheet(path, f"{target} at z = {height:g} m, epoch {answer.epoch}", grid, plans=plans)
 
 
 def _seen_box(target: str) -> list[float]:

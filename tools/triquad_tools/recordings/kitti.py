@@ -58,7 +58,7 @@ def read_folder(folder: Path) -> KittiFolder:
         raise ToolError(f"{folder}: holds no poses.txt")
     scans = _scan_paths(folder)
     poses = _read_poses(folder / "poses.txt")
-    _check_count(folder / "poses.txt", "poses", len(poses), len(scans))
+    _check_count(folder / "poses.txt", "poses", len(poses), scans=len(scans))
     calibration = folder / "calib.txt"
     if calibration.is_file():
         camera_from_lidar = _read_calibration(calibration)
@@ -67,7 +67,7 @@ def read_folder(folder: Path) -> KittiFolder:
     stamps = np.arange(len(scans), dtype=np.int64) * DEFAULT_PERIOD_NS
     if times.is_file():
         stamps = _read_stamps(times)
-        _check_count(times, "times", len(stamps), len(scans))
+        _check_count(times, "times", len(stamps), scans=len(scans))
     return KittiFolder(scans, poses, stamps)
 
 
@@ -109,13 +109,11 @@ def _parse_pose(place: str, line: str) -> Doubles:
     if len(words) != 12:
         raise ToolError(f"{place}: {len(words)} numbers where a pose has 12")
     pose = np.eye(4)
-    for i, word in enumerate(words):
-        pose[i // 4, i % 4] = _parse_number(place, word)
-    rotation = pose[:3, :3]
+    pose[:3] = np.reshape([_parse_number(place, word) for word in words], (3, 4))
     if not is_rotation(pose):
         raise ToolError(
             f"{place}: not a rotation: off orthonormal by {rotation_error(pose):.3g}, "
-            f"determinant {np.linalg.det(rotation):.3g}"
+            f"determinant {np.linalg.det(pose[:3, :3]):.3g}"
         )
     return orthonormal(pose)
 

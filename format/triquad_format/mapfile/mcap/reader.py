@@ -130,11 +130,9 @@ class RandomAccess(Protocol):
             DamagedMapFileError: there are not so many.
             OSError: they cannot be read.
         """
-        ...
 
     def close(self) -> None:
         """Close the source."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -92,11 +92,7 @@ class McapWriter:
         number = self._numbers[topic]
         message = _packed(
             Message(
-                channel_id=number,
-                log_time=time_ns,
-                data=payload,
-                publish_time=time_ns,
-                sequence=0,
+                channel_id=number, log_time=time_ns, data=payload, publish_time=time_ns, sequence=0
             )
         )
         shift = len(message) - len(payload)

@@ -240,8 +240,11 @@ def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
     if len(portions) == 1:
         return portions[0]
     codes, masks = np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8)
-    levels = [_levels_of(portion) for portion in portions]
-    seen_s = [_seen_of(portion) for portion in portions]
+    levels = [
+        np.zeros(int(surface_counts(p.surface).sum()), np.uint8) if p.levels is None else p.levels
+        for p in portions
+    ]
+    seen_s = [np.zeros(len(p.codes), np.int64) if p.seen_s is None else p.seen_s for p in portions]
     return Evidence(
         np.concatenate([codes, *(portion.codes for portion in portions)]),
         np.concatenate([masks, *(portion.surface for portion in portions)]),
@@ -249,13 +252,3 @@ def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
         levels=np.concatenate(levels) if any(p.levels is not None for p in portions) else None,
         seen_s=np.concatenate(seen_s) if any(p.seen_s is not None for p in portions) else None,
     )
-
-
-def _levels_of(evidence: Evidence) -> Bytes:
-    if evidence.levels is not None:
-        return evidence.levels
-    return np.zeros(int(surface_counts(evidence.surface).sum()), np.uint8)
-
-
-def _seen_of(evidence: Evidence) -> Longs:
-    return np.zeros(len(evidence.codes), np.int64) if evidence.seen_s is None else evidence.seen_s
