@@ -130,7 +130,8 @@ class LiveField:
     @property
     def arrays(self) -> FieldArrays:
         """The numbers as arrays, which share memory with the field where it is on the CPU."""
-        return self.tensors.arrays
+        mlp = tuple(part.values[0].cpu().numpy() for part in self.mlp)
+        return FieldArrays(self.features.values.cpu().numpy(), mlp, self.frequencies.cpu().numpy())
 
     def grow(self, leaves: Longs) -> None:
         """Make room for surfaces in ``leaves`` [N, 3]; new feature vectors start at random.
@@ -151,12 +152,15 @@ class LiveField:
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""
         tree = self.tree.freeze()
+        frequencies = self.frequencies  # which never change
+        if self.device.type == "cpu":
+            arrays = self.arrays
+            mlp = tuple(part.copy() for part in arrays.mlp)
+            numbers = FieldArrays(arrays.features.copy(), mlp, frequencies.numpy())
+            return FrozenCompiledField(self.settings, tree, numbers)
         mlp = tuple(part.values[0].clone() for part in self.mlp)
-        # Frequencies never change.
-        tensors = FieldTensors(self.features.values.clone(), mlp, self.frequencies)
-        if self.device.type != "cpu":
-            return TensorField(self.settings, tree, tensors)
-        return FrozenCompiledField(self.settings, tree, tensors.arrays)
+        tensors = FieldTensors(self.features.values.clone(), mlp, frequencies)
+        return TensorField(self.settings, tree, tensors)
 
 
 def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> LiveField:
