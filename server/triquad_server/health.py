@@ -14,7 +14,7 @@ from triquad_server.counter import Counter
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.memory import resident_bytes
-from triquad_server.store.checkpoints import Checkpoints
+from triquad_server.store.checkpoint_thread import CheckpointThread
 
 _log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ class Health:
     requests_refused: Counter
     scans: ScanQueue
     mapper: MapperThread
-    checkpoints: Checkpoints
+    checkpoints: CheckpointThread
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:

@@ -40,7 +40,7 @@ from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.net.requests import Handler, RequestHandlers, answering, payload_limit
 from triquad_server.settings import Settings
-from triquad_server.store.checkpoints import Checkpoints
+from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.store import Store
 from triquad_server.threads import Teams
@@ -95,7 +95,7 @@ class Service:
     def _open(self, failed: Callable[[], None]) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
         self._mapper = self._open_mapper(failed)
-        checkpoints = Checkpoints(
+        checkpoints = CheckpointThread(
             self._mapper,
             self._served.store,
             period_s=self._settings.store.period_s,

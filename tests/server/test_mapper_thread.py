@@ -14,7 +14,7 @@ from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.settings import ServiceSettings, StoreSettings
-from triquad_server.store.checkpoints import Checkpoints
+from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.store import Store
 
 NEVER_S = 3600.0
@@ -89,7 +89,7 @@ def test_whoever_reset_the_map_finds_the_epoch_that_shows_it() -> None:
 def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Path) -> None:
     store = Store(tmp_path, "test", StoreSettings())
     with closing(store), running(learning_mapper()) as thread:
-        checkpoints = Checkpoints(thread, store, 0.0, None)
+        checkpoints = CheckpointThread(thread, store, 0.0, None)
         checkpoints.start()
         with closing(checkpoints):
             for _ in range(5):

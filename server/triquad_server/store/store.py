@@ -27,7 +27,7 @@ from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mesh.preview import preview_part, preview_schema
 from triquad_server.settings import StoreSettings
-from triquad_server.store.locked_folder import LockedFolder
+from triquad_server.store.kept_checkpoints import KeptCheckpoints
 from triquad_server.store.restore import ValidCheckpoint, newest_valid
 
 _FEATURE_DTYPE = "<f2"
@@ -103,7 +103,7 @@ class Store:
         self.folder = root / map_name
         self._known: KnownParts | None = None
         try:
-            self._files = LockedFolder(self.folder, settings)
+            self._files = KeptCheckpoints(self.folder, settings)
         except OSError as error:
             raise StoreError(f"store {self.folder} cannot be written to: {error}") from error
 

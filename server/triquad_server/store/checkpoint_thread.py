@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 _NO_STORE = "the server was started without --store: the map is not kept"
 
 
-class Checkpoints:
+class CheckpointThread:
     """Writes the map to its store, on a thread of its own that gives way to those that answer.
 
     A store that fails never stops the mapping.

@@ -1,5 +1,5 @@
-"""The folder of a map's checkpoints: who writes to it, whether files are as they were, and which
-are deleted."""
+"""The checkpoints of a map in their folder: which are kept, whether they are as they were written,
+and who may write them."""
 
 import contextlib
 import fcntl
@@ -49,7 +49,7 @@ class _Checkpoint:
     files: frozenset[str]  # that it consists of
 
 
-class LockedFolder:
+class KeptCheckpoints:
     """The folder in which the checkpoints of one map lie; one process at a time may write to it.
 
     A locked file in it sees to that; the system lets go of it however the process ends.
