@@ -15,6 +15,7 @@ from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, 
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
 from triquad_map.questions.grid import Grid
+from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Polyline, Segments
 from triquad_map.questions.spheres import Spheres
@@ -60,6 +61,7 @@ __all__ = [
     "DownloadError",
     "FlushReport",
     "Grid",
+    "Ground",
     "KnownTiles",
     "InvalidInputError",
     "InvalidScanError",

@@ -54,8 +54,12 @@ class MapView(Protocol):
     def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
         """The trained field and the status at points."""
 
-    def status(self, points: Doubles) -> Bytes:
-        """Status values [N] of points."""
+    def status(self, points: Doubles, reach_m: float | None = None) -> Bytes:
+        """Status values [N] of points.
+
+        ``SURFACE`` reaches ``reach_m`` beyond the voxels in which rays ended; half a voxel if
+        not given.
+        """
 
     def nearest_surface(self, points: Doubles, max_distance_m: float) -> NearestSurface:
         """The nearest seen surface, searched for as far as ``max_distance_m``."""

@@ -22,6 +22,7 @@ from triquad_format.wire.query_messages import (
     AlignRequest,
     DistanceRequest,
     GridRequest,
+    GroundRequest,
     RaysRequest,
     SegmentsRequest,
     SpheresRequest,
@@ -165,6 +166,7 @@ class Service:
             {
                 keys.SEGMENTS: answering(SegmentsRequest, answers.segments),
                 keys.RAYS: answering(RaysRequest, answers.rays),
+                keys.GROUND: answering(GroundRequest, answers.ground),
                 keys.GRID: answering(GridRequest, answers.grid),
             },
             limits.query_workers,

@@ -171,7 +171,7 @@ class ServiceSettings(BaseModel):
 
     query_workers: Annotated[int, Field(ge=1, le=64)] = 2
     """Threads that answer queries of the field, as many for distances and spheres, and as many for
-    segments, rays and grids."""
+    segments, rays, ground and grids."""
 
     max_query_points: Annotated[int, Field(ge=1, le=20_000_000)] = 1_000_000
     """Points of one request for the field."""

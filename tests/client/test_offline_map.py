@@ -41,6 +41,7 @@ QUESTIONS: dict[str, Question] = {
     "query_segments": lambda view: view.query_segments(POINTS[:200], ENDS, radius_m=0.1),
     "query_polyline": lambda view: view.query_polyline(0.3 * ENDS[:40], radius_m=0.1),
     "query_rays": lambda view: view.query_rays([0, 0, 0], ENDS),
+    "query_ground": lambda view: view.query_ground(POINTS, 5.0),
     "query_grid": lambda view: view.query_grid(BOX, cell_m=0.5),
     "align": lambda view: view.align(servers.sphere(3000), moved(0.2)),
 }
@@ -149,6 +150,7 @@ def test_only_its_own_epoch_can_be_asked_for(offline: OfflineMap) -> None:
         lambda view: view.query_spheres(POINTS, -1.0),
         lambda view: view.query_segments(POINTS, ENDS),
         lambda view: view.query_rays([0, 0, 0], [[0, 0, 0]]),
+        lambda view: view.query_ground(POINTS, max_drop_m=0.0),
         lambda view: view.query_grid(BOX, cell_m=0.0),
         lambda view: view.query_sdf(POINTS, at_epoch=0),
         lambda view: view.query_distance([[9.0, 9, 9]], unknown="error"),

@@ -19,7 +19,7 @@ from triquad_format.wire.messages import (
     TileListRequest,
     TileRequest,
 )
-from triquad_format.wire.query_messages import RaysRequest, SegmentsRequest
+from triquad_format.wire.query_messages import GroundRequest, RaysRequest, SegmentsRequest
 
 ORIGIN = np.zeros(3)
 ONE_POINT = np.zeros((1, 3), np.float32)
@@ -34,6 +34,10 @@ def segments(count, length_m):
 def rays(count, range_m):
     ways = np.tile(np.array([1, 0, 0], np.float32), (count, 1))
     return RaysRequest(ORIGIN, np.zeros_like(ways), ways, range_m, False, 0)
+
+
+def ground(count, drop_m, z=0.0):
+    return GroundRequest(ORIGIN, np.full((count, 3), z, np.float32), drop_m, 0)
 
 
 @pytest.fixture(scope="module")
@@ -208,6 +212,12 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
         (keys.SEGMENTS, segments(2_000, 900.0), "too_large"),
         (keys.SEGMENTS, segments(1, 1_001.0), "bad_request"),
         (keys.RAYS, rays(100_000, 1_000.0), "too_large"),
+        (keys.GROUND, ground(1, 0.0), "bad_request"),
+        (keys.GROUND, ground(1, -1.0), "bad_request"),
+        (keys.GROUND, ground(1, 101.0), "bad_request"),
+        (keys.GROUND, ground(1, np.nan), "bad_request"),
+        (keys.GROUND, ground(1, 1.0, z=np.inf), "bad_request"),
+        (keys.GROUND, ground(100_000, 100.0), "too_large"),
         (keys.TILE, TileRequest(2**62, 0, 0, 0), "bad_request"),
         (keys.TILE, TileRequest(0, -(2**63), 0, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),

@@ -193,6 +193,8 @@ def test_no_points_are_no_error(client):
     assert len(client.query_spheres(np.zeros((0, 3)), 1.0).status) == 0
     assert len(client.query_segments(np.zeros((0, 3)), np.zeros((0, 3))).contact_m) == 0
     assert len(client.query_rays(np.zeros((0, 3)), np.zeros((0, 3))).range_m) == 0
+    nowhere = client.query_ground(np.zeros((0, 3)))
+    assert len(nowhere.height_m) == len(nowhere.slope_deg) == 0
 
 
 @pytest.mark.parametrize(
@@ -209,6 +211,13 @@ def test_no_points_are_no_error(client):
         (lambda c: c.query_polyline([[0.0, 0, 0]]), "a polyline of 1 points"),
         (lambda c: c.query_rays([0, 0, 0], [[0.0, 0, 0]]), "direction 0 .* no length"),
         (lambda c: c.query_rays(np.zeros((2, 3)), np.ones((3, 3))), "2 origins for 3"),
+        (lambda c: c.query_ground([[0, np.nan, 0]]), "point 0 is not finite"),
+        (lambda c: c.query_ground([[0.0, 0]]), "points are \\[1, 2\\]"),
+        (lambda c: c.query_ground([[0.0, 0, 0]], max_drop_m=0), "max_drop_m = 0: use 1e-06 to 100"),
+        (lambda c: c.query_ground([[0.0, 0, 0]], max_drop_m=-1), "max_drop_m = -1"),
+        (lambda c: c.query_ground([[0.0, 0, 0]], max_drop_m=101), "max_drop_m = 101"),
+        (lambda c: c.query_ground([[0.0, 0, 0]], max_drop_m=np.nan), "max_drop_m = nan"),
+        (lambda c: c.query_ground([[0.0, 0, 0]], "deep"), "max_drop_m = 'deep' is not a number"),
         (lambda c: c.query_grid(([0, 0, 0], [np.inf, 1, 1])), "finite"),
         (lambda c: c.query_grid(([0, 0, 0], [1e4, 1e4, 1e4])), "cells"),
     ],

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from support.exact_maps import exact_map, flat, table
 from support.map_records import SMALL, random_record, with_levels
 from triquad_format.records.region import MapRecord
+from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.evidence import LiveEvidence
 from triquad_map.compiled.recorded_view import RecordedView
 from triquad_map.compiled.surfels.surfel_map import surfel_index, surfel_places
@@ -16,6 +17,7 @@ from triquad_map.compiled.surfels.surfel_search import find_nearest
 from triquad_map.composition.composed_view import no_surfels
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
+from triquad_map.questions.ground import ground as ground_below
 from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_map.questions.spheres import spheres
@@ -151,6 +153,17 @@ def test_answers_of_planners_are_the_same(ground):
     have, want = (grid(view, shape, 3.0) for view in ground)
     np.testing.assert_allclose(have.distance_m, want.distance_m, atol=1e-5)
     np.testing.assert_array_equal(have.status, want.status)
+
+
+def test_the_ground_is_the_same(ground):
+    points = np.concatenate([places(400), 100.0 + places(10)])
+    have, want = (ground_below(view, points, 0.7) for view in ground)
+    assert set(want.status.tolist()) == set(Status)
+    np.testing.assert_array_equal(have.status, want.status)
+    np.testing.assert_allclose(have.height_m, want.height_m, atol=1e-3)
+    np.testing.assert_allclose(have.confidence, want.confidence, atol=1e-6)
+    along = np.einsum("ij,ij->i", have.normal, want.normal)[want.status == Status.SURFACE]
+    assert np.quantile(along, 0.01) > 0.99
 
 
 @given(st.integers(0, 10**6), st.sampled_from([TWO, APART]))

@@ -28,11 +28,14 @@ class ExactView:
             sdf, self.status(points), slopes.astype(np.float32) if gradient else None
         )
 
-    def status(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
+    def status(
+        self, points: NDArray[np.float64], reach_m: float | None = None
+    ) -> NDArray[np.uint8]:
+        reach_m = self.voxel_m if reach_m is None else reach_m
         local = self._local(points)
         sdf = self.scene.sdf(local)
         status = np.where(sdf > 0, Status.FREE, Status.UNKNOWN)
-        status = np.where(np.abs(sdf) < self.voxel_m, Status.SURFACE, status)
+        status = np.where(np.abs(sdf) < reach_m, Status.SURFACE, status)
         return np.where(self._seen(local), status, Status.UNKNOWN).astype(np.uint8)
 
     def nearest_surface(self, points: NDArray[np.float64], max_distance_m: float) -> NearestSurface:

@@ -4,6 +4,7 @@ from numpy.typing import ArrayLike
 from triquad_map.questions.align import Alignment, AlignOptions
 from triquad_map.questions.distance import DistanceOptions, Distances, Unknown
 from triquad_map.questions.grid import Grid
+from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayOptions, RayRanges
 from triquad_map.questions.segments import Polyline, SegmentOptions, Segments
 from triquad_map.questions.spheres import Spheres
@@ -85,6 +86,11 @@ class AsyncMapQueries:
         return await self._run(
             questions.rays(origins, directions, options, at_epoch=self._chosen(at_epoch))
         )
+
+    async def query_ground(
+        self, points: ArrayLike, max_drop_m: float = 2.0, at_epoch: int | None = None
+    ) -> Ground:
+        return await self._run(questions.ground(points, max_drop_m, self._chosen(at_epoch)))
 
     async def query_grid(
         self,

@@ -4,6 +4,7 @@ from numpy.typing import ArrayLike
 from triquad_map.questions.align import Alignment, AlignOptions
 from triquad_map.questions.distance import DistanceOptions, Distances, Unknown
 from triquad_map.questions.grid import Grid
+from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayOptions, RayRanges
 from triquad_map.questions.segments import Polyline, SegmentOptions, Segments
 from triquad_map.questions.spheres import Spheres
@@ -127,6 +128,19 @@ class MapQueries:
         return self._run(
             questions.rays(origins, directions, options, at_epoch=self._chosen(at_epoch))
         )
+
+    def query_ground(
+        self, points: ArrayLike, max_drop_m: float = 2.0, at_epoch: int | None = None
+    ) -> Ground:
+        """The ground below ``points`` [N, 3]: its height and slope, or that there is none.
+
+        Args:
+            points: metres, map frame, in free space above the ground, or at most half a voxel
+                below it.
+            max_drop_m: the ground is looked for down to here, at most 100 m.
+            at_epoch: see :class:`MapQueries`.
+        """
+        return self._run(questions.ground(points, max_drop_m, self._chosen(at_epoch)))
 
     def query_grid(
         self,

@@ -5,16 +5,14 @@ epoch; ``None`` is the newest. What cannot be asked raises :class:`InvalidInputE
 :mod:`triquad_map.questions.answers` is the other side.
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.arrays import Doubles
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_RANGE_M
-from triquad_format.wire.messages import MapReply, SdfReply, SdfRequest
+from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
     AlignReply,
     AlignRequest,
@@ -22,6 +20,8 @@ from triquad_format.wire.query_messages import (
     DistanceRequest,
     GridReply,
     GridRequest,
+    GroundReply,
+    GroundRequest,
     RaysReply,
     RaysRequest,
     SegmentsReply,
@@ -32,24 +32,22 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions, thinned
 from triquad_map.questions.distance import DistanceOptions, Distances, Unknown, with_unknown
 from triquad_map.questions.grid import Grid
+from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayOptions, RayRanges
 from triquad_map.questions.segments import Polyline, SegmentOptions, Segments, along_polyline
 from triquad_map.questions.spheres import Spheres
 
 from triquad_client import checks
+from triquad_client.calls.parts import in_parts, joined, offsets_from, origin_of
 from triquad_client.checks import Bounds
-from triquad_client.errors import BadReplyError, InvalidInputError
-from triquad_client.net.call import NEWEST, Ask, Call, ask, ask_each, offload, retried
+from triquad_client.errors import InvalidInputError
+from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried
 
 # Items of one request: it takes the server some tens of milliseconds, and others wait as long.
 _PART_SDF_POINTS = 100_000
 _PART_POINTS = 20_000  # around which something is searched for
-_PART_WAYS = 2_000  # segments or rays
+_PART_WAYS = 2_000  # segments, rays or columns down to the ground
 _PART_CELLS = 20_000  # unless a layer has more
-
-_ORIGIN_SAMPLE = 1000  # points
-
-MapReplyT = TypeVar("MapReplyT", bound=MapReply)
 
 
 @dataclass(frozen=True)
@@ -72,10 +70,10 @@ def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResu
     def request(part: slice, epoch: int) -> Ask[SdfReply]:
         return _ask_sdf(checked[part], gradient, epoch)
 
-    parts = yield from _in_parts(request, len(checked), most=_PART_SDF_POINTS, at_epoch=at_epoch)
+    parts = yield from in_parts(request, len(checked), most=_PART_SDF_POINTS, at_epoch=at_epoch)
     if len(parts) == 1:
-        return SdfResult(**_joined(parts))
-    return (yield from offload(lambda _: SdfResult(**_joined(parts))))
+        return SdfResult(**joined(parts))
+    return (yield from offload(lambda _: SdfResult(**joined(parts))))
 
 
 def pin_newest() -> Call[int]:
@@ -90,8 +88,8 @@ def pin_newest() -> Call[int]:
 
 
 def _ask_sdf(points: Doubles, gradient: bool, epoch: int) -> Ask[SdfReply]:
-    origin = _origin_of(points)
-    request = SdfRequest(origin, _offsets(points, origin), gradient=gradient, epoch=epoch)
+    origin = origin_of(points)
+    request = SdfRequest(origin, offsets_from(points, origin), gradient=gradient, epoch=epoch)
     return Ask(keys.SDF, request, SdfReply)
 
 
@@ -104,10 +102,10 @@ def distance(
     reach_m = checks.within("max_distance_m", options.max_distance_m)
 
     def request(part: slice, epoch: int) -> Ask[DistanceReply]:
-        origin = _origin_of(checked[part])
+        origin = origin_of(checked[part])
         message = DistanceRequest(
             origin=origin,
-            points=_offsets(checked[part], origin),
+            points=offsets_from(checked[part], origin),
             max_distance_m=reach_m,
             surface_point=options.surface_point,
             unknown_distance=options.unknown_distance or policy is not Unknown.FREE,
@@ -115,8 +113,8 @@ def distance(
         )
         return Ask(keys.DISTANCE, message, DistanceReply)
 
-    parts = yield from _in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
-    fields = _joined(parts, flags=["found"])
+    parts = yield from in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
+    fields = joined(parts, flags=["found"])
     for name in ("surface_point", "unknown_point"):
         if fields[name] is not None:
             fields[name] = fields[name] + _origins(checked, [len(part.found) for part in parts])
@@ -126,7 +124,7 @@ def distance(
 def _origins(points: Doubles, counts: list[int]) -> Doubles:
     """The origin [N, 3] from which each of ``points`` [N, 3] was sent, in parts of ``counts``."""
     starts = range(0, max(1, len(points)), _PART_POINTS)
-    origins = [_origin_of(points[start : start + _PART_POINTS]) for start in starts]
+    origins = [origin_of(points[start : start + _PART_POINTS]) for start in starts]
     return np.repeat(origins, counts, axis=0)
 
 
@@ -136,12 +134,14 @@ def spheres(centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None) -> Cal
     radii = checks.radii(radii_m, len(checked))
 
     def request(part: slice, epoch: int) -> Ask[SpheresReply]:
-        origin = _origin_of(checked[part])
-        message = SpheresRequest(origin, _offsets(checked[part], origin), radii[part], epoch=epoch)
+        origin = origin_of(checked[part])
+        message = SpheresRequest(
+            origin, offsets_from(checked[part], origin), radii[part], epoch=epoch
+        )
         return Ask(keys.SPHERES, message, SpheresReply)
 
-    parts = yield from _in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
-    return Spheres(**_joined(parts))
+    parts = yield from in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
+    return Spheres(**joined(parts))
 
 
 def segments(
@@ -155,19 +155,19 @@ def segments(
     reach_m = checks.within("max_distance_m", options.max_distance_m)
 
     def request(part: slice, epoch: int) -> Ask[SegmentsReply]:
-        origin = _origin_of(first[part])
+        origin = origin_of(first[part])
         message = SegmentsRequest(
             origin=origin,
-            starts=_offsets(first[part], origin),
-            ends=_offsets(last[part], origin),
+            starts=offsets_from(first[part], origin),
+            ends=offsets_from(last[part], origin),
             radius_m=radius_m,
             max_distance_m=reach_m,
             epoch=epoch,
         )
         return Ask(keys.SEGMENTS, message, SegmentsReply)
 
-    parts = yield from _in_parts(request, len(first), most=_PART_WAYS, at_epoch=at_epoch)
-    return Segments(**_joined(parts, flags=["blocked", "meets_unknown"]))
+    parts = yield from in_parts(request, len(first), most=_PART_WAYS, at_epoch=at_epoch)
+    return Segments(**joined(parts, flags=["blocked", "meets_unknown"]))
 
 
 def polyline(points: ArrayLike, options: SegmentOptions, at_epoch: int | None) -> Call[Polyline]:
@@ -188,10 +188,10 @@ def rays(
     reach_m = checks.within("max_range_m", options.max_range_m, MAX_RANGE_M)
 
     def request(part: slice, epoch: int) -> Ask[RaysReply]:
-        origin = _origin_of(starts[part])
+        origin = origin_of(starts[part])
         message = RaysRequest(
             origin=origin,
-            starts=_offsets(starts[part], origin),
+            starts=offsets_from(starts[part], origin),
             directions=ways[part].astype(np.float32),
             max_range_m=reach_m,
             through_unknown=options.through_unknown,
@@ -199,8 +199,25 @@ def rays(
         )
         return Ask(keys.RAYS, message, RaysReply)
 
-    parts = yield from _in_parts(request, len(ways), most=_PART_WAYS, at_epoch=at_epoch)
-    return RayRanges(**_joined(parts))
+    parts = yield from in_parts(request, len(ways), most=_PART_WAYS, at_epoch=at_epoch)
+    return RayRanges(**joined(parts))
+
+
+def ground(points: ArrayLike, max_drop_m: float, at_epoch: int | None) -> Call[Ground]:
+    """What lies at most ``max_drop_m`` below ``points`` [N, 3]."""
+    checked = checks.query_points(points)
+    drop_m = checks.within("max_drop_m", max_drop_m)
+
+    def request(part: slice, epoch: int) -> Ask[GroundReply]:
+        origin = origin_of(checked[part])
+        message = GroundRequest(
+            origin, offsets_from(checked[part], origin), max_drop_m=drop_m, epoch=epoch
+        )
+        return Ask(keys.GROUND, message, GroundReply)
+
+    parts = yield from in_parts(request, len(checked), most=_PART_WAYS, at_epoch=at_epoch)
+    fields = joined(parts)
+    return Ground(height_m=checked[:, 2] - fields.pop("drop_m"), **fields)
 
 
 def grid(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | None) -> Call[Grid]:
@@ -216,8 +233,8 @@ def grid(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | N
         return Ask(keys.GRID, message, GridReply)
 
     at_once = max(1, _PART_CELLS // (layer[0] * layer[1]))
-    parts = yield from _in_parts(request, columns, most=at_once, at_epoch=at_epoch)
-    return Grid(shape, **_joined(parts))
+    parts = yield from in_parts(request, columns, most=at_once, at_epoch=at_epoch)
+    return Grid(shape, **joined(parts))
 
 
 def align(
@@ -237,61 +254,3 @@ def align(
     )
     reply = yield from ask(Ask(keys.ALIGN, request, AlignReply))
     return Alignment(**vars(reply))
-
-
-def _in_parts(
-    request: Callable[[slice, int], Ask[MapReplyT]], count: int, *, most: int, at_epoch: int | None
-) -> Call[Sequence[MapReplyT]]:
-    """The replies about ``count`` items, ``most`` at a time, all from one epoch.
-
-    ``request`` makes what is asked about some of the items, of the epoch of some number.
-
-    Raises:
-        InvalidInputError: ``at_epoch`` is neither the number of an epoch nor ``None``, the newest.
-    """
-
-    def parts(epoch: int) -> Call[Sequence[MapReplyT]]:
-        first = yield from ask(request(slice(0, most), epoch))
-        if count <= most:
-            return [first]
-        rest = yield from ask_each(
-            range(most, count, most), lambda start: request(slice(start, start + most), first.epoch)
-        )
-        return [first, *rest]
-
-    epoch = checks.chosen_epoch(at_epoch)
-    if epoch != NEWEST:
-        return (yield from parts(epoch))
-    # The map may go on while the parts are under way: then all of it is asked again.
-    return (yield from retried("epoch_gone", lambda: parts(NEWEST)))
-
-
-def _joined(replies: Sequence[MapReply], flags: Sequence[str] = ()) -> dict[str, Any]:
-    """The fields of replies about parts as one: arrays end to end, ``flags`` as truth values.
-
-    Raises:
-        BadReplyError: the replies do not fit together.
-    """
-    try:
-        fields = {
-            name: np.concatenate([getattr(reply, name) for reply in replies])
-            if isinstance(value, np.ndarray)
-            else value
-            for name, value in vars(replies[0]).items()
-        }
-    except ValueError as error:
-        raise BadReplyError(f"the replies about parts do not fit together: {error}") from error
-    return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
-
-
-def _origin_of(points: Doubles) -> Doubles:
-    """An origin [3] among points [N, 3], from which they travel in single precision."""
-    # The median, so that a few far points do not cost the others their precision; of a sample,
-    # as it takes longer than all the rest.
-    some = points[:: max(1, len(points) // _ORIGIN_SAMPLE)]
-    return np.asarray(np.median(some, axis=0)) if len(points) else np.zeros(3)
-
-
-def _offsets(points: Doubles, origin: Doubles) -> Floats:
-    """Points [N, 3] as they travel: relative to an origin [3]."""
-    return (points - origin).astype(np.float32)

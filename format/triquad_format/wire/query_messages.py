@@ -109,6 +109,26 @@ class RaysReply(MapReply):
 
 
 @dataclass(frozen=True)
+class GroundRequest(Message):
+    """The ground below points."""
+
+    origin: Point  # metres, map frame
+    points: Positions  # [N, 3] metres, relative to origin
+    max_drop_m: float  # the ground is looked for up to here
+    epoch: int
+
+
+@dataclass(frozen=True)
+class GroundReply(MapReply):
+    """Answer to :class:`GroundRequest`."""
+
+    status: StatusCodes  # [N] surface: there is ground; free: there is none; else unknown
+    drop_m: Values  # [N] metres down to the ground; else as far as all was seen to be free
+    normal: Positions  # [N, 3] of the ground, unit vectors, map frame; zero where there is none
+    confidence: Values  # [N] in [0, 1]; 0 where there is no ground
+
+
+@dataclass(frozen=True)
 class GridRequest(Message):
     """Distance and status at the middles of a grid's cells."""
 

@@ -22,6 +22,8 @@ from triquad_format.wire.query_messages import (
     DistanceRequest,
     GridReply,
     GridRequest,
+    GroundReply,
+    GroundRequest,
     RaysReply,
     RaysRequest,
     SegmentsReply,
@@ -33,6 +35,7 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.align import AlignOptions, align
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
+from triquad_map.questions.ground import ground
 from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments, steps_at_most
 from triquad_map.questions.spheres import spheres
@@ -43,7 +46,7 @@ _STEPS_EACH = 50
 """Places along a segment that count as much as a point that is asked for."""
 
 _RANGE_EACH_M = 10.0
-"""Range of a ray that counts as much."""
+"""Range of a ray, or drop of a column, that counts as much."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +175,23 @@ class Answers:
             answer = rays(view, starts, directions / lengths[:, None], options=options)
         return RaysReply(answer.epoch, answer.range_m, answer.status)
 
+    def ground(self, request: GroundRequest) -> GroundReply:
+        """What lies below points."""
+        points = self._searched("point", request.origin, request.points)
+        drop_m = _within("max_drop_m", request.max_drop_m, MAX_DISTANCE_M)
+        self._check_count(
+            len(points) * drop_m / _RANGE_EACH_M, f"{len(points)} points with {drop_m:g} m below"
+        )
+        with self._view(request.epoch) as view:
+            answer = ground(view, points, drop_m)
+        return GroundReply(
+            epoch=answer.epoch,
+            status=answer.status,
+            drop_m=(points[:, 2] - answer.height_m).astype(np.float32),
+            normal=answer.normal,
+            confidence=answer.confidence,
+        )
+
     def grid(self, request: GridRequest) -> GridReply:
         """Distance and status at a grid's cells."""
         counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
@@ -231,6 +251,7 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
     SpheresRequest: Answers.spheres,
     SegmentsRequest: Answers.segments,
     RaysRequest: Answers.rays,
+    GroundRequest: Answers.ground,
     GridRequest: Answers.grid,
     AlignRequest: Answers.align,
 }

@@ -44,14 +44,14 @@ def rays(view: MapView, origins: Doubles, directions: Doubles, options: RayOptio
     """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach, map frame."""
     status = np.full(len(origins), Status.FREE, np.uint8)
     ranges = np.full(len(origins), options.max_range_m)
-    hit = _trace(view, origins, directions, ranges=ranges)
+    hit = trace(view, origins, directions, ranges=ranges)
     status[hit] = Status.SURFACE
     if not options.through_unknown:
         _stop_at_unknown(view, origins, directions, ranges=ranges, status=status)
     return RayRanges(ranges.astype(np.float32), status, view.epoch)
 
 
-def _trace(view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles) -> Bools:
+def trace(view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles) -> Bools:
     """Shorten ``ranges`` [N] to the first surface (Hart 1996); whether each ray meets one."""
     hit = np.zeros(len(origins), np.bool_)
     at = np.zeros(len(origins))

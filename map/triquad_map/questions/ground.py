@@ -1,0 +1,139 @@
+"""The ground below points: what a robot would stand on, or that nothing is there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
+from triquad_format.records.status import Status
+
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.rays import trace
+from triquad_map.questions.segments import STEP_VOXELS
+from triquad_map.view import MapView
+
+_TOLERANCE_VOXELS = 0.5
+"""How far above a point its ground may be, and how much above the ground need not be seen: a
+surface may cut the corner of a voxel in which no ray happened to end."""
+
+_LEAST_UP = 0.5
+"""Of the normal's z: what is steeper is not stepped down to as if it were a plane."""
+
+_LONGEST_REST_M = 0.02
+"""From where a ray met the surface to the surface."""
+
+_DOWN = np.array([0.0, 0.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What lies below N points, metres, map frame, of one epoch.
+
+    ``SURFACE``: the first surface below the point, which is its ground. ``FREE``: none as far down
+    as asked, and rays have passed through all of that: a hole or an edge. ``UNKNOWN``: some of
+    what lies between has not been seen, or the point lies in or behind a surface.
+    """
+
+    status: Bytes  # [N] Status
+    height_m: Doubles  # [N] z of the ground; else down to where all was seen to be free
+    normal: Floats  # [N, 3] of the ground, a unit vector to free space; 0: there is none
+    confidence: Floats  # [N] in [0, 1], as of distances; 0: there is none
+    epoch: int
+
+    @property
+    def slope_deg(self) -> Floats:
+        """How steep the ground is [N], 0 to 90 degrees; 90 where there is none."""
+        return np.degrees(np.arccos(np.clip(self.normal[:, 2], 0.0, 1.0)))
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """N ways straight down."""
+
+    starts: Doubles  # [N, 3]
+    depths: Doubles  # [N] to the first surface, or as far as asked
+    hit: Bools  # [N] whether there is one
+    buried: Bools  # [N] whether it begins in or behind one
+
+
+def ground(view: MapView, points: Doubles, max_drop_m: float) -> Ground:
+    """The ground at most ``max_drop_m`` below ``points`` [N, 3], metres, map frame."""
+    columns = _columns(view, points, max_drop_m)
+    unseen_m = np.where(columns.hit, _TOLERANCE_VOXELS * view.voxel_m, 0.0)
+    to_see_m = np.maximum(columns.depths - unseen_m, 0.0)
+    seen_m = _seen_down(view, columns.starts, to_see_m)
+    clear = (seen_m >= to_see_m) & ~columns.buried
+    answer = Ground(
+        status=np.where(clear & ~columns.hit, Status.FREE, Status.UNKNOWN).astype(np.uint8),
+        height_m=np.minimum(columns.starts[:, 2] - seen_m, points[:, 2]),
+        normal=np.zeros((len(points), 3), np.float32),
+        confidence=np.zeros(len(points), np.float32),
+        epoch=view.epoch,
+    )
+    rows = np.flatnonzero(clear & columns.hit)
+    _stand(view, answer, rows, places=columns.starts[rows] + columns.depths[rows, None] * _DOWN)
+    np.maximum(answer.height_m, points[:, 2] - max_drop_m, out=answer.height_m)
+    return answer
+
+
+def _stand(view: MapView, answer: Ground, rows: Longs, places: Doubles) -> None:
+    """Put the ground into ``rows`` [R] of the answer, where ``places`` [R, 3] on it bear."""
+    here = distances(view, places, DistanceOptions(view.voxel_m))
+    up = here.gradient[:, 2]
+    bears = (up > 0) & _ended_near(view, places)  # else it is met from behind, or made up
+    # The rest of the way to the surface, as if that were a plane.
+    rest_m = here.distance_m / np.maximum(up, _LEAST_UP)
+    heights = places[:, 2] - np.clip(rest_m, -_LONGEST_REST_M, _LONGEST_REST_M)
+    answer.status[rows[bears]] = Status.SURFACE
+    answer.height_m[rows[bears]] = heights[bears]
+    answer.normal[rows[bears]] = here.gradient[bears]
+    answer.confidence[rows[bears]] = here.confidence[bears]
+
+
+def _columns(view: MapView, points: Doubles, max_drop_m: float) -> _Columns:
+    """The columns below ``points`` [N, 3]; those of points at a surface begin a little above."""
+    starts = points.copy()
+    depths = np.full(len(points), max_drop_m)
+    hit = _trace_down(view, starts, depths)
+    buried = hit & (depths <= 0)
+    low = np.flatnonzero(buried)
+    lift_m = _TOLERANCE_VOXELS * view.voxel_m
+    starts[low, 2] += lift_m
+    again = np.full(len(low), max_drop_m + lift_m)
+    hit[low] = _trace_down(view, starts[low], again)
+    depths[low] = again
+    buried[low] = hit[low] & (again <= 0)
+    return _Columns(starts, depths, hit & ~buried, buried)
+
+
+def _trace_down(view: MapView, starts: Doubles, depths: Doubles) -> Bools:
+    """Shorten ``depths`` [N] to the first surface below; whether there is one."""
+    return trace(view, starts, np.broadcast_to(_DOWN, starts.shape), ranges=depths)
+
+
+def _seen_down(view: MapView, starts: Doubles, depths: Doubles) -> Doubles:
+    """How far below ``starts`` [N, 3] rays have shown all, at most ``depths`` [N].
+
+    Between two seen places half a voxel apart there is nothing unknown: voxels are twice as high.
+    """
+    seen_m = np.zeros(len(starts))
+    at = np.zeros(len(starts))
+    going = np.flatnonzero(depths > 0)
+    while len(going):
+        status = view.status(starts[going] + at[going, None] * _DOWN, reach_m=0.0)
+        going = going[status != Status.UNKNOWN]
+        seen_m[going] = at[going]
+        going = going[at[going] < depths[going]]
+        at[going] = np.minimum(at[going] + STEP_VOXELS * view.voxel_m, depths[going])
+    return seen_m
+
+
+def _ended_near(view: MapView, points: Doubles) -> Bools:
+    """Whether rays ended in the voxels of ``points`` [N, 3], or closely above or below.
+
+    Where none did, the field goes on from what lies beside, as if a hole were covered.
+    """
+    near_m = _TOLERANCE_VOXELS * view.voxel_m
+    ended = np.zeros(len(points), np.bool_)
+    for offset_m in (-near_m, 0.0, near_m):
+        ended |= view.status(points + offset_m * _DOWN, reach_m=0.0) == Status.SURFACE
+    return ended

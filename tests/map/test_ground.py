@@ -1,0 +1,185 @@
+"""Where a robot could stand: the ground of a known place, asked of a real server."""
+
+import asyncio
+
+import numpy as np
+import pytest
+import triquad_client
+from support import ground_scenes, servers
+from support.ground_scenes import HOLE_M, KERB_M, RAMP_DEG, STEP_M, TABLE_M, TREAD_M
+from triquad_client import Status
+from triquad_server.settings import Settings
+
+VOXEL_M = 0.2
+SETTINGS = Settings.model_validate(
+    {"field": {"depth": 8}, "training": {"batch": 4096, "samples_per_ray": 18.0}}
+)
+
+
+@pytest.fixture(scope="module")
+def endpoint():
+    with servers.running_service(SETTINGS) as endpoint:
+        yield endpoint
+
+
+@pytest.fixture(scope="module")
+def client(endpoint):
+    """Of a server to which a robot has shown the place, and that has learnt all of it."""
+    with triquad_client.connect(endpoint) as client:
+        for scan in ground_scenes.walk():
+            client.publish_scan(scan.points, scan.world_from_sensor)
+            client.flush(servers.WAIT_S, pending=2)
+        client.flush(servers.WAIT_S)
+        client.settle(servers.WAIT_S)
+        yield client
+
+
+def points_over(x, y, z):
+    """Points [N, 3] at one height over a rectangle, 5 cm apart."""
+    axes = [np.arange(low, high, 0.05) for low, high in (x, y)]
+    grid = np.meshgrid(*axes, indexing="ij")
+    return np.column_stack([axis.ravel() for axis in (*grid, np.full(grid[0].shape, z))])
+
+
+def check_level(answer, height_m, *, within_m=0.03):
+    """All is ground at one height."""
+    assert (answer.status == Status.SURFACE).mean() > 0.98
+    stands = answer.status == Status.SURFACE
+    error_m = np.abs(answer.height_m[stands] - height_m)
+    assert np.quantile(error_m, 0.95) < within_m
+    assert error_m.max() < 2 * within_m
+    assert (answer.confidence[stands] > 0).all()
+
+
+def test_a_kerb(client):
+    check_level(client.query_ground(points_over((-11, -7), (1.2, 1.9), 0.5)), 0.0, within_m=0.015)
+    check_level(client.query_ground(points_over((-11, -7), (2.1, 3.5), 0.6)), KERB_M)
+    across = client.query_ground(points_over((-9, -8.9), (1.5, 2.5), 0.5))
+    rises = np.diff(across.height_m.reshape(2, -1), axis=1)
+    assert (across.status == Status.SURFACE).all()
+    assert (rises > -0.01).all()
+    low, high = across.height_m.min(), across.height_m.max()
+    assert high - low == pytest.approx(KERB_M, abs=0.02)
+
+
+@pytest.mark.parametrize("tread", range(5))
+@pytest.mark.parametrize("up", [True, False], ids=["up", "down"])
+def test_every_tread_of_the_stairs_has_its_height(client, tread, up):
+    height_m = STEP_M * (tread + 1) * (1 if up else -1)
+    middle = (2 if up else -1) + (1 if up else -1) * TREAD_M * (tread + 0.5)
+    over = points_over((-5.5, -3.5), (middle - 0.05, middle + 0.05), height_m + 0.4)
+    check_level(client.query_ground(over), height_m)
+
+
+def test_the_ground_a_little_above_a_point_counts_and_no_more(client):
+    for below_m in (0.0, 0.04, 0.08):
+        check_level(client.query_ground(points_over((-8, 8), (-0.8, 0.8), -below_m)), 0.0)
+    for below_m in (0.12, 0.2, 0.3, 0.6):
+        buried = client.query_ground(points_over((-8, 8), (-0.8, 0.8), -below_m))
+        assert (buried.status == Status.UNKNOWN).all()
+        assert (buried.height_m <= -below_m + 1e-6).all()
+
+
+def test_a_ramp_has_its_slope(client):
+    over = points_over((-2.5, 0.5), (2.3, 4.7), 1.1)
+    answer = client.query_ground(over)
+    assert (answer.status == Status.SURFACE).all()
+    true_m = np.tan(np.deg2rad(RAMP_DEG)) * (over[:, 1] - 2)
+    np.testing.assert_allclose(answer.height_m, true_m, atol=0.03)
+    assert np.median(answer.slope_deg) == pytest.approx(RAMP_DEG, abs=1.0)
+    assert np.quantile(np.abs(answer.slope_deg - RAMP_DEG), 0.9) < 5
+    uphill = answer.normal[:, :2] @ (0.0, -1.0)
+    assert (uphill > 0.15).mean() > 0.95
+
+
+def test_a_hole_whose_bottom_is_seen(client):
+    bottom = client.query_ground(points_over((2.3, 4.7), (1.6, 2.4), 0.3))
+    check_level(bottom, -HOLE_M)
+    shallow = client.query_ground(points_over((2.3, 4.7), (1.6, 2.2), 0.3), max_drop_m=0.7)
+    assert (shallow.status == Status.FREE).all()
+    np.testing.assert_allclose(shallow.height_m, -0.4, atol=1e-6)
+
+
+def test_a_hole_whose_bottom_is_not_seen_is_never_ground(client):
+    """But within a voxel of its sides, which is as far as the map can tell."""
+    inside = points_over((3.42, 3.58), (-4.98 + VOXEL_M, -4.42 - VOXEL_M), 0.3)
+    answer = client.query_ground(inside)
+    assert (answer.status == Status.UNKNOWN).all()
+    assert not answer.normal.any()
+    assert not answer.confidence.any()
+    assert (answer.slope_deg == 90).all()
+
+
+def test_over_an_edge_there_is_no_ground(client):
+    assert (ground_scenes.SCENE.sdf(np.array([[8.0, -1.5, -1]])) > 0).all()
+    beyond = points_over((7, 11), (-5, -1 - VOXEL_M), 0.3)
+    answer = client.query_ground(beyond)
+    assert not (answer.status == Status.SURFACE).any()
+    seen = answer.status == Status.FREE
+    assert seen.any()
+    np.testing.assert_allclose(answer.height_m[seen], 0.3 - 2.0, atol=1e-6)
+    assert (answer.height_m[~seen] > 0.3 - 2.0).all()
+    bottom = client.query_ground(beyond, max_drop_m=4.0)
+    there = bottom.status == Status.SURFACE
+    assert there.any()
+    np.testing.assert_allclose(bottom.height_m[there], ground_scenes.BELOW_EDGE_M, atol=0.1)
+
+
+def test_far_ground_is_right_where_it_is_told(client):
+    """Up to eight metres from the nearest place of the sensor, at eight degrees."""
+    for x in ((-19.5, -13), (13, 19.5)):
+        answer = client.query_ground(points_over(x, (-0.5, 0.5), 0.4))
+        stands = answer.status == Status.SURFACE
+        assert stands.mean() > 0.8
+        np.testing.assert_allclose(answer.height_m[stands], 0.0, atol=0.03)
+        assert (answer.status[~stands] == Status.UNKNOWN).all()
+
+
+def test_the_first_surface_below_counts(client):
+    over = points_over((8.2, 9.0), (2.4, 3.2), 0.9)
+    check_level(client.query_ground(over), TABLE_M)
+    check_level(client.query_ground(over - [0, 0, 0.6]), 0.0)  # which is seen under the table
+
+
+def test_what_lies_below_unseen_space_is_no_ground(client):
+    inside_wall = client.query_ground(points_over((-8, 8), (8.2, 8.8), 3.0), max_drop_m=10)
+    assert (inside_wall.status == Status.UNKNOWN).all()
+
+
+def test_where_nothing_was_seen_nothing_is_said(client):
+    points = np.array([[0.0, 0, 50], [1e6, 0, 0], [0, -30, 0]])
+    answer = client.query_ground(points)
+    assert (answer.status == Status.UNKNOWN).all()
+    np.testing.assert_allclose(answer.height_m, points[:, 2])
+
+
+def test_parts_and_the_whole_agree(client):
+    points = points_over((-12, 12), (-0.9, 0.9), 0.5)
+    assert len(points) > 4_000  # more than one request holds
+    whole = client.query_ground(points)
+    some = client.query_ground(points[::50])
+    np.testing.assert_array_equal(whole.status[::50], some.status)
+    np.testing.assert_allclose(whole.height_m[::50], some.height_m, atol=1e-3)
+
+
+def test_whoever_asks_gets_the_same_answer(client, endpoint, tmp_path):
+    points = points_over((2.1, 4.9), (0.5, 2.9), 0.3)
+    want = client.query_ground(points, 0.7)
+
+    async def ask():
+        async with triquad_client.connect_async(endpoint) as other:
+            return await other.query_ground(points, 0.7)
+
+    client.download_map(tmp_path / "map.triquad")
+    with triquad_client.open_map(tmp_path / "map.triquad") as offline:
+        answers = [
+            asyncio.run(ask()),
+            client.pinned().query_ground(points, 0.7),
+            client.query_ground(points, 0.7, at_epoch=want.epoch),
+            offline.query_ground(points, 0.7),
+        ]
+    for have in answers:
+        assert have.epoch == want.epoch
+        assert (have.status == want.status).mean() > 0.995  # a file has features of half precision
+        same = have.status == want.status
+        np.testing.assert_allclose(have.height_m[same], want.height_m[same], atol=0.02)
