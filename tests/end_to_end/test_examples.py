@@ -129,6 +129,27 @@ def test_paths_bend_away_from_what_blocks_the_straight_one(run: Run) -> None:
     assert SCENE.sdf(path).min() > RADIUS_M - 0.05
 
 
+@pytest.mark.parametrize(
+    ("arguments", "stop_m", "why"),
+    [
+        ([], 7.0, "a step of +0.1"),  # the kerb
+        (["--step", "0.2"], 9.7, "the ground was not seen"),  # a house
+        (["--goal", "14", "-9", "--start", "14", "2"], 5.0, "the ground was not seen"),  # a car
+    ],
+)
+def test_a_robot_stops_where_it_cannot_stand(
+    run: Run, arguments: list[str], stop_m: float, why: str
+) -> None:
+    output = run("walk.py", *arguments)
+    found = re.search(r"stop after ([\d.]+) m: (.+)", output)
+    assert float(found[1]) == pytest.approx(stop_m, abs=0.3)
+    assert why in found[2]
+
+
+def test_a_robot_goes_on_along_the_road(run: Run) -> None:
+    assert "free all along" in run("walk.py", "--start", "2", "0", "--goal", "26", "0.5")
+
+
 def read_costmap(path: Path) -> tuple[NDArray[np.int8], NDArray[np.float64], float]:
     """Costs [x, y], the corner [2] and the cell, read as map_server reads them."""
     lines = path.with_suffix(".yaml").read_text().splitlines()
