@@ -17,6 +17,7 @@ from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.answers import REACH_M, measure_answers
 from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.ground import ground_latency, ground_points, measure_ground
 from triquad_tools.benchmarks.served import MAP, Served, latency_figures, served, stream
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.demo.probe import ProbeReport
@@ -46,10 +47,11 @@ def measure_planners(made: BenchStreet) -> list[Figure]:
         figures += _sixteen(server, made, points)
         figures += _beside_frozen(server, points[0])
         wait_until_settled(server.client, _SETTLE_LIMIT_S)
+        figures += ground_latency(server, ground_points(made))
         server.client.download_map(server.folder / "map.triquad")
         record = read_map(server.folder / "map.triquad")
     view = Mapper(MAP, Settings(), "cpu", record=record).publish()
-    return measure_answers(made, record, view) + figures
+    return measure_answers(made, record, view) + measure_ground(made, view) + figures
 
 
 def _planner_points(made: BenchStreet) -> list[Points]:

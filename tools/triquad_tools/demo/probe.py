@@ -29,6 +29,7 @@ QUESTIONS: dict[str, Callable[[Client, Doubles], int]] = {
     "sdf": lambda client, points: client.query_sdf(points).epoch,
     "gradient": lambda client, points: client.query_sdf(points, gradient=True).epoch,
     "distance": lambda client, points: client.query_distance(points).epoch,
+    "ground": lambda client, points: client.query_ground(points).epoch,
 }
 """What the planner may ask; each returns the epoch that answered."""
 
