@@ -65,6 +65,8 @@ def main() -> None:
     add("--width", type=float, default=0.5, help="of the robot, metres")
     add("--step", type=float, default=0.1, help="what it climbs and descends, metres")
     options = parser.parse_args()
+    if options.start == options.goal:
+        parser.error("start and goal are the same place")
     robot = Robot(options.width, options.step)
     places = lanes(np.array(options.start), np.array(options.goal), robot)
     heights = np.full((*places.shape[:2], 1), options.floor + ABOVE_M)
