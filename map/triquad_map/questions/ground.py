@@ -15,6 +15,9 @@ _TOLERANCE_VOXELS = 0.5
 """How far above a point its ground may be, and how much above the ground need not be seen: a
 surface may cut the corner of a voxel in which no ray happened to end."""
 
+_FACES_DOWN = -0.5
+"""Up to here a normal's z is that of a wall whose top edge was met: it leans as the field says."""
+
 _LEAST_UP = 0.5
 """Of the normal's z: what is steeper is not stepped down to as if it were a plane."""
 
@@ -79,7 +82,7 @@ def _stand(view: MapView, answer: Ground, rows: Longs, places: Doubles) -> None:
     """Put the ground into ``rows`` [R] of the answer, where ``places`` [R, 3] on it bear."""
     here = distances(view, places, DistanceOptions(view.voxel_m))
     up = here.gradient[:, 2]
-    bears = (up > 0) & _ended_near(view, places)  # else it is met from behind, or made up
+    bears = (up > _FACES_DOWN) & _ended_near(view, places)  # else met from behind, or made up
     # The rest of the way to the surface, as if that were a plane.
     rest_m = here.distance_m / np.maximum(up, _LEAST_UP)
     heights = places[:, 2] - np.clip(rest_m, -_LONGEST_REST_M, _LONGEST_REST_M)
