@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Longs
 
-_JOINED_VOXELS = 2
-"""Voxels of a cluster may lie so far apart: it is made of cells of this side, which touch."""
+_CELL_VOXELS = 2
+"""A cluster is made of cells of this side, which touch: its voxels lie up to as far apart."""
 
 _SIDES = (-1, 0, 1)
 _HALF_THE_NEIGHBOURS = [
@@ -28,13 +28,21 @@ class Boxes:
     box: NDArray[np.intp]  # [N] of each voxel
 
 
-def tight_boxes(voxels: Longs, longest: int, scale: int = 1) -> Boxes:
-    """The boxes around the clusters of ``voxels`` [N, 3].
+def clusters(voxels: Longs, scale: int = 1) -> NDArray[np.intp]:
+    """The cluster [N] of each of ``voxels`` [N, 3], numbered from 0.
 
-    Voxels that are at most two apart along each axis are in one cluster. Where its box is longer
-    than ``longest`` voxels, it is cut into equal pieces. Both lengths are taken ``scale`` times.
+    Voxels that are at most two apart along each axis, ``scale`` times, are in one cluster; those
+    that are more than three apart are not, unless others lie between.
     """
-    cluster = connected(voxels // (scale * _JOINED_VOXELS))
+    return connected(voxels // (scale * _CELL_VOXELS))
+
+
+def tight_boxes(voxels: Longs, longest: int, scale: int = 1) -> Boxes:
+    """The boxes around the :func:`clusters` of ``voxels`` [N, 3].
+
+    One that would be longer than ``longest`` voxels, ``scale`` times, is cut into equal pieces.
+    """
+    cluster = clusters(voxels, scale)
     whole = _around(voxels, cluster)
     size = whole.high - whole.low
     pieces = -(-size // (scale * longest))
