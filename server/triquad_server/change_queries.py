@@ -16,6 +16,7 @@ MAX_BOXES = 256
 """Boxes of one reply. Where there would be more, voxels twice as far apart share one, and boxes may
 be twice as long, and so on."""
 
+_DECIMALS = 6  # of metres: the last digits of a product mean nothing
 _LONGEST_VOXELS = 32  # 6.4 m with the default leaf
 
 
@@ -51,13 +52,16 @@ class ChangeQueries:
         return self._reply(_boxed(changes.part(inside)), since, newest)
 
     def _reply(self, kinds: "list[_Boxed]", since: int, newest: Epoch) -> ChangesReply:
-        leaf_m = newest.field_settings.leaf_m
+        low, high = (
+            np.concatenate(corners) * newest.field_settings.leaf_m
+            for corners in zip(*((kind.boxes.low, kind.boxes.high) for kind in kinds), strict=True)
+        )
         return ChangesReply(
             epoch=newest.number,
             server=self._server,
             since=since,
-            minimum=np.concatenate([kind.boxes.low for kind in kinds]) * leaf_m,
-            maximum=np.concatenate([kind.boxes.high for kind in kinds]) * leaf_m,
+            minimum=low.round(_DECIMALS),
+            maximum=high.round(_DECIMALS),
             appeared=np.concatenate([kind.appeared for kind in kinds]),
             epochs=np.concatenate([kind.epochs for kind in kinds]),
             voxels=np.concatenate([kind.counts for kind in kinds]),
