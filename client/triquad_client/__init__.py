@@ -22,6 +22,7 @@ from triquad_map.questions.spheres import Spheres
 
 from triquad_client.async_client import AsyncClient, connect_async
 from triquad_client.calls.async_queries import AsyncPinnedMap
+from triquad_client.calls.changes import ChangedBox, ChangeKind, ChangeReport
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.questions import SdfResult
 from triquad_client.calls.scans import FlushReport
@@ -53,6 +54,9 @@ __all__ = [
     "AsyncSyncedMap",
     "BadReplyError",
     "Bounds",
+    "ChangeKind",
+    "ChangeReport",
+    "ChangedBox",
     "CheckpointInfo",
     "Client",
     "ClosedError",

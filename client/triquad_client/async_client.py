@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
-from triquad_client.calls import admin, download, questions
+from triquad_client.calls import admin, changes, download, questions
 from triquad_client.calls.async_queries import AsyncMapQueries, AsyncPinnedMap
+from triquad_client.calls.changes import ChangeReport
 from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds
 from triquad_client.client import Client
@@ -68,6 +69,11 @@ class AsyncClient(AsyncMapQueries):
 
     async def pinned(self) -> AsyncPinnedMap:
         return AsyncPinnedMap(self._run, await self._run(questions.pin_newest()))
+
+    async def changes(
+        self, since: int | ChangeReport | None = None, bounds: Bounds | None = None
+    ) -> ChangeReport:
+        return await self._run(changes.changes(since, bounds))
 
     async def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
         return await self._run(fetch_tiles(bounds, level))

@@ -80,8 +80,8 @@ def stamp_ns(stamp_s: float) -> int:
     return round(stamp_s * 1e9)
 
 
-def chosen_epoch(at_epoch: int | None) -> int:
-    """The number of an epoch as it is sent: 0 is the newest."""
+def chosen_epoch(at_epoch: int | None, name: str = "at_epoch") -> int:
+    """The number of an epoch as it is sent: 0 is the newest. ``name`` is the argument's."""
     if at_epoch is None:
         return 0
     try:
@@ -89,9 +89,9 @@ def chosen_epoch(at_epoch: int | None) -> int:
             raise TypeError("a truth value")
         number = operator.index(at_epoch)
     except TypeError as error:
-        raise InvalidInputError(f"at_epoch = {at_epoch!r} is not the number of an epoch") from error
+        raise InvalidInputError(f"{name} = {at_epoch!r} is not the number of an epoch") from error
     if not 0 < number < 2**63:
-        raise InvalidInputError(f"at_epoch = {at_epoch!r}: epochs are numbered from 1 on")
+        raise InvalidInputError(f"{name} = {at_epoch!r}: epochs are numbered from 1 on")
     return number
 
 

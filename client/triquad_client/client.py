@@ -6,7 +6,8 @@ from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
-from triquad_client.calls import admin, download, questions
+from triquad_client.calls import admin, changes, download, questions
+from triquad_client.calls.changes import ChangeReport
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds
@@ -95,6 +96,25 @@ class Client(MapQueries):
     def pinned(self) -> PinnedMap:
         """The map as it is now, for queries that belong together."""
         return PinnedMap(self._run, self._run(questions.pin_newest()))
+
+    def changes(
+        self, since: int | ChangeReport | None = None, bounds: Bounds | None = None
+    ) -> ChangeReport:
+        """Where surface appeared or vanished since an epoch, a published state of the map.
+
+        What appeared and vanished again is not listed. To follow the map, give the report before:
+        its epoch, and its server, so that a restart is noticed whatever the epochs' numbers.
+
+        Args:
+            since: number of an epoch, of this run of the server; or an earlier report; ``None``:
+                the newest, to which nothing is listed.
+            bounds: corners of a box, metres, map frame; ``None``: everywhere.
+
+        Raises:
+            RefusedError: ``epoch_gone``: the server was restarted, does not remember as far back,
+                or has not published that epoch. Ask for what you need of the map anew.
+        """
+        return self._run(changes.changes(since, bounds))
 
     def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
         """The mesh tiles that meet ``bounds``, with the epoch in which each last changed.

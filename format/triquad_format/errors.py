@@ -4,7 +4,7 @@ ERROR_CODES = {
     "bad_request": "the request is malformed or out of range",
     "bad_version": "the request is of another protocol version",
     "too_large": "the request exceeds a limit of the server; split it",
-    "epoch_gone": "the pinned epoch is no longer kept",
+    "epoch_gone": "the epoch is not kept, or not known what changed since; ask the newest",
     "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
     "timeout": "the server could not finish in the time that the request allows",
     "busy": "too many requests are waiting",

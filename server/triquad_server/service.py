@@ -20,6 +20,7 @@ from triquad_format.wire.messages import (
 )
 from triquad_format.wire.query_messages import (
     AlignRequest,
+    ChangesRequest,
     DistanceRequest,
     GridRequest,
     GroundRequest,
@@ -29,6 +30,7 @@ from triquad_format.wire.query_messages import (
 )
 from triquad_map.questions.answers import Answers, QuestionLimits
 
+from triquad_server.change_queries import ChangeQueries
 from triquad_server.counter import Counter
 from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
@@ -112,6 +114,7 @@ class Service:
             checkpoints=checkpoints,
         )
         self._serve_queries()
+        self._serve_changes(health.server)
         self._serve_mesh(health.server)
         self._serve_status(health)
         self._serve_downloads()
@@ -172,6 +175,10 @@ class Service:
             limits.query_workers,
         )
         self._serve({keys.ALIGN: answering(AlignRequest, answers.align)})
+
+    def _serve_changes(self, server: str) -> None:
+        queries = ChangeQueries(self._mapper.epochs, self._mapper.surface, server)
+        self._serve({keys.CHANGES: answering(ChangesRequest, queries.changes)})
 
     def _serve_mesh(self, server: str) -> None:
         """Queries of mesh tiles, and following them."""

@@ -192,6 +192,10 @@ class ServiceSettings(BaseModel):
     pin_s: Annotated[float, Field(ge=0, le=1e6)] = 30.0
     """Time for which an epoch stays after it was last asked for by number."""
 
+    changes_kept: Annotated[int, Field(ge=0, le=100_000_000)] = 1_000_000
+    """Voxels whose surface appeared or vanished that are remembered, each change of each, for
+    clients that ask what changed: 13 bytes each."""
+
     flush_timeout_max_s: Annotated[float, Field(ge=0.1, le=1e6)] = 600.0
     """Longest time that a client may ask to wait in a flush."""
 

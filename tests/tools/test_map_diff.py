@@ -45,7 +45,7 @@ def test_what_moved_by_5_cm_is_found_to_have_moved_by_5_cm():
     found = diff(GROUND, RAISED)
     for tile in found.tiles:
         assert max(map(abs, (*tile.low_m[:2], *tile.high_m[:2]))) <= 3.0
-        assert tile.change.added == tile.change.gone == 0
+        assert tile.change.appeared == tile.change.vanished == 0
     inner = tile_at(found, 0.0, 0.0, 0.0).change
     assert inner.points_a == inner.points_b == 25
     assert inner.moved_median_m == pytest.approx(0.05, abs=2e-4)
@@ -56,28 +56,28 @@ def test_what_moved_by_5_cm_is_found_to_have_moved_by_5_cm():
     assert volumes == sorted(volumes, reverse=True)
 
 
-def test_what_is_added_was_free_and_hides_what_is_below():
+def test_what_appeared_was_free_and_hides_what_is_below():
     found = diff(GROUND, TABLE)
     top = tile_at(found, 0.0, 0.0, 1.0).change
-    assert (top.points_a, top.points_b, top.added, top.newly_seen) == (0, 25, 25, 0)
+    assert (top.points_a, top.points_b, top.appeared, top.newly_seen) == (0, 25, 25, 0)
     assert math.isnan(top.moved_median_m)
     below = tile_at(found, 0.0, 0.0, 0.0).change
-    assert (below.points_a, below.points_b, below.not_seen, below.gone) == (25, 0, 25, 0)
-    assert 0 < found.total.added <= IN_SQUARE
-    assert found.total.gone == 0
+    assert (below.points_a, below.points_b, below.no_longer_known, below.vanished) == (25, 0, 25, 0)
+    assert 0 < found.total.appeared <= IN_SQUARE
+    assert found.total.vanished == 0
 
 
-def test_what_is_gone_is_free_now_and_shows_what_is_below():
+def test_what_vanished_is_free_now_and_shows_what_is_below():
     found = diff(TABLE, GROUND)
     top = tile_at(found, 0.0, 0.0, 1.0).change
-    assert (top.points_a, top.points_b, top.gone, top.not_seen) == (25, 0, 25, 0)
+    assert (top.points_a, top.points_b, top.vanished, top.no_longer_known) == (25, 0, 25, 0)
     below = tile_at(found, 0.0, 0.0, 0.0).change
-    assert (below.points_a, below.points_b, below.newly_seen, below.added) == (0, 25, 25, 0)
+    assert (below.points_a, below.points_b, below.newly_seen, below.appeared) == (0, 25, 25, 0)
 
 
 def test_maps_of_different_places_have_seen_nothing_of_each_other():
     found = diff(GROUND, random_record(indices=()))
-    assert found.total.not_seen == found.total.points_a == POINTS
+    assert found.total.no_longer_known == found.total.points_a == POINTS
     assert found.total.changed_m3 == 0.0
     assert diff(random_record(indices=()), GROUND).total.newly_seen == POINTS
 
@@ -89,7 +89,7 @@ def test_the_same_scans_give_maps_that_differ_by_their_noise_alone():
     assert total.points_a > 10_000
     assert total.moved_median_m < 0.01
     assert total.moved_p95_m < 0.06
-    for count in (total.added, total.gone, total.newly_seen, total.not_seen):
+    for count in (total.appeared, total.vanished, total.newly_seen, total.no_longer_known):
         assert count < 0.002 * total.points_a
 
 
@@ -111,9 +111,10 @@ def test_table(files, capsys):
         f"{letter}  {path}: map 'ground', epoch 1" for letter, path in zip("AB", files, strict=True)
     ]
     assert lines[2].split()[:3] == ["from", "x", "m"]
-    assert len(lines) == 7
     assert lines[5].startswith("  all")
     assert "more: --limit" in lines[6]
+    assert lines[7].split()[0] == "what"
+    assert len(lines) <= 7 + 1 + 2 + 2
 
 
 def test_json(files, capsys):
@@ -121,7 +122,7 @@ def test_json(files, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["tile_m"] == 6.4
     assert found["total"]["points_a"] == POINTS
-    assert found["total"]["added"] > 0
+    assert found["total"]["appeared"] > 0
     assert set(found["tiles"][0]) == {"low_m", "high_m", "change"}
     assert found["tiles"][0]["change"].keys() == found["total"].keys()
 

@@ -10,7 +10,7 @@ from support.map_records import random_record
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands.inspect import main
-from triquad_tools.plots.diff_plan import ADDED, GONE
+from triquad_tools.plots.diff_plan import APPEARED, VANISHED
 from triquad_tools.plots.map_plan import latest_epochs, sample_errors, seen_columns
 from triquad_tools.plots.plan import FREE, UNKNOWN, Layer, PlanGrid, Scale, draw_layers, draw_values
 from triquad_tools.plots.slice_plan import SURFACE
@@ -168,7 +168,7 @@ def test_picture_of_a_difference(tmp_path):
         picture = tmp_path / "diff.png"
         assert main([first, second, "--diff", "--plot", str(picture)]) == 0
         pixels = read_picture(picture)
-        shares[first, second] = [share(pixels, colour) for colour in (ADDED, GONE)]
+        shares[first, second] = [share(pixels, colour) for colour in (APPEARED, VANISHED)]
     legend = shares[a, a]  # which has all colours
     assert shares[a, b][0] > 20 * legend[0]
     assert shares[a, b][1] == pytest.approx(legend[1])

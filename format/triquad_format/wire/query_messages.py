@@ -11,12 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.wire.codec import ArraySpec, Message
-from triquad_format.wire.messages import MapReply, Point, Pose, Positions, StatusCodes, Values
+from triquad_format.wire.messages import (
+    Integers,
+    MapReply,
+    Point,
+    Pose,
+    Positions,
+    StatusCodes,
+    Values,
+)
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Volume = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, None, None))]
 StatusVolume = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None, None, None))]
 Counts = Annotated[NDArray[np.int32], ArraySpec("<i4", (3,))]
+Corners = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3))]
 Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
 
 
@@ -169,3 +178,26 @@ class AlignReply(MapReply):
     converged: bool
     iterations: int
     points: int  # that were used
+
+
+@dataclass(frozen=True)
+class ChangesRequest(Message):
+    """Where surface appeared or vanished since an epoch."""
+
+    since: int  # number of an epoch; 0: the newest, after which nothing has changed yet
+    server: str  # of the reply or status that told of it; empty where that is not known
+    minimum: Point
+    maximum: Point  # of the box that is of interest, map frame; an open side is infinite
+
+
+@dataclass(frozen=True)
+class ChangesReply(MapReply):
+    """Answer to :class:`ChangesRequest`: boxes around voxels that changed."""
+
+    server: str
+    since: int
+    minimum: Corners  # [N, 3] metres, map frame
+    maximum: Corners  # [N, 3]
+    appeared: Flags  # [N] 1: surface appeared, 0: it vanished
+    epochs: Integers  # [N] of the newest change in each
+    voxels: Integers  # [N] that changed in each

@@ -19,6 +19,7 @@ from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import check_box
 from triquad_server.settings import ServiceSettings
+from triquad_server.surface_history import SurfaceHistory
 from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
@@ -77,7 +78,9 @@ class MapperThread:
         self._scans_taken = 0
         self._loss = 0.0  # as of the newest epoch
         self._step_s = _GIVE_WAY_S  # what the last step of training took
-        self.epochs = EpochHistory(mapper.publish(), settings)
+        first = mapper.publish()
+        self.epochs = EpochHistory(first, settings)
+        self.surface = SurfaceHistory(first, settings.changes_kept)
         self.progress = Progress()
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
@@ -228,6 +231,7 @@ class MapperThread:
         started = time.monotonic()
         epoch = self._mapper.publish()
         if epoch is not self.epochs.newest:
+            self.surface.add(epoch)
             self.epochs.add(epoch)
         self._loss = self._mapper.loss
         self._unpublished = False

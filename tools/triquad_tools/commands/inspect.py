@@ -15,6 +15,7 @@ from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
 from triquad_tools.mapfiles.checks import FailedCheckError, verify
 from triquad_tools.mapfiles.diff import compare, difference, print_diff
+from triquad_tools.mapfiles.object_changes import object_changes, print_objects
 from triquad_tools.mapfiles.source import MissingFilesError, read_whole
 from triquad_tools.mapfiles.store_log import print_log, read_log
 from triquad_tools.mapfiles.summary import print_summary, summarise
@@ -53,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--diff", action="store_true", help="compare two map files, A and B")
     add("--plot", type=Path, metavar="OUT.png", help="draw a plan of the map(s), or the slice")
     add("--tile", type=positive, metavar="M", help=f"side of a tile of --diff ({_TILE_M} m)")
-    add("--limit", type=count, metavar="N", help=f"rows of --diff ({_ROWS})")
+    add("--limit", type=count, metavar="N", help=f"rows of each table of --diff ({_ROWS})")
     add("--json", action="store_true", help="print JSON")
     _add_slice(parser.add_argument_group("slices"))
     return parser
@@ -167,6 +168,7 @@ def _diff(options: argparse.Namespace) -> int:
     with progress("comparing"):
         comparison = compare(a.record, b.record)
     diff = difference(comparison, options.tile or _TILE_M)
+    objects = object_changes(comparison)
     titles = [
         f"{letter}  {_title(path, file)}"
         for letter, path, file in zip("AB", options.files, (a, b), strict=True)
@@ -174,12 +176,13 @@ def _diff(options: argparse.Namespace) -> int:
     if options.plot:
         from triquad_tools.plots.diff_plan import draw_diff  # slow to import
 
-        draw_diff("\n".join(titles), comparison, options.plot)
+        draw_diff("\n".join(titles), comparison, objects, path=options.plot)
     if options.json:
-        print(json_text(diff))
+        print(json_text({**vars(diff), "objects": objects}))
     else:
         print("\n".join(titles))
         print_diff(diff, options.limit or _ROWS)
+        print_objects(objects, options.limit or _ROWS)
     return OK
 
 

@@ -60,18 +60,18 @@ class Change:
 
     points_a: int
     points_b: int
-    added: int  # of B: A has seen free space there
-    gone: int  # of A: B has seen free space there
+    appeared: int  # of B: A has seen free space there
+    vanished: int  # of A: B has seen free space there
     newly_seen: int  # of B: A has seen nothing there
-    not_seen: int  # of A: B has seen nothing there
+    no_longer_known: int  # of A: B has seen nothing there
     moved_median_m: float  # of the points of A that B has near its surface; NaN if there are none
     moved_p95_m: float
-    changed_m3: float  # swept by moves beyond NOISE_M, and what is added and gone
+    changed_m3: float  # swept by moves beyond NOISE_M, and what appeared and vanished
 
     @property
     def differs(self) -> bool:
         """Whether there is anything to tell."""
-        only_in_one = self.added or self.gone or self.newly_seen or self.not_seen
+        only_in_one = self.appeared or self.vanished or self.newly_seen or self.no_longer_known
         return bool(only_in_one) or self.moved_p95_m >= STILL_M
 
     @property
@@ -142,8 +142,8 @@ def print_diff(diff: MapDiff, limit: int) -> None:
     if not diff.tiles:
         print(f"  no difference at {diff.total.points_a:,} surface points")
         return
-    titles = ("from x m", "y m", "z m", "points A", "in B", "added %", "newly seen %", "gone %",
-              "not seen %", "moved cm", "95 % cm")  # fmt: skip
+    titles = ("from x m", "y m", "z m", "points A", "in B", "appeared %", "newly seen %",
+              "vanished %", "no longer known %", "moved cm", "95 % cm")  # fmt: skip
     rows = [
         (*(f"{low:g}" for low in tile.low_m), *_cells(tile.change)) for tile in diff.tiles[:limit]
     ]
@@ -171,19 +171,19 @@ def _tiles(comparison: Comparison, tile_m: float) -> Iterator[TileChange]:
 
 def _change(old: Sighting, new: Sighting) -> Change:
     moved = np.abs(old.sdf[old.status == Status.SURFACE]).astype(np.float64)
-    gone, added = len(old.having(Status.FREE)), len(new.having(Status.FREE))
+    vanished, appeared = len(old.having(Status.FREE)), len(new.having(Status.FREE))
     median, p95 = np.quantile(moved, [0.5, 0.95]) if len(moved) else (np.nan, np.nan)
     swept = float(moved[moved > NOISE_M].sum()) * old.leaf_m**2
     return Change(
         points_a=len(old.points),
         points_b=len(new.points),
-        added=added,
-        gone=gone,
+        appeared=appeared,
+        vanished=vanished,
         newly_seen=len(new.having(Status.UNKNOWN)),
-        not_seen=len(old.having(Status.UNKNOWN)),
+        no_longer_known=len(old.having(Status.UNKNOWN)),
         moved_median_m=float(median),
         moved_p95_m=float(p95),
-        changed_m3=swept + gone * old.leaf_m**3 + added * new.leaf_m**3,
+        changed_m3=swept + vanished * old.leaf_m**3 + appeared * new.leaf_m**3,
     )
 
 
@@ -191,10 +191,10 @@ def _cells(change: Change) -> tuple[str, ...]:
     return (
         f"{change.points_a:,}",
         f"{change.points_b:,}",
-        _share(change.added, change.points_b),
+        _share(change.appeared, change.points_b),
         _share(change.newly_seen, change.points_b),
-        _share(change.gone, change.points_a),
-        _share(change.not_seen, change.points_a),
+        _share(change.vanished, change.points_a),
+        _share(change.no_longer_known, change.points_a),
         _centimetres(change.moved_median_m),
         _centimetres(change.moved_p95_m),
     )

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import FancyArrowPatch, Rectangle
 from triquad_format.records.status import Status
 
 from triquad_tools.mapfiles.diff import Comparison
+from triquad_tools.mapfiles.object_changes import Cluster, Move, ObjectChanges
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
@@ -20,12 +22,18 @@ from triquad_tools.plots.plan import (
 )
 
 # Of Okabe and Ito's colours, which all can tell apart.
-ADDED, GONE, NEWLY_SEEN, NOT_SEEN = "#0072b2", "#d55e00", "#56b4e9", "#f0e442"
+APPEARED, VANISHED, NEWLY_SEEN, NO_LONGER_KNOWN = "#0072b2", "#d55e00", "#56b4e9", "#f0e442"
+MOVED = "#000000"
 _LEAST_RANGE_CM = 5.0
+_LINE_PT = 1.5
+_ARROWHEAD_PT = 8
+_LABEL_PT = (8, 8)  # from the arrow's head
+_BESIDE_M = 0.1  # outlines lie so far outside of what they surround
+_NOTE = "outlined: what appeared or vanished as a whole; arrows: what moved"
 
 
-def draw_diff(title: str, comparison: Comparison, path: Path) -> None:
-    """Draw a plan of the movement, and one of what is added, gone and newly seen.
+def draw_diff(title: str, comparison: Comparison, objects: ObjectChanges, path: Path) -> None:
+    """Draw a plan of the movement, and one of what appeared, vanished and moved as a whole.
 
     Raises:
         OSError: ``path`` cannot be written.
@@ -34,8 +42,8 @@ def draw_diff(title: str, comparison: Comparison, path: Path) -> None:
     points = np.concatenate([old.points, new.points])[:, :2]
     grid = PlanGrid.around(points, min(old.leaf_m, new.leaf_m))
     plans = [
-        Plan("Moved from A to B", partial(_draw_movement, grid, comparison)),
-        Plan("In only one of the maps", partial(_draw_presence, grid, comparison)),
+        Plan("How far the surface moved", partial(_draw_movement, grid, comparison)),
+        Plan("In only one of the maps", partial(_draw_presence, grid, comparison, objects), _NOTE),
     ]
     save_sheet(path, title, grid, plans=plans)
 
@@ -51,14 +59,44 @@ def _draw_movement(grid: PlanGrid, comparison: Comparison, axes: Axes) -> None:
     draw_values(axes, cells, scale)
 
 
-def _draw_presence(grid: PlanGrid, comparison: Comparison, axes: Axes) -> None:
+def _draw_presence(
+    grid: PlanGrid, comparison: Comparison, objects: ObjectChanges, axes: Axes
+) -> None:
     old, new = comparison.old, comparison.new
     # Later ones cover earlier ones: what only one map has seen says least.
     layers = (
         ("in both", FREE, old.having(Status.SURFACE)),
         ("newly seen: only B has been there", NEWLY_SEEN, new.having(Status.UNKNOWN)),
-        ("not seen: only A has been there", NOT_SEEN, old.having(Status.UNKNOWN)),
-        ("added: free space in A", ADDED, new.having(Status.FREE)),
-        ("gone: free space in B", GONE, old.having(Status.FREE)),
+        ("no longer known: only A has been there", NO_LONGER_KNOWN, old.having(Status.UNKNOWN)),
+        ("appeared: free space in A", APPEARED, new.having(Status.FREE)),
+        ("vanished: free space in B", VANISHED, old.having(Status.FREE)),
     )
     draw_layers(axes, [Layer(*layer[:2], grid.marked(layer[2])) for layer in layers])
+    for found, colour in ((objects.appeared, APPEARED), (objects.vanished, VANISHED)):
+        for cluster in found:
+            _draw_box(axes, cluster, colour)
+    for move in objects.moved:
+        _draw_box(axes, move.before, VANISHED)
+        _draw_box(axes, move.after, APPEARED)
+        _draw_arrow(axes, move)
+
+
+def _draw_box(axes: Axes, cluster: Cluster, colour: str) -> None:
+    """Outline a cluster, a little outside of it."""
+    (x, y, _), (width, depth, _) = (cluster.low_m, cluster.size_m + 2 * _BESIDE_M)
+    corner = (x - _BESIDE_M, y - _BESIDE_M)
+    axes.add_patch(
+        Rectangle(corner, width, depth, fill=False, edgecolor=colour, linewidth=_LINE_PT)
+    )
+
+
+def _draw_arrow(axes: Axes, move: Move) -> None:
+    """From where a cluster was to where it is, and how far that is."""
+    start, end = ((place[0], place[1]) for place in (move.before.middle_m, move.after.middle_m))
+    arrow = FancyArrowPatch(
+        start, end, color=MOVED, linewidth=_LINE_PT, arrowstyle="->",
+        mutation_scale=_ARROWHEAD_PT, shrinkA=0, shrinkB=0,
+    )  # fmt: skip
+    axes.add_patch(arrow)
+    length = f"{move.distance_m:.1f} m"
+    axes.annotate(length, end, xytext=_LABEL_PT, textcoords="offset points", color=MOVED)
