@@ -26,12 +26,21 @@ def with_tables(page: str) -> str:
 
 
 def _row(key: str, schema: dict[str, Any]) -> str:
-    if "enum" in schema:
-        allowed = ", ".join(f"`{json.dumps(value)}`" for value in schema["enum"])
-    else:
-        allowed = f"{schema['minimum']} to {schema['maximum']}"
     default, meaning = json.dumps(schema["default"]), " ".join(schema["description"].split())
-    return f"| `{key}` | `{default}` | {allowed} | {meaning} |\n"
+    shown = "none" if schema["default"] is None else f"`{default}`"
+    return f"| `{key}` | {shown} | {_allowed(schema)} | {meaning} |\n"
+
+
+def _allowed(schema: dict[str, Any]) -> str:
+    if "anyOf" in schema:  # the other is that there is none
+        return _allowed(schema["anyOf"][0])
+    if "enum" in schema:
+        return ", ".join(f"`{json.dumps(value)}`" for value in schema["enum"])
+    if "prefixItems" in schema:
+        return "[" + ", ".join(_allowed(item) for item in schema["prefixItems"]) + "]"
+    if schema["type"] == "boolean":
+        return "`true`, `false`"
+    return f"{schema['minimum']} to {schema['maximum']}"
 
 
 if __name__ == "__main__":

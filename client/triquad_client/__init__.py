@@ -45,6 +45,7 @@ from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.offline_map import OfflineMap, open_map
 from triquad_client.offline.synced_map import AsyncSyncedMap, SyncedMap, SyncReport
+from triquad_client.organised_cloud import empty_returns
 
 __all__ = [
     "Alignment",
@@ -98,5 +99,6 @@ __all__ = [
     "__version__",
     "connect",
     "connect_async",
+    "empty_returns",
     "open_map",
 ]

@@ -56,9 +56,12 @@ class AsyncClient(AsyncMapQueries):
         world_from_sensor: ArrayLike,
         stamp_s: float | None = None,
         source: str = "default",
+        no_return: ArrayLike | None = None,
     ) -> None:
         await self._driver.in_order(
-            lambda: self._scans.publish(points, world_from_sensor, stamp_s, source=source)
+            lambda: self._scans.publish(
+                points, world_from_sensor, stamp_s, source=source, no_return=no_return
+            )
         )
 
     async def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:

@@ -41,12 +41,29 @@ def query_points(points: ArrayLike) -> Doubles:
     return array
 
 
-def scan_points(points: ArrayLike) -> Floats:
+def scan_points(points: ArrayLike, *, least: int = 1) -> Floats:
     """Points [N, 3] of a scan as float32; points that are not finite may be among them."""
     array = _points(points, np.float32, InvalidScanError)
-    if len(array) == 0:
+    if len(array) < least:
         raise InvalidScanError("the scan has no points")
     return array
+
+
+def open_directions(vectors: ArrayLike) -> Floats:
+    """Unit vectors [M, 3] along the rays of a scan that met nothing, as float32."""
+    array = _points(vectors, np.float64, InvalidScanError, what="no_return")
+    longest = np.abs(array).max(axis=1, keepdims=True)
+    good = np.isfinite(longest[:, 0]) & (longest[:, 0] > 0)
+    if not good.all():
+        index = int(good.argmin())
+        raise InvalidScanError(
+            f"direction {index} of no_return is {array[index]}: a direction is finite and has a "
+            "length; leave out rays of which nothing is known"
+        )
+    # Scaled first: the square of a very long or short vector has no place in a double.
+    scaled = array / longest
+    unit: Floats = (scaled / np.linalg.norm(scaled, axis=1, keepdims=True)).astype(np.float32)
+    return unit
 
 
 def rigid_pose(world_from_sensor: ArrayLike) -> Doubles:
@@ -204,16 +221,18 @@ def ray_origins(origins: ArrayLike, count: int) -> Doubles:
     return np.broadcast_to(places, (count, 3))
 
 
-def _points(points: ArrayLike, dtype: Any, error: type[InvalidInputError]) -> NDArray[Any]:
+def _points(
+    points: ArrayLike, dtype: Any, error: type[InvalidInputError], *, what: str = "points"
+) -> NDArray[Any]:
     try:
         array = np.asarray(points)
         if array.dtype.kind not in "fiu":
             raise TypeError(f"dtype {array.dtype} is not one of real numbers")
         array = array.astype(dtype, copy=False)
     except (TypeError, ValueError) as cause:
-        raise error(f"points are not an array [N, 3] of real numbers: {cause}") from cause
+        raise error(f"{what} are not an array [N, 3] of real numbers: {cause}") from cause
     if array.size == 0 and array.ndim == 1:
         array = array.reshape(0, 3)
     if array.ndim != 2 or array.shape[1] != 3:
-        raise error(f"points are {list(array.shape)}, not [N, 3]")
+        raise error(f"{what} are {list(array.shape)}, not [N, 3]")
     return array

@@ -55,6 +55,7 @@ class Client(MapQueries):
         world_from_sensor: ArrayLike,
         stamp_s: float | None = None,
         source: str = "default",
+        no_return: ArrayLike | None = None,
     ) -> None:
         """Send a scan to be learnt. Returns once it is handed to the network.
 
@@ -63,11 +64,15 @@ class Client(MapQueries):
             world_from_sensor: [4, 4] rigid pose of the sensor in the map frame.
             stamp_s: seconds since 1970, never running backwards within a source; ``None``: now.
             source: name of the sensor.
+            no_return: directions [M, 3], sensor frame, of any length but 0, of rays that met
+                nothing within the sensor's range: the space along them is free. A ray of which
+                this is not known does not belong here; see docs/client.md. ``points`` may be
+                empty where there are any.
 
         Raises:
             InvalidScanError: the scan cannot be used; nothing was sent.
         """
-        self._scans.publish(points, world_from_sensor, stamp_s, source=source)
+        self._scans.publish(points, world_from_sensor, stamp_s, source=source, no_return=no_return)
 
     def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
         """Wait until what this client published is dealt with and queries see it.

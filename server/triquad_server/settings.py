@@ -6,13 +6,27 @@
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from triquad_format.errors import FormatError
 from triquad_format.records.field_settings import FieldSettings
+from triquad_format.wire.keys import check_name
+
+from triquad_server.source_settings import SourceSettings, check_box
 
 _RECORD = ConfigDict(
     frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
 )
 # Neither text nor a truth value is a number.
 _SECTION = _RECORD | ConfigDict(strict=True)
+
+SOURCE_SECTION = "sources.NAME"
+
+
+def _check_range(section: str, scan: "ScanSettings") -> None:
+    if scan.range_max_m < scan.range_min_m:
+        raise ValueError(
+            f"{section}.range_max_m = {scan.range_max_m:g} is less than "
+            f"{section}.range_min_m = {scan.range_min_m:g}: use at least that"
+        )
 
 
 class ScanSettings(BaseModel):
@@ -24,7 +38,8 @@ class ScanSettings(BaseModel):
     """Nearer points are dropped."""
 
     range_max_m: Annotated[float, Field(ge=0, le=1e4)] = 50.0
-    """Farther points are dropped; at least `range_min_m`."""
+    """So far reach rays: farther points are dropped, and the space up to this range is free, as
+    on rays without a return. At least `range_min_m`."""
 
     thin_m: Annotated[float, Field(ge=1e-3, le=10)] = 0.05
     """One point is kept per voxel of this side."""
@@ -49,11 +64,7 @@ class ScanSettings(BaseModel):
 
     @model_validator(mode="after")
     def _range_is_not_empty(self) -> "ScanSettings":
-        if self.range_max_m < self.range_min_m:
-            raise ValueError(
-                f"scan.range_max_m = {self.range_max_m:g} is less than "
-                f"scan.range_min_m = {self.range_min_m:g}: use at least that"
-            )
+        _check_range("scan", self)
         return self
 
 
@@ -211,21 +222,11 @@ class Settings(BaseModel):
     mesh: MeshSettings = MeshSettings()
     store: StoreSettings = StoreSettings()
     service: ServiceSettings = ServiceSettings()
+    sources: dict[str, SourceSettings] = {}
 
     @model_validator(mode="after")
     def _sections_fit(self) -> "Settings":
-        reach_m, most_m = self.scan.range_max_m, 8 * self.field.region_pitch_m
-        if reach_m > most_m:
-            raise ValueError(
-                f"scan.range_max_m = {reach_m:g} reaches over too many regions of field.leaf_m = "
-                f"{self.field.leaf_m:g} and field.depth = {self.field.depth}: "
-                f"use at most {most_m:g}, or larger regions"
-            )
-        if self.scan.thin_m * 1e6 < self.scan.range_max_m:
-            raise ValueError(
-                f"scan.thin_m = {self.scan.thin_m:g} is too fine for scan.range_max_m = "
-                f"{self.scan.range_max_m:g}: use at least {self.scan.range_max_m * 1e-6:g}"
-            )
+        self._check_reach("scan", self.scan)
         if self.mesh.cell_m + self.mesh.reach_m > 4 * self.field.leaf_m:
             raise ValueError(
                 f"mesh.cell_m = {self.mesh.cell_m:g} and mesh.reach_m = {self.mesh.reach_m:g} are "
@@ -234,11 +235,49 @@ class Settings(BaseModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def _sources_fit(self) -> "Settings":
+        for name, source in self.sources.items():
+            try:
+                check_name("source", name)
+            except FormatError as error:
+                raise ValueError(f"sources: {error}") from error
+            section, scan = f"sources.{name}", self.scan_of(source)
+            _check_range(section, scan)
+            self._check_reach(section, scan)
+            if source.robot_box_m is not None:
+                check_box(f"{section}.robot_box_m", source.robot_box_m, self.field.leaf_m)
+        return self
+
+    def scan_of(self, source: SourceSettings) -> ScanSettings:
+        """The section ``[scan]`` with the ranges of a source."""
+        ranges = source.model_dump(include={"range_min_m", "range_max_m"}, exclude_none=True)
+        return self.scan.model_copy(update=ranges)
+
+    def _check_reach(self, section: str, scan: ScanSettings) -> None:
+        reach_m, most_m = scan.range_max_m, 8 * self.field.region_pitch_m
+        if reach_m > most_m:
+            raise ValueError(
+                f"{section}.range_max_m = {reach_m:g} reaches over too many regions of field.leaf_m"
+                f" = {self.field.leaf_m:g} and field.depth = {self.field.depth}: "
+                f"use at most {most_m:g}, or larger regions"
+            )
+        if scan.thin_m * 1e6 < reach_m:
+            raise ValueError(
+                f"scan.thin_m = {scan.thin_m:g} is too fine for {section}.range_max_m = "
+                f"{reach_m:g}: use at least {reach_m * 1e-6:g}"
+            )
+
 
 def setting_schemas() -> dict[str, dict[str, Any]]:
-    """The JSON schema of each setting: by section, then by key."""
+    """The JSON schema of each setting: by section, then by key.
+
+    The sections of all sources are one, ``sources.NAME``.
+    """
     schema = Settings.model_json_schema()
+    references = {**schema["properties"]}
+    references[SOURCE_SECTION] = references.pop("sources")["additionalProperties"]
     return {
         section: schema["$defs"][reference["$ref"].rpartition("/")[2]]["properties"]
-        for section, reference in schema["properties"].items()
+        for section, reference in references.items()
     }

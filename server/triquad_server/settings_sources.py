@@ -18,7 +18,7 @@ from pydantic_settings import (
 )
 from triquad_format.errors import SettingsError
 
-from triquad_server.settings import Settings, setting_schemas
+from triquad_server.settings import SOURCE_SECTION, Settings, setting_schemas
 
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
 
@@ -66,10 +66,7 @@ def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> 
     ]
     merged: dict[str, Any] = {}
     for _, tables in sources:
-        for section, table in tables.items():
-            known = merged.get(section)
-            merges = isinstance(known, dict) and isinstance(table, dict)
-            merged[section] = known | table if merges else table
+        merged = _merged(merged, tables)
     try:
         return Settings.model_validate(merged)
     except ValidationError as error:
@@ -79,10 +76,22 @@ def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> 
 
 def settings_toml(settings: Settings) -> str:
     """The settings as a TOML file that :func:`load_settings` reads."""
+    tables = settings.model_dump(exclude_none=True)
+    # A name in quotes may hold points.
+    tables |= {f'sources."{name}"': table for name, table in tables.pop("sources").items()}
     lines: list[str] = []
-    for section, table in settings.model_dump().items():
+    for section, table in tables.items():
         lines += [f"[{section}]", *(f"{key} = {json.dumps(table[key])}" for key in table), ""]
     return "\n".join(lines)
+
+
+def _merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Nested tables, the values of the latter going before those of the former."""
+    both = tables | over
+    for key in tables.keys() & over.keys():
+        if isinstance(tables[key], dict) and isinstance(over[key], dict):
+            both[key] = _merged(tables[key], over[key])
+    return both
 
 
 def _read_file(file: Path) -> dict[str, Any]:
@@ -102,13 +111,18 @@ def _read_environment() -> dict[str, Any]:
 
 
 def _parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
-    tables: dict[str, dict[str, str]] = {}
+    tables: dict[str, Any] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
         section, dot, key = name.partition(".")
+        table = tables.setdefault(section, {})
+        if section == "sources":
+            source, dot, key = key.rpartition(".")
+            table = table.setdefault(source, {})
         if not (equals and dot):
-            raise SettingsError(f"--set {assignment}: write SECTION.KEY=VALUE")
-        tables.setdefault(section, {})[key] = value
+            form = "sources.NAME" if section == "sources" else "SECTION"
+            raise SettingsError(f"--set {assignment}: write {form}.KEY=VALUE")
+        table[key] = value
     return tables
 
 
@@ -123,12 +137,26 @@ def _with_numbers(tables: dict[str, Any]) -> dict[str, Any]:
         except ValidationError:
             return text
 
-    return {
-        section: {key: read(section, key, text) for key, text in table.items()}
-        if isinstance(table, dict)
-        else table
-        for section, table in tables.items()
-    }
+    def read_all(section: str, table: Any) -> Any:
+        if section == "sources":
+            return _with_values(table)
+        if not isinstance(table, dict):
+            return table
+        return {key: read(section, key, text) for key, text in table.items()}
+
+    return {section: read_all(section, table) for section, table in tables.items()}
+
+
+def _with_values(table: Any) -> Any:
+    """Nested tables of texts, with what each text stands for: a number, true or false, a list."""
+    if isinstance(table, dict):
+        return {key: _with_values(entry) for key, entry in table.items()}
+    if not isinstance(table, str):
+        return table
+    try:
+        return json.loads(table)
+    except (ValueError, RecursionError):
+        return table
 
 
 def _explain(details: ErrorDetails, sources: list[_Source]) -> str:
@@ -149,6 +177,12 @@ def _problem(details: ErrorDetails, name: str) -> str:
             return _unknown(location)
         case "model_type" | "dataclass_type":
             return f"{name} = {value} is not a section: write [{name}]"
+        case "dict_type":
+            return f"{name} = {value} is not a section: write [{SOURCE_SECTION}]"
+        case "bool_type":
+            return f"{name} = {value}: use true or false"
+        case "tuple_type" | "missing" | "too_long":
+            return f"{name} = {value}: write two corners, [[x, y, z], [x, y, z]]"
         case "greater_than_equal" | "less_than_equal":
             return f"{name} = {value} is out of range: use {_allowed(location)}"
         case "int_type" | "float_type":
@@ -160,16 +194,24 @@ def _problem(details: ErrorDetails, name: str) -> str:
 
 def _allowed(location: tuple[int | str, ...]) -> str:
     """The type and the range of a number."""
-    schema = setting_schemas()[str(location[0])][str(location[1])]
+    section, key, *inner = map(str, location)
+    if section == "sources":
+        section, key, *inner = SOURCE_SECTION, *inner
+    schema = setting_schemas()[section][key]
+    schema = schema.get("anyOf", [schema])[0]
+    for index in inner:
+        schema = schema["prefixItems"][int(index)]
     return f"{schema['minimum']} to {schema['maximum']} ({schema['type']})"
 
 
 def _unknown(location: tuple[int | str, ...]) -> str:
     """That a setting or a section is unknown, with the name that is nearest to it."""
     schemas = setting_schemas()
+    if len(location) > 2:
+        schemas[f"sources.{location[1]}"] = schemas.pop(SOURCE_SECTION)
     names = [f"{section}.{key}" for section, table in schemas.items() for key in table]
     if len(location) < 2:
-        names = list(schemas)
+        names = [section.partition(".")[0] for section in schemas]
     name = ".".join(map(str, location))
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0)[0]
     return f"unknown setting {name}: did you mean {nearest}?"

@@ -156,3 +156,54 @@ def test_what_is_forgotten_has_no_support() -> None:
     assert not record.seen_s.any()
     evidence.mark_surface(end, Sighting(np.array([200.0, 20, 20]), 0.2, 120))
     assert evidence.freeze().levels.tolist() == [0]
+
+
+def crossed(origin: np.ndarray, end: np.ndarray, least: float) -> set[tuple[int, ...]]:
+    """Voxels in which a ray goes farther than ``least``: the slow way."""
+    way = end - origin
+    stops = [0.0, 1.0]
+    for axis in np.flatnonzero(way):
+        planes = np.arange(min(origin[axis], end[axis]) // 1, max(origin[axis], end[axis]) + 1)
+        stops += list((planes - origin[axis]) / way[axis])
+    at = np.unique(np.clip(stops, 0.0, 1.0))
+    apart = np.diff(at) * np.linalg.norm(way)
+    middles = origin + ((at[:-1] + at[1:]) / 2)[:, None] * way
+    voxels = np.floor(middles[apart > least]).astype(int)
+    return {tuple(v) for v in voxels.tolist() if min(v) >= 0 and max(v) < SIDE}
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40))
+def test_open_rays_mark_the_voxels_that_they_cross_and_no_others(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    origin = rng.uniform(-10, SIDE + 10, 3)
+    directions = rng.normal(size=(count, 3))
+    directions *= rng.random((count, 3)) > 0.2  # some along an axis or a plane
+    directions = directions[directions.any(axis=1)]
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    ends = origin + rng.uniform(5, 80) * directions / lengths
+    evidence = LiveEvidence(SIDE)
+    evidence.carve(origin, ends, 0.0)
+    voxels = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    free = evidence.freeze().status(voxels + 0.5) == Status.FREE
+    marked = {tuple(v) for v in voxels[free].tolist()}
+    # Where a ray only touches a voxel, rounding decides.
+    assert set().union(*(crossed(origin, end, 1e-6) for end in ends)) <= marked
+    near = [crossed(origin + shift, end + shift, 0.0) for end in ends for shift in _SHIFTS]
+    assert marked <= set().union(*near)
+
+
+_SHIFTS = 1e-6 * np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), -1).reshape(-1, 3)
+
+
+def test_voxels_marked_free_keep_their_surface() -> None:
+    evidence = LiveEvidence(SIDE)
+    evidence.mark_surface(voxel(20.5, 20.5, 20.5))
+    grid = np.stack(np.meshgrid(*[np.arange(-8, SIDE + 8) + 0.5] * 3), -1).reshape(-1, 3)
+    evidence.mark_free(grid)
+    inside = ((grid > 0) & (grid < SIDE)).all(axis=1)
+    status = evidence.freeze().status(grid, reach=0.4)
+    at_surface = (grid == 20.5).all(axis=1)
+    assert (status[at_surface] == Status.SURFACE).all()
+    assert (status[inside & ~at_surface] == Status.FREE).all()
+    assert (status[~inside] == Status.UNKNOWN).all()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from triquad_server.engine.live_field import Batch
-from triquad_server.intake.scan import ScanRays
+from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.ray_intervals import (
     Placement,
     draw_ordered_samples,

@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from triquad_server.errors import ScanRefusedError
-from triquad_server.intake.scan import usable_rays
+from triquad_server.intake.rays import RobotBox, usable_rays
 from triquad_server.settings import ScanSettings
+from triquad_server.source_settings import SourceSettings
 
 SETTINGS = ScanSettings()
 
@@ -72,3 +74,60 @@ def test_returns_at_the_sensor_itself_are_dropped() -> None:
     rays = usable_rays(points, np.eye(4), ScanSettings(range_min_m=0.0))
     np.testing.assert_array_equal(rays.ends, [[5, 0, 0]])
     assert rays.points_dropped == {"too_near": 2}
+
+
+def test_rays_that_met_nothing_reach_as_far_as_the_sensor() -> None:
+    turn = pose(m00=0, m01=-1, m10=1, m11=0, m03=100)
+    rays = usable_rays(
+        points((60, 0, 0), (0, 0, 3e38), (5, 0, 0)),
+        turn,
+        ScanSettings(range_max_m=30.0),
+        no_return=points((0, 1e-30, 0), (0, 0, -2)),
+    )
+    assert len(rays.ends) == 1
+    np.testing.assert_allclose(
+        rays.open_ends, [[100, 30, 0], [100, 0, 30], [70, 0, 0], [100, 0, -30]], atol=1e-6
+    )
+    assert rays.points_dropped == {"too_far": 2}
+
+
+def test_a_scan_without_points_needs_rays_that_are_believed() -> None:
+    none = np.zeros((0, 3), np.float32)
+    up = points((0, 0, 1))
+    assert len(usable_rays(none, pose(), SETTINGS, no_return=up).open_ends) == 1
+    silent = SourceSettings(no_return=False)
+    with pytest.raises(ScanRefusedError, match="no ray without a return is used"):
+        usable_rays(none, pose(), SETTINGS, source=silent, no_return=up)
+
+
+@pytest.mark.parametrize("bad", [(0, 0, 0), (np.nan, 0, 1), (0, -np.inf, 0)])
+def test_what_is_no_direction_is_refused_by_its_index(bad: tuple[float, float, float]) -> None:
+    with pytest.raises(ScanRefusedError, match="direction 1 of no_return") as refusal:
+        usable_rays(points((5, 0, 0)), pose(), SETTINGS, no_return=points((0, 0, 1), bad))
+    assert refusal.value.reason == "bad_no_return"
+
+
+def test_points_on_the_robot_are_told_from_near_ones() -> None:
+    source = SourceSettings(robot_box_m=((-2, -1, -1), (3, 1, 1)))
+    scan = points((2.9, 0.9, 0.9), (0.2, 0, 0), (0, 1.2, 0), (0, 0, 0), (3.1, 0, 0), (-2, 0, 0))
+    rays = usable_rays(scan, pose(), SETTINGS, source=source)
+    np.testing.assert_allclose(rays.ends, [[3.1, 0, 0]], atol=1e-6)
+    assert rays.points_dropped == {"on_robot": 3, "too_near": 2}
+
+
+def test_the_voxels_of_a_turned_robot_are_those_whose_centres_it_holds() -> None:
+    turn = pose()
+    turn[:3, :3] = Rotation.from_euler("xyz", [0.2, -0.3, 0.9]).as_matrix()
+    turn[:3, 3] = 812.3, -41.7, 3.9
+    low, high = np.array([-1.0, -0.5, -0.4]), np.array([0.7, 0.6, 0.2])
+    centres = RobotBox(low, high, turn).voxel_centres(0.1)
+    every = np.stack(np.meshgrid(*[np.arange(-25, 25)] * 3), -1).reshape(-1, 3)
+    every = (np.floor(turn[:3, 3] / 0.1) + every + 0.5) * 0.1
+    in_box = (every - turn[:3, 3]) @ turn[:3, :3]
+    held = every[((in_box >= low) & (in_box <= high)).all(axis=1)]
+    assert len(held) > 500
+
+    def voxels(places: np.ndarray) -> set[tuple[int, ...]]:
+        return {tuple(voxel) for voxel in np.floor(places / 0.1).astype(int).tolist()}
+
+    assert voxels(centres) == voxels(held)

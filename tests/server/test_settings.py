@@ -7,6 +7,7 @@ from triquad_format.errors import SettingsError
 from triquad_server import cli
 from triquad_server.settings import Settings, setting_schemas
 from triquad_server.settings_sources import load_settings, settings_toml
+from triquad_server.source_settings import SourceSettings
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,9 +52,40 @@ def test_a_file_has_numbers_and_text_stands_for_them(
     assert (settings.scan.max_points, settings.scan.spread_m) == (4096, 0.1)
 
 
+def test_sources_have_sections_of_their_own_from_all_places(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text(
+        "[sources.roof]\nrange_max_m = 30\nrange_min_m = 2\n"
+        '[sources."front.left"]\nrobot_box_m = [[-1, -0.5, -1], [0.5, 0.5, 0]]\n'
+    )
+    monkeypatch.setenv("TRIQUAD_SOURCES__ROOF__RANGE_MAX_M", "40")
+    monkeypatch.setenv("TRIQUAD_SOURCES__REAR__ROBOT_BOX_M", "[[0, 0, 0], [1, 1, 1]]")
+    settings = load_settings(
+        path, ["sources.roof.no_return=false", "sources.front.left.range_min_m=0.2"]
+    )
+    box = ((-1.0, -0.5, -1.0), (0.5, 0.5, 0.0))
+    assert settings.sources == {
+        "roof": SourceSettings(range_max_m=40.0, range_min_m=2.0, no_return=False),
+        "front.left": SourceSettings(range_min_m=0.2, robot_box_m=box),
+        "rear": SourceSettings(robot_box_m=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))),
+    }
+    of_left = settings.scan_of(settings.sources["front.left"])
+    assert (of_left.range_min_m, of_left.range_max_m) == (0.2, settings.scan.range_max_m)
+    assert of_left.thin_m == settings.scan.thin_m
+
+
 def test_settings_that_are_printed_can_be_read(tmp_path: Path) -> None:
     settings = load_settings(
-        assignments=["field.encoding=fourier", "scan.thin_m=0.001", "mesh.reach_m=1e-5"]
+        assignments=[
+            "field.encoding=fourier",
+            "scan.thin_m=0.001",
+            "mesh.reach_m=1e-5",
+            "sources.roof.left.range_max_m=20",
+            "sources.roof.no_return=false",
+            "sources.roof.robot_box_m=[[-1, -1, -1], [1, 1, 1]]",
+        ]
     )
     path = tmp_path / "settings.toml"
     path.write_text(settings_toml(settings))
@@ -72,6 +104,10 @@ def test_the_command_prints_the_settings_in_effect(capsys: pytest.CaptureFixture
         ("TRIQUAD_TRIANING__BATCH", ["trianing.batch", "did you mean training.batch?"]),
         ("TRIQUAD_TRAINING__BATCH", ["training.batch = '0.5'", "integer"]),
         ("TRIQUAD_STORE", ["store = '0.5'", "[store]"]),
+        ("TRIQUAD_SOURCES__ROOF__RANGE_MX_M", ["did you mean sources.roof.range_max_m?"]),
+        ("TRIQUAD_SOURCES__ROOF__NO_RETURN", ["sources.roof.no_return = 0.5: use true or false"]),
+        ("TRIQUAD_SOURCES__ROOF", ["sources.roof = 0.5", "[sources.roof]"]),
+        ("TRIQUAD_SOURCES", ["sources = 0.5", "[sources.NAME]"]),
     ],
 )
 def test_errors_name_the_environment(
@@ -90,6 +126,8 @@ def test_errors_name_the_environment(
         ("training.batch=0", ["training.batch = 0 is out of range: use 1 to 10000000"]),
         ("training.batch", ["training.batch", "SECTION.KEY=VALUE"]),
         ("batch=4096", ["batch=4096", "SECTION.KEY=VALUE"]),
+        ("sources.roof=1", ["sources.roof=1", "sources.NAME.KEY=VALUE"]),
+        ("sources.roof.range_max_m=far", ["range_max_m = 'far'", "0 to 10000.0 (number)"]),
     ],
 )
 def test_errors_name_the_command_line(assignment: str, words: list[str]) -> None:
@@ -119,6 +157,13 @@ def test_errors_name_the_command_line(assignment: str, words: list[str]) -> None
         ("[training]\nbatch = 0\nseed = -1\n", ["training.batch = 0", "training.seed = -1"]),
         ("[scan]\nrange_max_m = 1\n", ["range_max_m = 1", "range_min_m = 1.5"]),
         ("field = 3\n", ["field", "3"]),
+        ("sources = 3\n", ["sources = 3", "[sources.NAME]"]),
+        ("[source.roof]\nrange_max_m = 9\n", ["unknown setting source: did you mean"]),
+        ("[sources.roof]\nrobot_box = 3\n", ["did you mean sources.roof.robot_box_m?"]),
+        ("[sources.roof]\nrobot_box_m = 3\n", ["robot_box_m = 3: write two corners, [[x, y, z]"]),
+        ("[sources.a]\nrobot_box_m = [[0, 0, 0], [1, 1]]\n", ["robot_box_m", "two corners"]),
+        ("[sources.a]\nrobot_box_m = [[0, 0, 0], [1, 1, 99]]\n", ["99", "use -20 to 20"]),
+        ("[sources.a]\nrange_max_m = true\n", ["sources.a.range_max_m = True", "number"]),
         ("[field\n", ["settings.toml"]),
         ("[scan]\nrange_min_m = nan\n", ["range_min_m", "nan"]),
         ("[training]\nseed = -1\n", ["seed", "-1"]),
@@ -142,10 +187,21 @@ def test_errors_name_the_key_and_the_value(tmp_path: Path, text: str, words: lis
         ({"field": {"leaf_m": 0.01, "depth": 6}}, ["range_max_m", "leaf_m", "depth"]),
         ({"scan": {"thin_m": 0.001, "range_max_m": 2000.0}}, ["thin_m", "range_max_m"]),
         ({"field": {"leaf_m": 0.05}, "mesh": {"cell_m": 0.5}}, ["cell_m", "leaf_m"]),
+        (
+            {"sources": {"roof.range_max_m": 1}},
+            ["sources.roof.range_max_m = 1", "range_min_m = 1.5"],
+        ),
+        ({"sources": {"roof.range_max_m": 9000}}, ["sources.roof.range_max_m", "leaf_m"]),
+        ({"sources": {"ro of.range_max_m": 9}}, ["'ro of'", "letters"]),
+        ({"sources": {"roof.robot_box_m": [[0, 0, 0], [1, 0, 1]]}}, ["robot_box_m", "smaller x"]),
+        (
+            {"sources": {"roof.robot_box_m": [[-9, -9, -9], [9, 9, 9]]}},
+            ["robot_box_m", "100000 voxels", "smaller box"],
+        ),
     ],
 )
 def test_settings_that_do_not_go_together_are_refused(
-    sections: dict[str, dict[str, float]],
+    sections: dict[str, dict[str, object]],
     words: list[str],
 ) -> None:
     with pytest.raises(SettingsError) as error:

@@ -56,6 +56,15 @@ def test_hits_lie_on_the_surface_and_points_match_them(world: Scene) -> None:
     np.testing.assert_allclose(_to_world(scan.points, pose), scan.true_hits, atol=1e-4)
 
 
+def test_every_ray_hits_something_or_is_told_to_have_met_nothing(world: Scene) -> None:
+    pose = drive(world, 5, 4.0)[3]
+    scan = QUIET.scan(world, pose, np.random.default_rng(0))
+    assert len(scan.points) + len(scan.no_return) == len(QUIET.directions)
+    assert len(scan.no_return) > 100
+    rays = scan.no_return.astype(np.float64) @ pose[:3, :3].T
+    assert np.isinf(world.cast(pose[:3, 3], rays, QUIET.range_max_m - 0.1)).all()
+
+
 def test_no_ray_passes_through_a_solid(world: Scene) -> None:
     pose = drive(world, 5, 4.0)[2]
     scan = QUIET.scan(world, pose, np.random.default_rng(0))

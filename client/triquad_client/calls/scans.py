@@ -50,7 +50,13 @@ class ScanPublisher:
         self._sources: dict[str, _Source] = {}
 
     def publish(
-        self, points: ArrayLike, world_from_sensor: ArrayLike, stamp_s: float | None, source: str
+        self,
+        points: ArrayLike,
+        world_from_sensor: ArrayLike,
+        stamp_s: float | None,
+        *,
+        source: str,
+        no_return: ArrayLike | None,
     ) -> None:
         """Send a scan; arguments as in ``Client.publish_scan``."""
         try:
@@ -58,7 +64,10 @@ class ScanPublisher:
         except FormatError as error:
             raise InvalidScanError(str(error)) from error
         pose = checks.rigid_pose(world_from_sensor)
-        cloud = np.ascontiguousarray(checks.scan_points(points))
+        directions = None if no_return is None else checks.open_directions(no_return)
+        # Rays that all met nothing are a scan, too.
+        least = 1 if directions is None or len(directions) == 0 else 0
+        cloud = np.ascontiguousarray(checks.scan_points(points, least=least))
         stamp_ns = time.time_ns() if stamp_s is None else checks.stamp_ns(stamp_s)
         # Held while sending: the server takes a scan that is overtaken by its successor for lost.
         with self._sending:
@@ -78,6 +87,7 @@ class ScanPublisher:
                 source=source,
                 session=self._session,
                 sequence=state.next_sequence,
+                no_return=directions,
             )
             self._connection.put(key, scan)
             state.next_sequence += 1

@@ -143,7 +143,9 @@ def seen_voxels(evidence: Evidence, masks: Bytes) -> Longs:
 
 def surface_counts(surface: Bytes) -> Longs:
     """Numbers [B] of surface voxels in blocks with these masks [B, BLOCK_BYTES]."""
-    counts: Longs = _BITS_SET[surface].sum(axis=1, dtype=np.int64)
+    counts = np.zeros(len(surface), np.int64)
+    used = np.flatnonzero(surface.any(axis=1))  # the others are of open air
+    counts[used] = _BITS_SET[surface[used]].sum(axis=1, dtype=np.int64)
     return counts
 
 

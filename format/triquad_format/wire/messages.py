@@ -38,6 +38,7 @@ class Scan(Message):
     source: str
     session: int
     sequence: int
+    no_return: Positions | None = None  # [M, 3] directions of rays that met nothing, sensor frame
 
 
 @dataclass(frozen=True)

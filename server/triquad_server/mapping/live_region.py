@@ -27,12 +27,13 @@ from triquad_server.engine.live_field import (
 )
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs import FrozenRegion
-from triquad_server.intake.scan import ScanRays
+from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.settings import ScanSettings, TrainingSettings
 
 _CARVE_SHORT_M = 0.1
+_OPEN_THINNED_AT = 0.25  # share of the length of rays that met nothing
 _CHECKPOINT_SAMPLES = 1_000_000
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
 _SURFELS_REFITTED = 8_000
@@ -69,6 +70,7 @@ class LiveRegion:
         self.field = field
         self.evidence = evidence
         _, seed = setup.seeds(index)
+        self._shifts = np.random.default_rng(seed)
         self.pool = ReplayPool(
             capacity=setup.training.pool_rays,
             placement=Placement(
@@ -128,9 +130,23 @@ class LiveRegion:
         self.field.grow(new)
         self.changed = True
         short = _CARVE_SHORT_M / self._settings.leaf_m
-        return lambda: self.evidence.carve(
-            origin, ends[thin(ends, 1.0, empty_keys(len(ends)))], short
-        )
+
+        def carve() -> None:
+            self.evidence.carve(origin, ends[thin(ends, 1.0, empty_keys(len(ends)))], short)
+            self._carve_open(origin, rays)
+
+        return carve
+
+    def _carve_open(self, origin: Doubles, rays: ScanRays) -> None:
+        """Record the space along rays that met nothing, and where the robot is, as free."""
+        ends = self.voxels(rays.open_ends)
+        # One per voxel at a quarter of their length: nearer, they leave no gaps. The voxels are
+        # shifted from scan to scan, so that a robot at rest uses other rays each time.
+        near = origin + _OPEN_THINNED_AT * (ends - origin) + self._shifts.random(3)
+        self.evidence.carve(origin, ends[thin(near, 1.0, empty_keys(len(ends)))], 0.0)
+        if rays.robot is not None:
+            centres = rays.robot.voxel_centres(self._settings.leaf_m)
+            self.evidence.mark_free(self.voxels(centres))
 
     def learn(self, rays: ScanRays, normals: Doubles) -> None:
         """Keep what the rays teach, to be trained on.

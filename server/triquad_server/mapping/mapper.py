@@ -14,10 +14,11 @@ from triquad_format.records.region import MapRecord
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.epochs import Epoch, FrozenRegion
 from triquad_server.errors import ScanRefusedError
-from triquad_server.intake.scan import ScanRays, usable_rays
+from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion, RegionSetup
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.settings import Settings
+from triquad_server.source_settings import ANY_SOURCE
 from triquad_server.threads import Teams
 
 _LOSS_MEMORY = 0.95
@@ -93,11 +94,22 @@ class Mapper:
         return sum(len(region.pool) for region in self._regions.values())
 
     def ingest(
-        self, points: Floats, world_from_sensor: Doubles, stamp_s: int = 0
+        self,
+        points: Floats,
+        world_from_sensor: Doubles,
+        stamp_s: int = 0,
+        *,
+        source: str = "",
+        no_return: Floats | None = None,
     ) -> dict[str, int]:
-        """Take in a scan: ``points`` [N, 3] in metres of the sensor frame, pose [4, 4].
+        """Take in a scan.
 
-        ``stamp_s`` is when it was taken, seconds since 1970.
+        Args:
+            points: [N, 3] metres, sensor frame.
+            world_from_sensor: pose [4, 4].
+            stamp_s: when it was taken, seconds since 1970.
+            source: whose settings count; empty: those of no particular source.
+            no_return: directions [M, 3], sensor frame, of rays that met nothing.
 
         Returns:
             How many points were not used, by reason.
@@ -105,7 +117,14 @@ class Mapper:
         Raises:
             ScanRefusedError: the scan cannot be used; the map is unchanged.
         """
-        rays = usable_rays(points, world_from_sensor, self._settings.scan)
+        of_source = self._settings.sources.get(source, ANY_SOURCE)
+        rays = usable_rays(
+            points,
+            world_from_sensor,
+            self._settings.scan_of(of_source),
+            source=of_source,
+            no_return=no_return,
+        )
         around = self._regions_around(rays)
         self._check_regions(around)
         regions = [self._region(index) for index in around]
@@ -189,16 +208,20 @@ class Mapper:
         return region.freeze(self._number, before.get(region.index))
 
     def _regions_around(self, rays: ScanRays) -> list[RegionIndex]:
-        """Regions whose cubes hold an end point or the sensor, and those of the map in between."""
-        pitch = self._field_settings.region_pitch_m
+        """Regions whose cubes hold an end point or the sensor, and those of the map in between.
+
+        Rays that met nothing, and the robot, make no region: they are recorded in those there are.
+        """
         half = self._field_settings.region_side_m / 2
+        pitch = self._field_settings.region_pitch_m
+
+        def spanned(column: Doubles) -> range:
+            low, high = column.min() - half, column.max() + half
+            return range(math.floor(low / pitch) + 1, math.ceil(high / pitch))
+
         columns = [np.append(rays.ends[:, axis], rays.origin[axis]) for axis in range(3)]
-        low = [math.floor((column.min() - half) / pitch) + 1 for column in columns]
-        high = [math.ceil((column.max() + half) / pitch) - 1 for column in columns]
-        x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
+        x, y, z = map(spanned, columns)
         around = list(itertools.product(x, y, z))
-        if len(around) == 1:
-            return around
 
         def holds_any(index: RegionIndex) -> bool:
             near = [
@@ -206,7 +229,15 @@ class Mapper:
             ]
             return bool((near[0] & near[1] & near[2]).any())
 
-        return [index for index in around if index in self._regions or holds_any(index)]
+        if len(around) > 1:
+            around = [index for index in around if index in self._regions or holds_any(index)]
+        free = rays.free_corners
+        reached = [spanned(np.append(columns[axis], free[:, axis])) for axis in range(3)]
+        return around + [
+            index
+            for index in self._regions
+            if index not in around and all(map(range.__contains__, reached, index))
+        ]
 
     def _check_regions(self, wanted: list[RegionIndex]) -> None:
         limit = self._settings.training.max_regions

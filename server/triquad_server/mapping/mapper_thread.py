@@ -209,7 +209,11 @@ class MapperThread:
             return False
         try:
             points_dropped = self._mapper.ingest(
-                scan.points, scan.world_from_sensor, scan.stamp_ns // 1_000_000_000
+                scan.points,
+                scan.world_from_sensor,
+                scan.stamp_ns // 1_000_000_000,
+                source=scan.source,
+                no_return=scan.no_return,
             )
         except ScanRefusedError as error:
             self._scans.dropped.add(error.reason)

@@ -23,7 +23,7 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.live_field import Batch
-from triquad_server.intake.scan import ScanRays
+from triquad_server.intake.rays import ScanRays
 from triquad_server.settings import ScanSettings
 
 END = 0  # and the two columns after it: the end point

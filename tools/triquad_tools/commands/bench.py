@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _COMMAND = "triquad-bench"
 _ON_STREET = ("core", "server", "file", "store", "mesh", "answers", "align", "offline")
-USUAL_PARTS = (*_ON_STREET, "growth")
+USUAL_PARTS = (*_ON_STREET, "growth", "air")
 PARTS = (*USUAL_PARTS, "ablation")
 
 
@@ -51,6 +51,10 @@ def _bench(options: argparse.Namespace) -> int:
     figures = _on_street([part for part in _ON_STREET if part in parts], options)
     if "growth" in parts:
         figures += _growth(options.seed)
+    if "air" in parts:
+        from triquad_tools.benchmarks.air import measure_air  # slow to import
+
+        figures += measure_air(options.seed)
     if "ablation" in parts:
         from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
 
@@ -136,8 +140,9 @@ def _parser() -> argparse.ArgumentParser:
         prog=_COMMAND,
         description="Measure triquad on this machine, on a simulated street: a server under a "
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
-        "file, checkpoints, mesh tiles, answers to planners, scans put back in place, and maps "
-        "opened offline. Takes a quarter of an hour; nothing else should run meanwhile.",
+        "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
+        "opened offline, and open air. Takes a quarter of an hour; nothing else should run "
+        "meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_tools.recordings.cloud import PosedScan, merged
 from triquad_tools.simulation.scene import Scene
@@ -23,6 +23,7 @@ class SimulatedScan(PosedScan):
     """What the sensor measured: returns with range noise, and the truth behind each."""
 
     true_hits: Doubles  # [N, 3] metres, world frame, exactly on the surface
+    no_return: Floats  # [M, 3] unit vectors, sensor frame, of the rays that met nothing
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,14 @@ class Lidar:
         rays = self.directions @ rotation.T
         ranges = scene.cast(origin, rays, self.range_max_m)
         seen = np.isfinite(ranges) & (ranges >= self.range_min_m)
+        missed = np.isinf(ranges)
         ranges = ranges[seen]
         measured = ranges + rng.normal(0.0, self.noise_m, len(ranges))
         return SimulatedScan(
             points=(measured[:, None] * self.directions[seen]).astype(np.float32),
             true_hits=origin + ranges[:, None] * rays[seen],
             world_from_sensor=world_from_sensor,
+            no_return=self.directions[missed].astype(np.float32),
         )
 
 

@@ -211,6 +211,17 @@ class LiveEvidence:
             if done < len(ends):
                 self._grow()
 
+    def mark_free(self, voxels: Doubles) -> None:
+        """Record that ``voxels`` [N, 3] are free; those outside the region are left out."""
+        self._frozen = None
+        new = np.empty((len(voxels), 3), np.int64)
+        done = 0
+        while done < len(voxels):
+            free = self._seen._replace(surface=self._seen.free)
+            done, self._blocks.count, _ = mark_ends(voxels, done, free, self._blocks.count, new, 0)
+            if done < len(voxels):
+                self._grow()
+
     def clear(self, low: Doubles, high: Doubles) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
         self._frozen = None

@@ -131,8 +131,11 @@ class Observations:
 
     def levels(self, surface: Bytes) -> Bytes:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
+        # Most blocks are open air.
+        used = np.flatnonzero(surface.view(np.uint64).any(axis=1))
+        surface, places = surface[used], self._observed.places[used]
         levels = np.empty(int(surface_counts(surface).sum()), np.uint8)
-        _levels(surface, self._observed, levels)
+        _levels(surface, self._observed._replace(places=places), levels)
         return levels
 
     def seen_s(self, blocks: int) -> Longs:

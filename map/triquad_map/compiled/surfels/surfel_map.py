@@ -66,6 +66,8 @@ def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
     for row in range(len(surface)):
         for byte in range(BLOCK_BYTES):
             bits = int(surface[row, byte])
+            if bits == 0:  # as in most blocks, which are of open air
+                continue
             for z in range(BLOCK_VOXELS):
                 if bits >> z & 1:
                     voxels[at, 0] = (cells[row, 0] << SHIFT) + (byte >> SHIFT)
@@ -89,6 +91,8 @@ def moved_rows(before: Bytes, before_starts: Ints, now: Bytes, count: int) -> In
         for byte in range(BLOCK_BYTES):
             bits = int(now[row, byte])
             old_bits = int(before[row, byte]) if known else 0
+            if bits | old_bits == 0:
+                continue
             for z in range(BLOCK_VOXELS):
                 if bits >> z & 1:
                     if old_bits >> z & 1:

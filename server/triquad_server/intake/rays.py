@@ -1,0 +1,226 @@
+"""From a scan to the rays that are used: checked, told apart by range, thinned, turned."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.pose import is_rigid, rotation_error
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.voxel_index import empty_keys, enter
+
+from triquad_server.errors import ScanRefusedError
+from triquad_server.settings import ScanSettings
+from triquad_server.source_settings import ANY_SOURCE, SourceSettings
+
+WORLD_LIMIT_M = 100_000.0
+"""A sensor farther than this from the map's origin is refused."""
+
+_NOWHERE = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
+"""Corners of a box that holds nothing."""
+
+
+@dataclass(frozen=True)
+class RobotBox:
+    """The space that the robot takes up while a scan is taken."""
+
+    low: Doubles  # [3] its corners, metres, sensor frame
+    high: Doubles
+    world_from_sensor: Doubles  # [4, 4]
+
+    @property
+    def corners(self) -> Doubles:
+        """Its corners [8, 3], map frame."""
+        corners = np.stack(np.meshgrid(*zip(self.low, self.high, strict=True)), -1).reshape(-1, 3)
+        world: Doubles = corners @ self.world_from_sensor[:3, :3].T + self.world_from_sensor[:3, 3]
+        return world
+
+    def voxel_centres(self, leaf_m: float) -> Doubles:
+        """The centres [N, 3], map frame, of the map's voxels that lie in it."""
+        rotation, origin = self.world_from_sensor[:3, :3], self.world_from_sensor[:3, 3]
+        corners = self.corners
+        first = np.floor(corners.min(axis=0) / leaf_m).astype(np.int64)
+        last = np.floor(corners.max(axis=0) / leaf_m).astype(np.int64)
+        sides = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
+        voxels = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
+        centres: Doubles = (voxels + 0.5) * leaf_m
+        inside = (centres - origin) @ rotation
+        return centres[((inside >= self.low) & (inside <= self.high)).all(axis=1)]
+
+
+@dataclass(frozen=True)
+class ScanRays:
+    """The usable rays of a scan, in the map frame, metres."""
+
+    origin: Doubles  # [3] the sensor
+    ends: Doubles  # [N, 3] where rays met a surface
+    points_dropped: dict[str, int]  # points of the scan that are not used, by reason
+    # [M, 3] the sensor's range on rays that met nothing so far
+    open_ends: Doubles = field(default_factory=lambda: np.empty((0, 3)))
+    robot: RobotBox | None = None
+
+    @property
+    def free_corners(self) -> Doubles:
+        """Points [K, 3] around all that is free without a ray's end that tells it."""
+        if self.robot is None:
+            return self.open_ends
+        return np.concatenate([self.open_ends, self.robot.corners])
+
+
+def _check_pose(world_from_sensor: Doubles) -> None:
+    """Refuse a pose [4, 4] that is not finite, not rigid or outside the world."""
+    pose = world_from_sensor
+    if pose.shape != (4, 4):
+        raise ScanRefusedError("pose_shape", f"the pose is {list(pose.shape)}, not [4, 4]")
+    if not np.isfinite(pose).all():
+        raise ScanRefusedError(
+            "pose_not_finite", f"the pose has values that are not finite: {pose}"
+        )
+    if not is_rigid(pose):
+        raise ScanRefusedError(
+            "pose_not_rigid",
+            f"the pose is not a rotation and a translation (rotation off by "
+            f"{rotation_error(pose):.2g}, last row {pose[3]}); scale and shear are not allowed",
+        )
+    far = float(np.abs(pose[:3, 3]).max())
+    if far > WORLD_LIMIT_M:
+        raise ScanRefusedError(
+            "outside_world",
+            f"the sensor is {far:.0f} m from the map's origin, more than {WORLD_LIMIT_M:.0f} m; "
+            "subtract an offset from the poses",
+        )
+
+
+def _check_sizes(points: Floats, no_return: Floats, max_points: int) -> None:
+    """Refuse points or directions that are not [N, 3], or more than ``max_points``."""
+    for what, array in (("points", points), ("no_return", no_return)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ScanRefusedError(f"{what}_shape", f"{what}: {list(array.shape)}, not [N, 3]")
+    count = len(points) + len(no_return)
+    if count > max_points:
+        raise ScanRefusedError(
+            "too_many_points",
+            f"{count} points and rays without a return exceed scan.max_points = {max_points}",
+        )
+
+
+def _unit_vectors(no_return: Floats) -> Doubles:
+    """Unit vectors [M, 3] along the rays without a return; what is no direction is refused."""
+    vectors = no_return.astype(np.float64)
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    good = np.isfinite(lengths[:, 0]) & (lengths[:, 0] > 0)
+    if not good.all():
+        index = int(good.argmin())
+        raise ScanRefusedError(
+            "bad_no_return",
+            f"direction {index} of no_return is {no_return[index]}: a direction is finite and "
+            "has a length",
+        )
+    unit: Doubles = vectors / lengths
+    return unit
+
+
+class _Limits(NamedTuple):
+    """Which points are used, as the kernel takes it."""
+
+    range_min_m: float
+    range_max_m: float
+    thin_m: float
+    robot_low: Doubles  # [3] corners of the robot, sensor frame
+    robot_high: Doubles
+
+
+class _Selection(NamedTuple):
+    """Points that are used, and by reason how many are not."""
+
+    kept: Doubles  # [N, 3]
+    beyond: Doubles  # [M, 3] where the rays to points that are too far leave the sensor's range
+    not_finite: int
+    on_robot: int
+    too_near: int
+    too_far: int
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """How many points are not used, by reason."""
+        counts = self._asdict()
+        reasons = ("not_finite", "on_robot", "too_near", "too_far")
+        return {reason: counts[reason] for reason in reasons if counts[reason]}
+
+
+@kernel(inline="always")
+def _is_within(x: float, y: float, z: float, low: Doubles, high: Doubles) -> bool:
+    """Whether a point lies between two corners."""
+    within: bool = low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]
+    return within
+
+
+@kernel()
+def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
+    """Tell the points that are used from the others."""
+    kept, beyond = np.empty((len(points), 3)), np.empty((len(points), 3))
+    count = not_finite = on_robot = too_near = too_far = 0
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        distance = np.sqrt(x * x + y * y + z * z)
+        if not np.isfinite(distance):
+            not_finite += 1
+        elif distance == 0:  # which is "no return" to many sensors
+            too_near += 1
+        elif _is_within(x, y, z, limits.robot_low, limits.robot_high):
+            on_robot += 1
+        elif distance < limits.range_min_m:
+            too_near += 1
+        elif distance > limits.range_max_m:
+            share = limits.range_max_m / distance
+            beyond[too_far, 0], beyond[too_far, 1] = share * x, share * y
+            beyond[too_far, 2] = share * z
+            too_far += 1
+        elif enter(keys, x, y, z, limits.thin_m):
+            kept[count, 0], kept[count, 1], kept[count, 2] = x, y, z
+            count += 1
+    return _Selection(kept[:count], beyond[:too_far], not_finite, on_robot, too_near, too_far)
+
+
+def usable_rays(
+    points: Floats,
+    world_from_sensor: Doubles,
+    settings: ScanSettings,
+    *,
+    source: SourceSettings = ANY_SOURCE,
+    no_return: Floats | None = None,
+) -> ScanRays:
+    """The rays of a scan that are finite, in range and thinned, and those that met nothing.
+
+    Args:
+        points: end points [N, 3], metres, sensor frame.
+        world_from_sensor: pose [4, 4].
+        settings: thinning, and the ranges of the source.
+        source: what else is particular to the source.
+        no_return: directions [M, 3], sensor frame, of rays that met nothing.
+
+    Raises:
+        ScanRefusedError: the pose or a direction is bad, or no ray can be used.
+    """
+    empty = np.empty((0, 3), np.float32) if no_return is None else no_return
+    _check_pose(world_from_sensor)
+    _check_sizes(points, empty, settings.max_points)
+    directions = _unit_vectors(empty) if source.no_return else np.empty((0, 3))
+    low, high = (np.array(corner, np.float64) for corner in source.robot_box_m or _NOWHERE)
+    limits = _Limits(settings.range_min_m, settings.range_max_m, settings.thin_m, low, high)
+    found = _select(np.ascontiguousarray(points), limits, empty_keys(len(points)))
+    open_ends = np.concatenate([found.beyond, settings.range_max_m * directions])
+    if len(found.kept) + len(open_ends) == 0:
+        raise ScanRefusedError(
+            "empty",
+            f"none of {len(points)} points is finite and at least {settings.range_min_m} m from "
+            "the sensor, and no ray without a return is used",
+        )
+    rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
+    return ScanRays(
+        origin.copy(),
+        found.kept @ rotation.T + origin,
+        found.dropped,
+        open_ends=open_ends @ rotation.T + origin,
+        robot=RobotBox(low, high, world_from_sensor) if source.robot_box_m else None,
+    )
