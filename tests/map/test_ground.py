@@ -7,8 +7,14 @@ import pytest
 import triquad_client
 from support import ground_scenes, servers
 from support.ground_scenes import HOLE_M, KERB_M, RAMP_DEG, STEP_M, TABLE_M, TREAD_M
+from support.small_world import settings, settle
 from triquad_client import Status
+from triquad_map.questions.ground import ground
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
+from triquad_tools.simulation.lidar import Lidar
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.solids import box, half_space
 
 VOXEL_M = 0.2
 SETTINGS = Settings.model_validate(
@@ -183,3 +189,26 @@ def test_whoever_asks_gets_the_same_answer(client, endpoint, tmp_path):
         assert (have.status == want.status).mean() > 0.995  # a file has features of half precision
         same = have.status == want.status
         np.testing.assert_allclose(have.height_m[same], want.height_m[same], atol=0.02)
+
+
+def test_what_just_appeared_is_not_seen_through():
+    """Its voxels are known at once; where in them it lies, the field has still to learn."""
+    mapper = Mapper("test", settings(samples_per_ray=6.0), "cpu")
+    bounds = (np.array([-9.0, -9, -1]), np.array([9.0, 9, 5]))
+    floor, block = half_space(0.0), box((0.0, 0.0, 0.0), (0.6, 0.6, 0.5))
+    pose = np.eye(4)
+    for number in range(9):
+        pose[:3, 3] = (0.1 * number - 3.0, 0.0, 1.5)
+        scene = Scene((floor,) if number < 8 else (floor, block), bounds)
+        scan = Lidar().scan(scene, pose, np.random.default_rng(number))
+        mapper.ingest(scan.points, pose)
+        if number == 7:
+            settle(mapper)
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 9))
+    over = np.stack([x.ravel(), y.ravel(), np.full(x.size, 1.2)], 1)
+    epoch = mapper.publish()
+    seen = epoch.status(over - (0, 0, 0.71), reach_m=0.0) == Status.SURFACE
+    assert seen.sum() > 20
+    answer = ground(epoch, over[seen], 2.0)
+    assert (answer.status == Status.UNKNOWN).all()
+    assert (answer.height_m > 0.3).all()

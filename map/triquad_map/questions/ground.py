@@ -15,6 +15,12 @@ _TOLERANCE_VOXELS = 0.5
 """How far above a point its ground may be, and how much above the ground need not be seen: a
 surface may cut the corner of a voxel in which no ray happened to end."""
 
+_OWN_VOXELS = 1.5
+"""So far above the ground, rays may have ended in voxels that it shares."""
+
+_BESIDE = 0.5
+"""Of the normal's z, up to which a surface is a wall."""
+
 _FACES_DOWN = -0.5
 """Up to here a normal's z is that of a wall whose top edge was met: it leans as the field says."""
 
@@ -117,17 +123,33 @@ def _seen_down(view: MapView, starts: Doubles, depths: Doubles) -> Doubles:
     """How far below ``starts`` [N, 3] rays have shown all, at most ``depths`` [N].
 
     Between two seen places half a voxel apart there is nothing unknown: voxels are twice as high.
+    A surface that the distances do not know yet, since it is new, is not seen through.
     """
     seen_m = np.zeros(len(starts))
     at = np.zeros(len(starts))
     going = np.flatnonzero(depths > 0)
     while len(going):
-        status = view.status(starts[going] + at[going, None] * _DOWN, reach_m=0.0)
-        going = going[status != Status.UNKNOWN]
+        places = starts[going] + at[going, None] * _DOWN
+        status = view.status(places, reach_m=0.0)
+        left_m = depths[going] - at[going]
+        going = going[(status != Status.UNKNOWN) & ~_is_new(view, places, status, left_m)]
         seen_m[going] = at[going]
         going = going[at[going] < depths[going]]
         at[going] = np.minimum(at[going] + STEP_VOXELS * view.voxel_m, depths[going])
     return seen_m
+
+
+def _is_new(view: MapView, places: Doubles, status: Bytes, left_m: Doubles) -> Bools:
+    """Whether rays ended in the voxels of ``places`` [N, 3], but not on a wall beside these.
+
+    ``left_m`` [N] is how far the first known surface below is: it needs some voxels itself.
+    """
+    new: Bools = (status == Status.SURFACE) & (left_m > _OWN_VOXELS * view.voxel_m)
+    rows = np.flatnonzero(new)
+    nearest = distances(view, places[rows], DistanceOptions(2 * view.voxel_m))
+    beside = np.abs(nearest.gradient[:, 2]) < _BESIDE
+    new[rows] = ~beside | (nearest.distance_m > view.voxel_m)
+    return new
 
 
 def _ended_near(view: MapView, points: Doubles) -> Bools:
