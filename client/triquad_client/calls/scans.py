@@ -28,7 +28,7 @@ class FlushReport:
     taken: int  # learnt from
     refused: int  # seen by the server, but of no use
     lost: int  # never arrived, or pushed out of the server's full queue
-    last_refusal: str | None  # why the last of the refused ones was
+    last_refusal: str | None  # by source, why the last of the refused ones was
 
 
 @dataclass
@@ -100,12 +100,16 @@ class ScanPublisher:
         requests = list(self._requests(timeout_s, pending))
         # All at once: each waits for its source, and they share the time.
         replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
-        refusals = [reply.last_refusal for reply in replies if reply.last_refusal is not None]
+        refusals = [
+            f"source {request.source!r}: {reply.last_refusal}"
+            for request, reply in zip(requests, replies, strict=True)
+            if reply.last_refusal is not None
+        ]
         return FlushReport(
             taken=sum(reply.taken for reply in replies),
             refused=sum(reply.refused for reply in replies),
             lost=sum(reply.lost for reply in replies),
-            last_refusal=refusals[-1] if refusals else None,
+            last_refusal="; ".join(refusals) or None,
         )
 
     def _requests(self, timeout_s: float, pending: int) -> Iterator[FlushRequest]:
