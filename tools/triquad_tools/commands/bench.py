@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _COMMAND = "triquad-bench"
 _ON_STREET = ("core", "server", "file", "store", "mesh", "answers", "align", "offline")
-USUAL_PARTS = (*_ON_STREET, "growth", "air")
+USUAL_PARTS = (*_ON_STREET, "growth", "air", "moving")
 PARTS = (*USUAL_PARTS, "ablation")
 
 
@@ -55,6 +55,10 @@ def _bench(options: argparse.Namespace) -> int:
         from triquad_tools.benchmarks.air import measure_air  # slow to import
 
         figures += measure_air(options.seed)
+    if "moving" in parts:
+        from triquad_tools.benchmarks.moving import measure_moving  # slow to import
+
+        figures += measure_moving(options.seed)
     if "ablation" in parts:
         from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
 
@@ -141,8 +145,8 @@ def _parser() -> argparse.ArgumentParser:
         description="Measure triquad on this machine, on a simulated street: a server under a "
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
         "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
-        "opened offline, and open air. Takes a quarter of an hour; nothing else should run "
-        "meanwhile.",
+        "opened offline, open air, and things that move. Takes over twenty minutes; nothing "
+        "else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument
