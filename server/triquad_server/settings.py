@@ -117,6 +117,21 @@ class TrainingSettings(BaseModel):
         return self
 
 
+class ChangeSettings(BaseModel):
+    """How quickly a surface is taken back that rays pass through, in a world that changes."""
+
+    model_config = _SECTION
+
+    static: bool = False
+    """The world stands still: no surface is ever taken back."""
+
+    scans: Annotated[int, Field(ge=1, le=1000)] = 3
+    """Scans in a row, at least, of which rays pass where a surface was, and none ends there."""
+
+    doubt: Annotated[float, Field(ge=1e-9, le=0.5)] = 0.01
+    """So improbable must that be, by how often rays ended and passed there before."""
+
+
 class MeshSettings(BaseModel):
     """The lattice of mesh tiles, and how clients follow them."""
 
@@ -218,6 +233,7 @@ class Settings(BaseModel):
 
     field: FieldSettings = FieldSettings()
     scan: ScanSettings = ScanSettings()
+    change: ChangeSettings = ChangeSettings()
     training: TrainingSettings = TrainingSettings()
     mesh: MeshSettings = MeshSettings()
     store: StoreSettings = StoreSettings()

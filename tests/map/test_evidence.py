@@ -2,7 +2,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.status import Status
-from triquad_map.compiled.evidence.evidence import FrozenEvidence, LiveEvidence
+from triquad_map.compiled.evidence.carving import Reach
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.surface import LEVELS
 
@@ -32,7 +34,7 @@ def test_surface_reaches_half_a_voxel() -> None:
 def test_a_ray_carves_the_voxels_it_crosses_and_stops_short() -> None:
     evidence = LiveEvidence(SIDE)
     origin, end = np.array([2.2, 3.3, 4.4]), np.array([[50.7, 31.1, 17.9]])
-    evidence.carve(origin, end, stop_short=0.5)
+    evidence.carve(origin, end, Reach(0.5))
     direction = (end[0] - origin) / np.linalg.norm(end[0] - origin)
     length = np.linalg.norm(end[0] - origin)
     along = origin + np.linspace(0, length - 0.51, 5000)[:, None] * direction
@@ -47,7 +49,7 @@ def test_a_ray_carves_the_voxels_it_crosses_and_stops_short() -> None:
 
 def test_a_ray_from_outside_carves_inside_only() -> None:
     evidence = LiveEvidence(SIDE)
-    evidence.carve(np.array([-20.0, 30.2, 30.2]), voxel(90, 31.1, 30.7), stop_short=0.5)
+    evidence.carve(np.array([-20.0, 30.2, 30.2]), voxel(90, 31.1, 30.7), Reach(0.5))
     assert evidence.freeze().status(voxel(5, 30.43, 30.3))[0] == Status.FREE
     assert evidence.freeze().status(voxel(SIDE - 0.5, 30.85, 30.6))[0] == Status.FREE
     assert evidence.freeze().status(voxel(SIDE + 2, 31, 30.6))[0] == Status.UNKNOWN
@@ -55,8 +57,8 @@ def test_a_ray_from_outside_carves_inside_only() -> None:
 
 def test_a_short_ray_carves_nothing() -> None:
     evidence = LiveEvidence(SIDE)
-    evidence.carve(np.array([5.0, 5, 5]), voxel(5.2, 5, 5), stop_short=0.5)
-    evidence.carve(np.array([5.0, 5, 5]), voxel(5, 5, 5), stop_short=0.0)
+    evidence.carve(np.array([5.0, 5, 5]), voxel(5.2, 5, 5), Reach(0.5))
+    evidence.carve(np.array([5.0, 5, 5]), voxel(5, 5, 5), Reach(0.0))
     assert (evidence.freeze().status(voxel(5.1, 5, 5)) == Status.UNKNOWN).all()
 
 
@@ -78,7 +80,7 @@ def test_it_remembers_exactly_the_marked_voxels(seed: int, count: int) -> None:
 def test_a_record_restores_it() -> None:
     evidence = LiveEvidence(SIDE)
     evidence.mark_surface(RNG.uniform(0, SIDE, (5000, 3)))
-    evidence.carve(np.full(3, 32.0), RNG.uniform(0, SIDE, (300, 3)), 0.5)
+    evidence.carve(np.full(3, 32.0), RNG.uniform(0, SIDE, (300, 3)), Reach(0.5))
     record = evidence.freeze().record()
     assert (np.diff(record.codes) > 0).all()
     restored = LiveEvidence.from_record(SIDE, record)
@@ -116,7 +118,7 @@ def test_support_rises_with_each_look_from_near_and_from_other_sides() -> None:
     def level_after(*origins: tuple[float, ...]) -> int:
         evidence = LiveEvidence(SIDE)
         for origin in origins:
-            evidence.mark_surface(ends[:1], Sighting(np.array(origin), 0.2, 1_000))
+            evidence.mark_surface(ends[:1], Sighting(np.array(origin), 0.2, 1_000, scan=1))
         return int(evidence.freeze().levels[0])
 
     near, far = (25.0, 20.5, 20.5), (120.0, 20.5, 20.5)
@@ -133,7 +135,7 @@ def test_levels_and_times_survive_a_record() -> None:
     rng = np.random.default_rng(5)
     for stamp_s, origin in zip((6_000, 9_000), origins, strict=True):
         ends = rng.uniform(0, SIDE, (3_000, 3)) ** 2 / SIDE  # many in some blocks
-        evidence.mark_surface(ends, Sighting(origin, 0.2, stamp_s))
+        evidence.mark_surface(ends, Sighting(origin, 0.2, stamp_s, scan=1))
     record = evidence.freeze().record()
     again = LiveEvidence.from_record(SIDE, record).freeze().record()
     np.testing.assert_array_equal(again.levels, record.levels)
@@ -141,7 +143,7 @@ def test_levels_and_times_survive_a_record() -> None:
     assert len(np.unique(record.levels)) > 2
     assert set(np.unique(record.seen_s)) == {6_000, 9_000}
     frozen = evidence.freeze()
-    evidence.mark_surface(ends, Sighting(origins[0], 0.2, 12_000))
+    evidence.mark_surface(ends, Sighting(origins[0], 0.2, 12_000, scan=2))
     np.testing.assert_array_equal(frozen.record().seen_s, record.seen_s)
 
 
@@ -149,12 +151,12 @@ def test_what_is_forgotten_has_no_support() -> None:
     evidence = LiveEvidence(SIDE)
     end = np.array([[20.5, 20.5, 20.5]])
     for _ in range(50):
-        evidence.mark_surface(end, Sighting(np.array([25.0, 20, 20]), 0.2, 60))
+        evidence.mark_surface(end, Sighting(np.array([25.0, 20, 20]), 0.2, 60, scan=1))
     evidence.clear(np.zeros(3), np.full(3, float(SIDE)))
     record = evidence.freeze().record()
     assert len(record.levels) == 0
     assert not record.seen_s.any()
-    evidence.mark_surface(end, Sighting(np.array([200.0, 20, 20]), 0.2, 120))
+    evidence.mark_surface(end, Sighting(np.array([200.0, 20, 20]), 0.2, 120, scan=2))
     assert evidence.freeze().levels.tolist() == [0]
 
 
@@ -183,7 +185,7 @@ def test_open_rays_mark_the_voxels_that_they_cross_and_no_others(seed: int, coun
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     ends = origin + rng.uniform(5, 80) * directions / lengths
     evidence = LiveEvidence(SIDE)
-    evidence.carve(origin, ends, 0.0)
+    evidence.carve(origin, ends, Reach(0.0))
     voxels = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)
     free = evidence.freeze().status(voxels + 0.5) == Status.FREE
     marked = {tuple(v) for v in voxels[free].tolist()}

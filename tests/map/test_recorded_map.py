@@ -10,7 +10,7 @@ from support.exact_maps import exact_map, flat, table
 from support.map_records import SMALL, random_record, with_levels
 from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
-from triquad_map.compiled.evidence.evidence import LiveEvidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.recorded_view import RecordedView
 from triquad_map.compiled.surfels.surfel_map import surfel_index, surfel_places
 from triquad_map.compiled.surfels.surfel_search import find_nearest

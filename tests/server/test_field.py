@@ -8,7 +8,7 @@ import torch
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
-from triquad_map.compiled.evidence.evidence import LiveEvidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_server.engine.live_field import (
     Batch,
     LiveField,

@@ -180,6 +180,7 @@ def test_neighbouring_regions_start_differently() -> None:
     setup = RegionSetup(
         field=chosen.field,
         scan=chosen.scan,
+        change=chosen.change,
         training=chosen.training,
         device=torch.device("cpu"),
         sums=GradientSums(),

@@ -1,19 +1,23 @@
 """One region of the live map: its field, its evidence and what it still has to learn."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Doubles, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import Region
-from triquad_map.compiled.evidence.evidence import LiveEvidence
+from triquad_map.compiled.evidence.carving import Reach
+from triquad_map.compiled.evidence.contradictions import Disbelief
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence, Marks
 from triquad_map.compiled.evidence.observations import Sighting
-from triquad_map.compiled.surfels.surfel_map import first_surfels
+from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import empty_keys, thin
+from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples
 
 from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
@@ -30,9 +34,14 @@ from triquad_server.epochs import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
 from triquad_server.mapping.replay_pool import ReplayPool
-from triquad_server.settings import ScanSettings, TrainingSettings
+from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
 _CARVE_SHORT_M = 0.1
+_CLEAR_SHORT_M = 0.5
+"""How far before its end a ray still shows that a surface is not there."""
+
+_SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
+_VISITS = 4  # to each of them
 _OPEN_THINNED_AT = 0.25  # share of the length of rays that met nothing
 _CHECKPOINT_SAMPLES = 1_000_000
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
@@ -46,6 +55,7 @@ class RegionSetup:
 
     field: FieldSettings
     scan: ScanSettings
+    change: ChangeSettings
     training: TrainingSettings
     device: torch.device
     sums: GradientSums
@@ -59,6 +69,13 @@ class RegionSetup:
         return field, pool
 
 
+def _disbelief(settings: ChangeSettings) -> Disbelief:
+    """The rule of the settings; the other signs are told by how improbable its own record is."""
+    doubt = math.log(settings.doubt)
+    shared = doubt + math.log(2)
+    return Disbelief(settings.scans, doubt, around=3 * doubt, shared=shared, witnessed=doubt / 2)
+
+
 class LiveRegion:
     """A region that is being mapped, by one thread. Everything public is in the map frame."""
 
@@ -70,7 +87,7 @@ class LiveRegion:
         self.field = field
         self.evidence = evidence
         _, seed = setup.seeds(index)
-        self._shifts = np.random.default_rng(seed)
+        self._random = np.random.default_rng(seed)
         self.pool = ReplayPool(
             capacity=setup.training.pool_rays,
             placement=Placement(
@@ -86,7 +103,13 @@ class LiveRegion:
         self.budget_samples = 0  # the training budget: samples that are still to be trained on
         self._fresh_budget_samples = 0  # those of them that are to be from the newest scan
         self.changed = True  # since it was last published
+        self._restored = False  # and not published since: where surfaces lie is in the field alone
+        self._scans = 0  # that it was seen in
+        self._marks: Marks | None = None  # of the newest
+        self._passed: list[Ints] = []  # where rays passed a surface since it was last published
+        self._gone: list[Longs] = []  # voxels whose surface went since it was last published
         self._setup = setup
+        self._disbelief = _disbelief(setup.change)
         self._settings = setup.field
         self._training = setup.training
         self._trainer: CompiledTrainer | TensorTrainer = (
@@ -109,6 +132,7 @@ class LiveRegion:
         field = field_from_record(record, setup.field, setup.device, seed=seed)
         evidence = LiveEvidence.from_record(1 << setup.field.depth, record.evidence)
         region = cls(record.index, setup, field, evidence)
+        region._restored = True
         state = record.training
         if state is not None and len(state.sample_points):
             region.pool.add(sample_intervals(state.sample_points, state.sample_labels))
@@ -124,15 +148,22 @@ class LiveRegion:
         """
         ends = self.voxels(rays.ends)
         origin = self.voxels(rays.origin[None])[0]
-        sighting = Sighting(origin, self._settings.leaf_m, stamp_s)
-        new = self.evidence.mark_surface(ends, sighting)
+        self._scans += 1
+        leaf_m = self._settings.leaf_m
+        sighting = Sighting(origin, leaf_m, stamp_s, self._scans)
+        self._marks = self.evidence.mark_surface(ends, sighting)
         # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
-        self.field.grow(new)
+        self.field.grow(self._marks.new)
         self.changed = True
-        short = _CARVE_SHORT_M / self._settings.leaf_m
+        clear_m = math.inf if self._setup.change.static else _CLEAR_SHORT_M
+        reach = Reach(_CARVE_SHORT_M / leaf_m, clear_m / leaf_m, self._scans)
 
         def carve() -> None:
-            self.evidence.carve(origin, ends[thin(ends, 1.0, empty_keys(len(ends)))], short)
+            thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
+            passed = self.evidence.carve(origin, thinned, reach)
+            if len(passed):
+                self._passed.append(passed)
+                self._gone.append(self.evidence.take_back(passed, self._disbelief))
             self._carve_open(origin, rays)
 
         return carve
@@ -140,10 +171,11 @@ class LiveRegion:
     def _carve_open(self, origin: Doubles, rays: ScanRays) -> None:
         """Record the space along rays that met nothing, and where the robot is, as free."""
         ends = self.voxels(rays.open_ends)
+        # Glass and black paint return nothing: these rays contradict no surface.
         # One per voxel at a quarter of their length: nearer, they leave no gaps. The voxels are
         # shifted from scan to scan, so that a robot at rest uses other rays each time.
-        near = origin + _OPEN_THINNED_AT * (ends - origin) + self._shifts.random(3)
-        self.evidence.carve(origin, ends[thin(near, 1.0, empty_keys(len(ends)))], 0.0)
+        near = origin + _OPEN_THINNED_AT * (ends - origin) + self._random.random(3)
+        self.evidence.carve(origin, ends[thin(near, 1.0, empty_keys(len(ends)))], Reach(0.0))
         if rays.robot is not None:
             centres = rays.robot.voxel_centres(self._settings.leaf_m)
             self.evidence.mark_free(self.voxels(centres))
@@ -163,6 +195,14 @@ class LiveRegion:
         samples = int(len(intervals) * self._training.samples_per_ray)
         self.budget_samples = min(self.budget_samples + samples, self._training.max_budget_samples)
         self._fresh_budget_samples = int(samples * self._training.fresh_share)
+
+    def set_normals(self, normals: Doubles) -> None:
+        """Keep the unit normals [N, 3] at the ends of the newest scan's rays; NaN where unknown.
+
+        Not beside what :meth:`see` returned.
+        """
+        if self._marks is not None:
+            self.evidence.set_normals(self._marks, normals)
 
     def train(self) -> float | Tensor:
         """One optimiser step; returns the loss: to read it on a GPU waits for the step."""
@@ -194,14 +234,23 @@ class LiveRegion:
         ``before`` is how it was published last: what did not change is shared with it.
         """
         self.changed = False
-        field, evidence = self.field.freeze(), self.evidence.freeze()
+        field = self.field.freeze()
         samples = field_samples(field, self._settings, self._setup.team.split)
+        if self._passed:
+            passed, rule = np.concatenate(self._passed), self._disbelief
+            self._gone.append(self.evidence.take_back_unseen(passed, rule, samples))
+            self._passed.clear()
+        evidence = self.evidence.freeze()
         most = _SURFELS_REFITTED if self.budget_samples else None
         surfels = (
             first_surfels(evidence, samples, epoch)
             if before is None
             else before.surfels.updated(evidence, samples, epoch, most=most)
         )
+        if self._restored:
+            self.evidence.set_discs(surfels.voxels, surfels.surfels)
+            self._restored = False
+        self._forget_gone(surfels)
         return FrozenRegion(
             index=self.index,
             centre=self.centre,
@@ -223,6 +272,25 @@ class LiveRegion:
             budget_samples=self.budget_samples,
         )
         return region_record(self.index, self.field, self.evidence.freeze(), training=state)
+
+    def _forget_gone(self, surfels: SurfelMap) -> None:
+        """Unlearn the surface that was taken back: its rays, and what the field shows there."""
+        if not any(len(voxels) for voxels in self._gone):
+            self._gone.clear()
+            return
+        voxels = np.unique(np.concatenate(self._gone), axis=0)
+        self._gone.clear()
+        voxels = voxels[~self.evidence.freeze().ended_in(voxels)]  # nothing ended there since
+        self.pool.forget_ends(voxels, self._settings)
+        inside = self._random.random((_SAMPLES_PER_VOXEL, len(voxels), 3))
+        points = (voxels + inside).reshape(-1, 3)
+        leaf_m, middle = self._settings.leaf_m, 1 << (self._settings.depth - 1)
+        nearest = no_surfels(np.full(len(points), self._setup.scan.truncation_m / leaf_m))
+        surfels.find_nearest(points, nearest)
+        offsets = ((points - middle) * leaf_m).astype(np.float32)
+        self.pool.add(sample_intervals(offsets, nearest.distances * leaf_m), fresh=False)
+        if self.budget_samples:  # else a map that has settled would change once more
+            self.budget_samples += _VISITS * len(points)
 
     def _cooling(self) -> float:
         """Share of the learning rate: falls as the budget is used up, so that the field settles."""

@@ -58,6 +58,7 @@ class Mapper:
         self._setup = RegionSetup(
             field=self._field_settings,
             scan=settings.scan,
+            change=settings.change,
             training=settings.training,
             device=self._device,
             sums=GradientSums(),
@@ -135,6 +136,8 @@ class Mapper:
             for region in regions:
                 region.learn(rays, normals)
             self._share_pool()
+        for region in regions:
+            region.set_normals(normals)
         return rays.points_dropped
 
     def train(self) -> None:

@@ -10,11 +10,12 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from triquad_format.records.arrays import Doubles, Floats, Ints, Longs
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
+from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
-from triquad_map.compiled.voxel_index import with_room
+from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, pack, with_room
 
 from triquad_server.engine.live_field import Batch
 from triquad_server.mapping.ray_intervals import (
@@ -70,6 +71,48 @@ def _put(
         occupancy[bins[place]] += 1
 
 
+@kernel()
+def _bins_of(voxels: Longs, leaf_m: float, middle: float) -> Bools:
+    """Which bins hold any part of ``voxels`` [N, 3]."""
+    chosen = np.zeros(_BINS, np.bool_)
+    corner = np.zeros(COLUMNS, np.float32)
+    for voxel in voxels:
+        for number in range(8):
+            for axis in range(3):
+                inset = 0.99 if number >> axis & 1 else 0.01
+                corner[END + axis] = (voxel[axis] + inset - middle) * leaf_m
+            chosen[_bin(corner)] = True
+    return chosen
+
+
+@kernel()
+def _remove_ending_in(
+    gone: Index,
+    bins_of_gone: Bools,
+    leaf_m: float,
+    middle: float,
+    size: int,
+    intervals: Floats,
+    bins: Ints,
+    occupancy: Ints,
+) -> int:
+    """Remove the intervals that end in voxels, and put the last ones there; returns the size."""
+    i = 0
+    while i < size:
+        if bins_of_gone[bins[i]]:
+            x = int(np.floor(intervals[i, END] / leaf_m + middle))
+            y = int(np.floor(intervals[i, END + 1] / leaf_m + middle))
+            z = int(np.floor(intervals[i, END + 2] / leaf_m + middle))
+            if find_row(gone, pack(x, y, z)) >= 0:
+                occupancy[bins[i]] -= 1
+                size -= 1
+                intervals[i] = intervals[size]
+                bins[i] = bins[size]
+                continue
+        i += 1
+    return size
+
+
 class ReplayPool:
     """Ray intervals of one region; the newest can be drawn from apart from the others."""
 
@@ -96,8 +139,8 @@ class ReplayPool:
     def __len__(self) -> int:
         return self._size
 
-    def add(self, intervals: Floats) -> None:
-        """Take in ``intervals`` [S, COLUMNS]; they become the newest."""
+    def add(self, intervals: Floats, fresh: bool = True) -> None:
+        """Take in ``intervals`` [S, COLUMNS]; if ``fresh``, they become the newest."""
         self.offered += len(intervals)
         used = self._size
         room = min(len(intervals), self._capacity - used)
@@ -110,9 +153,12 @@ class ReplayPool:
         self._extend(used + room)
         _put(intervals, places, used, self._intervals, self._bins, self._occupancy)
         if self._on_device is not None:
-            self._fresh_on_device = torch.from_numpy(places).to(self._device)
-            self._on_device[self._fresh_on_device] = torch.from_numpy(intervals).to(self._device)
-        self._fresh = places
+            changed = torch.from_numpy(places).to(self._device)
+            self._on_device[changed] = torch.from_numpy(intervals).to(self._device)
+            if fresh:
+                self._fresh_on_device = changed
+        if fresh:
+            self._fresh = places
 
     def draw(self, count: int, fresh: int) -> Batch:
         """``count`` samples on intervals at random, ``fresh`` of them on the newest."""
@@ -134,6 +180,22 @@ class ReplayPool:
         ends = self._intervals[: self._size, END : END + 3]
         self._keep(np.flatnonzero(~((ends >= low) & (ends <= high)).all(axis=1)))
         self.offered = self._size
+
+    def forget_ends(self, voxels: Longs, settings: FieldSettings) -> None:
+        """Drop the intervals that end in ``voxels`` [N, 3] of a region with these ``settings``."""
+        middle = float(1 << (settings.depth - 1))
+        self._size = _remove_ending_in(
+            VoxelIndex.of_cells(voxels).arrays,
+            _bins_of(voxels, settings.leaf_m, middle),
+            settings.leaf_m,
+            middle,
+            self._size,
+            self._intervals,
+            self._bins,
+            self._occupancy,
+        )
+        self._fresh = self._fresh[self._fresh < self._size]
+        self._copy_to_device()
 
     def sample(self, count: int) -> Batch:
         """Samples on at most ``count`` intervals, one on each: what a checkpoint keeps."""

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import BLOCK_BYTES, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
+from triquad_format.records.region import surface_counts
 from triquad_format.records.status import Status
 
-from triquad_map.compiled.evidence.observations import Observations, Sighting
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_crossed, mark_ends
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.evidence.unknown_search import find_unknown
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (
@@ -26,11 +24,9 @@ from triquad_map.compiled.voxel_index import (
     cells_of,
     find_block,
     is_set,
-    with_room,
 )
 
 _SEEN_STEP_S = 60
-_MIN_CAPACITY = 256
 
 _SURFACE = np.uint8(Status.SURFACE)
 _FREE = np.uint8(Status.FREE)
@@ -152,122 +148,3 @@ class FrozenEvidence:
             seen_s = np.zeros(len(record.codes), np.int64)
         masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
         return cls(SeenVoxels(side, index, *masks), levels, seen_s)
-
-
-class LiveEvidence:
-    """Two bit masks over the voxels of a region, in sparse blocks of 8 x 8 x 8.
-
-    One thread owns and changes it; :meth:`freeze` gives what others may read.
-    """
-
-    def __init__(self, side: int) -> None:
-        """``side`` is that of the region, voxels."""
-        self._blocks = VoxelIndex(_MIN_CAPACITY)
-        masks = np.zeros((2, _MIN_CAPACITY, BLOCK_BYTES), np.uint8)
-        self._seen = SeenVoxels(side, self._blocks.arrays, *masks)
-        self._observations = Observations(_MIN_CAPACITY)
-        self._frozen: FrozenEvidence | None = None  # until anything changes
-
-    @property
-    def blocks(self) -> int:
-        """Blocks in use."""
-        return self._blocks.count
-
-    def mark_surface(self, voxels: Doubles, sighting: Sighting | None = None) -> Longs:
-        """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out.
-
-        ``sighting`` tells from where and when; without it they support the surface no better.
-
-        Returns:
-            The voxels [M, 3] in which no ray had ended before.
-        """
-        self._frozen = None
-        new = np.empty((len(voxels), 3), np.int64)
-        done = found = 0
-        while done < len(voxels):
-            done, self._blocks.count, found = mark_ends(
-                voxels, done, self._seen, self._blocks.count, new, found
-            )
-            if done < len(voxels):
-                self._grow()
-        if sighting is not None:
-            self._observations.record(voxels, self._seen, sighting)
-        return new[:found]
-
-    def carve(self, origin: Doubles, ends: Doubles, stop_short: float) -> None:
-        """Record the free space between ``origin`` [3] and ``ends`` [N, 3].
-
-        Args:
-            origin: sensor position, may lie outside the region.
-            ends: end points of the rays.
-            stop_short: voxels before its end point where a ray stops to prove free space.
-        """
-        self._frozen = None
-        done = 0
-        while done < len(ends):
-            done, self._blocks.count = mark_crossed(
-                origin, ends, done, stop_short, self._seen, self._blocks.count
-            )
-            if done < len(ends):
-                self._grow()
-
-    def mark_free(self, voxels: Doubles) -> None:
-        """Record that ``voxels`` [N, 3] are free; those outside the region are left out."""
-        self._frozen = None
-        new = np.empty((len(voxels), 3), np.int64)
-        done = 0
-        while done < len(voxels):
-            free = self._seen._replace(surface=self._seen.free)
-            done, self._blocks.count, _ = mark_ends(voxels, done, free, self._blocks.count, new, 0)
-            if done < len(voxels):
-                self._grow()
-
-    def clear(self, low: Doubles, high: Doubles) -> None:
-        """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
-        self._frozen = None
-        corners = self._blocks.cells() * BLOCK_VOXELS
-        near = ((corners < high) & (corners + BLOCK_VOXELS > low)).all(axis=1)
-        offsets = np.stack(np.meshgrid(*[np.arange(BLOCK_VOXELS)] * 3, indexing="ij"), -1)
-        for row in np.flatnonzero(near):
-            centres = corners[row] + offsets + 0.5
-            kept = ~((centres > low) & (centres < high)).all(axis=-1)
-            keep = np.packbits(kept, axis=-1, bitorder="little").reshape(BLOCK_BYTES)
-            self._seen.surface[row] &= keep
-            self._seen.free[row] &= keep
-        self._observations.forget(np.flatnonzero(near), self._seen.surface[: self.blocks])
-
-    def freeze(self) -> FrozenEvidence:
-        """The evidence as it is now; the same object until anything changes."""
-        if self._frozen is None:
-            side, _, *masks = self._seen
-            surface, free = (mask[: self.blocks].copy() for mask in masks)
-            self._frozen = FrozenEvidence(
-                SeenVoxels(side, self._blocks.freeze(), surface, free),
-                self._observations.levels(surface),
-                self._observations.seen_s(self.blocks),
-            )
-        return self._frozen
-
-    @classmethod
-    def from_record(cls, side: int, record: EvidenceRecord) -> "LiveEvidence":
-        """The evidence of a record, of a region of ``side`` voxels."""
-        evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
-        evidence._blocks = VoxelIndex.of_cells(frozen.cells)
-        evidence._seen = frozen.seen
-        if record.levels is not None:
-            evidence._observations = Observations.restore(
-                frozen.surface, frozen.levels, frozen.seen_s
-            )
-        evidence._make_room()
-        return evidence
-
-    def _grow(self) -> None:
-        self._blocks.grow()
-        self._make_room()
-
-    def _make_room(self) -> None:
-        """Make room for as many blocks as the index has room for."""
-        side, _, *masks = self._seen
-        roomy = (with_room(mask, self._blocks.capacity) for mask in masks)
-        self._seen = SeenVoxels(side, self._blocks.arrays, *roomy)
-        self._observations.make_room(self._blocks.capacity)

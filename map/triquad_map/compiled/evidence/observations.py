@@ -1,4 +1,4 @@
-"""How often, from how near, from where and when last rays ended in each voxel."""
+"""What is known of each voxel in which rays ended: how often, from where, and what became of it."""
 
 from typing import NamedTuple
 
@@ -6,24 +6,54 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import BLOCK_BYTES, surface_counts
+from triquad_format.records.region import surface_counts
 
+from triquad_map.compiled.evidence.levels import fill_levels
+from triquad_map.compiled.evidence.observed import (
+    COUNT_COLUMNS,
+    EARLIER_MISSES,
+    EARLIER_PASSES,
+    ENDS,
+    HIT_SCAN,
+    HITS,
+    MEAN,
+    MISSES,
+    NORMAL,
+    PASS_SCANS,
+    PASSES,
+    SECTORS,
+    SHAPE_COLUMNS,
+    SPREAD,
+    WEIGHT,
+    Observed,
+    Vector,
+    row_of,
+)
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, with_room
-from triquad_map.surface import LEAST_STRENGTH, LEVELS, NEAR_M, SECTORS_COUNTED
+from triquad_map.compiled.voxel_index import (
+    LOW,
+    SHIFT,
+    byte_of,
+    find_block,
+    with_room,
+)
+from triquad_map.surface import (
+    LEAST_STRENGTH,
+    NEAR_M,
+    SurfelKind,
+    Surfels,
+)
 
 _VOXELS = BLOCK_VOXELS**3
 _MIN_CAPACITY = 64
+_MIN_ROWS = 1024
+_DISC = int(SurfelKind.DISC)
+_DISC_ENDS, _DISC_SPREAD = 16.0, 0.15  # that a disc of the field stands for
 
-
-class Observed(NamedTuple):
-    """The arrays of the observations, as kernels take them."""
-
-    places: Ints  # [blocks] where in the others a block of evidence stands; 0: nothing is known
-    weights: Floats  # [places, voxels] rays, the near ones counting more
-    sectors: Bytes  # [places, voxels] a bit for each eighth of the horizon looked from
-    seen_s: Longs  # [places] when the last ray ended in the block
+_RESTORED_HITS = 8  # of a voxel whose record is not in the file
+_COUNTED_ENDS = 64
+"""Of a voxel; the shape that further ones give counts as that of so many."""
 
 
 class Sighting(NamedTuple):
@@ -32,6 +62,7 @@ class Sighting(NamedTuple):
     origin: Doubles  # [3] the sensor, voxels
     leaf_m: float
     stamp_s: int  # seconds since 1970
+    scan: int  # its number, from 1 on; that of the next is greater
 
 
 @kernel(inline="always")
@@ -43,6 +74,42 @@ def _sector(x: float, y: float) -> int:
     return eighth + (1 if abs(y) > abs(x) else 0)
 
 
+@kernel(inline="always")
+def _add_ray(shape: Floats, counts: Ints, end: Doubles, sighting: Sighting) -> None:
+    """Count a ray that ended at ``end`` [3] by how far and where the sensor was."""
+    origin = sighting.origin
+    dx, dy, dz = origin[0] - end[0], origin[1] - end[1], origin[2] - end[2]
+    square = (dx * dx + dy * dy + dz * dz) * (sighting.leaf_m / NEAR_M) ** 2
+    shape[WEIGHT] += np.float32(1 / (1 + square))
+    counts[SECTORS] |= 1 << _sector(dx, dy)
+
+
+@kernel()
+def _add_end(shape: Floats, counts: Ints, end: Vector, scan: int) -> None:
+    """Count a ray that ended at a place in a voxel."""
+    is_first = shape[ENDS] == 0
+    if is_first:
+        for axis in range(3):
+            shape[MEAN + axis] = end[axis]
+        shape[SPREAD] = 0
+    count = min(shape[ENDS] + 1, _COUNTED_ENDS)
+    shape[ENDS] = count
+    squared = 0.0
+    for axis in range(3):
+        off = end[axis] - shape[MEAN + axis]
+        step = off / count
+        shape[MEAN + axis] += step
+        squared += off * (off - step)
+    shape[SPREAD] += (squared - shape[SPREAD]) / count
+    if counts[HIT_SCAN] != scan:
+        counts[HIT_SCAN] = scan
+        counts[HITS] += 1
+        if not is_first:  # else they passed while nothing was there
+            counts[EARLIER_PASSES] += counts[PASSES]
+            counts[EARLIER_MISSES] += counts[MISSES]
+        counts[PASS_SCANS] = counts[PASSES] = counts[MISSES] = 0
+
+
 @kernel()
 def _record(
     voxels: Doubles,
@@ -50,135 +117,180 @@ def _record(
     seen: SeenVoxels,
     sighting: Sighting,
     observed: Observed,
-    count: int,
-) -> tuple[int, int]:
-    """Count rays that ended at ``voxels`` [N, 3]; returns (points done, places in use)."""
-    origin, leaf_m = sighting.origin, sighting.leaf_m
+    places: int,
+    rows: int,
+    found: Ints,
+) -> tuple[int, int, int]:
+    """Count rays that ended at ``voxels`` [N, 3]; returns (points done, places, rows in use).
+
+    The row of each ray's voxel goes to ``found`` [N]; 0 outside the region.
+    """
     for i in range(start, len(voxels)):
         x = int(np.floor(voxels[i, 0]))
         y = int(np.floor(voxels[i, 1]))
         z = int(np.floor(voxels[i, 2]))
-        row = find_block(seen.blocks, x, y, z, seen.side)
-        if row < 0:  # outside the region
+        block = find_block(seen.blocks, x, y, z, seen.side)
+        found[i] = 0
+        if block < 0:  # outside the region
             continue
-        place = observed.places[row]
+        place = observed.places[block]
         if place == 0:
-            if count == len(observed.seen_s):
-                return i, count
-            place = count
-            observed.places[row] = place
-            count += 1
+            if places == len(observed.seen_s):
+                return i, places, rows
+            place = places
+            observed.places[block] = place
+            places += 1
         voxel = byte_of(x, y) << SHIFT | (z & LOW)
-        dx, dy, dz = origin[0] - voxels[i, 0], origin[1] - voxels[i, 1], origin[2] - voxels[i, 2]
-        square = (dx * dx + dy * dy + dz * dz) * (leaf_m / NEAR_M) ** 2
-        observed.weights[place, voxel] += np.float32(1 / (1 + square))
-        observed.sectors[place, voxel] |= np.uint8(1 << _sector(dx, dy))
+        row = observed.rows[place, voxel]
+        if row == 0:
+            if rows == len(observed.owners):
+                return i, places, rows
+            row = rows
+            observed.rows[place, voxel] = row
+            observed.owners[row] = block << (3 * SHIFT) | voxel
+            rows += 1
+        found[i] = row
+        shape, counts = observed.shapes[row], observed.counts[row]
         observed.seen_s[place] = max(observed.seen_s[place], sighting.stamp_s)
-    return len(voxels), count
-
-
-@kernel(inline="always")
-def _level(weight: float, sectors: int) -> int:
-    """The level of a voxel that was looked at from some ``sectors``, a bit for each."""
-    count = 0
-    for sector in range(8):
-        count += sectors >> sector & 1
-    strength = weight * (0.5 + 0.5 * min(SECTORS_COUNTED, max(1, count)))
-    level = 0
-    while level < LEVELS - 1 and strength >= LEAST_STRENGTH * (1 << level):
-        level += 1
-    return level
+        _add_ray(shape, counts, voxels[i], sighting)
+        end = (voxels[i, 0] - x, voxels[i, 1] - y, voxels[i, 2] - z)
+        _add_end(shape, counts, end, sighting.scan)
+    return len(voxels), places, rows
 
 
 @kernel()
-def _levels(surface: Bytes, observed: Observed, levels: Bytes) -> None:
-    """Fill in the ``levels`` of the voxels of ``surface``."""
-    at = 0
-    for row in range(len(surface)):
-        place = observed.places[row]
-        for byte in range(BLOCK_BYTES):
-            bits = int(surface[row, byte])
-            if bits == 0:
-                continue
-            for z in range(BLOCK_VOXELS):
-                if bits >> z & 1:
-                    voxel = byte << SHIFT | z
-                    weight = observed.weights[place, voxel]
-                    levels[at] = _level(weight, observed.sectors[place, voxel])
-                    at += 1
+def _set_normals(rows: Ints, normals: Doubles, observed: Observed) -> None:
+    for i, row in enumerate(rows):
+        if row != 0 and not np.isnan(normals[i, 0]):
+            for axis in range(3):
+                observed.shapes[row, NORMAL + axis] = normals[i, axis]
+
+
+@kernel()
+def _set_discs(
+    voxels: Longs,
+    offsets: Floats,
+    normals: Floats,
+    kinds: Bytes,
+    seen: SeenVoxels,
+    observed: Observed,
+) -> None:
+    for i in range(len(voxels)):
+        shape = observed.shapes[row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])]
+        is_disc = kinds[i] == _DISC
+        for axis in range(3):
+            shape[MEAN + axis] = offsets[i, axis] + 0.5 if is_disc else np.nan
+            shape[NORMAL + axis] = normals[i, axis] if is_disc else 0.0
+        shape[SPREAD] = _DISC_SPREAD
+        shape[ENDS] = _DISC_ENDS if is_disc else 0
 
 
 class Observations:
     """The observations of the blocks of some evidence, by their rows."""
 
     def __init__(self, blocks: int) -> None:
-        """``blocks`` is how many rows there is room for."""
-        self._count = 1  # places in use
-        self._observed = _arrays(blocks, _MIN_CAPACITY)
+        """``blocks`` is how many there is room for."""
+        self._places = 1  # in use
+        self._rows = 1
+        self.arrays = _arrays(blocks, _MIN_CAPACITY, _MIN_ROWS)
 
     def make_room(self, blocks: int) -> None:
-        """Make room for so many rows."""
-        places = with_room(self._observed.places, blocks)
-        self._observed = self._observed._replace(places=places)
+        """Make room for so many blocks."""
+        places = with_room(self.arrays.places, blocks)
+        self.arrays = self.arrays._replace(places=places)
 
-    def record(self, voxels: Doubles, seen: SeenVoxels, sighting: Sighting) -> None:
-        """Count rays that ended at ``voxels`` [N, 3], whose blocks are all in ``seen``."""
+    def record(self, voxels: Doubles, seen: SeenVoxels, sighting: Sighting) -> Ints:
+        """Count rays that ended at ``voxels`` [N, 3], whose blocks are all in ``seen``.
+
+        Returns:
+            The row of each ray's voxel [N]; 0 outside the region.
+        """
+        found = np.empty(len(voxels), np.int32)
         done = 0
         while done < len(voxels):
-            done, self._count = _record(voxels, done, seen, sighting, self._observed, self._count)
+            done, self._places, self._rows = _record(
+                voxels, done, seen, sighting, self.arrays, self._places, self._rows, found
+            )
             if done < len(voxels):
                 self._grow()
+        return found
+
+    def set_normals(self, rows: Ints, normals: Doubles) -> None:
+        """Keep the ``normals`` [N, 3] of the surface in ``rows`` [N]; NaN: as they were."""
+        _set_normals(rows, normals, self.arrays)
+
+    def set_discs(self, voxels: Longs, surfels: Surfels, seen: SeenVoxels) -> None:
+        """Take the middles and normals of ``voxels`` [N, 3] from their ``surfels``.
+
+        Where there is no disc, the next ray that ends there tells where the surface is.
+        """
+        _set_discs(voxels, surfels.offsets, surfels.normals, surfels.kinds, seen, self.arrays)
 
     def levels(self, surface: Bytes) -> Bytes:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
         # Most blocks are open air.
         used = np.flatnonzero(surface.view(np.uint64).any(axis=1))
-        surface, places = surface[used], self._observed.places[used]
+        surface, places = surface[used], self.arrays.places[used]
         levels = np.empty(int(surface_counts(surface).sum()), np.uint8)
-        _levels(surface, self._observed._replace(places=places), levels)
+        fill_levels(surface, self.arrays._replace(places=places), levels)
         return levels
 
     def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
-        return self._observed.seen_s[self._observed.places[:blocks]]
+        return self.arrays.seen_s[self.arrays.places[:blocks]]
 
     def forget(self, blocks: NDArray[np.intp], surface: Bytes) -> None:
         """Forget, in the rows ``blocks`` [N], voxels that are not set in ``surface`` any more."""
-        places = self._observed.places[blocks]
+        places = self.arrays.places[blocks]
         kept = np.unpackbits(surface[blocks], axis=1, bitorder="little")
-        self._observed.weights[places] *= kept
-        self._observed.sectors[places] *= kept
+        self.arrays.rows[places] *= kept
 
     @classmethod
     def restore(cls, surface: Bytes, levels: Bytes, seen_s: Longs) -> "Observations":
         """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels."""
         used = np.flatnonzero(surface.any(axis=1))
         places = slice(1, 1 + len(used))
-        observed = _arrays(len(surface), max(_MIN_CAPACITY, 2 * len(used)))
-        observed.places[used] = np.arange(1, 1 + len(used))
-        observed.seen_s[places] = seen_s[used]
-        # The least strength of each level, seen from one sector.
         ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
+        rows = slice(1, 1 + len(levels))
+        arrays = _arrays(
+            len(surface),
+            max(_MIN_CAPACITY, 2 * len(used)),
+            max(_MIN_ROWS, 2 * len(levels)),
+        )
+        arrays.places[used] = np.arange(1, 1 + len(used))
+        arrays.seen_s[places] = seen_s[used]
+        arrays.rows[places][ended] = np.arange(1, 1 + len(levels))
+        block, voxel = np.nonzero(ended)
+        arrays.owners[rows] = used[block] << (3 * SHIFT) | voxel
+        # The least strength of each level, seen from one sector.
         known = levels > 0
-        observed.weights[places][ended] = known * LEAST_STRENGTH * 2.0 ** (levels - 1.0)
-        observed.sectors[places][ended] = known
+        arrays.shapes[rows, WEIGHT] = known * LEAST_STRENGTH * 2.0 ** (levels - 1.0)
+        arrays.counts[rows, SECTORS] = known
+        arrays.counts[rows, HITS] = _RESTORED_HITS
         observations = cls(len(surface))
-        observations._count, observations._observed = 1 + len(used), observed
+        observations._places, observations._rows = 1 + len(used), 1 + len(levels)
+        observations.arrays = arrays
         return observations
 
     def _grow(self) -> None:
-        old, capacity = self._observed, 2 * len(self._observed.seen_s)
-        self._observed = old._replace(
-            weights=with_room(old.weights, capacity),
-            sectors=with_room(old.sectors, capacity),
-            seen_s=with_room(old.seen_s, capacity),
-        )
+        """Double what is full."""
+        arrays = self.arrays._asdict()
+        for names, count in ((_BY_PLACE, self._places), (_BY_ROW, self._rows)):
+            if count == len(arrays[names[-1]]):
+                arrays |= {name: with_room(arrays[name], 2 * count) for name in names}
+        self.arrays = Observed(**arrays)
 
 
-def _arrays(blocks: int, capacity: int) -> Observed:
+_BY_PLACE = ("rows", "seen_s")
+_BY_ROW = ("owners", "shapes", "counts")
+
+
+def _arrays(blocks: int, places: int, rows: int) -> Observed:
     return Observed(
-        np.zeros(blocks, np.int32),
-        np.zeros((capacity, _VOXELS), np.float32),
-        np.zeros((capacity, _VOXELS), np.uint8),
-        np.zeros(capacity, np.int64),
+        places=np.zeros(blocks, np.int32),
+        rows=np.zeros((places, _VOXELS), np.int32),
+        seen_s=np.zeros(places, np.int64),
+        owners=np.zeros(rows, np.int64),
+        shapes=np.zeros((rows, SHAPE_COLUMNS), np.float32),
+        counts=np.zeros((rows, COUNT_COLUMNS), np.int32),
     )

@@ -162,6 +162,16 @@ class SurfelMap:
     def __len__(self) -> int:
         return len(self._fitted.epochs)
 
+    @property
+    def voxels(self) -> Longs:
+        """The voxel [S, 3] of each surfel."""
+        return self._fitted.places.voxels
+
+    @property
+    def surfels(self) -> Surfels:
+        """The surfels, in the order of their voxels."""
+        return self._fitted.surfels
+
     def find_nearest(self, points: Doubles, found: NearestSurfels) -> None:
         """Improve ``found`` where a surfel lies nearer to leaf coordinates ``points`` [N, 3]."""
         find_nearest(points, self._index, found)

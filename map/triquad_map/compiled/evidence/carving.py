@@ -1,0 +1,148 @@
+"""Rays that carve: the voxels that they cross are free, and surfaces that they pass are doubted.
+
+Kernels stop where the index has no more room; the caller makes room and goes on.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from triquad_format.records.arrays import Doubles, Ints
+
+from triquad_map.compiled.evidence.contradictions import Passing, note_pass
+from triquad_map.compiled.evidence.observed import Observed, Vector
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.voxel_index import (
+    LOW,
+    SHIFT,
+    bit_of,
+    block_key,
+    byte_of,
+    is_inside,
+    make_row,
+)
+
+_NO_ROOM = -2
+
+_CLEAR_SHARE = 0.9
+"""Of a ray, that may show that a surface is not there: beyond it, rays graze the ground."""
+
+
+class Reach(NamedTuple):
+    """How far before their ends rays stop to tell of what they cross, in voxels."""
+
+    free: float  # that a voxel is free
+    clear: float = np.inf  # that a surface is not there; infinite: never
+    scan: int = 0  # number of the scan that the rays are of
+
+
+@kernel(inline="always")
+def _crossing(origin: float, direction: float) -> tuple[int, float, float]:
+    """Which way a ray steps on an axis, how far apart its crossings are, and how far the first."""
+    if direction == 0:
+        return 1, np.inf, np.inf
+    fraction = origin - np.floor(origin)
+    if direction > 0:
+        return 1, 1 / direction, (1 - fraction) / direction
+    return -1, -1 / direction, -fraction / direction
+
+
+@kernel(inline="always")
+def _inside(origin: float, direction: float, side: int) -> tuple[float, float]:
+    """How far along a ray it enters and leaves the region on an axis."""
+    if direction == 0:
+        return (-np.inf, np.inf) if 0 <= origin <= side else (np.inf, -np.inf)
+    a, b = -origin / direction, (side - origin) / direction
+    return min(a, b), max(a, b)
+
+
+@kernel(inline="always")
+def _part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[float, float]:
+    """Where the part of a ray begins and ends that lies in the region."""
+    enters_x, leaves_x = _inside(at[0], way[0], side)
+    enters_y, leaves_y = _inside(at[1], way[1], side)
+    enters_z, leaves_z = _inside(at[2], way[2], side)
+    first = max(0.0, enters_x, enters_y, enters_z)
+    return first, min(length, leaves_x, leaves_y, leaves_z)
+
+
+@kernel()
+def _walk(
+    ray: Passing, reach: float, seen: SeenVoxels, count: int, observed: Observed, passed: Ints
+) -> int:
+    """Set the bits of the voxels on a way (Amanatides and Woo 1987); returns the blocks in use."""
+    side, index, surface, masks = seen
+    at, way = ray.start, ray.way
+    x, y, z = int(np.floor(at[0])), int(np.floor(at[1])), int(np.floor(at[2]))
+    step_x, apart_x, next_x = _crossing(at[0], way[0])
+    step_y, apart_y, next_y = _crossing(at[1], way[1])
+    step_z, apart_z, next_z = _crossing(at[2], way[2])
+    row, place, travelled = -1, 0, 0.0
+    entered = True  # another block
+    while travelled <= reach:
+        if entered:
+            row = -1
+            if is_inside(x, y, z, side):
+                row = make_row(index, count, block_key(x, y, z))
+                if row < 0:
+                    return _NO_ROOM
+                count = max(count, row + 1)
+                place = observed.places[row]
+        if row >= 0:
+            byte, bit = byte_of(x, y), bit_of(z)
+            masks[row, byte] |= bit
+            if place and travelled < ray.clear and surface[row, byte] & bit:
+                voxel = observed.rows[place, byte << SHIFT | (z & LOW)]
+                note_pass(ray, (x, y, z), voxel, observed.shapes, observed.counts, passed)
+        if next_x <= next_y and next_x <= next_z:
+            travelled = next_x
+            next_x += apart_x
+            x += step_x
+            entered = (x & LOW) == (0 if step_x > 0 else LOW)
+        elif next_y <= next_z:
+            travelled = next_y
+            next_y += apart_y
+            y += step_y
+            entered = (y & LOW) == (0 if step_y > 0 else LOW)
+        else:
+            travelled = next_z
+            next_z += apart_z
+            z += step_z
+            entered = (z & LOW) == (0 if step_z > 0 else LOW)
+    return count
+
+
+@kernel()
+def mark_crossed(
+    origin: Doubles,
+    ends: Doubles,
+    start: int,
+    reach: Reach,
+    seen: SeenVoxels,
+    count: int,
+    observed: Observed,
+    passed: Ints,
+) -> tuple[int, int]:
+    """Set the bits of the voxels that rays cross; the rows that they pass go to ``passed``.
+
+    Returns (rays done, blocks in use).
+    """
+    at = (origin[0], origin[1], origin[2])
+    for i in range(start, len(ends)):
+        dx, dy, dz = ends[i, 0] - at[0], ends[i, 1] - at[1], ends[i, 2] - at[2]
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if length <= reach.free:
+            continue
+        way = (dx / length, dy / length, dz / length)
+        first, last = _part_inside(at, way, length - reach.free, seen.side)
+        if first > last:
+            continue
+        begin = (at[0] + first * way[0], at[1] + first * way[1], at[2] + first * way[2])
+        ray = Passing(
+            begin, way, min(length - reach.clear, _CLEAR_SHARE * length) - first, reach.scan
+        )
+        used = _walk(ray, last - first, seen, count, observed, passed)
+        if used == _NO_ROOM:
+            return i, count
+        count = used
+    return len(ends), count

@@ -1,0 +1,197 @@
+"""What rays have shown of a region, while they go on to show more."""
+
+from typing import NamedTuple
+
+import numpy as np
+from triquad_format.records.arrays import Doubles, Ints, Longs
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES
+from triquad_format.records.region import Evidence as EvidenceRecord
+
+from triquad_map.compiled.evidence.carving import Reach, mark_crossed
+from triquad_map.compiled.evidence.contradictions import (
+    Disbelief,
+    doubted,
+    middles,
+    take_back,
+    take_back_rows,
+)
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.observations import Observations, Sighting
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_ends
+from triquad_map.compiled.voxel_index import VoxelIndex, with_room
+from triquad_map.surface import SampleField, Surfels
+
+_MIN_CAPACITY = 256
+
+_FIELD_FREE = 0.5
+"""A field of more voxels than this, where a surface was seen, shows none."""
+
+
+class Marks(NamedTuple):
+    """Where the rays of a scan ended."""
+
+    new: Longs  # [M, 3] voxels in which there was no surface before
+    rows: Ints  # [N] of each ray's voxel, for what is told of them later
+
+
+class LiveEvidence:
+    """Two bit masks over the voxels of a region, in sparse blocks of 8 x 8 x 8.
+
+    One thread owns and changes it; :meth:`freeze` gives what others may read.
+    """
+
+    def __init__(self, side: int) -> None:
+        """``side`` is that of the region, voxels."""
+        self._blocks = VoxelIndex(_MIN_CAPACITY)
+        masks = np.zeros((2, _MIN_CAPACITY, BLOCK_BYTES), np.uint8)
+        self._seen = SeenVoxels(side, self._blocks.arrays, *masks)
+        self._observations = Observations(_MIN_CAPACITY)
+        self._frozen: FrozenEvidence | None = None  # until anything changes
+
+    @property
+    def blocks(self) -> int:
+        """Blocks in use."""
+        return self._blocks.count
+
+    def mark_surface(self, voxels: Doubles, sighting: Sighting | None = None) -> Marks:
+        """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out.
+
+        ``sighting`` tells from where and when; without it they support the surface no better.
+        """
+        self._frozen = None
+        new = np.empty((len(voxels), 3), np.int64)
+        done = found = 0
+        while done < len(voxels):
+            done, self._blocks.count, found = mark_ends(
+                voxels, done, self._seen, self._blocks.count, new, found
+            )
+            if done < len(voxels):
+                self._grow()
+        if sighting is None:
+            return Marks(new[:found], np.zeros(len(voxels), np.int32))
+        return Marks(new[:found], self._observations.record(voxels, self._seen, sighting))
+
+    def set_normals(self, marks: Marks, normals: Doubles) -> None:
+        """Keep the unit ``normals`` [N, 3] of surfaces that were marked; NaN where unknown."""
+        self._observations.set_normals(marks.rows, normals)
+
+    def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
+        """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].
+
+        For evidence that was restored: a record tells of voxels only.
+        """
+        self._observations.set_discs(voxels, surfels, self._seen)
+
+    def carve(self, origin: Doubles, ends: Doubles, reach: Reach) -> Ints:
+        """Record the free space between ``origin`` [3] and ``ends`` [N, 3].
+
+        Args:
+            origin: sensor position, may lie outside the region.
+            ends: end points of the rays.
+            reach: how far the rays tell of what they cross.
+
+        Returns:
+            What :meth:`take_back` asks for: where rays passed a surface.
+        """
+        self._frozen = None
+        passed = np.zeros(len(self._observations.arrays.owners), np.int32)
+        done = 0
+        while done < len(ends):
+            done, self._blocks.count = mark_crossed(
+                origin,
+                ends,
+                done,
+                reach,
+                self._seen,
+                self._blocks.count,
+                self._observations.arrays,
+                passed,
+            )
+            if done < len(ends):
+                self._grow()
+        return passed[1 : 1 + passed[0]]
+
+    def take_back(self, passed: Ints, rule: Disbelief) -> Longs:
+        """Take back the surface of voxels that the rays of :meth:`carve` contradict.
+
+        Returns:
+            These voxels [M, 3]; they are free.
+        """
+        return take_back(passed, self._seen, self._observations.arrays, rule)
+
+    def take_back_unseen(self, passed: Ints, rule: Disbelief, field: SampleField) -> Longs:
+        """Take back the surface that rays crossed and that the field does not show either.
+
+        Args:
+            passed: where the rays of :meth:`carve` passed a surface.
+            rule: when a surface is gone.
+            field: in voxels; it has learnt from all rays around.
+
+        Returns:
+            Voxels [M, 3]; they are free.
+        """
+        seen, observed = self._seen, self._observations.arrays
+        rows = doubted(np.unique(passed), seen, observed, rule)
+        if len(rows):
+            rows = rows[field(middles(rows, seen, observed)).values > _FIELD_FREE]
+            self._frozen = None
+        return take_back_rows(rows, seen, observed)
+
+    def mark_free(self, voxels: Doubles) -> None:
+        """Record that ``voxels`` [N, 3] are free; those outside the region are left out."""
+        self._frozen = None
+        new = np.empty((len(voxels), 3), np.int64)
+        done = 0
+        while done < len(voxels):
+            free = self._seen._replace(surface=self._seen.free)
+            done, self._blocks.count, _ = mark_ends(voxels, done, free, self._blocks.count, new, 0)
+            if done < len(voxels):
+                self._grow()
+
+    def clear(self, low: Doubles, high: Doubles) -> None:
+        """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
+        self._frozen = None
+        corners = self._blocks.cells() * BLOCK_VOXELS
+        near = ((corners < high) & (corners + BLOCK_VOXELS > low)).all(axis=1)
+        offsets = np.stack(np.meshgrid(*[np.arange(BLOCK_VOXELS)] * 3, indexing="ij"), -1)
+        for row in np.flatnonzero(near):
+            centres = corners[row] + offsets + 0.5
+            kept = ~((centres > low) & (centres < high)).all(axis=-1)
+            keep = np.packbits(kept, axis=-1, bitorder="little").reshape(BLOCK_BYTES)
+            self._seen.surface[row] &= keep
+            self._seen.free[row] &= keep
+        self._observations.forget(np.flatnonzero(near), self._seen.surface[: self.blocks])
+
+    def freeze(self) -> FrozenEvidence:
+        """The evidence as it is now; the same object until anything changes."""
+        if self._frozen is None:
+            side, _, *masks = self._seen
+            surface, free = (mask[: self.blocks].copy() for mask in masks)
+            self._frozen = FrozenEvidence(
+                SeenVoxels(side, self._blocks.freeze(), surface, free),
+                self._observations.levels(surface),
+                self._observations.seen_s(self.blocks),
+            )
+        return self._frozen
+
+    @classmethod
+    def from_record(cls, side: int, record: EvidenceRecord) -> "LiveEvidence":
+        """The evidence of a record, of a region of ``side`` voxels."""
+        evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
+        evidence._blocks = VoxelIndex.of_cells(frozen.cells)
+        evidence._seen = frozen.seen
+        evidence._observations = Observations.restore(frozen.surface, frozen.levels, frozen.seen_s)
+        evidence._make_room()
+        return evidence
+
+    def _grow(self) -> None:
+        self._blocks.grow()
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Make room for as many blocks as the index has room for."""
+        side, _, *masks = self._seen
+        roomy = (with_room(mask, self._blocks.capacity) for mask in masks)
+        self._seen = SeenVoxels(side, self._blocks.arrays, *roomy)
+        self._observations.make_room(self._blocks.capacity)

@@ -1,0 +1,136 @@
+"""Surface that rays contradict is taken back; what is only missed at times stays."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from triquad_format.records.arrays import Doubles
+from triquad_map.compiled.evidence.carving import Reach
+from triquad_map.compiled.evidence.contradictions import Disbelief
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.observations import Sighting
+from triquad_map.compiled.surfels.surfel_map import surfel_voxels
+
+SIDE = 256
+DOUBT = np.log(0.01)
+RULE = Disbelief(3, own=DOUBT, around=3 * DOUBT, shared=np.log(0.02), witnessed=DOUBT / 2)
+SENSOR = np.array([20.3, 128.4, 128.6])
+WALL_X = 60.5
+
+
+class Watched:
+    """Evidence that takes in scans, as the server does."""
+
+    def __init__(self) -> None:
+        self.evidence = LiveEvidence(SIDE)
+        self.scans = 0
+
+    def scan(self, ends: Doubles, normal: Doubles | None = None, sensor: Doubles = SENSOR) -> int:
+        """Take in rays that end at ``ends`` [N, 3]; returns how many voxels were taken back."""
+        self.scans += 1
+        sighting = Sighting(sensor, 0.2, self.scans, scan=self.scans)
+        marks = self.evidence.mark_surface(ends, sighting)
+        passed = self.evidence.carve(sensor, ends, Reach(0.5, 2.5, self.scans))
+        gone = self.evidence.take_back(passed, RULE)
+        if normal is not None:
+            self.evidence.set_normals(marks, np.tile(normal, (len(ends), 1)))
+        return len(gone)
+
+    def believed(self, voxels: Doubles) -> float:
+        """Share of ``voxels`` [N, 3] that are surface."""
+        return float(self.evidence.freeze().ended_in(np.floor(voxels).astype(np.int64)).mean())
+
+
+def panel(rng: np.random.Generator, x: float, half: float = 8.0, count: int = 1500) -> Doubles:
+    """Random points on a square that faces the sensor."""
+    y, z = SENSOR[1:, None] + rng.uniform(-half, half, (2, count))
+    return np.stack([np.full(count, x), y, z], 1)
+
+
+def behind(ends: Doubles, x: float) -> Doubles:
+    """Where rays to ``ends`` arrive that go on to a plane at ``x``."""
+    return SENSOR + (ends - SENSOR) * ((x - SENSOR[0]) / (ends[:, :1] - SENSOR[0]))
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(3)
+
+
+def test_a_wall_through_which_rays_pass_is_taken_back(rng: np.random.Generator) -> None:
+    watched, facing = Watched(), np.array([1.0, 0, 0])
+    for _ in range(10):
+        watched.scan(panel(rng, WALL_X), facing)
+    wall = panel(rng, WALL_X, half=7.0)
+    assert watched.believed(wall) == 1.0
+    for _ in range(8):
+        watched.scan(behind(panel(rng, WALL_X), 120.0))
+    assert watched.believed(wall) < 0.01
+    frozen = watched.evidence.freeze()
+    assert (frozen.status(wall, reach=0.0) == 1).mean() > 0.99  # free
+
+
+def test_a_wall_that_rays_reach_stays_for_ever(rng: np.random.Generator) -> None:
+    watched, facing = Watched(), np.array([1.0, 0, 0])
+    for _ in range(100):
+        assert watched.scan(panel(rng, WALL_X + rng.normal(0, 0.05)), facing) == 0
+
+
+def test_it_comes_back_and_goes_again_each_time(rng: np.random.Generator) -> None:
+    watched, facing = Watched(), np.array([1.0, 0, 0])
+    wall = panel(rng, WALL_X, half=7.0)
+    for _ in range(3):
+        for _ in range(10):
+            watched.scan(panel(rng, WALL_X), facing)
+        assert watched.believed(wall) == 1.0
+        for _ in range(10):
+            watched.scan(behind(panel(rng, WALL_X), 120.0))
+        assert watched.believed(wall) < 0.02
+
+
+def test_ground_is_not_taken_back_by_rays_that_graze_it(rng: np.random.Generator) -> None:
+    watched, up = Watched(), np.array([0.0, 0, 1.0])
+    ground_z, first = SENSOR[2] - 8.3, None
+    for _ in range(60):
+        x = SENSOR[0] + rng.uniform(10, 200, 4000)
+        y = SENSOR[1] + rng.uniform(-10, 10, 4000)
+        z = ground_z + rng.normal(0, 0.05, 4000)
+        ends = np.stack([x, y, z], 1)
+        first = ends if first is None else first
+        watched.scan(ends, up)
+    assert first is not None
+    assert watched.believed(first) > 0.998
+
+
+@settings(max_examples=10, deadline=None)
+@given(share=st.floats(0.15, 0.9), seed=st.integers(0, 1000))
+def test_what_is_hit_and_missed_by_turns_stays(share: float, seed: int) -> None:
+    """A fence: of the rays to a voxel, this share ends there, and the others go on."""
+    rng, watched = np.random.default_rng(seed), Watched()
+    for _ in range(120):
+        ends = panel(rng, WALL_X, half=4.0, count=400)
+        through = rng.random(len(ends)) > share
+        ends[through] = behind(ends[through], 120.0)
+        watched.scan(ends)
+    assert watched.believed(panel(rng, WALL_X, half=3.0)) > 0.97
+
+
+def test_nothing_goes_while_no_ray_passes(rng: np.random.Generator) -> None:
+    watched = Watched()
+    watched.scan(panel(rng, WALL_X))
+    elsewhere = SENSOR + rng.uniform(-1, 1, (500, 3)) * (0, 30, 30) - (15, 0, 0)
+    for _ in range(200):
+        assert watched.scan(elsewhere) == 0
+
+
+def test_support_falls_while_a_surface_is_contradicted(rng: np.random.Generator) -> None:
+    watched = Watched()
+    for _ in range(30):
+        watched.scan(panel(rng, WALL_X, half=2.0), np.array([1.0, 0, 0]))
+    before = watched.evidence.freeze().levels.astype(float).mean()
+    watched.scan(behind(panel(rng, WALL_X, half=2.0), 120.0))
+    frozen = watched.evidence.freeze()
+    voxels = surfel_voxels(frozen.cells, frozen.surface, len(frozen.levels))
+    wall = voxels[:, 0] == int(WALL_X)
+    assert wall.any()
+    assert frozen.levels[wall].astype(float).mean() < before - 0.5

@@ -1,0 +1,185 @@
+"""A world that moves: what is gone disappears from the map, and with it all that hung on it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_world import settings
+from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.status import Status
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.surfels.surfel_map import surfel_voxels
+from triquad_server.epochs import Epoch
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.mesher import mesh_tile, tile_lattice
+from triquad_server.settings import MeshSettings, Settings
+from triquad_tools.simulation.lidar import Lidar
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.solids import Solid, box, half_space
+
+CENTRE, HALF = np.array([5.0, 0.5, 0.45]), np.array([0.6, 0.9, 0.45])
+BOX = box((5.0, 0.5, 0.45), (0.6, 0.9, 0.45))
+BOUNDS = (np.array([-9.0, -9, -1]), np.array([9.0, 9, 5]))
+STANDING = (
+    half_space(0.0),
+    box((8.0, 0.0, 2.0), (0.2, 8.0, 2.0)),
+    box((0.0, 7.0, 2.0), (8.0, 0.2, 2.0)),
+    box((0.0, -7.0, 2.0), (8.0, 0.2, 2.0)),
+)
+
+
+class Watched:
+    """A map of a place, which a sensor that moves to and fro keeps scanning."""
+
+    def __init__(self, chosen: Settings | None = None) -> None:
+        self.settings = chosen or settings(samples_per_ray=6.0)
+        self.mapper = Mapper("test", self.settings, "cpu")
+        self.scans = 0
+
+    def scan(self, *there: Solid, count: int, steps: int = 4) -> Epoch:
+        """Take in some scans of the place with what is ``there`` besides, and publish."""
+        scene = Scene((*STANDING, *there), BOUNDS)
+        for _ in range(count):
+            pose = np.eye(4)
+            pose[:3, 3] = (0.5 * np.sin(0.7 * self.scans), 0.3 * np.cos(self.scans), 1.4)
+            made = Lidar(columns=1024).scan(scene, pose, np.random.default_rng(self.scans))
+            self.mapper.ingest(made.points, pose, stamp_s=self.scans)
+            self.scans += 1
+            for _ in range(steps):
+                self.mapper.train()
+            if self.scans % 2 == 0:
+                self.mapper.publish()
+        return self.mapper.publish()
+
+    def restart(self) -> None:
+        """Go on from the record, as a server does that was started again."""
+        record = self.mapper.changes_since(None).record
+        bare = tuple(replace(region, training=None) for region in record.regions)
+        self.mapper = Mapper("test", self.settings, "cpu", replace(record, regions=bare))
+
+
+def surface_voxels(evidence: FrozenEvidence) -> Longs:
+    """Voxels [N, 3] in which surface is believed."""
+    return surfel_voxels(evidence.cells, evidence.surface, len(evidence.levels))
+
+
+def faces(count: int = 400) -> Doubles:
+    """Points [N, 3] on the faces of the box that the sensor sees, away from its edges."""
+    rng = np.random.default_rng(5)
+    points = CENTRE + 0.8 * HALF * rng.uniform(-1, 1, (count, 3))
+    points[: count // 2, 0] = CENTRE[0] - HALF[0]
+    points[count // 2 :, 2] = CENTRE[2] + HALF[2]
+    return points[(points[:, 2] > 0.3)]
+
+
+def share(epoch: Epoch, status: Status, front: bool = False) -> float:
+    """Share of the points on the box's faces, or on its front alone, that have a status."""
+    points = faces()
+    if front:  # the top is seen at a grazing angle
+        points = points[points[:, 0] < CENTRE[0] - 0.9 * HALF[0]]
+    return float((epoch.status(points) == status).mean())
+
+
+def mesh_area(epoch: Epoch) -> float:
+    """Area of the mesh where the box stood, square metres; the ground below is not counted."""
+    lattice, area = tile_lattice(MeshSettings(), 0), 0.0
+    low, high = CENTRE - HALF - 0.1, CENTRE + HALF + 0.1
+    low[2] = 0.25
+    for x, y, z in lattice.tiles_meeting(low[None], high[None]).tolist():
+        mesh = mesh_tile(epoch, (x, y, z), lattice)
+        a, b, c = (mesh.origin + mesh.vertices[mesh.faces[:, i]] for i in range(3))
+        middle = (a + b + c) / 3
+        inside = ((middle > low) & (middle < high)).all(axis=1)
+        area += 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1)[inside].sum())
+    return area
+
+
+def test_what_is_gone_leaves_nothing_behind() -> None:
+    watched = Watched()
+    before = watched.scan(BOX, count=8)
+    assert share(before, Status.SURFACE) > 0.95
+    assert mesh_area(before) > 1.0
+    assert mesh_area(watched.scan(count=10)) < 0.05
+    assert share(watched.scan(count=1), Status.FREE, front=True) > 0.95
+    after = watched.scan(count=30)
+    assert share(after, Status.FREE) > 0.9
+    assert mesh_area(after) < 0.05
+    nearest = after.nearest_surface(CENTRE[None], 2.0)
+    assert nearest.distance[0] > 0.4  # the ground, and no surfel of the box
+
+
+def test_the_field_learns_that_it_is_free_there() -> None:
+    watched = Watched()
+    watched.scan(BOX, count=8)
+    after = watched.scan(count=20)
+    free = faces()[faces()[:, 2] > 0.5]
+    assert np.median(after.query(free).sdf) > 0.1
+
+
+def test_no_ray_that_ended_there_is_trained_on_again() -> None:
+    watched = Watched()
+    watched.scan(BOX, count=8)
+    watched.scan(count=10)
+    region = max(watched.mapper.regions, key=lambda region: len(region.pool))
+    samples = region.pool.sample(len(region.pool))
+    points = samples.points.numpy() + region.centre
+    inside = (np.abs(points - CENTRE) < HALF - 0.25).all(axis=1)
+    assert (samples.labels.numpy()[inside] > 0).all()
+
+
+def test_what_stands_keeps_its_surface() -> None:
+    watched = Watched()
+    watched.scan(BOX, count=8)
+    first = watched.mapper.publish().frozen_regions[0].evidence
+    watched.scan(count=30)
+    now = watched.mapper.publish().frozen_regions[0]
+    voxels = surface_voxels(first)
+    centres = now.centre + (voxels + 0.5 - (1 << 7)) * 0.2
+    standing = Scene(STANDING, BOUNDS).sdf(centres) < 0.05
+    away = (np.abs(centres - CENTRE) > HALF + 0.4).any(axis=1)
+    assert now.evidence.ended_in(voxels[standing & away]).mean() > 0.997
+
+
+def test_it_returns_and_leaves_again() -> None:
+    watched = Watched()
+    for _ in range(3):
+        assert share(watched.scan(BOX, count=10), Status.SURFACE) > 0.9
+        left = watched.scan(count=10)
+        assert share(left, Status.SURFACE, front=True) < 0.02
+        assert share(watched.scan(count=15), Status.SURFACE) < 0.15
+
+
+def test_in_a_static_world_nothing_is_taken_back() -> None:
+    chosen = settings(samples_per_ray=6.0)
+    still = chosen.model_copy(update={"change": chosen.change.model_copy(update={"static": True})})
+    watched = Watched(still)
+    watched.scan(BOX, count=8)
+    assert share(watched.scan(count=10), Status.SURFACE) > 0.95
+
+
+def test_a_restored_map_stays_until_rays_contradict_it() -> None:
+    watched = Watched()
+    before = watched.scan(BOX, count=8)
+    voxels = surface_voxels(before.frozen_regions[0].evidence)
+    watched.restart()
+    assert watched.mapper.publish().frozen_regions[0].evidence.ended_in(voxels).all()
+    same = watched.scan(BOX, count=30).frozen_regions[0].evidence
+    assert same.ended_in(voxels).mean() > 0.997
+    watched.restart()
+    watched.mapper.publish()
+    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.15
+
+
+def test_confidence_falls_before_it_is_gone() -> None:
+    watched = Watched()
+    before = watched.scan(BOX, count=8, steps=40).nearest_surface(faces(), 0.3)
+    after = watched.scan(count=1, steps=0).nearest_surface(faces(), 0.3)
+    still = before.found & after.found
+    assert still.mean() > 0.5
+    assert after.confidence[still].mean() < before.confidence[still].mean() - 0.01
+
+
+@pytest.mark.parametrize(("key", "value"), [("scans", 0), ("doubt", 0.0), ("doubt", 1.0)])
+def test_settings_out_of_range_are_refused(key: str, value: float) -> None:
+    with pytest.raises(ValueError, match=key):
+        Settings.model_validate({"change": {key: value}})
