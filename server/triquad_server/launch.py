@@ -35,6 +35,7 @@ few milliseconds, which is Python's default for a single turn."""
 _QUICK_S = 3.0
 """Compiled code that is found on disk is ready by then."""
 
+_WARM_UP_SCANS = 6  # of rays that pass the sphere, until it is taken back
 _WARM_UP_DIRECTIONS = 400
 _WARM_UP_RADIUS_M = 3.0
 
@@ -150,7 +151,7 @@ def warm_up(
     teams: Teams | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Map and ask a made-up sphere, and forget it.
+    """Map and ask a made-up sphere, let it vanish, and forget it.
 
     Compiling takes a minute at the very first start; then the compiled code is found on disk.
     ``report`` is told what comes next.
@@ -165,7 +166,12 @@ def warm_up(
     mapper.ingest((directions * radius).astype(np.float32), np.eye(4))
     report("training")
     mapper.train()
+    mapper.publish()
+    report("what is gone")
+    for _ in range(_WARM_UP_SCANS):
+        mapper.ingest((2 * directions * radius).astype(np.float32), np.eye(4))
     epoch = mapper.publish()
+    Mapper("warm-up", settings, device, mapper.changes_since(None).record, teams).publish()
     report("queries")
     epoch.query(directions, gradient=True)
     distances(epoch, directions, DistanceOptions(unknown_distance=True))
