@@ -22,8 +22,12 @@ from triquad_server.settings import SOURCE_SECTION, Settings, setting_schemas
 
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
 
-_NUMBERS = {"integer": TypeAdapter[float](int), "number": TypeAdapter(float)}
-"""What reads text as a number, by the type in a setting's schema."""
+_READERS: dict[str, TypeAdapter[Any]] = {
+    "integer": TypeAdapter(int),
+    "number": TypeAdapter(float),
+    "boolean": TypeAdapter(bool),
+}
+"""What reads text, by the type in a setting's schema."""
 
 
 class _Sources(Settings, BaseSettings):
@@ -61,8 +65,8 @@ def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> 
     """
     sources = [
         _Source(f"settings file {file}", {} if file is None else _read_file(file)),
-        _Source("environment", _with_numbers(_read_environment())),
-        _Source("--set", _with_numbers(_parse_assignments(assignments))),
+        _Source("environment", _as_in_a_file(_read_environment())),
+        _Source("--set", _as_in_a_file(_parse_assignments(assignments))),
     ]
     merged: dict[str, Any] = {}
     for _, tables in sources:
@@ -97,7 +101,8 @@ def _merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 def _read_file(file: Path) -> dict[str, Any]:
     try:
         file.stat()  # a file that is missing would count as empty
-        return TomlConfigSettingsSource(_Sources, file)()
+        # As it is written: a call would take [Scan] for [scan], and of both drop one.
+        return TomlConfigSettingsSource(_Sources, file).toml_data
     except (OSError, ValueError, RecursionError) as error:
         raise SettingsError(f"settings file {file}: {error}") from error
 
@@ -126,14 +131,14 @@ def _parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     return tables
 
 
-def _with_numbers(tables: dict[str, Any]) -> dict[str, Any]:
-    """Tables of texts as a file would have them: those of numbers are read, where they can be."""
+def _as_in_a_file(tables: dict[str, Any]) -> dict[str, Any]:
+    """Tables of texts as a file would have them: what stands for another value is read."""
     schemas = setting_schemas()
 
-    def read(section: str, key: str, text: str) -> float | str:
-        numbers = _NUMBERS.get(schemas.get(section, {}).get(key, {}).get("type", "string"))
+    def read(section: str, key: str, text: str) -> Any:
+        reader = _READERS.get(schemas.get(section, {}).get(key, {}).get("type", "string"))
         try:
-            return numbers.validate_python(text) if numbers else text
+            return reader.validate_python(text) if reader else text
         except ValidationError:
             return text
 
@@ -174,6 +179,8 @@ def _problem(details: ErrorDetails, name: str) -> str:
         case "value_error":
             return str(details["ctx"]["error"])
         case "extra_forbidden" | "unexpected_keyword_argument":
+            if location[0] == "sources" and isinstance(details["input"], dict):
+                return _split_name(location, details["input"])
             return _unknown(location)
         case "model_type" | "dataclass_type":
             return f"{name} = {value} is not a section: write [{name}]"
@@ -183,13 +190,26 @@ def _problem(details: ErrorDetails, name: str) -> str:
             return f"{name} = {value}: use true or false"
         case "tuple_type" | "missing" | "too_long":
             return f"{name} = {value}: write two corners, [[x, y, z], [x, y, z]]"
-        case "greater_than_equal" | "less_than_equal":
+        case "greater_than_equal" | "less_than_equal" | "finite_number":
             return f"{name} = {value} is out of range: use {_allowed(location)}"
         case "int_type" | "float_type":
             quotes = ", without quotes" if isinstance(details["input"], str) else ""
             return f"{name} = {value} is of another type: use {_allowed(location)}{quotes}"
         case _:
             return f"{name} = {value}: {details['msg']}"
+
+
+def _split_name(location: tuple[int | str, ...], table: dict[str, Any]) -> str:
+    """That a table lies in the section of a source, where the points of a name cut it up."""
+    section, *parts = map(str, location)
+    while len(table) == 1 and isinstance(inner := next(iter(table.values())), dict):
+        parts.extend(table)
+        table = inner
+    name = ".".join(parts)
+    return (
+        f"{section}.{name} is no section: in a file, the name of a source that has points in it "
+        f'stands in quotes, [{section}."{name}"]'
+    )
 
 
 def _allowed(location: tuple[int | str, ...]) -> str:
