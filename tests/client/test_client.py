@@ -90,9 +90,16 @@ def test_a_router_without_maps_is_told_apart() -> None:
         triquad_client.connect(endpoint)
 
 
-def test_a_map_name_that_cannot_be_is_refused(endpoint: str) -> None:
-    with pytest.raises(InvalidInputError, match="map name"):
-        triquad_client.connect(endpoint, "a/b")
+@pytest.mark.parametrize("name", ["a/b", None])
+def test_a_map_name_that_cannot_be_is_refused(endpoint: str, name: Any) -> None:
+    with pytest.raises(InvalidInputError, match=f"map name {name!r}"):
+        triquad_client.connect(endpoint, name)
+
+
+@pytest.mark.parametrize("timeout_s", [10**400, -1, np.inf, "long"])
+def test_a_timeout_that_cannot_be_is_refused(endpoint: str, timeout_s: Any) -> None:
+    with pytest.raises(InvalidInputError, match="timeout_s = "):
+        triquad_client.connect(endpoint, timeout_s=timeout_s)
 
 
 def test_two_maps_on_one_network_do_not_disturb_each_other() -> None:
@@ -161,6 +168,7 @@ def test_points_that_are_no_scan_are_refused_here(client: Client, points: Any, t
         (np.diag([1.0, 1, -1, 1]), "not rigid"),
         (np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1.0]]), "transposed"),
         ("pose", "not a matrix"),
+        (np.full((4, 4), 10**400).tolist(), "not a matrix"),
     ],
 )
 def test_poses_that_are_not_rigid_are_refused_here(client: Client, pose: Any, text: str) -> None:
@@ -168,9 +176,9 @@ def test_poses_that_are_not_rigid_are_refused_here(client: Client, pose: Any, te
         client.publish_scan(CLOUD, pose)
 
 
-@pytest.mark.parametrize("stamp", [np.nan, np.inf, -1.0, 1e30])
-def test_stamps_that_are_no_time_are_refused_here(client: Client, stamp: float) -> None:
-    with pytest.raises(InvalidScanError, match="stamp"):
+@pytest.mark.parametrize("stamp", [np.nan, np.inf, -1.0, 1e30, 10**400, "now"])
+def test_stamps_that_are_no_time_are_refused_here(client: Client, stamp: Any) -> None:
+    with pytest.raises(InvalidScanError, match="stamp_s = "):
         client.publish_scan(CLOUD, POSE, stamp)
 
 
@@ -182,9 +190,10 @@ def test_time_that_runs_backwards_is_refused_here_per_source(client: Client) -> 
         client.publish_scan(CLOUD, POSE, 1000.4, "a")
 
 
-def test_sources_that_are_no_names_are_refused_here(client: Client) -> None:
-    with pytest.raises(InvalidScanError, match="source name 'a/b'"):
-        client.publish_scan(CLOUD, POSE, source="a/b")
+@pytest.mark.parametrize("source", ["a/b", "", None, 3])
+def test_sources_that_are_no_names_are_refused_here(client: Client, source: Any) -> None:
+    with pytest.raises(InvalidScanError, match=f"source name {source!r} .* use a text of 1 to 64"):
+        client.publish_scan(CLOUD, POSE, source=source)
 
 
 def test_lists_and_other_numbers_are_taken(client: Client) -> None:
@@ -210,19 +219,43 @@ def test_points_that_are_not_finite_are_refused_by_index(client: Client) -> None
 
 @pytest.mark.parametrize(
     "bounds",
-    [((0, 0), (1, 1)), ((1, 0, 0), (0, 1, 1)), ((np.nan, 0, 0), (1, 1, 1)), (1, 2, 3), 5],
+    [
+        ((0, 0), (1, 1)),
+        ((1, 0, 0), (0, 1, 1)),
+        ((np.nan, 0, 0), (1, 1, 1)),
+        ((0, 0, 0), (1, 1, 10**400)),
+        (1, 2, 3),
+        5,
+    ],
 )
 def test_bounds_that_are_no_box_are_refused_here(client: Client, bounds: Any) -> None:
     with pytest.raises(InvalidInputError, match="bounds"):
         client.mesh(bounds)
 
 
-@pytest.mark.parametrize("arguments", [(-1.0, 0), (1.0, -1)])
-def test_a_flush_of_negative_length_is_refused_here(
-    client: Client, arguments: tuple[float, int]
+@pytest.mark.parametrize(
+    ("timeout_s", "pending", "text"),
+    [
+        (-1.0, 0, "timeout_s = -1.0: use 0 to 1e\\+06"),
+        (1.0, -1, "pending = -1: use 0"),
+        (10**400, 0, "timeout_s = 1000.*000: use 0 to"),
+        ("long", 0, "timeout_s = 'long' is not a number"),
+    ],
+)
+def test_a_flush_that_cannot_be_waited_for_is_refused_here(
+    client: Client, timeout_s: Any, pending: int, text: str
 ) -> None:
-    with pytest.raises(InvalidInputError):
-        client.flush(*arguments)
+    with pytest.raises(InvalidInputError, match=text):
+        client.flush(timeout_s, pending)
+
+
+def test_however_long_a_settled_map_may_take_it_is_told_at_once(client: Client) -> None:
+    client.flush(servers.WAIT_S)
+    client.settle(servers.WAIT_S)
+    assert client.settle(10**400).settled
+    for bad in (np.nan, "long"):
+        with pytest.raises(InvalidInputError, match="timeout_s = "):
+            client.settle(bad)
 
 
 def test_far_coordinates_keep_their_precision(client: Client) -> None:

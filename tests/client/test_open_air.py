@@ -203,6 +203,8 @@ def test_an_organised_cloud_tells_its_empty_returns() -> None:
         (np.zeros((6, 3)), np.zeros((6, 3)), r"cloud: \[6, 3\] is not \[rows, columns, 3\]"),
         (np.zeros((2, 6, 3)), np.zeros((6, 2, 3)), r"cloud is \[2, 6, 3\] and directions are"),
         (np.zeros((2, 6, 3)), "up", "directions: not an array"),
+        (np.zeros((2, 6, 3)), np.full((2, 6, 3), 10**400).tolist(), "directions: not an array"),
+        (np.zeros((2, 6, 3)), np.full((2, 6, 3), "1"), "directions: not an array"),
     ],
 )
 def test_clouds_and_directions_that_do_not_fit_are_refused(
