@@ -135,6 +135,9 @@ def test_errors_name_the_environment(
         ("scan.range_min_m=nan", ["scan.range_min_m = nan", "use 0 to 1000 (number)"]),
         ("scan.range_min_m=inf", ["scan.range_min_m = inf", "use 0 to 1000 (number)"]),
         ("training.batch=nan", ["training.batch = 'nan'", "use 1 to 10000000 (integer)"]),
+        ("change.scans=0", ["change.scans = 0 is out of range: use 1 to 1000 (integer)"]),
+        ("change.doubt=0", ["change.doubt = 0.0 is out of range: use 1e-09 to 0.5 (number)"]),
+        ("change.doubt=1", ["change.doubt = 1.0 is out of range: use 1e-09 to 0.5 (number)"]),
         ("change.static=maybe", ["change.static = 'maybe'", "use true or false"]),
     ],
 )
