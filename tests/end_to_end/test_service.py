@@ -31,24 +31,6 @@ POSE = np.eye(4)
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
 
 
-@pytest.fixture
-def endpoint():
-    with servers.running_service() as endpoint:
-        yield endpoint
-
-
-@pytest.fixture
-def client(endpoint):
-    with triquad_client.connect(endpoint) as client:
-        yield client
-
-
-def learn(client, scans=2):
-    for _ in range(scans):
-        client.publish_scan(servers.sphere(), POSE)
-    return client.flush(servers.WAIT_S)
-
-
 def test_an_empty_map_answers_that_it_knows_nothing(client):
     result = client.query_sdf(PROBES, gradient=True)
     assert np.isnan(result.sdf).all()
@@ -60,7 +42,7 @@ def test_an_empty_map_answers_that_it_knows_nothing(client):
 
 def test_what_was_flushed_shows_in_the_next_answer(client):
     before = client.query_sdf(PROBES).epoch
-    report = learn(client)
+    report = servers.learn(client)
     assert (report.taken, report.refused, report.lost) == (2, 0, 0)
     result = client.query_sdf(servers.sphere(100))
     assert result.epoch > before
@@ -69,7 +51,7 @@ def test_what_was_flushed_shows_in_the_next_answer(client):
 
 
 def test_a_settled_map_has_learnt_the_surface(client):
-    learn(client, 4)
+    servers.learn(client, 4)
     status = client.settle(servers.WAIT_S)
     assert status.scans_taken == 4
     assert status.samples_trained > 0
@@ -116,21 +98,21 @@ def test_flush_ends_when_its_time_is_over(endpoint):
 
 
 def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client, endpoint):
-    learn(client)
+    servers.learn(client)
     probes = np.tile(PROBES, (1500, 1))  # 300 000 points: several requests
     stop = threading.Event()
 
     def publish():
         with triquad_client.connect(endpoint) as publisher:
             while not stop.is_set():
-                learn(publisher, 1)
+                servers.learn(publisher, 1)
 
     thread = threading.Thread(target=publish)
     thread.start()
     try:
         epochs = set()
         for _ in range(5):
-            learn(client, 1)  # returns once a new epoch is out
+            servers.learn(client, 1)  # returns once a new epoch is out
             result = client.query_sdf(probes)
             rows = result.sdf.reshape(1500, -1)
             # The part of a request in which a point travels moves its origin, by less than 1 um.
@@ -144,7 +126,7 @@ def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client,
 
 
 def test_many_threads_may_ask_at_once(client):
-    learn(client)
+    servers.learn(client)
     expected = client.query_sdf(PROBES, gradient=True)
     epoch = client.settle(servers.WAIT_S).epoch
     expected = client.query_sdf(PROBES, gradient=True)
@@ -173,7 +155,7 @@ def test_an_epoch_that_is_gone_is_told_apart(endpoint):
 
 
 def test_tiles_make_one_mesh(client):
-    learn(client)
+    servers.learn(client)
     client.settle(servers.WAIT_S)
     listed = client.tiles()
     assert len(listed.tiles) == len(listed.changed) > 1
@@ -191,7 +173,7 @@ def test_tiles_make_one_mesh(client):
 
 
 def test_meshes_are_cropped_to_bounds(client):
-    learn(client)
+    servers.learn(client)
     client.settle(servers.WAIT_S)
     whole = client.mesh()
     upper = client.mesh(((-10, -10, 0), (10, 10, np.inf)))
@@ -201,7 +183,7 @@ def test_meshes_are_cropped_to_bounds(client):
 
 
 def test_reset_forgets_a_box_or_everything(client):
-    learn(client)
+    servers.learn(client)
     epoch = client.reset(((0, -10, -10), (10, 10, 10)))
     points = servers.sphere(400)
     result = client.query_sdf(points)
@@ -211,11 +193,11 @@ def test_reset_forgets_a_box_or_everything(client):
     epoch = client.reset()
     assert client.status().regions == 0
     assert client.query_sdf(points).epoch >= epoch
-    assert learn(client, 1).taken == 3
+    assert servers.learn(client, 1).taken == 3
 
 
 def test_a_downloaded_map_is_the_map(client, tmp_path):
-    learn(client)
+    servers.learn(client)
     client.settle(servers.WAIT_S)
     path = tmp_path / "map.triquad"
     info = client.download_map(path)
@@ -253,7 +235,7 @@ def test_without_a_store_checkpoints_are_refused_and_the_status_says_so(client):
 
 def test_a_checkpoint_restores_the_same_answers(tmp_path):
     with servers.service_and_client(store=tmp_path) as client:
-        learn(client)
+        servers.learn(client)
         client.settle(servers.WAIT_S)
         info = client.checkpoint()
         assert client.checkpoint() == info
@@ -279,20 +261,20 @@ def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_pa
 
     with servers.running_service(store=tmp_path) as endpoint:
         with triquad_client.connect(endpoint) as client:
-            learn(client)
+            servers.learn(client)
         monkeypatch.setattr(Store, "write", reset_meanwhile)
     assert replies == [None]
 
 
 def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
     with servers.service_and_client(store=tmp_path) as client:
-        learn(client)
+        servers.learn(client)
         shutil.rmtree(tmp_path / servers.MAP)
         (tmp_path / servers.MAP).write_text("in the way")
         with pytest.raises(RefusedError, match="cannot be written"):
             client.checkpoint()
         assert "cannot be written" in client.status().store_error
-        assert learn(client, 1).taken == 3
+        assert servers.learn(client, 1).taken == 3
         (tmp_path / servers.MAP).unlink()
         (tmp_path / servers.MAP).mkdir()
         assert client.checkpoint().epoch > 0
@@ -338,7 +320,7 @@ def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
 
 
 def test_a_box_of_the_map_is_downloaded_without_the_rest(client, tmp_path):
-    learn(client)
+    servers.learn(client)
     client.settle(servers.WAIT_S)
     whole = client.download_map(tmp_path / "whole.triquad")
     low, high = (1.0, -4.5, -4.5), (4.5, 4.5, 4.5)
