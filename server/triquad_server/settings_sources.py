@@ -45,11 +45,15 @@ class _Source(NamedTuple):
     tables: dict[str, Any]
 
     def gives(self, location: tuple[int | str, ...]) -> bool:
-        """Whether the value at a section and key comes from here."""
-        section = self.tables.get(str(location[0])) if location else None
-        if len(location) < 2:
-            return section is not None
-        return isinstance(section, dict) and location[1] in section
+        """Whether the value at a section and key, or a part of it, comes from here."""
+        table: Any = self.tables
+        for part in location:
+            if not isinstance(table, dict):  # a list comes as a whole
+                break
+            if part not in table:
+                return False
+            table = table[part]
+        return bool(location)
 
 
 def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> Settings:
@@ -168,9 +172,13 @@ def _explain(details: ErrorDetails, sources: list[_Source]) -> str:
     """What is wrong with a setting, and what is right."""
     location = details["loc"]
     origins = [source.origin for source in sources if source.gives(location)]
-    # The last source has the last word.
-    prefix = f"{origins[-1]}: " if origins else ""
-    return prefix + _problem(details, ".".join(map(str, location)))
+    problem = _problem(details, ".".join(map(str, location)))
+    if not origins:
+        return problem
+    # The last source has the last word, and only a file has numbers beside text.
+    is_number = details["type"] in ("int_type", "float_type")
+    quoted = is_number and isinstance(details["input"], str) and origins == [sources[0].origin]
+    return f"{origins[-1]}: {problem}" + (", without quotes" if quoted else "")
 
 
 def _problem(details: ErrorDetails, name: str) -> str:
@@ -193,8 +201,7 @@ def _problem(details: ErrorDetails, name: str) -> str:
         case "greater_than_equal" | "less_than_equal" | "finite_number":
             return f"{name} = {value} is out of range: use {_allowed(location)}"
         case "int_type" | "float_type":
-            quotes = ", without quotes" if isinstance(details["input"], str) else ""
-            return f"{name} = {value} is of another type: use {_allowed(location)}{quotes}"
+            return f"{name} = {value} is of another type: use {_allowed(location)}"
         case _:
             return f"{name} = {value}: {details['msg']}"
 

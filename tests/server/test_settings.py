@@ -122,6 +122,19 @@ def test_errors_name_the_environment(
     assert all(word in str(error.value) for word in ["environment", *words])
 
 
+def test_errors_of_a_source_name_the_place_of_that_key(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[sources.roof]\nrange_max_m = '9'\nrobot_box_m = [[0, 0, 0], [1, 1, 99]]\n")
+    with pytest.raises(SettingsError) as error:
+        load_settings(path, ["sources.roof.no_return=false", "sources.roof.range_min_m=-1"])
+    wrong = str(error.value).split("; ")
+    assert [text.partition(" = ")[0] for text in wrong] == [
+        "--set: sources.roof.range_min_m",
+        f"settings file {path}: sources.roof.range_max_m",
+        f"settings file {path}: sources.roof.robot_box_m.1.2",
+    ]
+
+
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
@@ -144,6 +157,7 @@ def test_errors_name_the_environment(
 def test_errors_name_the_command_line(assignment: str, words: list[str]) -> None:
     with pytest.raises(SettingsError) as error:
         load_settings(assignments=[assignment])
+    assert "quotes" not in str(error.value)
     assert all(word in str(error.value) for word in ["--set", *words])
 
 
