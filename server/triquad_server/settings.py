@@ -1,6 +1,6 @@
 """Settings of the server: one record per section, with ranges and descriptions.
 
-:mod:`triquad_server.settings_sources` reads them from a file, the environment and the command line.
+:mod:`triquad_server.settings_loading` reads them from a file, the environment and the command line.
 """
 
 from typing import Annotated, Any

@@ -6,7 +6,7 @@ import pytest
 from triquad_format.errors import SettingsError
 from triquad_server import cli
 from triquad_server.settings import Settings, setting_schemas
-from triquad_server.settings_sources import load_settings, settings_toml
+from triquad_server.settings_loading import load_settings, settings_toml
 from triquad_server.source_settings import SourceSettings
 
 ROOT = Path(__file__).parents[2]

@@ -30,7 +30,7 @@ _READERS: dict[str, TypeAdapter[Any]] = {
 """What reads text, by the type in a setting's schema."""
 
 
-class _Sources(Settings, BaseSettings):
+class _NamedSettings(Settings, BaseSettings):
     """Settings with the names that they have in the environment."""
 
     model_config = SettingsConfigDict(
@@ -38,10 +38,10 @@ class _Sources(Settings, BaseSettings):
     )
 
 
-class _Source(NamedTuple):
+class _Origin(NamedTuple):
     """Settings from one place, as nested tables of values that are not checked yet."""
 
-    origin: str
+    name: str
     tables: dict[str, Any]
 
     def gives(self, location: tuple[int | str, ...]) -> bool:
@@ -67,18 +67,18 @@ def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> 
         SettingsError: the file cannot be read, or a setting is unknown, of the wrong type or out
             of range. The text names the setting, where it comes from and what is allowed.
     """
-    sources = [
-        _Source(f"settings file {file}", {} if file is None else _read_file(file)),
-        _Source("environment", _as_in_a_file(_read_environment())),
-        _Source("--set", _as_in_a_file(_parse_assignments(assignments))),
+    origins = [
+        _Origin(f"settings file {file}", {} if file is None else _read_file(file)),
+        _Origin("environment", _as_in_a_file(_read_environment())),
+        _Origin("--set", _as_in_a_file(_parse_assignments(assignments))),
     ]
     merged: dict[str, Any] = {}
-    for _, tables in sources:
+    for _, tables in origins:
         merged = _merged(merged, tables)
     try:
         return Settings.model_validate(merged)
     except ValidationError as error:
-        texts = [_explain(details, sources) for details in error.errors()]
+        texts = [_explain(details, origins) for details in error.errors()]
         raise SettingsError("; ".join(texts)) from error
 
 
@@ -106,7 +106,7 @@ def _read_file(file: Path) -> dict[str, Any]:
     try:
         file.stat()  # a file that is missing would count as empty
         # As it is written: a call would take [Scan] for [scan], and of both drop one.
-        return TomlConfigSettingsSource(_Sources, file).toml_data
+        return TomlConfigSettingsSource(_NamedSettings, file).toml_data
     except (OSError, ValueError, RecursionError) as error:
         raise SettingsError(f"settings file {file}: {error}") from error
 
@@ -116,7 +116,7 @@ def _read_environment() -> dict[str, Any]:
         section, delimiter, key = variable.removeprefix(_PREFIX).lower().partition(_DELIMITER)
         if variable.startswith(_PREFIX) and delimiter and section not in Settings.model_fields:
             raise SettingsError(f"environment: {variable}: {_unknown((section, key))}")
-    return EnvSettingsSource(_Sources)()
+    return EnvSettingsSource(_NamedSettings)()
 
 
 def _parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
@@ -168,17 +168,17 @@ def _with_values(table: Any) -> Any:
         return table
 
 
-def _explain(details: ErrorDetails, sources: list[_Source]) -> str:
+def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:
     """What is wrong with a setting, and what is right."""
     location = details["loc"]
-    origins = [source.origin for source in sources if source.gives(location)]
+    givers = [origin for origin in origins if origin.gives(location)]
     problem = _problem(details, ".".join(map(str, location)))
-    if not origins:
+    if not givers:
         return problem
-    # The last source has the last word, and only a file has numbers beside text.
+    # The last has the last word, and only a file has numbers beside text.
     is_number = details["type"] in ("int_type", "float_type")
-    quoted = is_number and isinstance(details["input"], str) and origins == [sources[0].origin]
-    return f"{origins[-1]}: {problem}" + (", without quotes" if quoted else "")
+    quoted = is_number and isinstance(details["input"], str) and givers == origins[:1]
+    return f"{givers[-1].name}: {problem}" + (", without quotes" if quoted else "")
 
 
 def _problem(details: ErrorDetails, name: str) -> str:
