@@ -12,8 +12,7 @@ from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 
 SIDE = 256
-DOUBT = np.log(0.01)
-RULE = Disbelief(3, own=DOUBT, around=3 * DOUBT, shared=np.log(0.02), witnessed=DOUBT / 2)
+RULE = Disbelief.of(scans=3, doubt=0.01)
 SENSOR = np.array([20.3, 128.4, 128.6])
 WALL_X = 60.5
 

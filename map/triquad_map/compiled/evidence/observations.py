@@ -75,39 +75,46 @@ def _sector(x: float, y: float) -> int:
 
 
 @kernel(inline="always")
-def _add_ray(shape: Floats, counts: Ints, end: Doubles, sighting: Sighting) -> None:
-    """Count a ray that ended at ``end`` [3] by how far and where the sensor was."""
+def _add_ray(row: int, end: Vector, sighting: Sighting, observed: Observed) -> None:
+    """Count a ray that ended at ``end``, voxels, by how far and where the sensor was."""
     origin = sighting.origin
     dx, dy, dz = origin[0] - end[0], origin[1] - end[1], origin[2] - end[2]
     square = (dx * dx + dy * dy + dz * dz) * (sighting.leaf_m / NEAR_M) ** 2
-    shape[WEIGHT] += np.float32(1 / (1 + square))
-    counts[SECTORS] |= 1 << _sector(dx, dy)
+    observed.shapes[row, WEIGHT] += np.float32(1 / (1 + square))
+    observed.counts[row, SECTORS] |= 1 << _sector(dx, dy)
 
 
-@kernel()
-def _add_end(shape: Floats, counts: Ints, end: Vector, scan: int) -> None:
-    """Count a ray that ended at a place in a voxel."""
-    is_first = shape[ENDS] == 0
-    if is_first:
+@kernel(inline="always")
+def _add_end(row: int, end: Vector, observed: Observed) -> None:
+    """Move the shape of the surface in a voxel by a ray that ended at a place in it."""
+    shapes = observed.shapes
+    count = min(shapes[row, ENDS] + np.float32(1), np.float32(_COUNTED_ENDS))
+    if count == 1:
         for axis in range(3):
-            shape[MEAN + axis] = end[axis]
-        shape[SPREAD] = 0
-    count = min(shape[ENDS] + 1, _COUNTED_ENDS)
-    shape[ENDS] = count
-    squared = 0.0
+            shapes[row, MEAN + axis] = end[axis]
+        shapes[row, SPREAD] = 0
+    shapes[row, ENDS] = count
+    squared = np.float32(0)
     for axis in range(3):
-        off = end[axis] - shape[MEAN + axis]
+        off = np.float32(end[axis]) - shapes[row, MEAN + axis]
         step = off / count
-        shape[MEAN + axis] += step
+        shapes[row, MEAN + axis] += step
         squared += off * (off - step)
-    shape[SPREAD] += (squared - shape[SPREAD]) / count
-    if counts[HIT_SCAN] != scan:
-        counts[HIT_SCAN] = scan
-        counts[HITS] += 1
-        if not is_first:  # else they passed while nothing was there
-            counts[EARLIER_PASSES] += counts[PASSES]
-            counts[EARLIER_MISSES] += counts[MISSES]
-        counts[PASS_SCANS] = counts[PASSES] = counts[MISSES] = 0
+    shapes[row, SPREAD] += (squared - shapes[row, SPREAD]) / count
+
+
+@kernel(inline="always")
+def _begin_hit(row: int, scan: int, observed: Observed) -> None:
+    """Count a scan of which a ray ended in a voxel: what passed before goes to its record."""
+    counts = observed.counts
+    if counts[row, HIT_SCAN] == scan:
+        return
+    counts[row, HIT_SCAN] = scan
+    counts[row, HITS] += 1
+    if observed.shapes[row, ENDS] > 0:  # else they passed while nothing was there
+        counts[row, EARLIER_PASSES] += counts[row, PASSES]
+        counts[row, EARLIER_MISSES] += counts[row, MISSES]
+    counts[row, PASS_SCANS] = counts[row, PASSES] = counts[row, MISSES] = 0
 
 
 @kernel()
@@ -150,11 +157,11 @@ def _record(
             observed.owners[row] = block << (3 * SHIFT) | voxel
             rows += 1
         found[i] = row
-        shape, counts = observed.shapes[row], observed.counts[row]
         observed.seen_s[place] = max(observed.seen_s[place], sighting.stamp_s)
-        _add_ray(shape, counts, voxels[i], sighting)
-        end = (voxels[i, 0] - x, voxels[i, 1] - y, voxels[i, 2] - z)
-        _add_end(shape, counts, end, sighting.scan)
+        end = (voxels[i, 0], voxels[i, 1], voxels[i, 2])
+        _add_ray(row, end, sighting, observed)
+        _begin_hit(row, sighting.scan, observed)
+        _add_end(row, (end[0] - x, end[1] - y, end[2] - z), observed)
     return len(voxels), places, rows
 
 
