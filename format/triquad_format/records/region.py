@@ -26,6 +26,9 @@ MAX_LEVEL = 7
 MAX_SEEN_S = (2**63 - 1) // 10**9
 """The latest time of a surface: stamps are nanoseconds below ``2**63``."""
 
+OUTCOME_BITS = (2, 4, 4)
+"""Bits of the codes that tell how often rays hit, passed and missed a surface voxel."""
+
 MAX_INTEGER = 32_639
 """Largest integer feature: its two bytes, both signed, reach no further."""
 
@@ -78,6 +81,12 @@ class Evidence:
     """[B] When a ray last ended in the block: whole seconds since 1970, by the stamps of scans.
 
     0 where none did or it is not known; ``None``: nowhere known.
+    """
+    outcomes: Bytes | None = None
+    """[S, 3] Codes of how often rays hit, passed and missed each surface voxel.
+
+    In the order of :func:`seen_voxels`. ``docs/map-file.md`` says what the codes stand for;
+    ``None``: not known.
     """
 
 
@@ -153,13 +162,22 @@ def masked(evidence: Evidence, mask: Bytes) -> Evidence:
     """The evidence of the voxels whose bit is set in ``mask`` [B, BLOCK_BYTES]."""
     surface, free = evidence.surface & mask, evidence.free & mask
     rows = np.flatnonzero((surface | free).any(axis=1))
-    levels, seen_s = evidence.levels, evidence.seen_s
-    if levels is not None:
+    levels, seen_s, outcomes = evidence.levels, evidence.seen_s, evidence.outcomes
+    if levels is not None or outcomes is not None:
         before, after = (
             np.unpackbits(bits, bitorder="little").astype(bool)
             for bits in (evidence.surface, surface)
         )
-        levels = levels[after[before]]
+        kept = after[before]
+        levels = None if levels is None else levels[kept]
+        outcomes = None if outcomes is None else outcomes[kept]
     if seen_s is not None:
         seen_s = np.where(surface.any(axis=1), seen_s, 0)[rows]
-    return Evidence(evidence.codes[rows], surface[rows], free[rows], levels=levels, seen_s=seen_s)
+    return Evidence(
+        evidence.codes[rows],
+        surface[rows],
+        free[rows],
+        levels=levels,
+        seen_s=seen_s,
+        outcomes=outcomes,
+    )
