@@ -6,6 +6,7 @@ level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a pl
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,10 +151,17 @@ def seen_voxels(evidence: Evidence, masks: Bytes) -> Longs:
     return blocks + inner
 
 
+def used_blocks(masks: Bytes) -> NDArray[np.intp]:
+    """Rows of ``masks`` [B, BLOCK_BYTES] with any bit set."""
+    # Of surface most rows are empty: they are of open air. Eight bytes at a time, by columns, takes
+    # a quarter of the time of ``any``.
+    return np.flatnonzero(reduce(np.bitwise_or, masks.view(np.uint64).T))
+
+
 def surface_counts(surface: Bytes) -> Longs:
     """Numbers [B] of surface voxels in blocks with these masks [B, BLOCK_BYTES]."""
     counts = np.zeros(len(surface), np.int64)
-    used = np.flatnonzero(surface.any(axis=1))  # the others are of open air
+    used = used_blocks(surface)
     counts[used] = _BITS_SET[surface[used]].sum(axis=1, dtype=np.int64)
     return counts
 

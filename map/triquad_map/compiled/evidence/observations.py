@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import surface_counts
+from triquad_format.records.region import surface_counts, used_blocks
 
 from triquad_map.compiled.evidence.levels import fill_levels
 from triquad_map.compiled.evidence.observed import (
@@ -231,8 +231,7 @@ class Observations:
 
     def levels(self, surface: Bytes) -> Bytes:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
-        # Most blocks are open air.
-        used = np.flatnonzero(surface.view(np.uint64).any(axis=1))
+        used = used_blocks(surface)
         surface, places = surface[used], self.arrays.places[used]
         levels = np.empty(int(surface_counts(surface).sum()), np.uint8)
         fill_levels(surface, self.arrays._replace(places=places), levels)
@@ -240,7 +239,7 @@ class Observations:
 
     def outcomes(self, surface: Bytes) -> Bytes:
         """Codes [S, 3] of what became of rays at each voxel set in ``surface``, in their order."""
-        used = np.flatnonzero(surface.view(np.uint64).any(axis=1))
+        used = used_blocks(surface)
         ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
         rows = self.arrays.rows[self.arrays.places[used]][ended]
         return outcome_codes(self.arrays.counts[rows][:, _RECORD])
@@ -263,7 +262,7 @@ class Observations:
 
         ``outcomes`` are the codes [S, 3] of what became of rays; ``None``: not known.
         """
-        used = np.flatnonzero(surface.any(axis=1))
+        used = used_blocks(surface)
         places = slice(1, 1 + len(used))
         ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
         rows = slice(1, 1 + len(levels))
