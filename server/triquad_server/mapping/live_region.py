@@ -264,7 +264,7 @@ class LiveRegion:
             labels=samples.labels,
             budget_samples=self.budget_samples,
         )
-        return region_record(self.index, self.field, self.evidence.freeze(), training=state)
+        return region_record(self.index, self.field, self.evidence, training=state)
 
     def _forget_gone(self, surfels: SurfelMap) -> None:
         """Unlearn the surface that was taken back: its rays, and what the field shows there."""

@@ -175,13 +175,20 @@ class LiveEvidence:
             )
         return self._frozen
 
+    def record(self) -> EvidenceRecord:
+        """The evidence as the map file holds it, with what to go on from it takes."""
+        frozen = self.freeze()
+        return frozen.record(self._observations.outcomes(frozen.surface))
+
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "LiveEvidence":
         """The evidence of a record, of a region of ``side`` voxels."""
         evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
         evidence._seen = frozen.seen
-        evidence._observations = Observations.restore(frozen.surface, frozen.levels, frozen.seen_s)
+        evidence._observations = Observations.restore(
+            frozen.surface, frozen.levels, frozen.seen_s, outcomes=record.outcomes
+        )
         evidence._make_room()
         return evidence
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import surface_counts
+from triquad_format.records.region import surface_counts, used_blocks
 
 from triquad_map.compiled.evidence.levels import fill_levels
 from triquad_map.compiled.evidence.observed import (
@@ -29,6 +29,7 @@ from triquad_map.compiled.evidence.observed import (
     Vector,
     row_of,
 )
+from triquad_map.compiled.evidence.outcomes import outcome_codes, outcome_counts
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (
@@ -51,7 +52,9 @@ _MIN_ROWS = 1024
 _DISC = int(SurfelKind.DISC)
 _DISC_ENDS, _DISC_SPREAD = 16.0, 0.15  # that a disc of the field stands for
 
-_RESTORED_HITS = 8  # of a voxel whose record is not in the file
+_RECORD = [HITS, EARLIER_PASSES, EARLIER_MISSES]
+"""What files keep of a voxel's record."""
+
 _COUNTED_ENDS = 64
 """Of a voxel; the shape that further ones give counts as that of so many."""
 
@@ -235,12 +238,18 @@ class Observations:
 
     def levels(self, surface: Bytes) -> Bytes:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
-        # Most blocks are open air.
-        used = np.flatnonzero(surface.view(np.uint64).any(axis=1))
+        used = used_blocks(surface)
         surface, places = surface[used], self.arrays.places[used]
         levels = np.empty(int(surface_counts(surface).sum()), np.uint8)
         fill_levels(surface, self.arrays._replace(places=places), levels)
         return levels
+
+    def outcomes(self, surface: Bytes) -> Bytes:
+        """Codes [S, 3] of what became of rays at each voxel set in ``surface``, in their order."""
+        used = used_blocks(surface)
+        ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
+        rows = self.arrays.rows[self.arrays.places[used]][ended]
+        return outcome_codes(self.arrays.counts[rows][:, _RECORD])
 
     def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
@@ -253,9 +262,14 @@ class Observations:
         self.arrays.rows[places] *= kept
 
     @classmethod
-    def restore(cls, surface: Bytes, levels: Bytes, seen_s: Longs) -> "Observations":
-        """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels."""
-        used = np.flatnonzero(surface.any(axis=1))
+    def restore(
+        cls, surface: Bytes, levels: Bytes, seen_s: Longs, *, outcomes: Bytes | None
+    ) -> "Observations":
+        """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels.
+
+        ``outcomes`` are the codes [S, 3] of what became of rays; ``None``: not known.
+        """
+        used = used_blocks(surface)
         places = slice(1, 1 + len(used))
         ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
         rows = slice(1, 1 + len(levels))
@@ -273,7 +287,9 @@ class Observations:
         known = levels > 0
         arrays.shapes[rows, WEIGHT] = known * LEAST_STRENGTH * 2.0 ** (levels - 1.0)
         arrays.counts[rows, SECTORS] = known
-        arrays.counts[rows, HITS] = _RESTORED_HITS
+        if outcomes is None:
+            outcomes = np.zeros((len(levels), len(_RECORD)), np.uint8)
+        arrays.counts[rows, _RECORD] = outcome_counts(outcomes)
         observations = cls(len(surface))
         observations._places, observations._rows = 1 + len(used), 1 + len(levels)
         observations.arrays = arrays
