@@ -137,16 +137,18 @@ def _around(row: int, seen: SeenVoxels, observed: Observed) -> Around:
 def _goes_along(counts: Ints, around: Around, rule: Disbelief) -> bool:
     """Whether a surface goes since those around it are gone.
 
-    Where two thirds of them are, no ray need have passed it: a thing goes as a whole.
+    A thing goes as a whole: no ray need pass each of its voxels. What has a record of its own goes
+    only if that speaks for it, or if no ray passed and two thirds are gone.
     """
-    if around.gone < _LEAST_GONE:
-        return bool(0 < around.gone == around.known and counts[PASS_SCANS] >= rule.scans)
-    if 3 * around.gone >= 2 * around.known:
-        return True
-    if 2 * around.gone < around.known:
+    if around.gone == 0 or 2 * around.gone < around.known:
+        return False
+    all_gone = around.gone == around.known and counts[PASS_SCANS] >= rule.scans
+    if around.gone < _LEAST_GONE and not all_gone:
         return False
     if counts[HITS] < _OWN_RECORD_HITS:
         return True
+    if counts[PASSES] == 0:  # which says nothing either way
+        return bool(3 * around.gone >= 2 * around.known)
     share = (counts[EARLIER_PASSES] + 0.5) / (counts[HITS] + counts[EARLIER_PASSES] + 1.0)
     return bool(counts[PASSES] * np.log(share) <= rule.shared)
 
