@@ -201,7 +201,7 @@ def fence_voxels(epoch: Epoch) -> Longs:
 
 def test_a_restored_fence_is_not_doubted_like_a_wall() -> None:
     watched = Watched()
-    fence = fence_voxels(watched.scan(*BARS, count=40, steps=1))
+    fence = fence_voxels(watched.scan(*BARS, count=60, steps=1))
     assert len(fence) > 100
     mapper, scans = watched.mapper, watched.scans
 
