@@ -24,6 +24,7 @@ from triquad_map.compiled.evidence.observed import (
     SECTORS,
     SHAPE_COLUMNS,
     SPREAD,
+    TOWARDS,
     WEIGHT,
     Observed,
     Vector,
@@ -81,16 +82,17 @@ def _add_ray(shape: Floats, counts: Ints, end: Doubles, sighting: Sighting) -> N
     dx, dy, dz = origin[0] - end[0], origin[1] - end[1], origin[2] - end[2]
     square = (dx * dx + dy * dy + dz * dz) * (sighting.leaf_m / NEAR_M) ** 2
     shape[WEIGHT] += np.float32(1 / (1 + square))
+    shape[TOWARDS], shape[TOWARDS + 1], shape[TOWARDS + 2] = dx, dy, dz
     counts[SECTORS] |= 1 << _sector(dx, dy)
 
 
 @kernel()
 def _add_end(shape: Floats, counts: Ints, end: Vector, scan: int) -> None:
-    """Count a ray that ended at a place in a voxel."""
+    """Count a ray that ended at a place in a voxel; the first begins its shape anew."""
     is_first = shape[ENDS] == 0
     if is_first:
         for axis in range(3):
-            shape[MEAN + axis] = end[axis]
+            shape[MEAN + axis], shape[NORMAL + axis] = end[axis], 0
         shape[SPREAD] = 0
     count = min(shape[ENDS] + 1, _COUNTED_ENDS)
     shape[ENDS] = count
@@ -177,6 +179,8 @@ def _set_discs(
 ) -> None:
     for i in range(len(voxels)):
         shape = observed.shapes[row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])]
+        if shape[ENDS] != 0:  # rays have told since
+            continue
         is_disc = kinds[i] == _DISC
         for axis in range(3):
             shape[MEAN + axis] = offsets[i, axis] + 0.5 if is_disc else np.nan

@@ -13,7 +13,8 @@ NORMAL = 3  # and the two after it: of the surface; 0 where it is not known or n
 SPREAD = 6  # mean squared distance of the ends from their middle, voxels
 ENDS = 7  # rays that ended there, up to _COUNTED_ENDS
 WEIGHT = 8  # rays, the near ones counting more
-SHAPE_COLUMNS = 9
+TOWARDS = 9  # and the two after it: from the last end to the sensor, voxels
+SHAPE_COLUMNS = 12
 
 HIT_SCAN = 0  # the last scan of which a ray ended there
 HITS = 1  # scans of which rays ended there
