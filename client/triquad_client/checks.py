@@ -5,6 +5,8 @@ What cannot be is refused with :class:`InvalidInputError`, of scans with :class:
 
 import math
 import operator
+import reprlib
+import time
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -22,6 +24,10 @@ Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
 
 FARTHEST_M = 1e9
+LONGEST_S = 1e6  # that a request may take
+_NO_NUMBER = (TypeError, ValueError, OverflowError)
+"""What conversions raise: Python's integers may be larger than any float."""
+
 _MAX_CELLS = 100_000_000  # of a grid
 
 
@@ -70,7 +76,7 @@ def rigid_pose(world_from_sensor: ArrayLike) -> Doubles:
     """A pose [4, 4] as float64: a rotation and a translation, within 1e-3."""
     try:
         pose = np.asarray(world_from_sensor, np.float64)
-    except (TypeError, ValueError) as error:
+    except _NO_NUMBER as error:
         raise InvalidScanError(f"world_from_sensor is not a matrix: {error}") from error
     if pose.shape != (4, 4):
         raise InvalidScanError(f"world_from_sensor is {list(pose.shape)}, not [4, 4]")
@@ -92,9 +98,18 @@ def rigid_pose(world_from_sensor: ArrayLike) -> Doubles:
 
 def stamp_ns(stamp_s: float) -> int:
     """A stamp in seconds since 1970 as nanoseconds."""
-    if not math.isfinite(stamp_s) or not 0 <= stamp_s < 2**63 / 1e9:
-        raise InvalidScanError(f"stamp_s = {stamp_s!r} is not a time in seconds since 1970")
-    return round(stamp_s * 1e9)
+    try:
+        seconds = _number(stamp_s)
+    except _NO_NUMBER:
+        seconds = math.nan
+    if not 0 <= seconds < 2**63 / 1e9:
+        raise InvalidScanError(f"stamp_s = {_shown(stamp_s)} is not a time in seconds since 1970")
+    return round(seconds * 1e9)
+
+
+def deadline(timeout_s: float) -> float:
+    """When so many seconds from now are over, on the monotonic clock; they may be infinite."""
+    return time.monotonic() + within("timeout_s", timeout_s, math.inf, least=-math.inf)
 
 
 def chosen_epoch(at_epoch: int | None, name: str = "at_epoch") -> int:
@@ -106,9 +121,11 @@ def chosen_epoch(at_epoch: int | None, name: str = "at_epoch") -> int:
             raise TypeError("a truth value")
         number = operator.index(at_epoch)
     except TypeError as error:
-        raise InvalidInputError(f"{name} = {at_epoch!r} is not the number of an epoch") from error
+        raise InvalidInputError(
+            f"{name} = {_shown(at_epoch)} is not the number of an epoch"
+        ) from error
     if not 0 < number < 2**63:
-        raise InvalidInputError(f"{name} = {at_epoch!r}: epochs are numbered from 1 on")
+        raise InvalidInputError(f"{name} = {_shown(at_epoch)}: epochs are numbered from 1 on")
     return number
 
 
@@ -118,8 +135,8 @@ def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
         return np.full(3, -np.inf), np.full(3, np.inf)
     try:
         minimum, maximum = (np.asarray(corner, np.float64) for corner in bounds)
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"bounds = {bounds!r}: give (minimum, maximum)") from error
+    except _NO_NUMBER as error:
+        raise InvalidInputError(f"bounds = {_shown(bounds)}: give (minimum, maximum)") from error
     if minimum.shape != (3,) or maximum.shape != (3,):
         raise InvalidInputError(f"bounds = {bounds!r}: each corner has three coordinates")
     if not (minimum <= maximum).all():
@@ -130,7 +147,7 @@ def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
 def level_of_detail(level: int) -> int:
     """``level`` where the mesh has such a level of detail."""
     if type(level) is not int or not 0 <= level < LEVELS:
-        raise InvalidInputError(f"level = {level!r}: use 0 to {LEVELS - 1}")
+        raise InvalidInputError(f"level = {_shown(level)}: use 0 to {LEVELS - 1}")
     return level
 
 
@@ -179,11 +196,11 @@ def within(
 ) -> float:
     """A number from ``least`` to ``most``."""
     try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"{name} = {value!r} is not a number") from error
+        number = _number(value)
+    except _NO_NUMBER as error:
+        raise InvalidInputError(f"{name} = {_shown(value)} is not a number") from error
     if not least <= number <= most:
-        raise InvalidInputError(f"{name} = {value!r}: use {least:g} to {most:g}")
+        raise InvalidInputError(f"{name} = {_shown(value)}: use {least:g} to {most:g}")
     return number
 
 
@@ -191,7 +208,7 @@ def radii(values: ArrayLike, count: int) -> Floats:
     """Radii [count], from as many or a single one."""
     try:
         array = np.broadcast_to(np.asarray(values, np.float32), (count,))
-    except (TypeError, ValueError) as error:
+    except _NO_NUMBER as error:
         raise InvalidInputError(f"radii_m are not one number or {count}: {error}") from error
     bad = ~((array >= 0) & (array <= MAX_DISTANCE_M))
     if bad.any():
@@ -214,25 +231,59 @@ def directions(vectors: ArrayLike) -> Doubles:
 
 def ray_origins(origins: ArrayLike, count: int) -> Doubles:
     """Origins [count, 3], from as many or a single one."""
-    given = np.asarray(origins)
-    places = query_points(given[None] if given.shape == (3,) else given)
+    try:
+        is_one = np.shape(origins) == (3,)
+    except ValueError:  # rows of different lengths, which are refused below
+        is_one = False
+    places = query_points(np.asarray(origins)[None] if is_one else origins)
     if len(places) not in (1, count):
         raise InvalidInputError(f"{len(places)} origins for {count} directions: one, or as many")
     return np.broadcast_to(places, (count, 3))
+
+
+def organised(name: str, values: ArrayLike) -> Doubles:
+    """An array [rows, columns, 3] as float64; values that are not finite may be in it."""
+    try:
+        array = _real_numbers(values, np.float64)
+    except _NO_NUMBER as error:
+        raise InvalidScanError(f"{name}: not an array of real numbers: {error}") from error
+    if array.ndim != 3 or array.shape[2] != 3:
+        raise InvalidScanError(f"{name}: {list(array.shape)} is not [rows, columns, 3]")
+    return array
 
 
 def _points(
     points: ArrayLike, dtype: Any, error: type[InvalidInputError], *, what: str = "points"
 ) -> NDArray[Any]:
     try:
-        array = np.asarray(points)
-        if array.dtype.kind not in "fiu":
-            raise TypeError(f"dtype {array.dtype} is not one of real numbers")
-        array = array.astype(dtype, copy=False)
-    except (TypeError, ValueError) as cause:
+        array = _real_numbers(points, dtype)
+    except _NO_NUMBER as cause:
         raise error(f"{what} are not an array [N, 3] of real numbers: {cause}") from cause
     if array.size == 0 and array.ndim == 1:
         array = array.reshape(0, 3)
     if array.ndim != 2 or array.shape[1] != 3:
         raise error(f"{what} are {list(array.shape)}, not [N, 3]")
     return array
+
+
+def _real_numbers(values: ArrayLike, dtype: Any) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"dtype {array.dtype} is not one of real numbers")
+    return array.astype(dtype, copy=False)
+
+
+def _number(value: Any) -> float:
+    """``value`` as a float; an integer that is too large for one is infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
+def _shown(value: Any) -> str:
+    """``value`` for a text, cut short; Python does not write integers of thousands of digits."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:
+        return f"an integer of {value.bit_length()} bits"

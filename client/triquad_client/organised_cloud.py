@@ -1,9 +1,10 @@
 """Organised clouds, in which a ray without a return has its place too."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
 
+from triquad_client import checks
 from triquad_client.errors import InvalidScanError
 
 
@@ -22,7 +23,7 @@ def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:
     Raises:
         InvalidScanError: the two are not arrays of one shape.
     """
-    points, rays = _organised("cloud", cloud), _organised("directions", directions)
+    points, rays = checks.organised("cloud", cloud), checks.organised("directions", directions)
     if points.shape != rays.shape:
         raise InvalidScanError(
             f"cloud is {list(points.shape)} and directions are {list(rays.shape)}: give the "
@@ -31,14 +32,3 @@ def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:
     empty = np.isnan(points).any(axis=-1) | (points == 0).all(axis=-1)
     of_empty: Doubles = rays[empty]
     return of_empty
-
-
-def _organised(what: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Values [rows, columns, 3] as float64."""
-    try:
-        array = np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InvalidScanError(f"{what}: not an array of real numbers: {error}") from error
-    if array.ndim != 3 or array.shape[2] != 3:
-        raise InvalidScanError(f"{what}: {list(array.shape)} is not [rows, columns, 3]")
-    return array

@@ -69,7 +69,7 @@ def _exit_code(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from triquad_server.net.session import NetworkOptions
-    from triquad_server.settings_sources import load_settings, settings_toml
+    from triquad_server.settings_loading import load_settings, settings_toml
     from triquad_server.stop import Stop, Stops
 
     check_name("map", options.map)

@@ -1,6 +1,6 @@
 """Settings of the server: one record per section, with ranges and descriptions.
 
-:mod:`triquad_server.settings_sources` reads them from a file, the environment and the command line.
+:mod:`triquad_server.settings_loading` reads them from a file, the environment and the command line.
 """
 
 from typing import Annotated, Any
@@ -10,7 +10,7 @@ from triquad_format.errors import FormatError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
-from triquad_server.source_settings import SourceSettings, check_box
+from triquad_server.source_settings import SourceSettings, check_robot_box
 
 _RECORD = ConfigDict(
     frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
@@ -38,7 +38,7 @@ class ScanSettings(BaseModel):
     """Nearer points are dropped."""
 
     range_max_m: Annotated[float, Field(ge=0, le=1e4)] = 50.0
-    """So far reach rays: farther points are dropped, and the space up to this range is free, as
+    """How far rays reach: farther points are dropped, and the space up to this range is free, as
     on rays without a return. At least `range_min_m`."""
 
     thin_m: Annotated[float, Field(ge=1e-3, le=10)] = 0.05
@@ -129,7 +129,8 @@ class ChangeSettings(BaseModel):
     """Scans in a row, at least, of which rays pass where a surface was, and none ends there."""
 
     doubt: Annotated[float, Field(ge=1e-9, le=0.5)] = 0.01
-    """So improbable must that be, by how often rays ended and passed there before."""
+    """How probable such rays may be, at most, if the surface were still there: told by how often
+    rays ended and passed there before."""
 
 
 class MeshSettings(BaseModel):
@@ -262,7 +263,7 @@ class Settings(BaseModel):
             _check_range(section, scan)
             self._check_reach(section, scan)
             if source.robot_box_m is not None:
-                check_box(f"{section}.robot_box_m", source.robot_box_m, self.field.leaf_m)
+                check_robot_box(f"{section}.robot_box_m", source.robot_box_m, self.field.leaf_m)
         return self
 
     def scan_of(self, source: SourceSettings) -> ScanSettings:

@@ -28,7 +28,7 @@ class SourceSettings(BaseModel):
     """Nearer points are dropped; by default as in `[scan]`."""
 
     range_max_m: Annotated[float, Field(ge=0, le=1e4)] | None = None
-    """So far reach rays; by default as in `[scan]`."""
+    """How far rays reach; by default as in `[scan]`."""
 
     no_return: bool = True
     """Whether rays of which a scan says that they met nothing are believed."""
@@ -42,7 +42,7 @@ ANY_SOURCE = SourceSettings()
 """Of a source that has no section."""
 
 
-def check_box(name: str, box: Box, leaf_m: float) -> None:
+def check_robot_box(name: str, box: Box, leaf_m: float) -> None:
     """Refuse a box that holds nothing, or very many voxels of side ``leaf_m``.
 
     Raises:

@@ -64,6 +64,10 @@ def test_a_source_that_is_not_believed_shows_nothing() -> None:
         client.publish_scan(NOTHING, POSE, source="glassy", no_return=UP)
         report = client.flush(servers.WAIT_S)
         assert (report.taken, report.refused) == (1, 1)
+        assert report.last_refusal is not None
+        assert "1 rays without a return are not believed" in report.last_refusal
+        assert "no_return = false" in report.last_refusal
+        assert client.status().points_dropped == {"no_return": 1}
         assert statuses(client, [[0, 0, 3], [2, 0, 0]]) == [Status.UNKNOWN, Status.FREE]
 
 
@@ -161,7 +165,7 @@ def test_what_is_no_direction_is_refused_here(no_return: Any, text: str) -> None
     [
         (np.array([[0, 0, 1], [0, 0, 0]], np.float32), ["direction 1", "length"]),
         (np.array([[np.nan, 0, 1]], np.float32), ["direction 0", "finite"]),
-        (np.ones((499_600, 3), np.float32), ["500100", "limit of 500000"]),
+        (np.ones((499_600, 3), np.float32), ["500100", "scan.max_points = 500000"]),
     ],
 )
 def test_what_is_no_direction_is_refused_by_the_server(
@@ -203,6 +207,8 @@ def test_an_organised_cloud_tells_its_empty_returns() -> None:
         (np.zeros((6, 3)), np.zeros((6, 3)), r"cloud: \[6, 3\] is not \[rows, columns, 3\]"),
         (np.zeros((2, 6, 3)), np.zeros((6, 2, 3)), r"cloud is \[2, 6, 3\] and directions are"),
         (np.zeros((2, 6, 3)), "up", "directions: not an array"),
+        (np.zeros((2, 6, 3)), np.full((2, 6, 3), 10**400).tolist(), "directions: not an array"),
+        (np.zeros((2, 6, 3)), np.full((2, 6, 3), "1"), "directions: not an array"),
     ],
 )
 def test_clouds_and_directions_that_do_not_fit_are_refused(

@@ -84,10 +84,10 @@ def test_an_epoch_may_be_any_integer(client: Client) -> None:
 
 def test_the_other_client_pins_alike() -> None:
     with servers.running_service(SETTINGS) as endpoint:
-        asyncio.run(asyncio.wait_for(pin_with(endpoint), servers.WAIT_S))
+        asyncio.run(asyncio.wait_for(assert_pinned_stays(endpoint), servers.WAIT_S))
 
 
-async def pin_with(endpoint: str) -> None:
+async def assert_pinned_stays(endpoint: str) -> None:
     with triquad_client.connect(endpoint) as learner:
         await asyncio.to_thread(learn_more, learner)
         async with triquad_client.connect_async(endpoint) as client:

@@ -16,23 +16,6 @@ EAST = ((1, -9, -9), (9, 9, 9))
 WEST = ((-9, -9, -9), (-1, 9, 9))
 
 
-@pytest.fixture
-def endpoint():
-    with servers.running_service() as endpoint:
-        yield endpoint
-
-
-@pytest.fixture
-def client(endpoint):
-    with triquad_client.connect(endpoint) as client:
-        yield client
-
-
-def learn(client, pose=POSE):
-    client.publish_scan(servers.sphere(), pose)
-    client.flush(servers.WAIT_S)
-
-
 def kinds(report):
     return {box.kind for box in report.boxes}
 
@@ -52,7 +35,7 @@ def test_a_program_polls_with_the_report_before(client):
     start = client.changes()
     assert start.boxes == ()
     assert start.epoch == start.since == client.status().epoch
-    learn(client)
+    servers.learn(client)
     report = client.changes(since=start)
     assert report.since == start.epoch < report.epoch
     assert kinds(report) == {ChangeKind.APPEARED}
@@ -70,14 +53,14 @@ def test_a_program_polls_with_the_report_before(client):
 
 
 def test_what_is_forgotten_has_vanished_and_appears_again(client):
-    learn(client)
+    servers.learn(client)
     start = client.changes()
     forgotten = client.reset(EAST)
     gone = client.changes(since=start)
     assert kinds(gone) == {ChangeKind.VANISHED}
     assert {box.epoch for box in gone.boxes} == {forgotten}
     assert all(box.minimum[0] >= 1 - 1e-9 for box in gone.boxes)
-    learn(client)
+    servers.learn(client)
     again = client.changes(since=gone)
     assert kinds(again) == {ChangeKind.APPEARED}
     assert voxels(again) == voxels(gone)
@@ -86,7 +69,7 @@ def test_what_is_forgotten_has_vanished_and_appears_again(client):
 
 def test_bounds_leave_out_what_changed_elsewhere(client):
     start = client.changes()
-    learn(client)
+    servers.learn(client)
     everywhere = client.changes(start)
     east, west = client.changes(start, EAST), client.changes(start, bounds=WEST)
     assert 0 < voxels(east) < voxels(everywhere)
@@ -143,7 +126,7 @@ def test_bad_requests_are_refused_by_the_server_too(endpoint):
 def test_what_changed_before_a_restart_is_not_known(tmp_path):
     with servers.service_and_client(store=tmp_path) as client:
         start = client.changes()
-        learn(client)
+        servers.learn(client)
         before = client.changes(since=start)
         client.checkpoint()
     with servers.service_and_client(store=tmp_path) as client:

@@ -1,52 +1,26 @@
 """The service with a real map, asked by the real client over the loopback."""
 
 import math
-import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import pytest
 import triquad_client
 from support import servers
-from triquad_client import DownloadError, InvalidInputError, RefusedError, Status
-from triquad_format.mapfile.reader import read_map
+from triquad_client import Status
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,
     FlushRequest,
-    MapChunk,
-    MapChunkRequest,
-    ResetRequest,
     SdfRequest,
     ServerStatus,
     TileRequest,
 )
 from triquad_map.questions.answers import Answers
-from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.settings import ServiceSettings
-from triquad_server.store.store import Store
 
 POSE = np.eye(4)
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
-
-
-@pytest.fixture
-def endpoint():
-    with servers.running_service() as endpoint:
-        yield endpoint
-
-
-@pytest.fixture
-def client(endpoint):
-    with triquad_client.connect(endpoint) as client:
-        yield client
-
-
-def learn(client, scans=2):
-    for _ in range(scans):
-        client.publish_scan(servers.sphere(), POSE)
-    return client.flush(servers.WAIT_S)
 
 
 def test_an_empty_map_answers_that_it_knows_nothing(client):
@@ -60,7 +34,7 @@ def test_an_empty_map_answers_that_it_knows_nothing(client):
 
 def test_what_was_flushed_shows_in_the_next_answer(client):
     before = client.query_sdf(PROBES).epoch
-    report = learn(client)
+    report = servers.learn(client)
     assert (report.taken, report.refused, report.lost) == (2, 0, 0)
     result = client.query_sdf(servers.sphere(100))
     assert result.epoch > before
@@ -69,7 +43,7 @@ def test_what_was_flushed_shows_in_the_next_answer(client):
 
 
 def test_a_settled_map_has_learnt_the_surface(client):
-    learn(client, 4)
+    servers.learn(client, 4)
     status = client.settle(servers.WAIT_S)
     assert status.scans_taken == 4
     assert status.samples_trained > 0
@@ -116,21 +90,21 @@ def test_flush_ends_when_its_time_is_over(endpoint):
 
 
 def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client, endpoint):
-    learn(client)
+    servers.learn(client)
     probes = np.tile(PROBES, (1500, 1))  # 300 000 points: several requests
     stop = threading.Event()
 
     def publish():
         with triquad_client.connect(endpoint) as publisher:
             while not stop.is_set():
-                learn(publisher, 1)
+                servers.learn(publisher, 1)
 
     thread = threading.Thread(target=publish)
     thread.start()
     try:
         epochs = set()
         for _ in range(5):
-            learn(client, 1)  # returns once a new epoch is out
+            servers.learn(client, 1)  # returns once a new epoch is out
             result = client.query_sdf(probes)
             rows = result.sdf.reshape(1500, -1)
             # The part of a request in which a point travels moves its origin, by less than 1 um.
@@ -144,7 +118,7 @@ def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client,
 
 
 def test_many_threads_may_ask_at_once(client):
-    learn(client)
+    servers.learn(client)
     expected = client.query_sdf(PROBES, gradient=True)
     epoch = client.settle(servers.WAIT_S).epoch
     expected = client.query_sdf(PROBES, gradient=True)
@@ -173,7 +147,7 @@ def test_an_epoch_that_is_gone_is_told_apart(endpoint):
 
 
 def test_tiles_make_one_mesh(client):
-    learn(client)
+    servers.learn(client)
     client.settle(servers.WAIT_S)
     listed = client.tiles()
     assert len(listed.tiles) == len(listed.changed) > 1
@@ -191,7 +165,7 @@ def test_tiles_make_one_mesh(client):
 
 
 def test_meshes_are_cropped_to_bounds(client):
-    learn(client)
+    servers.learn(client)
     client.settle(servers.WAIT_S)
     whole = client.mesh()
     upper = client.mesh(((-10, -10, 0), (10, 10, np.inf)))
@@ -201,7 +175,7 @@ def test_meshes_are_cropped_to_bounds(client):
 
 
 def test_reset_forgets_a_box_or_everything(client):
-    learn(client)
+    servers.learn(client)
     epoch = client.reset(((0, -10, -10), (10, 10, 10)))
     points = servers.sphere(400)
     result = client.query_sdf(points)
@@ -211,92 +185,7 @@ def test_reset_forgets_a_box_or_everything(client):
     epoch = client.reset()
     assert client.status().regions == 0
     assert client.query_sdf(points).epoch >= epoch
-    assert learn(client, 1).taken == 3
-
-
-def test_a_downloaded_map_is_the_map(client, tmp_path):
-    learn(client)
-    client.settle(servers.WAIT_S)
-    path = tmp_path / "map.triquad"
-    info = client.download_map(path)
-    assert path.stat().st_size == info.bytes
-    record = read_map(path)
-    assert record.epoch == info.epoch == client.status().epoch
-    assert len(record.regions) == 1
-    assert record.regions[0].training is None
-    assert client.download_map(path) == info
-    client.download_map(path, training=True)
-    assert read_map(path).regions[0].training is not None
-    assert [entry.name for entry in tmp_path.iterdir()] == ["map.triquad"]
-
-
-def test_chunks_of_other_files_or_beyond_the_end_are_refused(client, endpoint, tmp_path):
-    info = client.download_map(tmp_path / "map.triquad")
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        assert peer.refusal(keys.MAP_CHUNK, MapChunkRequest("00" * 32, 0, 10)) == "chunk_gone"
-        for offset, length in ((-1, 10), (info.bytes, 10), (2**62, 10), (0, 0), (0, -1)):
-            request = MapChunkRequest(info.sha256, offset, length)
-            assert peer.refusal(keys.MAP_CHUNK, request) == "bad_request"
-        data = (tmp_path / "map.triquad").read_bytes()
-        for length, end in ((5, 8), (2**62, None)):
-            answer = peer.ask(keys.MAP_CHUNK, codec.encode(MapChunkRequest(info.sha256, 3, length)))
-            assert codec.decode(MapChunk, answer).data == data[3:end]
-
-
-def test_without_a_store_checkpoints_are_refused_and_the_status_says_so(client):
-    with pytest.raises(RefusedError, match="without --store") as caught:
-        client.checkpoint()
-    assert caught.value.code == "store"
-    assert "not kept" in client.status().store_error
-
-
-def test_a_checkpoint_restores_the_same_answers(tmp_path):
-    with servers.service_and_client(store=tmp_path) as client:
-        learn(client)
-        client.settle(servers.WAIT_S)
-        info = client.checkpoint()
-        assert client.checkpoint() == info
-        assert client.status().last_checkpoint == info
-        before = client.query_sdf(PROBES, gradient=True)
-    with servers.service_and_client(store=tmp_path) as client:
-        after = client.query_sdf(PROBES, gradient=True)
-        assert client.status().last_checkpoint.epoch == info.epoch
-    assert after.epoch == before.epoch
-    assert np.array_equal(after.status, before.status)
-    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features are half precision
-
-
-def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_path, monkeypatch):
-    replies = []
-    write = Store.write
-
-    def reset_meanwhile(store, record):
-        with servers.raw_session(connect=endpoint) as session:
-            request = ResetRequest(np.full(3, -np.inf), np.full(3, np.inf))
-            replies.append(servers.RawPeer(session).ask(keys.RESET, codec.encode(request)))
-        return write(store, record)
-
-    with servers.running_service(store=tmp_path) as endpoint:
-        with triquad_client.connect(endpoint) as client:
-            learn(client)
-        monkeypatch.setattr(Store, "write", reset_meanwhile)
-    assert replies == [None]
-
-
-def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
-    with servers.service_and_client(store=tmp_path) as client:
-        learn(client)
-        shutil.rmtree(tmp_path / servers.MAP)
-        (tmp_path / servers.MAP).write_text("in the way")
-        with pytest.raises(RefusedError, match="cannot be written"):
-            client.checkpoint()
-        assert "cannot be written" in client.status().store_error
-        assert learn(client, 1).taken == 3
-        (tmp_path / servers.MAP).unlink()
-        (tmp_path / servers.MAP).mkdir()
-        assert client.checkpoint().epoch > 0
-        assert client.status().store_error is None
+    assert servers.learn(client, 1).taken == 3
 
 
 def test_the_status_is_published(endpoint):
@@ -335,30 +224,3 @@ def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
             assert codec.decode(ErrorReply, reply.err.payload.to_bytes()).code == "busy"
         go_on.set()
         assert [reply.ok is not None for replies in answered for reply in replies] == [True, True]
-
-
-def test_a_box_of_the_map_is_downloaded_without_the_rest(client, tmp_path):
-    learn(client)
-    client.settle(servers.WAIT_S)
-    whole = client.download_map(tmp_path / "whole.triquad")
-    low, high = (1.0, -4.5, -4.5), (4.5, 4.5, 4.5)
-    box = client.download_box(tmp_path / "box.triquad", (low, high))
-    assert box.epoch == whole.epoch
-    assert box.bytes < whole.bytes
-    points = np.random.default_rng(0).uniform(low, high, (500, 3))
-    here = MapEvaluator(read_map(tmp_path / "box.triquad")).query(points, gradient=True)
-    there = MapEvaluator(read_map(tmp_path / "whole.triquad")).query(points, gradient=True)
-    assert np.array_equal(here.sdf, there.sdf)
-    assert np.array_equal(here.status, there.status)
-    everything = client.download_box(tmp_path / "all.triquad", ((-math.inf,) * 3, (math.inf,) * 3))
-    assert read_map(tmp_path / "all.triquad").regions[0].parameters > 0
-    assert everything.epoch == whole.epoch
-    with pytest.raises(InvalidInputError, match="hold nothing"):
-        client.download_box(tmp_path / "none.triquad", (low, low))
-    with pytest.raises(DownloadError, match="nothing of the map lies between"):
-        client.download_box(tmp_path / "none.triquad", ((500, 0, 0), (501, 1, 1)))
-    assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "all.triquad",
-        "box.triquad",
-        "whole.triquad",
-    ]

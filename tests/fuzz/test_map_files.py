@@ -49,7 +49,7 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> list[ValidMap]:
 @mutants
 @given(data=st.data())
 def test_damage_is_found(maps: list[ValidMap], mutation: Mutation, data: st.DataObject) -> None:
-    read_mutant(maps, mutation, data)
+    check_mutant(maps, mutation, data)
 
 
 @pytest.mark.parametrize("mutation", FORGERY)
@@ -58,7 +58,7 @@ def test_damage_is_found(maps: list[ValidMap], mutation: Mutation, data: st.Data
 def test_forged_maps_are_valid(
     maps: list[ValidMap], mutation: Mutation, data: st.DataObject
 ) -> None:
-    read_mutant(maps, mutation, data, forged=True)
+    check_mutant(maps, mutation, data, forged=True)
 
 
 @pytest.mark.parametrize("mutation", [add_bombs, forge_bombs])
@@ -67,7 +67,7 @@ def test_forged_maps_are_valid(
 def test_bombs_take_little_memory(
     maps: list[ValidMap], mutation: Mutation, data: st.DataObject
 ) -> None:
-    read_mutant(maps, mutation, data, forged=mutation is forge_bombs)
+    check_mutant(maps, mutation, data, forged=mutation is forge_bombs)
 
 
 def test_a_reader_that_checks_no_digests_is_found(
@@ -79,16 +79,16 @@ def test_a_reader_that_checks_no_digests_is_found(
     @settings(mutants, max_examples=500, derandomize=True, phases=[Phase.generate])
     @given(data=st.data())
     def damage_is_found(data: st.DataObject) -> None:
-        read_mutant(maps, change_parts, data)
+        check_mutant(maps, change_parts, data)
 
     with pytest.raises(AssertionError, match="read as another map"):
         damage_is_found()
 
 
-def read_mutant(
+def check_mutant(
     maps: list[ValidMap], mutation: Mutation, data: st.DataObject, *, forged: bool = False
 ) -> None:
-    """Change one file of a map, and read the map in each way."""
+    """Change one file of a map, and check what each way of reading the map makes of it."""
     valid = data.draw(st.sampled_from(maps))
     name = data.draw(st.sampled_from(sorted(valid.files)))
     mutant = mutation(data.draw, valid.files[name])

@@ -6,7 +6,7 @@ import pytest
 from triquad_format.errors import SettingsError
 from triquad_server import cli
 from triquad_server.settings import Settings, setting_schemas
-from triquad_server.settings_sources import load_settings, settings_toml
+from triquad_server.settings_loading import load_settings, settings_toml
 from triquad_server.source_settings import SourceSettings
 
 ROOT = Path(__file__).parents[2]
@@ -46,7 +46,10 @@ def test_a_file_has_numbers_and_text_stands_for_them(
     path = tmp_path / "settings.toml"
     path.write_text("[training]\nlearning_rate = 1\n")
     monkeypatch.setenv("TRIQUAD_FIELD__LEAF_M", "1")
+    monkeypatch.setenv("TRIQUAD_CHANGE__STATIC", "true")
     settings = load_settings(path, ["scan.max_points=4096", "scan.spread_m=1e-1"])
+    assert settings.change.static
+    assert not load_settings(assignments=["change.static=false"]).change.static
     assert settings.training.learning_rate == 1.0
     assert settings.field.leaf_m == 1.0
     assert (settings.scan.max_points, settings.scan.spread_m) == (4096, 0.1)
@@ -119,6 +122,19 @@ def test_errors_name_the_environment(
     assert all(word in str(error.value) for word in ["environment", *words])
 
 
+def test_errors_of_a_source_name_the_place_of_that_key(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[sources.roof]\nrange_max_m = '9'\nrobot_box_m = [[0, 0, 0], [1, 1, 99]]\n")
+    with pytest.raises(SettingsError) as error:
+        load_settings(path, ["sources.roof.no_return=false", "sources.roof.range_min_m=-1"])
+    wrong = str(error.value).split("; ")
+    assert [text.partition(" = ")[0] for text in wrong] == [
+        "--set: sources.roof.range_min_m",
+        f"settings file {path}: sources.roof.range_max_m",
+        f"settings file {path}: sources.roof.robot_box_m.1.2",
+    ]
+
+
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
@@ -128,11 +144,20 @@ def test_errors_name_the_environment(
         ("batch=4096", ["batch=4096", "SECTION.KEY=VALUE"]),
         ("sources.roof=1", ["sources.roof=1", "sources.NAME.KEY=VALUE"]),
         ("sources.roof.range_max_m=far", ["range_max_m = 'far'", "0 to 10000.0 (number)"]),
+        ("sources.roof.range_max_m=NaN", ["range_max_m = nan", "use 0 to 10000.0 (number)"]),
+        ("scan.range_min_m=nan", ["scan.range_min_m = nan", "use 0 to 1000 (number)"]),
+        ("scan.range_min_m=inf", ["scan.range_min_m = inf", "use 0 to 1000 (number)"]),
+        ("training.batch=nan", ["training.batch = 'nan'", "use 1 to 10000000 (integer)"]),
+        ("change.scans=0", ["change.scans = 0 is out of range: use 1 to 1000 (integer)"]),
+        ("change.doubt=0", ["change.doubt = 0.0 is out of range: use 1e-09 to 0.5 (number)"]),
+        ("change.doubt=1", ["change.doubt = 1.0 is out of range: use 1e-09 to 0.5 (number)"]),
+        ("change.static=maybe", ["change.static = 'maybe'", "use true or false"]),
     ],
 )
 def test_errors_name_the_command_line(assignment: str, words: list[str]) -> None:
     with pytest.raises(SettingsError) as error:
         load_settings(assignments=[assignment])
+    assert "quotes" not in str(error.value)
     assert all(word in str(error.value) for word in ["--set", *words])
 
 
@@ -159,13 +184,19 @@ def test_errors_name_the_command_line(assignment: str, words: list[str]) -> None
         ("field = 3\n", ["field", "3"]),
         ("sources = 3\n", ["sources = 3", "[sources.NAME]"]),
         ("[source.roof]\nrange_max_m = 9\n", ["unknown setting source: did you mean"]),
+        (
+            "[sources.roof]\nrange_max_m = 9\n[Sources.roof]\nrange_min_m = 2\n",
+            ["unknown setting Sources: did you mean sources?"],
+        ),
+        ("[sources.front.left]\nrange_max_m = 9\n", ["quotes", '[sources."front.left"]']),
+        ("[sources.a.b.c]\nrange_max_m = 9\n", ["sources.a.b.c", '[sources."a.b.c"]']),
         ("[sources.roof]\nrobot_box = 3\n", ["did you mean sources.roof.robot_box_m?"]),
         ("[sources.roof]\nrobot_box_m = 3\n", ["robot_box_m = 3: write two corners, [[x, y, z]"]),
         ("[sources.a]\nrobot_box_m = [[0, 0, 0], [1, 1]]\n", ["robot_box_m", "two corners"]),
         ("[sources.a]\nrobot_box_m = [[0, 0, 0], [1, 1, 99]]\n", ["99", "use -20 to 20"]),
         ("[sources.a]\nrange_max_m = true\n", ["sources.a.range_max_m = True", "number"]),
         ("[field\n", ["settings.toml"]),
-        ("[scan]\nrange_min_m = nan\n", ["range_min_m", "nan"]),
+        ("[scan]\nrange_min_m = nan\n", ["range_min_m = nan", "use 0 to 1000 (number)"]),
         ("[training]\nseed = -1\n", ["seed", "-1"]),
         (f"[field]\nleaf_m = 1{'0' * 400}\n", ["leaf_m", "number"]),
         (f"[field]\ndepth = 1{'0' * 400}\n", ["depth", "use 6 to 15"]),

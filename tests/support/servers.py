@@ -54,6 +54,13 @@ def sphere(count: int = 4000, radius_m: float = RADIUS_M) -> NDArray[np.float32]
     return (radius_m * directions).astype(np.float32)
 
 
+def learn(client: triquad_client.Client, scans: int = 2) -> triquad_client.FlushReport:
+    """Have the server take in some scans of a sphere around the map's origin."""
+    for _ in range(scans):
+        client.publish_scan(sphere(), np.eye(4))
+    return client.flush(WAIT_S)
+
+
 @cache
 def compiled() -> None:
     """Have all kernels compiled: at the first start that takes longer than a request may."""

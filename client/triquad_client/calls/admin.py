@@ -34,7 +34,7 @@ def settle(timeout_s: float) -> Call[ServerStatus]:
     Raises:
         RequestTimeoutError: it still had something after ``timeout_s``.
     """
-    deadline = time.monotonic() + timeout_s
+    deadline = checks.deadline(timeout_s)
     while not (now := (yield from status())).settled:
         if time.monotonic() > deadline:
             raise RequestTimeoutError(f"the server still learns after {timeout_s:g} s")

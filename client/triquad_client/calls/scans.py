@@ -95,9 +95,10 @@ class ScanPublisher:
 
     def flush(self, timeout_s: float, pending: int) -> Call[FlushReport]:
         """Wait for the server; arguments as in ``Client.flush``."""
-        if timeout_s < 0 or pending < 0:
-            raise InvalidInputError(f"timeout_s = {timeout_s!r}, pending = {pending!r}: negative")
-        requests = list(self._requests(timeout_s, pending))
+        wait_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
+        if pending < 0:
+            raise InvalidInputError(f"pending = {pending!r}: use 0 or more")
+        requests = list(self._requests(wait_s, pending))
         # All at once: each waits for its source, and they share the time.
         replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
         refusals = [
@@ -123,7 +124,7 @@ class ScanPublisher:
                     source=source,
                     session=self._session,
                     sequence=target,
-                    timeout_s=float(timeout_s),
+                    timeout_s=timeout_s,
                 )
 
 

@@ -12,6 +12,7 @@ from triquad_format.errors import TriquadError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import TileUpdates
 
+from triquad_client import checks
 from triquad_client.errors import ClosedError, RequestTimeoutError
 from triquad_client.mesh.followed_mesh import (
     FollowedMesh,
@@ -59,7 +60,7 @@ class WatchedMesh:
         return self._followed.known_tiles()
 
     def _next(self, timeout_s: float | None) -> Call[MeshUpdate | None]:
-        ends = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        ends = math.inf if timeout_s is None else checks.deadline(timeout_s)
         while True:
             left_s = max(0.0, ends - time.monotonic())
             update = yield from self._update(min(left_s, _LONGEST_WAIT_S))
@@ -69,7 +70,7 @@ class WatchedMesh:
                 return None
 
     def _catch_up(self, timeout_s: float) -> Call[None]:
-        ends = time.monotonic() + timeout_s
+        ends = checks.deadline(timeout_s)
         wait_s = 0.0
         while not (update := (yield from self._update(wait_s))).complete:
             if time.monotonic() > ends:

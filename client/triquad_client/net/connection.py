@@ -12,6 +12,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 
+from triquad_client import checks
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
@@ -193,6 +194,7 @@ def open_connection(
     endpoint: str, map_name: str, timeout_s: float, config: str | Path | None
 ) -> Connection:
     """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
+    timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
     try:
         keys.check_name("map", map_name)
     except FormatError as error:

@@ -36,10 +36,10 @@ RESET = "admin/reset"
 
 def check_name(kind: str, name: str) -> str:
     """``name``, where it can stand in a key."""
-    if not _NAME.fullmatch(name):
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise FormatError(
-            f"{kind} name {name!r} is not allowed: use 1 to 64 letters, digits, '_', '.', '-', "
-            "beginning with a letter or digit"
+            f"{kind} name {name!r} is not allowed: use a text of 1 to 64 letters, digits, "
+            "'_', '.', '-', beginning with a letter or digit"
         )
     return name
 

@@ -172,7 +172,7 @@ class ServerStatus(Message):
     scans_dropped: dict[str, int]  # by reason
     scans_lost: dict[str, int]  # by source: never arrived, or pushed out of the full queue
     scans_waiting: int
-    points_dropped: dict[str, int]  # by reason, points of scans that were taken
+    points_dropped: dict[str, int]  # by reason, points and rays of scans that were taken
     requests_refused: dict[str, int]  # by error code
     samples_trained: int
     rays_kept: int  # rays whose lessons are in the replay pools

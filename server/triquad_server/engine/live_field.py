@@ -12,6 +12,7 @@ from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
 from triquad_map.compiled.field.quadtree import LiveQuadtree
 
@@ -130,8 +131,7 @@ class LiveField:
     @property
     def arrays(self) -> FieldArrays:
         """The numbers as arrays, which share memory with the field where it is on the CPU."""
-        mlp = tuple(part.values[0].cpu().numpy() for part in self.mlp)
-        return FieldArrays(self.features.values.cpu().numpy(), mlp, self.frequencies.cpu().numpy())
+        return self.tensors.arrays
 
     def grow(self, leaves: Longs) -> None:
         """Make room for surfaces in ``leaves`` [N, 3]; new feature vectors start at random.
@@ -152,14 +152,13 @@ class LiveField:
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""
         tree = self.tree.freeze()
-        frequencies = self.frequencies  # which never change
+        now = self.tensors  # of which the frequencies never change
         if self.device.type == "cpu":
-            arrays = self.arrays
-            mlp = tuple(part.copy() for part in arrays.mlp)
-            numbers = FieldArrays(arrays.features.copy(), mlp, frequencies.numpy())
-            return FrozenCompiledField(self.settings, tree, numbers)
-        mlp = tuple(part.values[0].clone() for part in self.mlp)
-        tensors = FieldTensors(self.features.values.clone(), mlp, frequencies)
+            features, mlp, frequencies = now.arrays
+            own = FieldArrays(features.copy(), tuple(part.copy() for part in mlp), frequencies)
+            return FrozenCompiledField(self.settings, tree, own)
+        clones = tuple(part.clone() for part in now.mlp)
+        tensors = FieldTensors(now.features.clone(), clones, now.frequencies)
         return TensorField(self.settings, tree, tensors)
 
 
@@ -181,7 +180,7 @@ def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> L
 def region_record(
     index: RegionIndex,
     field: LiveField | FrozenField,
-    evidence: FrozenEvidence,
+    evidence: FrozenEvidence | LiveEvidence,
     training: TrainingState | None,
 ) -> Region:
     """A region as plain arrays that share nothing with ``field`` and ``evidence``."""

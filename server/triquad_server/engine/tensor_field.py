@@ -37,6 +37,12 @@ class FieldTensors:
     mlp: tuple[Tensor, ...]  # weights [in, out] and bias [out] of each layer in turn
     frequencies: Tensor  # [m] of Fourier features, on coordinates normalised to [-1, 1]
 
+    @property
+    def arrays(self) -> FieldArrays:
+        """The numbers as arrays, which share memory with tensors on the CPU."""
+        mlp = tuple(part.cpu().numpy() for part in self.mlp)
+        return FieldArrays(self.features.cpu().numpy(), mlp, self.frequencies.cpu().numpy())
+
 
 @dataclass(frozen=True)
 class Corners:
@@ -131,9 +137,7 @@ class TensorField:
     @property
     def arrays(self) -> FieldArrays:
         """The numbers of the field, as arrays that share memory with tensors on the CPU."""
-        numbers = self.tensors
-        mlp = tuple(part.cpu().numpy() for part in numbers.mlp)
-        return FieldArrays(numbers.features.cpu().numpy(), mlp, numbers.frequencies.cpu().numpy())
+        return self.tensors.arrays
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
         """The field at points [N, 3]."""

@@ -54,7 +54,7 @@ class ScanRays:
 
     origin: Doubles  # [3] the sensor
     ends: Doubles  # [N, 3] where rays met a surface
-    points_dropped: dict[str, int]  # points of the scan that are not used, by reason
+    points_dropped: dict[str, int]  # points and rays of the scan that are not used, by reason
     # [M, 3] the sensor's range on rays that met nothing so far
     open_ends: Doubles = field(default_factory=lambda: np.empty((0, 3)))
     robot: RobotBox | None = None
@@ -91,12 +91,20 @@ def _check_pose(world_from_sensor: Doubles) -> None:
         )
 
 
-def _check_sizes(points: Floats, no_return: Floats, max_points: int) -> None:
-    """Refuse points or directions that are not [N, 3], or more than ``max_points``."""
+def _check_shapes(points: Floats, no_return: Floats) -> None:
+    """Refuse points or directions that are not [N, 3]."""
     for what, array in (("points", points), ("no_return", no_return)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise ScanRefusedError(f"{what}_shape", f"{what}: {list(array.shape)}, not [N, 3]")
-    count = len(points) + len(no_return)
+
+
+def check_count(points: Floats, no_return: Floats | None, max_points: int) -> None:
+    """Refuse more than ``max_points`` points and rays without a return.
+
+    Raises:
+        ScanRefusedError: ``too_many_points``.
+    """
+    count = len(points) + (0 if no_return is None else len(no_return))
     if count > max_points:
         raise ScanRefusedError(
             "too_many_points",
@@ -182,6 +190,23 @@ def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
     return _Selection(kept[:count], beyond[:too_far], not_finite, on_robot, too_near, too_far)
 
 
+def _why_empty(
+    points: int, disbelieved: int, settings: ScanSettings, *, source: SourceSettings
+) -> str:
+    """Why nothing is left of a scan of so many points, and what decides that."""
+    box = " and outside of robot_box_m" if source.robot_box_m else ""
+    rays = "there is no ray without a return"
+    if disbelieved:
+        rays = (
+            f"{disbelieved} rays without a return are not believed, since the settings of the "
+            "source have no_return = false"
+        )
+    return (
+        f"none of {points} points is finite and at least range_min_m = {settings.range_min_m:g} m "
+        f"from the sensor{box}, and {rays}"
+    )
+
+
 def usable_rays(
     points: Floats,
     world_from_sensor: Doubles,
@@ -204,23 +229,23 @@ def usable_rays(
     """
     empty = np.empty((0, 3), np.float32) if no_return is None else no_return
     _check_pose(world_from_sensor)
-    _check_sizes(points, empty, settings.max_points)
+    _check_shapes(points, empty)
+    check_count(points, no_return, settings.max_points)
     directions = _unit_vectors(empty) if source.no_return else np.empty((0, 3))
+    disbelieved = 0 if source.no_return else len(empty)
     low, high = (np.array(corner, np.float64) for corner in source.robot_box_m or _NOWHERE)
     limits = _Limits(settings.range_min_m, settings.range_max_m, settings.thin_m, low, high)
     found = _select(np.ascontiguousarray(points), limits, empty_keys(len(points)))
     open_ends = np.concatenate([found.beyond, settings.range_max_m * directions])
     if len(found.kept) + len(open_ends) == 0:
         raise ScanRefusedError(
-            "empty",
-            f"none of {len(points)} points is finite and at least {settings.range_min_m} m from "
-            "the sensor, and no ray without a return is used",
+            "empty", _why_empty(len(points), disbelieved, settings, source=source)
         )
     rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
     return ScanRays(
         origin.copy(),
         found.kept @ rotation.T + origin,
-        found.dropped,
+        found.dropped | ({"no_return": disbelieved} if disbelieved else {}),
         open_ends=open_ends @ rotation.T + origin,
         robot=RobotBox(low, high, world_from_sensor) if source.robot_box_m else None,
     )

@@ -9,6 +9,8 @@ from triquad_format.errors import FormatError, ProtocolVersionError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import Scan
 
+from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.rays import check_count
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.net.requests import payload_limit
 
@@ -80,10 +82,10 @@ class ScanIntake:
         except FormatError as error:
             self._drop("bad_source", key, error)
             return
-        rays = len(scan.points) + (0 if scan.no_return is None else len(scan.no_return))
-        if rays > self._max_points:
-            text = f"{rays} points and rays without a return exceed the limit of {self._max_points}"
-            self._queue.refuse(scan, "too_many_points", text)
+        try:
+            check_count(scan.points, scan.no_return, self._max_points)
+        except ScanRefusedError as error:
+            self._queue.refuse(scan, error.reason, str(error))
             return
         self._queue.put(scan)
 

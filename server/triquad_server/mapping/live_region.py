@@ -69,13 +69,6 @@ class RegionSetup:
         return field, pool
 
 
-def _disbelief(settings: ChangeSettings) -> Disbelief:
-    """The rule of the settings; the other signs are told by how improbable its own record is."""
-    doubt = math.log(settings.doubt)
-    shared = doubt + math.log(2)
-    return Disbelief(settings.scans, doubt, around=3 * doubt, shared=shared, witnessed=doubt / 2)
-
-
 class LiveRegion:
     """A region that is being mapped, by one thread. Everything public is in the map frame."""
 
@@ -109,7 +102,7 @@ class LiveRegion:
         self._passed: list[Ints] = []  # where rays passed a surface since it was last published
         self._gone: list[Longs] = []  # voxels whose surface went since it was last published
         self._setup = setup
-        self._disbelief = _disbelief(setup.change)
+        self._disbelief = Disbelief.of(setup.change.scans, setup.change.doubt)
         self._settings = setup.field
         self._training = setup.training
         self._trainer: CompiledTrainer | TensorTrainer = (
@@ -272,7 +265,7 @@ class LiveRegion:
             labels=samples.labels,
             budget_samples=self.budget_samples,
         )
-        return region_record(self.index, self.field, self.evidence.freeze(), training=state)
+        return region_record(self.index, self.field, self.evidence, training=state)
 
     def _forget_gone(self, surfels: SurfelMap) -> None:
         """Unlearn the surface that was taken back: its rays, and what the field shows there."""

@@ -113,7 +113,7 @@ class Mapper:
             no_return: directions [M, 3], sensor frame, of rays that met nothing.
 
         Returns:
-            How many points were not used, by reason.
+            How many points and rays without a return were not used, by reason.
 
         Raises:
             ScanRefusedError: the scan cannot be used; the map is unchanged.

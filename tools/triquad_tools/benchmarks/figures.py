@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+_FIRST_SCANS = 20
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -41,6 +43,11 @@ def seconds(work: Callable[[], object]) -> float:
     started = time.perf_counter()
     work()
     return time.perf_counter() - started
+
+
+def typical(scans_s: list[float]) -> float:
+    """What a scan takes [seconds] after the first, which meet nothing but new surface."""
+    return statistics.median(scans_s[_FIRST_SCANS:])
 
 
 @dataclass(frozen=True)

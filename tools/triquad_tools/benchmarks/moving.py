@@ -4,7 +4,6 @@ Things move along a street and then are gone. The map trains and publishes betwe
 server's does.
 """
 
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,9 +19,8 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.marching_cubes import centroids
 from triquad_server.mesh.mesher import mesh_tile, tile_lattice
 from triquad_server.settings import MeshSettings, Settings
-from triquad_server.source_settings import ANY_SOURCE
 
-from triquad_tools.benchmarks.figures import Figure, seconds
+from triquad_tools.benchmarks.figures import Figure, seconds, typical
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import mesh_area_m2
 from triquad_tools.simulation.scene import Scene
@@ -39,7 +37,6 @@ LOOKS = (0, 10, 30, 100)  # scans of the empty street
 _LEFT_AT_MOST = {10: 2.0, 30: 0.5}  # per cent of the trail, after so many of them
 _STEPS = 14  # of training between two scans
 _PUBLISHED = 5  # one scan in so many
-_SETTLE_SCANS = 20  # as in the part core
 _TRAIL_CLEAR_M = 0.35  # from anything static: no voxel of the trail touches it
 _GHOST_CLEAR_M = 0.2
 _AIR_M = 0.05
@@ -52,7 +49,6 @@ def measure_moving(seed: int) -> list[Figure]:
     warm_up(Settings(), "cpu")
     traffic = street_traffic(seed, BUSY_SCANS, BUSY_SCANS + LOOKS[-1])
     followed = follow(traffic, LOOKS)
-    typical = statistics.median(followed.ingest_s[_SETTLE_SCANS:])
     last, after_30 = followed.looks[100], followed.looks[30]
     air = 100 * after_30.air_in_trail
     return [
@@ -61,7 +57,7 @@ def measure_moving(seed: int) -> list[Figure]:
         Figure("voxels of thin things kept after 100", 100 * thin_kept(traffic), "%"),
         Figure("mesh left in the trail after 30", after_30.ghost_m2, "m2", at_most=0.5),
         Figure("trail in the air for the field after 30", air, "%"),
-        Figure("take in a scan, things moving", 1e3 * typical, "ms"),
+        Figure("take in a scan, things moving", 1e3 * typical(followed.ingest_s), "ms"),
     ]
 
 
@@ -190,8 +186,7 @@ class _Ended:
         """Enter the voxels in which rays end that the map uses."""
         pose, leaf_m = scan.world_from_sensor, self.settings.field.leaf_m
         points = scan.points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        limits = self.settings.scan_of(ANY_SOURCE)
-        ends = usable_rays(scan.points, pose, limits, source=ANY_SOURCE).ends
+        ends = usable_rays(scan.points, pose, self.settings.scan).ends
         keys, marked = _keys(points, leaf_m), self.mark(scan)
         used = np.isin(keys, _keys(ends, leaf_m))
         self._marked = np.union1d(self._marked, keys[used & marked])

@@ -23,7 +23,7 @@ from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
 SCANS = 100
-_LENGTH_M = 110.0  # so that the map has some 2 million parameters
+LENGTH_M = 110.0  # so that the map has some 2 million parameters
 _COLUMNS = 1024  # some 60,000 points a scan
 
 
@@ -41,8 +41,8 @@ class BenchStreet(DrivenStreet):
 
 def bench_street(seed: int) -> BenchStreet:
     """100 scans along the exact street ``seed``."""
-    scene = street(seed, _LENGTH_M)
-    poses = drive(scene, SCANS, _LENGTH_M / SCANS)
+    scene = street(seed, LENGTH_M)
+    poses = drive(scene, SCANS, LENGTH_M / SCANS)
     driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed=seed))
     visible = driven.drive.true_hits(STREET_VOXEL_M)
     low, high = scene.bounds  # to which meshes are cut

@@ -49,20 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _bench(options: argparse.Namespace) -> int:
     parts = options.parts or USUAL_PARTS
     figures = _on_street([part for part in _ON_STREET if part in parts], options)
-    if "growth" in parts:
-        figures += _growth(options.seed)
-    if "air" in parts:
-        from triquad_tools.benchmarks.air import measure_air  # slow to import
-
-        figures += measure_air(options.seed)
-    if "moving" in parts:
-        from triquad_tools.benchmarks.moving import measure_moving  # slow to import
-
-        figures += measure_moving(options.seed)
-    if "ablation" in parts:
-        from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
-
-        figures += measure_ablation(options.seed, options.scans, options.step)
+    figures += _alone([part for part in PARTS if part in parts and part not in _ON_STREET], options)
     _present(figures, options)
     return OK
 
@@ -92,6 +79,23 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
     }
     made = bench_street(options.seed)
     return [figure for part in parts for figure in measures[part](made)]
+
+
+def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
+    """The figures of parts that each drive for themselves."""
+    if not parts:
+        return []
+    from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
+    from triquad_tools.benchmarks.air import measure_air
+    from triquad_tools.benchmarks.moving import measure_moving
+
+    measures: dict[str, Callable[[int], list[Figure]]] = {
+        "growth": _growth,
+        "air": measure_air,
+        "moving": measure_moving,
+        "ablation": partial(measure_ablation, scans=options.scans, step_m=options.step),
+    }
+    return [figure for part in parts for figure in measures[part](options.seed)]
 
 
 def _growth(street_seed: int) -> "list[Figure]":

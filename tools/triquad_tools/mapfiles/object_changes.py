@@ -21,7 +21,7 @@ FARTHEST_M = 5.0
 
 LEAST_SIZE_SHARE, LEAST_POINTS_SHARE = 0.7, 0.5
 """Of what is the same, the smaller size along each axis is such a share of the larger, and so is
-the smaller number of points, which hangs on from where it was seen."""
+the smaller number of points, which depends on where it was seen from."""
 
 Corner = tuple[float, ...]
 

@@ -100,7 +100,7 @@ def street_traffic(seed: int, busy_scans: int, scans: int, lidar: Lidar | None =
 
 
 def thin_things(x: float, y: float, length_m: float = 12.0) -> list[Solid]:
-    """Posts of 2 cm, two wires of 4 cm and a fence of bars of 16 mm; thick are none of them.
+    """Posts of 2 cm, two wires of 4 cm and a fence of bars of 16 mm.
 
     They stand along x for ``length_m`` from ``x`` on, within 1.2 m of ``y``, metres.
     """

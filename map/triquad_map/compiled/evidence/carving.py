@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Doubles, Ints
 
-from triquad_map.compiled.evidence.contradictions import Passing, note_pass
+from triquad_map.compiled.evidence.crossings import Passing, note_passes
 from triquad_map.compiled.evidence.observed import Observed, Vector
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
@@ -68,16 +68,20 @@ def _part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[flo
 
 @kernel()
 def _walk(
-    ray: Passing, reach: float, seen: SeenVoxels, count: int, observed: Observed, passed: Ints
-) -> int:
-    """Set the bits of the voxels on a way (Amanatides and Woo 1987); returns the blocks in use."""
+    ray: Passing, reach: float, seen: SeenVoxels, count: int, observed: Observed, crossed: Ints
+) -> tuple[int, int]:
+    """Set the bits of the voxels on a way (Amanatides and Woo 1987).
+
+    Those of them in which rays ended go to ``crossed`` [, 4], with their rows: to note them here
+    would slow every step. Returns (blocks in use, voxels in ``crossed``).
+    """
     side, index, surface, masks = seen
     at, way = ray.start, ray.way
     x, y, z = int(np.floor(at[0])), int(np.floor(at[1])), int(np.floor(at[2]))
     step_x, apart_x, next_x = _crossing(at[0], way[0])
     step_y, apart_y, next_y = _crossing(at[1], way[1])
     step_z, apart_z, next_z = _crossing(at[2], way[2])
-    row, place, travelled = -1, 0, 0.0
+    row, place, travelled, found = -1, 0, 0.0, 0
     entered = True  # another block
     while travelled <= reach:
         if entered:
@@ -85,15 +89,16 @@ def _walk(
             if is_inside(x, y, z, side):
                 row = make_row(index, count, block_key(x, y, z))
                 if row < 0:
-                    return _NO_ROOM
+                    return _NO_ROOM, 0
                 count = max(count, row + 1)
-                place = observed.places[row]
+                place = observed.places[row] if travelled < ray.clear else 0
         if row >= 0:
             byte, bit = byte_of(x, y), bit_of(z)
             masks[row, byte] |= bit
-            if place and travelled < ray.clear and surface[row, byte] & bit:
-                voxel = observed.rows[place, byte << SHIFT | (z & LOW)]
-                note_pass(ray, (x, y, z), voxel, observed.shapes, observed.counts, passed)
+            if place and surface[row, byte] & bit and travelled < ray.clear:
+                crossed[found, 0], crossed[found, 1], crossed[found, 2] = x, y, z
+                crossed[found, 3] = observed.rows[place, byte << SHIFT | (z & LOW)]
+                found += 1
         if next_x <= next_y and next_x <= next_z:
             travelled = next_x
             next_x += apart_x
@@ -109,7 +114,7 @@ def _walk(
             next_z += apart_z
             z += step_z
             entered = (z & LOW) == (0 if step_z > 0 else LOW)
-    return count
+    return count, found
 
 
 @kernel()
@@ -128,6 +133,7 @@ def mark_crossed(
     Returns (rays done, blocks in use).
     """
     at = (origin[0], origin[1], origin[2])
+    crossed = np.empty((3 * seen.side + 3, 4), np.int32)  # no way has more voxels
     for i in range(start, len(ends)):
         dx, dy, dz = ends[i, 0] - at[0], ends[i, 1] - at[1], ends[i, 2] - at[2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -138,11 +144,12 @@ def mark_crossed(
         if first > last:
             continue
         begin = (at[0] + first * way[0], at[1] + first * way[1], at[2] + first * way[2])
-        ray = Passing(
-            begin, way, min(length - reach.clear, _CLEAR_SHARE * length) - first, reach.scan
-        )
-        used = _walk(ray, last - first, seen, count, observed, passed)
+        clear = min(length - reach.clear, _CLEAR_SHARE * length) - first
+        ray = Passing(begin, way, clear, reach.scan)
+        used, found = _walk(ray, last - first, seen, count, observed, crossed)
         if used == _NO_ROOM:
             return i, count
         count = used
+        if found:
+            note_passes(ray, crossed[:found], observed, passed)
     return len(ends), count

@@ -14,7 +14,6 @@ from triquad_map.compiled.evidence.contradictions import (
     doubted,
     middles,
     take_back,
-    take_back_rows,
 )
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.observations import Observations, Sighting
@@ -123,7 +122,8 @@ class LiveEvidence:
         Returns:
             These voxels [M, 3]; they are free.
         """
-        return take_back(passed, self._seen, self._observations.arrays, rule)
+        self._frozen = None
+        return take_back(np.empty(0, np.int64), passed, self._seen, self._observations.arrays, rule)
 
     def take_back_unseen(self, passed: Ints, rule: Disbelief, field: SampleField) -> Longs:
         """Take back the surface that rays crossed and that the field does not show either.
@@ -141,7 +141,7 @@ class LiveEvidence:
         if len(rows):
             rows = rows[field(middles(rows, seen, observed)).values > _FIELD_FREE]
             self._frozen = None
-        return take_back_rows(rows, seen, observed)
+        return take_back(rows, np.empty(0, np.int32), seen, observed, rule)
 
     def mark_free(self, voxels: Doubles) -> None:
         """Record that ``voxels`` [N, 3] are free; those outside the region are left out."""
@@ -180,13 +180,20 @@ class LiveEvidence:
             )
         return self._frozen
 
+    def record(self) -> EvidenceRecord:
+        """The evidence as the map file holds it, with what to go on from it takes."""
+        frozen = self.freeze()
+        return frozen.record(self._observations.outcomes(frozen.surface))
+
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "LiveEvidence":
         """The evidence of a record, of a region of ``side`` voxels."""
         evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
         evidence._seen = frozen.seen
-        evidence._observations = Observations.restore(frozen.surface, frozen.levels, frozen.seen_s)
+        evidence._observations = Observations.restore(
+            frozen.surface, frozen.levels, frozen.seen_s, outcomes=record.outcomes
+        )
         evidence._make_room()
         return evidence
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import surface_counts
+from triquad_format.records.region import surface_counts, used_blocks
 
 from triquad_map.compiled.evidence.levels import fill_levels
 from triquad_map.compiled.evidence.observed import (
@@ -14,6 +14,7 @@ from triquad_map.compiled.evidence.observed import (
     EARLIER_MISSES,
     EARLIER_PASSES,
     ENDS,
+    FIRST_SCAN,
     HIT_SCAN,
     HITS,
     MEAN,
@@ -30,6 +31,7 @@ from triquad_map.compiled.evidence.observed import (
     Vector,
     row_of,
 )
+from triquad_map.compiled.evidence.outcomes import outcome_codes, outcome_counts
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (
@@ -52,7 +54,9 @@ _MIN_ROWS = 1024
 _DISC = int(SurfelKind.DISC)
 _DISC_ENDS, _DISC_SPREAD = 16.0, 0.15  # that a disc of the field stands for
 
-_RESTORED_HITS = 8  # of a voxel whose record is not in the file
+_RECORD = [HITS, EARLIER_PASSES, EARLIER_MISSES]
+"""What files keep of a voxel's record."""
+
 _COUNTED_ENDS = 64
 """Of a voxel; the shape that further ones give counts as that of so many."""
 
@@ -76,40 +80,50 @@ def _sector(x: float, y: float) -> int:
 
 
 @kernel(inline="always")
-def _add_ray(shape: Floats, counts: Ints, end: Doubles, sighting: Sighting) -> None:
-    """Count a ray that ended at ``end`` [3] by how far and where the sensor was."""
+def _add_ray(row: int, end: Vector, sighting: Sighting, observed: Observed) -> None:
+    """Count a ray that ended at ``end``, voxels, by how far and where the sensor was."""
     origin = sighting.origin
     dx, dy, dz = origin[0] - end[0], origin[1] - end[1], origin[2] - end[2]
     square = (dx * dx + dy * dy + dz * dz) * (sighting.leaf_m / NEAR_M) ** 2
-    shape[WEIGHT] += np.float32(1 / (1 + square))
-    shape[TOWARDS], shape[TOWARDS + 1], shape[TOWARDS + 2] = dx, dy, dz
-    counts[SECTORS] |= 1 << _sector(dx, dy)
+    observed.shapes[row, WEIGHT] += np.float32(1 / (1 + square))
+    for axis, towards in enumerate((dx, dy, dz)):
+        observed.shapes[row, TOWARDS + axis] = towards
+    observed.counts[row, SECTORS] |= 1 << _sector(dx, dy)
 
 
-@kernel()
-def _add_end(shape: Floats, counts: Ints, end: Vector, scan: int) -> None:
-    """Count a ray that ended at a place in a voxel; the first begins its shape anew."""
-    is_first = shape[ENDS] == 0
-    if is_first:
+@kernel(inline="always")
+def _add_end(row: int, end: Vector, observed: Observed) -> None:
+    """Move the shape of the surface in a voxel by a ray that ended at a place in it."""
+    shapes = observed.shapes
+    count = min(shapes[row, ENDS] + np.float32(1), np.float32(_COUNTED_ENDS))
+    if count == 1:
         for axis in range(3):
-            shape[MEAN + axis], shape[NORMAL + axis] = end[axis], 0
-        shape[SPREAD] = 0
-    count = min(shape[ENDS] + 1, _COUNTED_ENDS)
-    shape[ENDS] = count
-    squared = 0.0
+            shapes[row, MEAN + axis], shapes[row, NORMAL + axis] = end[axis], 0
+        shapes[row, SPREAD] = 0
+    shapes[row, ENDS] = count
+    squared = np.float32(0)
     for axis in range(3):
-        off = end[axis] - shape[MEAN + axis]
+        off = np.float32(end[axis]) - shapes[row, MEAN + axis]
         step = off / count
-        shape[MEAN + axis] += step
+        shapes[row, MEAN + axis] += step
         squared += off * (off - step)
-    shape[SPREAD] += (squared - shape[SPREAD]) / count
-    if counts[HIT_SCAN] != scan:
-        counts[HIT_SCAN] = scan
-        counts[HITS] += 1
-        if not is_first:  # else they passed while nothing was there
-            counts[EARLIER_PASSES] += counts[PASSES]
-            counts[EARLIER_MISSES] += counts[MISSES]
-        counts[PASS_SCANS] = counts[PASSES] = counts[MISSES] = 0
+    shapes[row, SPREAD] += (squared - shapes[row, SPREAD]) / count
+
+
+@kernel(inline="always")
+def _begin_hit(row: int, scan: int, observed: Observed) -> None:
+    """Count a scan of which a ray ended in a voxel: what passed before goes to its record."""
+    counts = observed.counts
+    if counts[row, HIT_SCAN] == scan:
+        return
+    counts[row, HIT_SCAN] = scan
+    counts[row, HITS] += 1
+    if observed.shapes[row, ENDS] > 0:  # else they passed while nothing was there
+        counts[row, EARLIER_PASSES] += counts[row, PASSES]
+        counts[row, EARLIER_MISSES] += counts[row, MISSES]
+    else:
+        counts[row, FIRST_SCAN] = scan
+    counts[row, PASS_SCANS] = counts[row, PASSES] = counts[row, MISSES] = 0
 
 
 @kernel()
@@ -152,11 +166,11 @@ def _record(
             observed.owners[row] = block << (3 * SHIFT) | voxel
             rows += 1
         found[i] = row
-        shape, counts = observed.shapes[row], observed.counts[row]
         observed.seen_s[place] = max(observed.seen_s[place], sighting.stamp_s)
-        _add_ray(shape, counts, voxels[i], sighting)
-        end = (voxels[i, 0] - x, voxels[i, 1] - y, voxels[i, 2] - z)
-        _add_end(shape, counts, end, sighting.scan)
+        end = (voxels[i, 0], voxels[i, 1], voxels[i, 2])
+        _add_ray(row, end, sighting, observed)
+        _begin_hit(row, sighting.scan, observed)
+        _add_end(row, (end[0] - x, end[1] - y, end[2] - z), observed)
     return len(voxels), places, rows
 
 
@@ -232,12 +246,18 @@ class Observations:
 
     def levels(self, surface: Bytes) -> Bytes:
         """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
-        # Most blocks are open air.
-        used = np.flatnonzero(surface.view(np.uint64).any(axis=1))
+        used = used_blocks(surface)
         surface, places = surface[used], self.arrays.places[used]
         levels = np.empty(int(surface_counts(surface).sum()), np.uint8)
         fill_levels(surface, self.arrays._replace(places=places), levels)
         return levels
+
+    def outcomes(self, surface: Bytes) -> Bytes:
+        """Codes [S, 3] of what became of rays at each voxel set in ``surface``, in their order."""
+        used = used_blocks(surface)
+        ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
+        rows = self.arrays.rows[self.arrays.places[used]][ended]
+        return outcome_codes(self.arrays.counts[rows][:, _RECORD])
 
     def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
@@ -250,9 +270,14 @@ class Observations:
         self.arrays.rows[places] *= kept
 
     @classmethod
-    def restore(cls, surface: Bytes, levels: Bytes, seen_s: Longs) -> "Observations":
-        """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels."""
-        used = np.flatnonzero(surface.any(axis=1))
+    def restore(
+        cls, surface: Bytes, levels: Bytes, seen_s: Longs, *, outcomes: Bytes | None
+    ) -> "Observations":
+        """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels.
+
+        ``outcomes`` are the codes [S, 3] of what became of rays; ``None``: not known.
+        """
+        used = used_blocks(surface)
         places = slice(1, 1 + len(used))
         ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
         rows = slice(1, 1 + len(levels))
@@ -270,7 +295,9 @@ class Observations:
         known = levels > 0
         arrays.shapes[rows, WEIGHT] = known * LEAST_STRENGTH * 2.0 ** (levels - 1.0)
         arrays.counts[rows, SECTORS] = known
-        arrays.counts[rows, HITS] = _RESTORED_HITS
+        if outcomes is None:
+            outcomes = np.zeros((len(levels), len(_RECORD)), np.uint8)
+        arrays.counts[rows, _RECORD] = outcome_counts(outcomes)
         observations = cls(len(surface))
         observations._places, observations._rows = 1 + len(used), 1 + len(levels)
         observations.arrays = arrays

@@ -25,7 +25,8 @@ MISSES = 5  # rays of theirs that crossed the surface
 EARLIER_PASSES = 6  # rays that passed before the last hit
 EARLIER_MISSES = 7
 SECTORS = 8  # a bit for each eighth of the horizon looked from
-COUNT_COLUMNS = 9
+FIRST_SCAN = 9  # of which a ray ended on the surface that is there now
+COUNT_COLUMNS = 10
 
 
 class Observed(NamedTuple):

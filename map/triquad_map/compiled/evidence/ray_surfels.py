@@ -5,6 +5,7 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.evidence.observed import (
     ENDS,
+    FIRST_SCAN,
     HIT_SCAN,
     HITS,
     MEAN,
@@ -21,7 +22,8 @@ from triquad_map.surface import SurfelKind, Surfels, nothing_shown
 _RAY_DISC, _RAY_POINT = int(SurfelKind.RAY_DISC), int(SurfelKind.RAY_POINT)
 
 _NEW = 10
-"""Scans of which rays ended in a voxel, at most: later the field has had time to learn it."""
+"""Scans from the first to the last of which rays ended on a surface: one that was seen for longer
+the field has had time to learn."""
 
 
 def ray_surfels(voxels: Longs, seen: SeenVoxels, observed: Observed) -> Surfels:
@@ -85,7 +87,8 @@ def _fill(
     for i in range(len(voxels)):
         row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
         shape = observed.shapes[row]
-        if row == 0 or shape[ENDS] == 0 or observed.counts[row, HITS] > _NEW:
+        age = observed.counts[row, HIT_SCAN] - observed.counts[row, FIRST_SCAN]
+        if row == 0 or shape[ENDS] == 0 or age > _NEW:
             continue
         is_flat = _set_normal(voxels[i], row, seen, observed, normal)
         kinds[i] = _RAY_DISC if is_flat else _RAY_POINT

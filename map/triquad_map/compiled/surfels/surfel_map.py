@@ -50,9 +50,11 @@ class SurfelPlaces:
 
 def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
     """Places for the voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks at ``cells`` [, 3]."""
-    starts = np.concatenate([[0], np.cumsum(surface_counts(surface))]).astype(np.int32)
-    voxels = surfel_voxels(cells, surface, int(starts[-1]))
-    return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface))
+    counts = surface_counts(surface)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    used = np.flatnonzero(counts)  # most blocks are of open air
+    voxels = surfel_voxels(cells[used], surface[used], int(starts[-1]))
+    return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface, used))
 
 
 def surfel_index(places: SurfelPlaces, surfels: Surfels) -> SurfelIndex:
@@ -131,9 +133,11 @@ def _block_boxes(cells: Longs, surface: Bytes, rows: Longs) -> Ints:
     return boxes
 
 
-def block_groups(cells: Longs, surface: Bytes) -> BlockGroups:
-    """The blocks at ``cells`` [blocks, 3] that hold any of ``surface``, in groups."""
-    used = np.flatnonzero(surface.any(axis=1))
+def block_groups(cells: Longs, surface: Bytes, used: NDArray[np.intp]) -> BlockGroups:
+    """The blocks ``used`` [N], of those at ``cells`` [blocks, 3], in groups.
+
+    They are those that hold any of ``surface`` [blocks, BLOCK_BYTES].
+    """
     codes, owners = np.unique(morton.encode(cells[used] >> GROUP_SHIFT), return_inverse=True)
     order = np.argsort(owners, kind="stable")
     starts = np.searchsorted(owners[order], np.arange(len(codes) + 1))
@@ -227,7 +231,11 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
         copies = {name: array.copy() for name, array in vars(before.surfels).items()}
         return _Fitted(old, Surfels(**copies), before.epochs.copy())
     after = _nothing_in(surfel_places(evidence.cells, evidence.surface))
-    rows = moved_rows(old.surface, old.starts, after.places.surface, len(after.epochs))
+    used = np.flatnonzero(np.diff(after.places.starts))
+    known = used[used < len(old.surface)]
+    rows = moved_rows(
+        old.surface[known], old.starts[known], evidence.surface[used], len(after.epochs)
+    )
     kept = np.flatnonzero(rows >= 0)
     rows = rows[kept]
     for name, array in vars(after.surfels).items():

@@ -96,8 +96,20 @@ def test_a_scan_without_points_needs_rays_that_are_believed() -> None:
     up = points((0, 0, 1))
     assert len(usable_rays(none, pose(), SETTINGS, no_return=up).open_ends) == 1
     silent = SourceSettings(no_return=False)
-    with pytest.raises(ScanRefusedError, match="no ray without a return is used"):
+    with pytest.raises(ScanRefusedError, match="1 rays without a return .* no_return = false"):
         usable_rays(none, pose(), SETTINGS, source=silent, no_return=up)
+    with pytest.raises(ScanRefusedError, match="0 points .* there is no ray without a return"):
+        usable_rays(none, pose(), SETTINGS, source=silent)
+
+
+def test_rays_that_are_not_believed_are_counted() -> None:
+    silent = SourceSettings(no_return=False)
+    up = points((0, 0, 1), (0, 1, 0))
+    rays = usable_rays(
+        points((5, 0, 0), (0.1, 0, 0)), pose(), SETTINGS, source=silent, no_return=up
+    )
+    assert (len(rays.ends), len(rays.open_ends)) == (1, 0)
+    assert rays.points_dropped == {"too_near": 1, "no_return": 2}
 
 
 @pytest.mark.parametrize("bad", [(0, 0, 0), (np.nan, 0, 1), (0, -np.inf, 0)])

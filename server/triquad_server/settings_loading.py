@@ -22,11 +22,15 @@ from triquad_server.settings import SOURCE_SECTION, Settings, setting_schemas
 
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
 
-_NUMBERS = {"integer": TypeAdapter[float](int), "number": TypeAdapter(float)}
-"""What reads text as a number, by the type in a setting's schema."""
+_READERS: dict[str, TypeAdapter[Any]] = {
+    "integer": TypeAdapter(int),
+    "number": TypeAdapter(float),
+    "boolean": TypeAdapter(bool),
+}
+"""What reads text, by the type in a setting's schema."""
 
 
-class _Sources(Settings, BaseSettings):
+class _NamedSettings(Settings, BaseSettings):
     """Settings with the names that they have in the environment."""
 
     model_config = SettingsConfigDict(
@@ -34,18 +38,22 @@ class _Sources(Settings, BaseSettings):
     )
 
 
-class _Source(NamedTuple):
+class _Origin(NamedTuple):
     """Settings from one place, as nested tables of values that are not checked yet."""
 
-    origin: str
+    name: str
     tables: dict[str, Any]
 
     def gives(self, location: tuple[int | str, ...]) -> bool:
-        """Whether the value at a section and key comes from here."""
-        section = self.tables.get(str(location[0])) if location else None
-        if len(location) < 2:
-            return section is not None
-        return isinstance(section, dict) and location[1] in section
+        """Whether the value at a section and key, or a part of it, comes from here."""
+        table: Any = self.tables
+        for part in location:
+            if not isinstance(table, dict):  # a list comes as a whole
+                break
+            if part not in table:
+                return False
+            table = table[part]
+        return bool(location)
 
 
 def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> Settings:
@@ -59,18 +67,18 @@ def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> 
         SettingsError: the file cannot be read, or a setting is unknown, of the wrong type or out
             of range. The text names the setting, where it comes from and what is allowed.
     """
-    sources = [
-        _Source(f"settings file {file}", {} if file is None else _read_file(file)),
-        _Source("environment", _with_numbers(_read_environment())),
-        _Source("--set", _with_numbers(_parse_assignments(assignments))),
+    origins = [
+        _Origin(f"settings file {file}", {} if file is None else _read_file(file)),
+        _Origin("environment", _as_in_a_file(_read_environment())),
+        _Origin("--set", _as_in_a_file(_parse_assignments(assignments))),
     ]
     merged: dict[str, Any] = {}
-    for _, tables in sources:
+    for _, tables in origins:
         merged = _merged(merged, tables)
     try:
         return Settings.model_validate(merged)
     except ValidationError as error:
-        texts = [_explain(details, sources) for details in error.errors()]
+        texts = [_explain(details, origins) for details in error.errors()]
         raise SettingsError("; ".join(texts)) from error
 
 
@@ -97,7 +105,8 @@ def _merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 def _read_file(file: Path) -> dict[str, Any]:
     try:
         file.stat()  # a file that is missing would count as empty
-        return TomlConfigSettingsSource(_Sources, file)()
+        # As it is written: a call would take [Scan] for [scan], and of both drop one.
+        return TomlConfigSettingsSource(_NamedSettings, file).toml_data
     except (OSError, ValueError, RecursionError) as error:
         raise SettingsError(f"settings file {file}: {error}") from error
 
@@ -107,7 +116,7 @@ def _read_environment() -> dict[str, Any]:
         section, delimiter, key = variable.removeprefix(_PREFIX).lower().partition(_DELIMITER)
         if variable.startswith(_PREFIX) and delimiter and section not in Settings.model_fields:
             raise SettingsError(f"environment: {variable}: {_unknown((section, key))}")
-    return EnvSettingsSource(_Sources)()
+    return EnvSettingsSource(_NamedSettings)()
 
 
 def _parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
@@ -126,14 +135,14 @@ def _parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     return tables
 
 
-def _with_numbers(tables: dict[str, Any]) -> dict[str, Any]:
-    """Tables of texts as a file would have them: those of numbers are read, where they can be."""
+def _as_in_a_file(tables: dict[str, Any]) -> dict[str, Any]:
+    """Tables of texts as a file would have them: what stands for another value is read."""
     schemas = setting_schemas()
 
-    def read(section: str, key: str, text: str) -> float | str:
-        numbers = _NUMBERS.get(schemas.get(section, {}).get(key, {}).get("type", "string"))
+    def read(section: str, key: str, text: str) -> Any:
+        reader = _READERS.get(schemas.get(section, {}).get(key, {}).get("type", "string"))
         try:
-            return numbers.validate_python(text) if numbers else text
+            return reader.validate_python(text) if reader else text
         except ValidationError:
             return text
 
@@ -159,13 +168,17 @@ def _with_values(table: Any) -> Any:
         return table
 
 
-def _explain(details: ErrorDetails, sources: list[_Source]) -> str:
+def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:
     """What is wrong with a setting, and what is right."""
     location = details["loc"]
-    origins = [source.origin for source in sources if source.gives(location)]
-    # The last source has the last word.
-    prefix = f"{origins[-1]}: " if origins else ""
-    return prefix + _problem(details, ".".join(map(str, location)))
+    givers = [origin for origin in origins if origin.gives(location)]
+    problem = _problem(details, ".".join(map(str, location)))
+    if not givers:
+        return problem
+    # The last has the last word, and only a file has numbers beside text.
+    is_number = details["type"] in ("int_type", "float_type")
+    quoted = is_number and isinstance(details["input"], str) and givers == origins[:1]
+    return f"{givers[-1].name}: {problem}" + (", without quotes" if quoted else "")
 
 
 def _problem(details: ErrorDetails, name: str) -> str:
@@ -174,6 +187,8 @@ def _problem(details: ErrorDetails, name: str) -> str:
         case "value_error":
             return str(details["ctx"]["error"])
         case "extra_forbidden" | "unexpected_keyword_argument":
+            if location[0] == "sources" and isinstance(details["input"], dict):
+                return _split_name(location, details["input"])
             return _unknown(location)
         case "model_type" | "dataclass_type":
             return f"{name} = {value} is not a section: write [{name}]"
@@ -183,13 +198,25 @@ def _problem(details: ErrorDetails, name: str) -> str:
             return f"{name} = {value}: use true or false"
         case "tuple_type" | "missing" | "too_long":
             return f"{name} = {value}: write two corners, [[x, y, z], [x, y, z]]"
-        case "greater_than_equal" | "less_than_equal":
+        case "greater_than_equal" | "less_than_equal" | "finite_number":
             return f"{name} = {value} is out of range: use {_allowed(location)}"
         case "int_type" | "float_type":
-            quotes = ", without quotes" if isinstance(details["input"], str) else ""
-            return f"{name} = {value} is of another type: use {_allowed(location)}{quotes}"
+            return f"{name} = {value} is of another type: use {_allowed(location)}"
         case _:
             return f"{name} = {value}: {details['msg']}"
+
+
+def _split_name(location: tuple[int | str, ...], table: dict[str, Any]) -> str:
+    """That a table lies in the section of a source, where the points of a name cut it up."""
+    section, *parts = map(str, location)
+    while len(table) == 1 and isinstance(inner := next(iter(table.values())), dict):
+        parts.extend(table)
+        table = inner
+    name = ".".join(parts)
+    return (
+        f"{section}.{name} is no section: in a file, the name of a source that has points in it "
+        f'stands in quotes, [{section}."{name}"]'
+    )
 
 
 def _allowed(location: tuple[int | str, ...]) -> str:

@@ -1,0 +1,145 @@
+"""What the client refuses to send, by name, and what it takes."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import Client, InvalidInputError, InvalidScanError
+
+POSE = np.eye(4)
+CLOUD = np.ones((10, 3), np.float32)
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with servers.service_and_client() as client:
+        yield client
+
+
+@pytest.mark.parametrize(
+    ("points", "text"),
+    [
+        (np.zeros((0, 3)), "no points"),
+        (np.zeros((5, 2)), r"\[5, 2\], not \[N, 3\]"),
+        (np.zeros(3), r"\[3\], not"),
+        (np.zeros((2, 3), complex), "complex128"),
+        (np.full((2, 3), "x"), "dtype"),
+        ([[1, 2, 3], [4, 5]], "points are not"),
+        (None, "points are not"),
+    ],
+)
+def test_points_that_are_no_scan_are_refused_here(client: Client, points: Any, text: str) -> None:
+    with pytest.raises(InvalidScanError, match=text):
+        client.publish_scan(points, POSE)
+
+
+@pytest.mark.parametrize(
+    ("pose", "text"),
+    [
+        (np.eye(3), r"\[3, 3\], not \[4, 4\]"),
+        (np.full((4, 4), np.nan), "not finite"),
+        (np.diag([2.0, 2, 2, 1]), "not rigid"),
+        (np.diag([1.0, 1, -1, 1]), "not rigid"),
+        (np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1.0]]), "transposed"),
+        ("pose", "not a matrix"),
+        (np.full((4, 4), 10**400).tolist(), "not a matrix"),
+    ],
+)
+def test_poses_that_are_not_rigid_are_refused_here(client: Client, pose: Any, text: str) -> None:
+    with pytest.raises(InvalidScanError, match=text):
+        client.publish_scan(CLOUD, pose)
+
+
+@pytest.mark.parametrize("stamp", [np.nan, np.inf, -1.0, 1e30, 10**400, "now"])
+def test_stamps_that_are_no_time_are_refused_here(client: Client, stamp: Any) -> None:
+    with pytest.raises(InvalidScanError, match="stamp_s = "):
+        client.publish_scan(CLOUD, POSE, stamp)
+
+
+def test_time_that_runs_backwards_is_refused_here_per_source(client: Client) -> None:
+    client.publish_scan(servers.sphere(10), POSE, 1000.5, "a")
+    client.publish_scan(servers.sphere(10), POSE, 1000.5, "a")
+    client.publish_scan(servers.sphere(10), POSE, 10.0, "b")
+    with pytest.raises(InvalidScanError, match="in order"):
+        client.publish_scan(CLOUD, POSE, 1000.4, "a")
+
+
+@pytest.mark.parametrize("source", ["a/b", "", None, 3])
+def test_sources_that_are_no_names_are_refused_here(client: Client, source: Any) -> None:
+    with pytest.raises(InvalidScanError, match=f"source name {source!r} .* use a text of 1 to 64"):
+        client.publish_scan(CLOUD, POSE, source=source)
+
+
+def test_lists_and_other_numbers_are_taken(client: Client) -> None:
+    taken = client.flush(servers.WAIT_S).taken
+    client.publish_scan(servers.sphere(100).tolist(), np.eye(4, dtype=int).tolist())
+    client.publish_scan(np.asfortranarray(servers.sphere(100).astype(np.float64))[::-1], POSE)
+    client.publish_scan((100 * servers.sphere(100)).astype(np.int16) // 100, POSE)
+    report = client.flush(servers.WAIT_S)
+    assert (report.taken - taken, report.lost) == (3, 0)
+    assert client.query_sdf([[0, 0, 0], [1, 2, 3]]).sdf.shape == (2,)
+
+
+def test_points_that_are_not_finite_are_refused_by_index(client: Client) -> None:
+    points = np.zeros((5, 3))
+    points[3, 1] = np.nan
+    with pytest.raises(InvalidInputError, match="point 3 is not finite"):
+        client.query_sdf(points)
+    with pytest.raises(InvalidInputError, match="point 1 is .* metres of the map frame"):
+        client.query_sdf([[0, 0, 0], [0, 2e9, 0]])
+    with pytest.raises(ValueError, match="not finite"):
+        client.query_sdf([[np.inf, 0, 0]], gradient=True)
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        ((0, 0), (1, 1)),
+        ((1, 0, 0), (0, 1, 1)),
+        ((np.nan, 0, 0), (1, 1, 1)),
+        ((0, 0, 0), (1, 1, 10**400)),
+        (1, 2, 3),
+        5,
+    ],
+)
+def test_bounds_that_are_no_box_are_refused_here(client: Client, bounds: Any) -> None:
+    with pytest.raises(InvalidInputError, match="bounds"):
+        client.mesh(bounds)
+
+
+@pytest.mark.parametrize(
+    ("timeout_s", "pending", "text"),
+    [
+        (-1.0, 0, "timeout_s = -1.0: use 0 to 1e\\+06"),
+        (1.0, -1, "pending = -1: use 0"),
+        (10**400, 0, "timeout_s = 1000.*000: use 0 to"),
+        ("long", 0, "timeout_s = 'long' is not a number"),
+    ],
+)
+def test_a_flush_that_cannot_be_waited_for_is_refused_here(
+    client: Client, timeout_s: Any, pending: int, text: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=text):
+        client.flush(timeout_s, pending)
+
+
+def test_however_long_a_settled_map_may_take_it_is_told_at_once(client: Client) -> None:
+    client.flush(servers.WAIT_S)
+    client.settle(servers.WAIT_S)
+    assert client.settle(10**400).settled
+    for bad in (np.nan, "long"):
+        with pytest.raises(InvalidInputError, match="timeout_s = "):
+            client.settle(bad)
+
+
+def test_far_coordinates_keep_their_precision(client: Client) -> None:
+    """Offsets travel in single precision from an origin in double precision."""
+    far = np.array([[50_000.0, 0, 0]]) + servers.sphere(20)
+    pose = np.eye(4)
+    pose[0, 3] = 50_000.0
+    client.publish_scan(servers.sphere(), pose, source="far")
+    client.flush(servers.WAIT_S)
+    assert (client.query_sdf(far).status == triquad_client.Status.SURFACE).all()
