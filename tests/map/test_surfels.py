@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from support import small_world
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.observations import Sighting
 from triquad_map.compiled.surfels.surfel_map import first_surfels
 from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples, in_one
-from triquad_map.surface import FieldSample, SurfelKind, fit_surfels
+from triquad_map.surface import FieldSample, SurfelKind, Surfels, fit_surfels, nothing_shown
 from triquad_server.mapping.mapper import Mapper
 
 SIDE = 64
@@ -56,6 +57,79 @@ def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
     np.testing.assert_array_equal(surfels.offsets[0], 0)
 
 
+def by_rays(kind, offset):
+    """What rays have shown of all voxels: a floor that lies so far above their middles."""
+
+    def shown(voxels):
+        offsets, normals = np.zeros((2, len(voxels), 3), np.float32)
+        offsets[:, 2], normals[:, 2] = offset, 1
+        return Surfels(offsets, normals, np.full(len(voxels), kind, np.uint8))
+
+    return shown
+
+
+@pytest.mark.parametrize("kind", [SurfelKind.RAY_DISC, SurfelKind.RAY_POINT])
+@pytest.mark.parametrize("height", [29.7, 20.0])  # of the field's surface, next door or far below
+def test_where_the_field_has_not_learnt_what_rays_saw_they_count(kind, height):
+    voxels, field = np.array([[30, 30, 30]]), plane(np.array([0.0, 0, 1]), height)
+    surfels = fit_surfels(
+        voxels, field, lambda asked: np.ones(len(asked), bool), by_rays(kind, 0.3)
+    )
+    assert surfels.kinds[0] == kind
+    np.testing.assert_allclose(surfels.offsets[0], (0, 0, 0.3), atol=1e-6)
+
+
+def test_the_field_takes_over_once_it_has_learnt_the_surface():
+    voxels, shown = np.array([[30, 30, 30]]), by_rays(SurfelKind.RAY_DISC, 0.3)
+    field = plane(np.array([0.0, 0, 1]), 30.75)
+    surfels = fit_surfels(voxels, field, lambda asked: np.ones(len(asked), bool), shown)
+    assert surfels.kinds[0] == SurfelKind.DISC
+    next_door = plane(np.array([0.0, 0, 1]), 31.1)  # and rays ended a little below it, too
+    shown = by_rays(SurfelKind.RAY_DISC, 0.45)
+    surfels = fit_surfels(voxels, next_door, lambda asked: np.ones(len(asked), bool), shown)
+    assert surfels.kinds[0] == SurfelKind.NONE
+
+
+def seen_by_rays(ends, normal=None):
+    """Evidence of one scan from above, and what its rays show of some voxels."""
+    evidence = LiveEvidence(SIDE)
+    sighting = Sighting(np.array([32.0, 32, 60]), 0.2, stamp_s=1, scan=1)
+    marks = evidence.mark_surface(ends, sighting)
+    normals = np.full(ends.shape, np.nan if normal is None else normal)
+    evidence.set_normals(marks, normals)
+    return evidence
+
+
+def test_rays_show_a_disc_that_faces_the_sensor():
+    ends = np.array([[30.3, 30.4, 30.1], [30.5, 30.6, 30.3]])
+    shown = seen_by_rays(ends, (0.0, 0, -1)).ray_surfels(np.array([[30, 30, 30], [9, 9, 9]]))
+    assert shown.kinds.tolist() == [SurfelKind.RAY_DISC, SurfelKind.NONE]
+    np.testing.assert_allclose(shown.offsets[0], ends.mean(axis=0) - 30.5, atol=1e-5)
+    np.testing.assert_allclose(shown.normals[0], (0, 0, 1))
+
+
+def test_where_no_normal_is_known_the_ends_around_may_lie_on_a_plane():
+    rng = np.random.default_rng(4)
+    slope = np.array([0.6, 0, 0.8])
+    ends = rng.uniform(28, 34, (400, 3))
+    ends[:, 2] = 30.5 - (ends[:, 0] - 30.5) * 0.75
+    shown = seen_by_rays(ends).ray_surfels(np.array([[30, 30, 30]]))
+    assert shown.kinds[0] == SurfelKind.RAY_DISC
+    np.testing.assert_allclose(shown.normals[0], slope, atol=0.05)
+    scattered = rng.uniform(28, 34, (400, 3))
+    shown = seen_by_rays(scattered).ray_surfels(np.array([[30, 30, 30]]))
+    assert shown.kinds[0] == SurfelKind.RAY_POINT
+
+
+def test_of_restored_evidence_rays_have_shown_nothing():
+    evidence = seen_by_rays(np.array([[30.3, 30.4, 30.1]]), (0.0, 0, 1))
+    restored = LiveEvidence.from_record(SIDE, evidence.freeze().record())
+    voxels = np.array([[30, 30, 30]])
+    assert restored.ray_surfels(voxels).kinds[0] == SurfelKind.NONE
+    restored.set_discs(voxels, nothing_shown(voxels))  # not even a disc of the field
+    assert restored.ray_surfels(voxels).kinds[0] == SurfelKind.NONE
+
+
 def nearest(surfels, points):
     found = no_surfels(np.full(len(points), 40.0))
     surfels.find_nearest(points, found)
@@ -101,12 +175,12 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
     assert rounds > 1
 
 
-def surfels_of(region, mapper_settings):
+def surfels_of(region, by_rays, mapper_settings):
     samples = field_samples(region.engine, mapper_settings, in_one)  # type: ignore[arg-type]
-    return first_surfels(region.evidence, samples, 1)
+    return first_surfels(region.evidence, samples, 1, by_rays)
 
 
-def test_a_settled_map_answers_from_the_field_as_it_is():
+def test_a_settled_map_answers_as_if_fitted_anew():
     chosen = small_world.settings()
     drive = small_world.world(3)
     mapper = Mapper("test", chosen, "cpu")
@@ -117,7 +191,7 @@ def test_a_settled_map_answers_from_the_field_as_it_is():
     small_world.settle(mapper)
     epoch = mapper.publish()
     rng = np.random.default_rng(3)
-    for region in epoch.frozen_regions:
+    for live, region in zip(mapper.regions, epoch.frozen_regions, strict=True):
         points = rng.uniform(0, 1 << chosen.field.depth, (200, 3))
-        expected = nearest(surfels_of(region, chosen.field), points)
+        expected = nearest(surfels_of(region, live.evidence.ray_surfels, chosen.field), points)
         np.testing.assert_array_equal(nearest(region.surfels, points).closest, expected.closest)

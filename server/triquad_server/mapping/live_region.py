@@ -235,10 +235,11 @@ class LiveRegion:
             self._passed.clear()
         evidence = self.evidence.freeze()
         most = _SURFELS_REFITTED if self.budget_samples else None
+        shown = self.evidence.ray_surfels
         surfels = (
-            first_surfels(evidence, samples, epoch)
+            first_surfels(evidence, samples, epoch, shown)
             if before is None
-            else before.surfels.updated(evidence, samples, epoch, most=most)
+            else before.surfels.updated(evidence, samples, epoch, most=most, by_rays=shown)
         )
         if self._restored:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)

@@ -17,6 +17,7 @@ from triquad_map.compiled.evidence.contradictions import (
 )
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.observations import Observations, Sighting
+from triquad_map.compiled.evidence.ray_surfels import ray_surfels
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_ends
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
 from triquad_map.surface import SampleField, Surfels
@@ -81,6 +82,10 @@ class LiveEvidence:
         For evidence that was restored: a record tells of voxels only.
         """
         self._observations.set_discs(voxels, surfels, self._seen)
+
+    def ray_surfels(self, voxels: Longs) -> Surfels:
+        """What rays alone show: a :data:`triquad_map.surface.ShownByRays`."""
+        return ray_surfels(voxels, self._seen, self._observations.arrays)
 
     def carve(self, origin: Doubles, ends: Doubles, reach: Reach) -> Ints:
         """Record the free space between ``origin`` [3] and ``ends`` [N, 3].

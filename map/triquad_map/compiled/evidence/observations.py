@@ -14,6 +14,7 @@ from triquad_map.compiled.evidence.observed import (
     EARLIER_MISSES,
     EARLIER_PASSES,
     ENDS,
+    FIRST_SCAN,
     HIT_SCAN,
     HITS,
     MEAN,
@@ -24,6 +25,7 @@ from triquad_map.compiled.evidence.observed import (
     SECTORS,
     SHAPE_COLUMNS,
     SPREAD,
+    TOWARDS,
     WEIGHT,
     Observed,
     Vector,
@@ -84,6 +86,8 @@ def _add_ray(row: int, end: Vector, sighting: Sighting, observed: Observed) -> N
     dx, dy, dz = origin[0] - end[0], origin[1] - end[1], origin[2] - end[2]
     square = (dx * dx + dy * dy + dz * dz) * (sighting.leaf_m / NEAR_M) ** 2
     observed.shapes[row, WEIGHT] += np.float32(1 / (1 + square))
+    for axis, towards in enumerate((dx, dy, dz)):
+        observed.shapes[row, TOWARDS + axis] = towards
     observed.counts[row, SECTORS] |= 1 << _sector(dx, dy)
 
 
@@ -94,7 +98,7 @@ def _add_end(row: int, end: Vector, observed: Observed) -> None:
     count = min(shapes[row, ENDS] + np.float32(1), np.float32(_COUNTED_ENDS))
     if count == 1:
         for axis in range(3):
-            shapes[row, MEAN + axis] = end[axis]
+            shapes[row, MEAN + axis], shapes[row, NORMAL + axis] = end[axis], 0
         shapes[row, SPREAD] = 0
     shapes[row, ENDS] = count
     squared = np.float32(0)
@@ -117,6 +121,8 @@ def _begin_hit(row: int, scan: int, observed: Observed) -> None:
     if observed.shapes[row, ENDS] > 0:  # else they passed while nothing was there
         counts[row, EARLIER_PASSES] += counts[row, PASSES]
         counts[row, EARLIER_MISSES] += counts[row, MISSES]
+    else:
+        counts[row, FIRST_SCAN] = scan
     counts[row, PASS_SCANS] = counts[row, PASSES] = counts[row, MISSES] = 0
 
 
@@ -187,6 +193,8 @@ def _set_discs(
 ) -> None:
     for i in range(len(voxels)):
         shape = observed.shapes[row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])]
+        if shape[ENDS] != 0:  # rays have told since
+            continue
         is_disc = kinds[i] == _DISC
         for axis in range(3):
             shape[MEAN + axis] = offsets[i, axis] + 0.5 if is_disc else np.nan

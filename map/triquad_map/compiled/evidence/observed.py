@@ -13,7 +13,8 @@ NORMAL = 3  # and the two after it: of the surface; 0 where it is not known or n
 SPREAD = 6  # mean squared distance of the ends from their middle, voxels
 ENDS = 7  # rays that ended there, up to _COUNTED_ENDS
 WEIGHT = 8  # rays, the near ones counting more
-SHAPE_COLUMNS = 9
+TOWARDS = 9  # and the two after it: from the last end to the sensor, voxels
+SHAPE_COLUMNS = 12
 
 HIT_SCAN = 0  # the last scan of which a ray ended there
 HITS = 1  # scans of which rays ended there
@@ -24,7 +25,8 @@ MISSES = 5  # rays of theirs that crossed the surface
 EARLIER_PASSES = 6  # rays that passed before the last hit
 EARLIER_MISSES = 7
 SECTORS = 8  # a bit for each eighth of the horizon looked from
-COUNT_COLUMNS = 9
+FIRST_SCAN = 9  # of which a ray ended on the surface that is there now
+COUNT_COLUMNS = 10
 
 
 class Observed(NamedTuple):
