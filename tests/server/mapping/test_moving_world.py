@@ -166,7 +166,7 @@ def test_it_returns_and_leaves_again() -> None:
         assert share(watched.scan(BOX, count=10), Status.SURFACE) > 0.9
         left = watched.scan(count=10)
         assert share(left, Status.SURFACE, front=True) < 0.02
-        assert share(watched.scan(count=15), Status.SURFACE) < 0.15
+        assert share(watched.scan(count=15), Status.SURFACE) < 0.1
 
 
 def test_in_a_static_world_nothing_is_taken_back() -> None:

@@ -42,7 +42,11 @@ _OWN_RECORD_HITS = 3
 _LEAST_GONE = 3
 """So many voxels around must be gone to take one along that rays need not have passed."""
 
-_SCANS_AROUND = 2  # times those that a voxel's own record asks for
+_SOLID_HITS = 20
+"""A surface that was hit so many times for each time it was crossed has no gaps: crossings of all
+its voxels count together."""
+
+_SCANS_AROUND = 2  # times those that a voxel's own record asks for, where rays need not cross it
 
 
 class Disbelief(NamedTuple):
@@ -50,7 +54,7 @@ class Disbelief(NamedTuple):
 
     scans: int  # at least so many in a row, of which rays passed and none ended there
     own: float  # and so improbable are their crossings: logarithm of the probability
-    around: float  # or so improbable the passes of a voxel and all those around it
+    around: float  # or so improbable what passed a voxel and all those around it
     shared: float  # or so improbable its passes alone, where half of those around it are gone
     witnessed: float  # or so improbable its crossings, where the field shows no surface either
 
@@ -103,6 +107,9 @@ class Around(NamedTuple):
     known: int  # of those around it
     gone: int  # of these, whose surface is not believed any more
     doubted: int  # of these, that are believed, and that rays passed since
+    scans: int  # most in a row of which rays passed one of them
+    misses: int
+    earlier_misses: int
     passes: int
     earlier_passes: int
     hits: int
@@ -112,7 +119,7 @@ class Around(NamedTuple):
 def _around(row: int, seen: SeenVoxels, observed: Observed) -> Around:
     """What is known of a voxel and those around it."""
     x, y, z = _voxel_of(row, seen, observed)
-    known = gone = doubted = passes = earlier = hits = 0
+    known = gone = doubted = scans = misses = earlier_misses = passes = earlier = hits = 0
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
@@ -120,6 +127,9 @@ def _around(row: int, seen: SeenVoxels, observed: Observed) -> Around:
                 if near == 0:
                     continue
                 other = observed.counts[near]
+                scans = max(scans, other[PASS_SCANS])
+                misses += other[MISSES]
+                earlier_misses += other[EARLIER_MISSES]
                 passes += other[PASSES]
                 earlier += other[EARLIER_PASSES]
                 hits += other[HITS]
@@ -130,7 +140,7 @@ def _around(row: int, seen: SeenVoxels, observed: Observed) -> Around:
                     gone += 1
                 elif other[PASS_SCANS] > 0:
                     doubted += 1
-    return Around(known, gone, doubted, passes, earlier, hits)
+    return Around(known, gone, doubted, scans, misses, earlier_misses, passes, earlier, hits)
 
 
 @kernel()
@@ -154,20 +164,29 @@ def _goes_along(counts: Ints, around: Around, rule: Disbelief) -> bool:
 
 
 @kernel()
+def _is_doubted_around(counts: Ints, around: Around, rule: Disbelief) -> bool:
+    """Whether no surface around a voxel is believed, and what passed all of it is improbable."""
+    if around.gone + around.doubted < around.known:
+        return False
+    solid = around.hits >= _SOLID_HITS * around.earlier_misses
+    if solid and counts[MISSES] and around.scans >= rule.scans:
+        if _improbability(around.misses, around.earlier_misses, around.hits) < rule.around:
+            return True
+    if counts[PASS_SCANS] < _SCANS_AROUND * rule.scans:
+        return False
+    return _improbability(around.passes, around.earlier_passes, around.hits) < rule.around
+
+
+@kernel()
 def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
     """Whether the surface of a voxel is gone, by its own record or with those around it."""
     counts = observed.counts[row]
-    scans = counts[PASS_SCANS]
-    if scans >= rule.scans and counts[MISSES] >= rule.scans:
+    if counts[PASS_SCANS] >= rule.scans and counts[MISSES] >= rule.scans:
         own = _improbability(counts[MISSES], counts[EARLIER_MISSES], counts[HITS])
         if own < rule.own:
             return True
     around = _around(row, seen, observed)
-    if _goes_along(counts, around, rule):
-        return True
-    if scans < _SCANS_AROUND * rule.scans or around.gone + around.doubted < around.known:
-        return False
-    return _improbability(around.passes, around.earlier_passes, around.hits) < rule.around
+    return _goes_along(counts, around, rule) or _is_doubted_around(counts, around, rule)
 
 
 @kernel()
