@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support import small_world
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.observations import Sighting
+from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.surfels.surfel_map import first_surfels
 from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples, in_one

@@ -13,7 +13,7 @@ from triquad_format.records.region import Region
 from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence, Marks
-from triquad_map.compiled.evidence.observations import Sighting
+from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import empty_keys, thin

@@ -13,24 +13,16 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Ints, Longs
 
 from triquad_map.compiled.evidence.observed import (
-    EARLIER_MISSES,
-    EARLIER_PASSES,
-    ENDS,
-    HIT_SCAN,
-    HITS,
-    MEAN,
-    MISSES,
-    PASS_SCANS,
-    PASSED_SCAN,
-    PASSES,
-    SECTORS,
-    WEIGHT,
     Observed,
-    row_of,
+    ObservedVoxel,
+    Voxel,
+    has_surface,
+    rows_around,
+    voxel_of,
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of, byte_of, unpack
+from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
 
 _PRIOR_HITS, _PRIOR_PASSES = 0.3, 0.7
 """What is taken to have been seen of a voxel before anything was: one ray in all."""
@@ -68,9 +60,6 @@ class Disbelief(NamedTuple):
         return cls(scans, own, around=3 * own, shared=own + math.log(2), witnessed=own / 2)
 
 
-Voxel = tuple[int, int, int]
-
-
 @kernel()
 def _improbability(passes: int, earlier: int, hits: int) -> float:
     """Logarithm of how probable so many passes in a row are, by what was seen earlier."""
@@ -82,23 +71,9 @@ def _improbability(passes: int, earlier: int, hits: int) -> float:
 
 
 @kernel()
-def _voxel_of(row: int, seen: SeenVoxels, observed: Observed) -> Voxel:
-    """The voxel of a row."""
-    owner = observed.owners[row]
-    x, y, z = unpack(seen.blocks.row_keys[owner >> (3 * SHIFT)])
-    return (
-        (x << SHIFT) + (owner >> (2 * SHIFT) & LOW),
-        (y << SHIFT) + (owner >> SHIFT & LOW),
-        (z << SHIFT) + (owner & LOW),
-    )
-
-
-@kernel()
-def _has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
-    """Whether the surface of a row is still believed."""
-    owner = observed.owners[row]
-    block = owner >> (3 * SHIFT)
-    return bool(seen.surface[block, owner >> SHIFT & (1 << (2 * SHIFT)) - 1] & bit_of(owner & LOW))
+def _own_improbability(voxel: ObservedVoxel) -> float:
+    """Logarithm of how probable the crossings of a voxel are by its own record."""
+    return _improbability(voxel.misses, voxel.earlier_misses, voxel.hits)
 
 
 class Around(NamedTuple):
@@ -118,33 +93,29 @@ class Around(NamedTuple):
 @kernel()
 def _around(row: int, seen: SeenVoxels, observed: Observed) -> Around:
     """What is known of a voxel and those around it."""
-    x, y, z = _voxel_of(row, seen, observed)
-    known = gone = doubted = scans = misses = earlier_misses = passes = earlier = hits = 0
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                near = row_of(seen, observed, x + i, y + j, z + k)
-                if near == 0:
-                    continue
-                other = observed.counts[near]
-                scans = max(scans, other[PASS_SCANS])
-                misses += other[MISSES]
-                earlier_misses += other[EARLIER_MISSES]
-                passes += other[PASSES]
-                earlier += other[EARLIER_PASSES]
-                hits += other[HITS]
-                if near == row:
-                    continue
-                known += 1
-                if not _has_surface(near, seen, observed):
-                    gone += 1
-                elif other[PASS_SCANS] > 0:
-                    doubted += 1
-    return Around(known, gone, doubted, scans, misses, earlier_misses, passes, earlier, hits)
+    known = gone = doubted = scans = misses = earlier_misses = passes = earlier_passes = hits = 0
+    for near in rows_around(row, seen, observed):
+        if near == 0:
+            continue
+        other = observed.voxels[near]
+        scans = max(scans, other.pass_scans)
+        misses += other.misses
+        earlier_misses += other.earlier_misses
+        passes += other.passes
+        earlier_passes += other.earlier_passes
+        hits += other.hits
+        if near == row:
+            continue
+        known += 1
+        if not has_surface(near, seen, observed):
+            gone += 1
+        elif other.pass_scans > 0:
+            doubted += 1
+    return Around(known, gone, doubted, scans, misses, earlier_misses, passes, earlier_passes, hits)
 
 
 @kernel()
-def _goes_along(counts: Ints, around: Around, rule: Disbelief) -> bool:
+def _goes_along(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
     """Whether a surface goes since those around it are gone.
 
     A thing goes as a whole: no ray need pass each of its voxels. What has a record of its own goes
@@ -152,27 +123,28 @@ def _goes_along(counts: Ints, around: Around, rule: Disbelief) -> bool:
     """
     if around.gone == 0 or 2 * around.gone < around.known:
         return False
-    all_gone = around.gone == around.known and counts[PASS_SCANS] >= rule.scans
+    all_gone = around.gone == around.known and voxel.pass_scans >= rule.scans
     if around.gone < _LEAST_GONE and not all_gone:
         return False
-    if counts[HITS] < _OWN_RECORD_HITS:
+    if voxel.hits < _OWN_RECORD_HITS:
         return True
-    if counts[PASSES] == 0:  # which says nothing either way
+    if voxel.passes == 0:  # which says nothing either way
         return bool(3 * around.gone >= 2 * around.known)
-    share = (counts[EARLIER_PASSES] + 0.5) / (counts[HITS] + counts[EARLIER_PASSES] + 1.0)
-    return bool(counts[PASSES] * np.log(share) <= rule.shared)
+    share = (voxel.earlier_passes + 0.5) / (voxel.hits + voxel.earlier_passes + 1.0)
+    return bool(voxel.passes * np.log(share) <= rule.shared)
 
 
 @kernel()
-def _is_doubted_around(counts: Ints, around: Around, rule: Disbelief) -> bool:
+def _is_doubted_around(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
     """Whether no surface around a voxel is believed, and what passed all of it is improbable."""
     if around.gone + around.doubted < around.known:
         return False
-    solid = around.hits >= _SOLID_HITS * around.earlier_misses
-    if solid and counts[MISSES] and around.scans >= rule.scans:
-        if _improbability(around.misses, around.earlier_misses, around.hits) < rule.around:
+    is_solid = around.hits >= _SOLID_HITS * around.earlier_misses
+    if is_solid and voxel.misses and around.scans >= rule.scans:
+        crossed = _improbability(around.misses, around.earlier_misses, around.hits)
+        if crossed < rule.around:
             return True
-    if counts[PASS_SCANS] < _SCANS_AROUND * rule.scans:
+    if voxel.pass_scans < _SCANS_AROUND * rule.scans:
         return False
     return _improbability(around.passes, around.earlier_passes, around.hits) < rule.around
 
@@ -180,13 +152,12 @@ def _is_doubted_around(counts: Ints, around: Around, rule: Disbelief) -> bool:
 @kernel()
 def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
     """Whether the surface of a voxel is gone, by its own record or with those around it."""
-    counts = observed.counts[row]
-    if counts[PASS_SCANS] >= rule.scans and counts[MISSES] >= rule.scans:
-        own = _improbability(counts[MISSES], counts[EARLIER_MISSES], counts[HITS])
-        if own < rule.own:
-            return True
+    voxel = observed.voxels[row]
+    scans = min(voxel.pass_scans, voxel.misses)
+    if scans >= rule.scans and _own_improbability(voxel) < rule.own:
+        return True
     around = _around(row, seen, observed)
-    return _goes_along(counts, around, rule) or _is_doubted_around(counts, around, rule)
+    return _goes_along(voxel, around, rule) or _is_doubted_around(voxel, around, rule)
 
 
 @kernel()
@@ -197,18 +168,15 @@ def _take_back(
 
     Those around it that were not hit since it was passed are added to ``waiting``.
     """
-    x, y, z = _voxel_of(row, seen, observed)
+    voxel = observed.voxels[row]
+    x, y, z = voxel_of(row, seen, observed)
     taken.append((x, y, z))
-    seen.surface[observed.owners[row] >> (3 * SHIFT), byte_of(x, y)] &= ~bit_of(z)
-    observed.shapes[row, WEIGHT] = observed.shapes[row, ENDS] = 0
-    observed.counts[row, SECTORS] = 0
-    passed_scan = observed.counts[row, PASSED_SCAN]
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                near = row_of(seen, observed, x + i, y + j, z + k)
-                if near != 0 and observed.counts[near, HIT_SCAN] < passed_scan:
-                    waiting.append(near)
+    seen.surface[voxel.owner >> (3 * SHIFT), byte_of(x, y)] &= ~bit_of(z)
+    voxel.weight = voxel.ends = 0
+    voxel.sectors = 0
+    for near in rows_around(row, seen, observed):
+        if near != 0 and observed.voxels[near].hit_scan < voxel.passed_scan:
+            waiting.append(near)
 
 
 @kernel()
@@ -220,13 +188,13 @@ def take_back(
     That of the rows ``gone`` is; that of ``passed``, by rays of the newest scan, may be. With what
     goes, those around it are asked once more.
     """
-    taken = [_voxel_of(0, seen, observed) for _ in range(0)]
-    waiting = [np.int64(row) for row in passed if observed.counts[row, PASS_SCANS] >= rule.scans]
+    taken = [voxel_of(0, seen, observed) for _ in range(0)]
+    waiting = [np.int64(row) for row in passed if observed.voxels[row].pass_scans >= rule.scans]
     for row in gone:
         _take_back(row, seen, observed, taken, waiting)
     while len(waiting):
         row = waiting.pop()
-        if _has_surface(row, seen, observed) and _is_gone(row, seen, observed, rule):
+        if has_surface(row, seen, observed) and _is_gone(row, seen, observed, rule):
             _take_back(row, seen, observed, taken, waiting)
     voxels = np.empty((len(taken), 3), np.int64)
     for number, (x, y, z) in enumerate(taken):
@@ -240,11 +208,10 @@ def doubted(passed: Ints, seen: SeenVoxels, observed: Observed, rule: Disbelief)
     chosen = np.empty(len(passed), np.int64)
     count = 0
     for row in passed:
-        counts = observed.counts[row]
-        if counts[MISSES] == 0 or not _has_surface(row, seen, observed):
+        voxel = observed.voxels[row]
+        if voxel.misses == 0 or not has_surface(row, seen, observed):
             continue
-        own = _improbability(counts[MISSES], counts[EARLIER_MISSES], counts[HITS])
-        if own < rule.witnessed:
+        if _own_improbability(voxel) < rule.witnessed:
             chosen[count] = row
             count += 1
     return chosen[:count]
@@ -255,8 +222,7 @@ def middles(rows: Longs, seen: SeenVoxels, observed: Observed) -> Doubles:
     """Where the surface of ``rows`` [N] was seen [N, 3], voxels."""
     places = np.empty((len(rows), 3))
     for i, row in enumerate(rows):
-        x, y, z = _voxel_of(row, seen, observed)
-        places[i, 0] = x + observed.shapes[row, MEAN]
-        places[i, 1] = y + observed.shapes[row, MEAN + 1]
-        places[i, 2] = z + observed.shapes[row, MEAN + 2]
+        voxel, mean = voxel_of(row, seen, observed), observed.voxels[row].mean
+        for axis in range(3):
+            places[i, axis] = voxel[axis] + mean[axis]
     return places

@@ -16,9 +16,10 @@ from triquad_map.compiled.evidence.contradictions import (
     take_back,
 )
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.observations import Observations, Sighting
+from triquad_map.compiled.evidence.observations import Observations
 from triquad_map.compiled.evidence.ray_surfels import ray_surfels
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_ends
+from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
 from triquad_map.surface import SampleField, Surfels
 
@@ -99,7 +100,7 @@ class LiveEvidence:
             What :meth:`take_back` asks for: where rays passed a surface.
         """
         self._frozen = None
-        passed = np.zeros(len(self._observations.arrays.owners), np.int32)
+        passed = np.zeros(len(self._observations.arrays.voxels), np.int32)
         done = 0
         while done < len(ends):
             done, self._blocks.count = mark_crossed(

@@ -3,17 +3,7 @@
 import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
-from triquad_map.compiled.evidence.observed import (
-    ENDS,
-    FIRST_SCAN,
-    HIT_SCAN,
-    HITS,
-    MEAN,
-    NORMAL,
-    TOWARDS,
-    Observed,
-    row_of,
-)
+from triquad_map.compiled.evidence.observed import Observed, row_of
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
@@ -42,19 +32,19 @@ def _normal_around(
     Only those count that rays have ended in since they did here, and not much more often: a floor
     does not, on which something was put.
     """
-    hits = observed.counts[row, HITS]
-    since, most = observed.counts[row, HIT_SCAN] - hits, 2 * hits + 1
+    here = observed.voxels[row]
+    since, most = here.hit_scan - here.hits, 2 * here.hits + 1
     moments = np.zeros(MOMENTS)
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
                 near = row_of(seen, observed, voxel[0] + i, voxel[1] + j, voxel[2] + k)
-                shape, counts = observed.shapes[near], observed.counts[near]
-                if near == 0 or shape[ENDS] == 0:
+                other = observed.voxels[near]
+                if near == 0 or other.ends == 0:
                     continue
-                if counts[HIT_SCAN] > since and counts[HITS] <= most:
-                    at = (i + shape[MEAN], j + shape[MEAN + 1], k + shape[MEAN + 2])
-                    add_points(moments, at, shape[ENDS])
+                if other.hit_scan > since and other.hits <= most:
+                    at = (i + other.mean[0], j + other.mean[1], k + other.mean[2])
+                    add_points(moments, at, other.ends)
     return bool(plane_normal(moments, normal))
 
 
@@ -63,9 +53,8 @@ def _set_normal(
     voxel: Longs, row: int, seen: SeenVoxels, observed: Observed, normal: Doubles
 ) -> bool:
     """Set the normal of the surface in a voxel, to the sensor; False: it is the way there."""
-    shape = observed.shapes[row]
-    towards = shape[TOWARDS : TOWARDS + 3]
-    normal[:] = shape[NORMAL : NORMAL + 3]
+    towards = observed.voxels[row].towards
+    normal[:] = observed.voxels[row].normal
     if not normal.any() and not _normal_around(voxel, row, seen, observed, normal):
         normal[:] = towards / max(np.sqrt((towards * towards).sum()), 1e-6)
         return False
@@ -86,10 +75,9 @@ def _fill(
     normal = np.zeros(3)
     for i in range(len(voxels)):
         row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
-        shape = observed.shapes[row]
-        age = observed.counts[row, HIT_SCAN] - observed.counts[row, FIRST_SCAN]
-        if row == 0 or shape[ENDS] == 0 or age > _NEW:
+        here = observed.voxels[row]
+        if row == 0 or here.ends == 0 or here.hit_scan - here.first_scan > _NEW:
             continue
         is_flat = _set_normal(voxels[i], row, seen, observed, normal)
         kinds[i] = _RAY_DISC if is_flat else _RAY_POINT
-        offsets[i], normals[i] = shape[MEAN : MEAN + 3] - np.float32(0.5), normal
+        offsets[i], normals[i] = here.mean - np.float32(0.5), normal
