@@ -186,8 +186,7 @@ def test_whoever_asks_gets_the_same_answer(client, endpoint, tmp_path):
         ]
     for have in answers:
         assert have.epoch == want.epoch
-        # A file has features of half precision, and not what rays alone have shown.
-        assert (have.status == want.status).mean() > 0.99
+        assert (have.status == want.status).mean() > 0.995  # a file has features of half precision
         same = have.status == want.status
         np.testing.assert_allclose(have.height_m[same], want.height_m[same], atol=0.02)
 

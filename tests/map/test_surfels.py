@@ -102,8 +102,10 @@ def seen_by_rays(ends, normal=None):
 
 def test_rays_show_a_disc_that_faces_the_sensor():
     ends = np.array([[30.3, 30.4, 30.1], [30.5, 30.6, 30.3]])
-    shown = seen_by_rays(ends, (0.0, 0, -1)).ray_surfels(np.array([[30, 30, 30], [9, 9, 9]]))
+    evidence = seen_by_rays(ends, (0.0, 0, -1))
+    shown = evidence.ray_surfels(np.array([[30, 30, 30], [9, 9, 9]]), since=1)
     assert shown.kinds.tolist() == [SurfelKind.RAY_DISC, SurfelKind.NONE]
+    assert evidence.ray_surfels(np.array([[30, 30, 30]]), since=2).kinds[0] == SurfelKind.NONE
     np.testing.assert_allclose(shown.offsets[0], ends.mean(axis=0) - 30.5, atol=1e-5)
     np.testing.assert_allclose(shown.normals[0], (0, 0, 1))
 
@@ -113,11 +115,11 @@ def test_where_no_normal_is_known_the_ends_around_may_lie_on_a_plane():
     slope = np.array([0.6, 0, 0.8])
     ends = rng.uniform(28, 34, (400, 3))
     ends[:, 2] = 30.5 - (ends[:, 0] - 30.5) * 0.75
-    shown = seen_by_rays(ends).ray_surfels(np.array([[30, 30, 30]]))
+    shown = seen_by_rays(ends).ray_surfels(np.array([[30, 30, 30]]), since=1)
     assert shown.kinds[0] == SurfelKind.RAY_DISC
     np.testing.assert_allclose(shown.normals[0], slope, atol=0.05)
     scattered = rng.uniform(28, 34, (400, 3))
-    shown = seen_by_rays(scattered).ray_surfels(np.array([[30, 30, 30]]))
+    shown = seen_by_rays(scattered).ray_surfels(np.array([[30, 30, 30]]), since=1)
     assert shown.kinds[0] == SurfelKind.RAY_POINT
 
 
@@ -125,9 +127,9 @@ def test_of_restored_evidence_rays_have_shown_nothing():
     evidence = seen_by_rays(np.array([[30.3, 30.4, 30.1]]), (0.0, 0, 1))
     restored = LiveEvidence.from_record(SIDE, evidence.freeze().record())
     voxels = np.array([[30, 30, 30]])
-    assert restored.ray_surfels(voxels).kinds[0] == SurfelKind.NONE
+    assert restored.ray_surfels(voxels, since=0).kinds[0] == SurfelKind.NONE
     restored.set_discs(voxels, nothing_shown(voxels))  # not even a disc of the field
-    assert restored.ray_surfels(voxels).kinds[0] == SurfelKind.NONE
+    assert restored.ray_surfels(voxels, since=0).kinds[0] == SurfelKind.NONE
 
 
 def nearest(surfels, points):
@@ -175,9 +177,9 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
     assert rounds > 1
 
 
-def surfels_of(region, by_rays, mapper_settings):
+def surfels_of(region, mapper_settings):
     samples = field_samples(region.engine, mapper_settings, in_one)  # type: ignore[arg-type]
-    return first_surfels(region.evidence, samples, 1, by_rays)
+    return first_surfels(region.evidence, samples, 1)
 
 
 def test_a_settled_map_answers_as_if_fitted_anew():
@@ -191,7 +193,7 @@ def test_a_settled_map_answers_as_if_fitted_anew():
     small_world.settle(mapper)
     epoch = mapper.publish()
     rng = np.random.default_rng(3)
-    for live, region in zip(mapper.regions, epoch.frozen_regions, strict=True):
+    for region in epoch.frozen_regions:
         points = rng.uniform(0, 1 << chosen.field.depth, (200, 3))
-        expected = nearest(surfels_of(region, live.evidence.ray_surfels, chosen.field), points)
+        expected = nearest(surfels_of(region, chosen.field), points)
         np.testing.assert_array_equal(nearest(region.surfels, points).closest, expected.closest)

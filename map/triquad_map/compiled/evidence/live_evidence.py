@@ -84,9 +84,12 @@ class LiveEvidence:
         """
         self._observations.set_discs(voxels, surfels, self._seen)
 
-    def ray_surfels(self, voxels: Longs) -> Surfels:
-        """What rays alone show: a :data:`triquad_map.surface.ShownByRays`."""
-        return ray_surfels(voxels, self._seen, self._observations.arrays)
+    def ray_surfels(self, voxels: Longs, since: int) -> Surfels:
+        """What rays alone show of surface that was first seen in scan ``since`` or later.
+
+        See :data:`triquad_map.surface.ShownByRays`.
+        """
+        return ray_surfels(voxels, since, self._seen, self._observations.arrays)
 
     def carve(self, origin: Doubles, ends: Doubles, reach: Reach) -> Ints:
         """Record the free space between ``origin`` [3] and ``ends`` [N, 3].

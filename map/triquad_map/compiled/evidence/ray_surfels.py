@@ -11,15 +11,14 @@ from triquad_map.surface import SurfelKind, Surfels, nothing_shown
 
 _RAY_DISC, _RAY_POINT = int(SurfelKind.RAY_DISC), int(SurfelKind.RAY_POINT)
 
-_NEW = 10
-"""Scans from the first to the last of which rays ended on a surface: one that was seen for longer
-the field has had time to learn."""
 
+def ray_surfels(voxels: Longs, since: int, seen: SeenVoxels, observed: Observed) -> Surfels:
+    """The surfels of ``voxels`` [N, 3]; see :data:`triquad_map.surface.ShownByRays`.
 
-def ray_surfels(voxels: Longs, seen: SeenVoxels, observed: Observed) -> Surfels:
-    """The surfels of ``voxels`` [N, 3]; see :data:`triquad_map.surface.ShownByRays`."""
+    Only where rays first ended in scan ``since`` or later: of the rest the field has learnt.
+    """
     surfels = nothing_shown(voxels)
-    _fill(voxels, seen, observed, surfels.offsets, surfels.normals, surfels.kinds)
+    _fill(voxels, since, seen, observed, surfels.offsets, surfels.normals, surfels.kinds)
     return surfels
 
 
@@ -66,6 +65,7 @@ def _set_normal(
 @kernel()
 def _fill(
     voxels: Longs,
+    since: int,
     seen: SeenVoxels,
     observed: Observed,
     offsets: Floats,
@@ -76,7 +76,7 @@ def _fill(
     for i in range(len(voxels)):
         row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
         here = observed.voxels[row]
-        if row == 0 or here.ends == 0 or here.hit_scan - here.first_scan > _NEW:
+        if row == 0 or here.ends == 0 or here.first_scan < since:
             continue
         is_flat = _set_normal(voxels[i], row, seen, observed, normal)
         kinds[i] = _RAY_DISC if is_flat else _RAY_POINT
