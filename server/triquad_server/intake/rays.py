@@ -55,16 +55,17 @@ class ScanRays:
     origin: Doubles  # [3] the sensor
     ends: Doubles  # [N, 3] where rays met a surface
     points_dropped: dict[str, int]  # points and rays of the scan that are not used, by reason
-    # [M, 3] the sensor's range on rays that met nothing so far
+    # [K, 3] the sensor's range on rays that met something beyond it
+    far_ends: Doubles = field(default_factory=lambda: np.empty((0, 3)))
+    # [M, 3] and on rays that met nothing
     open_ends: Doubles = field(default_factory=lambda: np.empty((0, 3)))
     robot: RobotBox | None = None
 
     @property
     def free_corners(self) -> Doubles:
         """Points [K, 3] around all that is free without a ray's end that tells it."""
-        if self.robot is None:
-            return self.open_ends
-        return np.concatenate([self.open_ends, self.robot.corners])
+        corners = [] if self.robot is None else [self.robot.corners]
+        return np.concatenate([self.far_ends, self.open_ends, *corners])
 
 
 def _check_pose(world_from_sensor: Doubles) -> None:
@@ -236,8 +237,7 @@ def usable_rays(
     low, high = (np.array(corner, np.float64) for corner in source.robot_box_m or _NOWHERE)
     limits = _Limits(settings.range_min_m, settings.range_max_m, settings.thin_m, low, high)
     found = _select(np.ascontiguousarray(points), limits, empty_keys(len(points)))
-    open_ends = np.concatenate([found.beyond, settings.range_max_m * directions])
-    if len(found.kept) + len(open_ends) == 0:
+    if len(found.kept) + len(found.beyond) + len(directions) == 0:
         raise ScanRefusedError(
             "empty", _why_empty(len(points), disbelieved, settings, source=source)
         )
@@ -246,6 +246,7 @@ def usable_rays(
         origin.copy(),
         found.kept @ rotation.T + origin,
         found.dropped | ({"no_return": disbelieved} if disbelieved else {}),
-        open_ends=open_ends @ rotation.T + origin,
+        far_ends=found.beyond @ rotation.T + origin,
+        open_ends=settings.range_max_m * directions @ rotation.T + origin,
         robot=RobotBox(low, high, world_from_sensor) if source.robot_box_m else None,
     )

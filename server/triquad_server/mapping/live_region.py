@@ -42,7 +42,7 @@ _CLEAR_SHORT_M = 0.5
 
 _SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
 _VISITS = 4  # to each of them
-_OPEN_THINNED_AT = 0.25  # share of the length of rays that met nothing
+_FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 _CHECKPOINT_SAMPLES = 1_000_000
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
 _NEW_SCANS = 10
@@ -136,25 +136,34 @@ class LiveRegion:
 
         def carve() -> None:
             thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
+            far_ends = self._thinned_open(origin, rays.far_ends, _FAR_THINNED_AT)
             passed = self.evidence.carve(origin, thinned, reach)
-            if len(passed):
-                self._passed.append(passed)
-                self._gone.append(self.evidence.take_back(passed, self._disbelief))
-            self._carve_open(origin, rays)
+            passed_farther = self.evidence.carve(origin, far_ends, reach._replace(free=0.0))
+            self._doubt(np.concatenate([passed, passed_farther]))
+            # Glass and black paint return nothing: these rays contradict no surface.
+            open_ends = self._thinned_open(origin, rays.open_ends, _OPEN_THINNED_AT)
+            self.evidence.carve(origin, open_ends, Reach(0.0))
+            if rays.robot is not None:
+                self.evidence.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
 
         return carve
 
-    def _carve_open(self, origin: Doubles, rays: ScanRays) -> None:
-        """Record the space along rays that met nothing, and where the robot is, as free."""
-        ends = self.voxels(rays.open_ends)
-        # Glass and black paint return nothing: these rays contradict no surface.
-        # One per voxel at a quarter of their length: nearer, they leave no gaps. The voxels are
-        # shifted from scan to scan, so that a robot at rest uses other rays each time.
-        near = origin + _OPEN_THINNED_AT * (ends - origin) + self._random.random(3)
-        self.evidence.carve(origin, ends[thin(near, 1.0, empty_keys(len(ends)))], Reach(0.0))
-        if rays.robot is not None:
-            centres = rays.robot.voxel_centres(self._settings.leaf_m)
-            self.evidence.mark_free(self.voxels(centres))
+    def _doubt(self, passed: Ints) -> None:
+        """Take back the surface that rays contradict; ``passed`` is where they passed one."""
+        if len(passed):
+            self._passed.append(passed)
+            self._gone.append(self.evidence.take_back(passed, self._disbelief))
+
+    def _thinned_open(self, origin: Doubles, ends: Doubles, share: float) -> Doubles:
+        """Some of the rays to ``ends`` [N, 3], map frame, as voxels: they go as far as can be.
+
+        One per voxel at a share of their length: nearer, they leave no gaps. The voxels are
+        shifted from scan to scan, so that a robot at rest uses other rays each time.
+        """
+        reached = self.voxels(ends)
+        near = origin + share * (reached - origin) + self._random.random(3)
+        thinned: Doubles = reached[thin(near, 1.0, empty_keys(len(reached)))]
+        return thinned
 
     def learn(self, rays: ScanRays, normals: Doubles) -> None:
         """Keep what the rays teach, to be trained on.

@@ -85,9 +85,8 @@ def test_rays_that_met_nothing_reach_as_far_as_the_sensor() -> None:
         no_return=points((0, 1e-30, 0), (0, 0, -2)),
     )
     assert len(rays.ends) == 1
-    np.testing.assert_allclose(
-        rays.open_ends, [[100, 30, 0], [100, 0, 30], [70, 0, 0], [100, 0, -30]], atol=1e-6
-    )
+    np.testing.assert_allclose(rays.far_ends, [[100, 30, 0], [100, 0, 30]], atol=1e-6)
+    np.testing.assert_allclose(rays.open_ends, [[70, 0, 0], [100, 0, -30]], atol=1e-6)
     assert rays.points_dropped == {"too_far": 2}
 
 

@@ -190,6 +190,14 @@ def test_a_restored_map_stays_until_rays_contradict_it() -> None:
     assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.15
 
 
+def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
+    chosen = settings(samples_per_ray=6.0)
+    near = chosen.model_copy(update={"scan": chosen.scan.model_copy(update={"range_max_m": 6.5})})
+    watched = Watched(near)
+    assert share(watched.scan(BOX, count=8), Status.SURFACE, front=True) > 0.95
+    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.1
+
+
 def test_an_hour_elsewhere_takes_nothing_back() -> None:
     watched = Watched()
     watched.scan(BOX, count=8)
