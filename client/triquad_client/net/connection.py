@@ -41,6 +41,15 @@ class Connection:
         self.map_name = map_name
         self.timeout_s = timeout_s
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether the connection was closed.
+
+        Zenoh is not asked: its answer waits for a lock and holds Python's meanwhile, while a thread
+        of Zenoh that has the former may want the latter, to tell that a request has ended.
+        """
+        return not self._close.alive
+
     def close(self) -> None:
         """Close the session; closing twice does no harm. What is under way ends unanswered."""
         self._close()
@@ -96,7 +105,7 @@ class Connection:
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
-        if self._session.is_closed():
+        if self.is_closed:
             return closed_error()
         info = self._session.info
         if not (info.routers_zid() or info.peers_zid()):
@@ -149,7 +158,7 @@ class Connection:
         return max(self.timeout_s, ask.min_timeout_s) + ask.server_wait_s
 
     def _broken(self, error: Exception) -> Exception:
-        if self._session.is_closed():
+        if self.is_closed:
             return closed_error()
         return ConnectError(f"the connection is broken: {error}")
 
