@@ -3,8 +3,9 @@
 The field is right within the band where it is trained and saturates beyond it. So distances over
 any range are measured to surfels, one in each voxel in which rays ended: where the field crosses
 zero there, and which way it faces. A surfel depends on the field around one voxel alone, which
-makes it cheap to keep up to date. Surfels are in voxel units: one is the side of a leaf, and the
-voxel at integer coordinates ``v`` is the cube ``[v, v + 1)`` of leaf coordinates (see
+makes it cheap to keep up to date. Surface that has just appeared the field has still to learn:
+until then the rays themselves tell where it lies. Surfels are in voxel units: one is the side of a
+leaf, and the voxel at integer coordinates ``v`` is the cube ``[v, v + 1)`` of leaf coordinates (see
 :mod:`triquad_format.records.region`).
 
 The support of a surface is a level that fits a file, and a confidence for planners. Each ray that
@@ -43,6 +44,10 @@ _ON_SURFACE = 0.15
 _IN_VOXEL = 0.525
 _NEXT_VOXEL = 1.0
 
+_TOUCHES, _BEHIND = 0.05, 0.5
+"""A field that has learnt the surface that rays saw is less than this there, or negative so far
+behind it, in voxels."""
+
 LEVELS = MAX_LEVEL + 1
 
 NEAR_M = 10.0
@@ -54,7 +59,7 @@ SECTORS_COUNTED = 5
 LEAST_STRENGTH = 0.25
 """Of level 1; each further level is twice as strong."""
 
-POINT_SHARE = 0.5
+UNLEARNT_SHARE = 0.5
 """Of the confidence, where rays ended but the field shows no surface."""
 
 
@@ -64,6 +69,8 @@ class SurfelKind(IntEnum):
     NONE = 0  # nothing: the surface lies in the next voxel, which has its own
     DISC = 1
     POINT = 2  # the field shows no surface to lay a disc on
+    RAY_DISC = 3  # where rays ended on a plane that the field has not learnt
+    RAY_POINT = 4  # where they ended, but not on a plane
 
 
 @dataclass(frozen=True)
@@ -71,7 +78,7 @@ class Surfels:
     """The surfels of N voxels."""
 
     offsets: Floats  # [N, 3] from the voxel's middle, voxels
-    normals: Floats  # [N, 3] unit vectors to free space; of a POINT they mean little
+    normals: Floats  # [N, 3] unit vectors to free space; of points they mean little
     kinds: Bytes  # [N] SurfelKind
 
 
@@ -89,8 +96,32 @@ SampleField = Callable[[Doubles], FieldSample]
 Seen = Callable[[Longs], Bools]
 """Whether rays ended in voxels [N, 3]."""
 
+ShownByRays = Callable[[Longs], Surfels]
+"""The surfels of voxels [N, 3] by what rays alone have shown; NONE where that is not known."""
 
-def fit_surfels(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
+
+def nothing_shown(voxels: Longs) -> Surfels:
+    """Of a map from a file: which voxels rays ended in is known, but not where in them."""
+    offsets, normals = np.zeros((2, len(voxels), 3), np.float32)
+    return Surfels(offsets, normals, np.full(len(voxels), SurfelKind.NONE, np.uint8))
+
+
+def fit_surfels(
+    voxels: Longs, field: SampleField, seen: Seen, by_rays: ShownByRays = nothing_shown
+) -> Surfels:
+    """The surfels of ``voxels`` [N, 3]: the field's, or where it shows no surface, the rays'."""
+    surfels = _surfels_of_field(voxels, field, seen)
+    rows = np.flatnonzero(surfels.kinds != SurfelKind.DISC)
+    shown = by_rays(voxels[rows])
+    places: Doubles = (voxels[rows] + 0.5 + shown.offsets).astype(np.float64)
+    unlearnt = (shown.kinds != SurfelKind.NONE) & (field(places).values > _TOUCHES)
+    unlearnt &= field(places - _BEHIND * shown.normals).values > 0
+    for name, array in vars(surfels).items():
+        array[rows[unlearnt]] = getattr(shown, name)[unlearnt]
+    return surfels
+
+
+def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
     """The surfels of ``voxels`` [N, 3], by Newton's method from their middles."""
     middles = (voxels + 0.5).astype(np.float64)
     points: Doubles = middles
@@ -123,7 +154,7 @@ def _step(sample: FieldSample) -> Doubles:
 
 def support_confidence(levels: Bytes, kinds: Bytes) -> Floats:
     """The confidence [N] of surfels of some :class:`SurfelKind` at these levels, just seen."""
-    shares = np.where(kinds == SurfelKind.POINT, np.float32(POINT_SHARE), np.float32(1))
+    shares = np.where(kinds == SurfelKind.DISC, np.float32(1), np.float32(UNLEARNT_SHARE))
     return np.asarray(level_confidence()[levels] * shares, np.float32)
 
 

@@ -27,6 +27,8 @@ class NearestSurface:
     point: Doubles  # [N, 3] the nearest point of it
     mean: Doubles  # [N, 3] about the same, over all that is nearly as near
     confidence: Floats  # [N] in [0, 1]
+    learnt: Bools  # [N] whether the field shows it; else rays alone do
+    normal: Floats  # [N, 3] of what is not learnt, unit vectors to free space; else 0
 
 
 @dataclass(frozen=True)

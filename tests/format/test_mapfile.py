@@ -12,7 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
-from support.map_records import SMALL, assert_same, random_record, with_integers, with_levels
+from support.map_records import (
+    SMALL,
+    assert_same,
+    random_record,
+    with_integers,
+    with_levels,
+    with_outcomes,
+)
 from support.mapfile_edit import (
     edited,
     file_bytes,
@@ -37,6 +44,7 @@ from triquad_server.mesh.preview import preview_schema, previews_of
 GOLDEN = Path(__file__).parents[1] / "golden"
 GOLDEN_NAMES = ("map_v1.triquad", "map_v1_next.triquad")
 GOLDEN_LEVELS = "map_v1_levels.triquad"
+GOLDEN_OUTCOMES = "map_v1_outcomes.triquad"
 GOLDEN_PRODUCER = "0.1.0"
 GOLDEN_ZSTD = (1, 5, 7)
 """The release of zstd that compressed the golden files: others may give other bytes."""
@@ -59,6 +67,11 @@ def golden_levels():
     return with_levels(record)
 
 
+def golden_outcomes():
+    """The record of the golden file that has outcomes of rays besides."""
+    return with_outcomes(golden_levels())
+
+
 def write_golden(folder):
     """The golden files: a complete one, and what changed after it. None has a preview."""
     schema = preview_schema()
@@ -66,6 +79,7 @@ def write_golden(folder):
     write_pair(folder, *golden_records(), names=GOLDEN_NAMES, stamps=stamps, preview_schema=schema)
     previews = Previews(schema, {})
     write_map(golden_levels(), folder / GOLDEN_LEVELS, stamp_ns=stamps[0], previews=previews)
+    write_map(golden_outcomes(), folder / GOLDEN_OUTCOMES, stamp_ns=stamps[0], previews=previews)
 
 
 # Round trips
@@ -211,6 +225,7 @@ def test_golden_files_read_back():
     assert_same(read_map(GOLDEN / GOLDEN_NAMES[0]), base)
     assert_same(read_map(GOLDEN / GOLDEN_NAMES[1]), record)
     assert_same(read_map(GOLDEN / GOLDEN_LEVELS), golden_levels())
+    assert_same(read_map(GOLDEN / GOLDEN_OUTCOMES), golden_outcomes())
 
 
 @pytest.fixture
@@ -218,7 +233,7 @@ def golden_pairs(monkeypatch, tmp_path):
     """The golden files, and what the writer writes now, under the name that it had then."""
     monkeypatch.setattr("triquad_format.mapfile.metadata.__version__", GOLDEN_PRODUCER)
     write_golden(tmp_path)
-    names = (*GOLDEN_NAMES, GOLDEN_LEVELS)
+    names = (*GOLDEN_NAMES, GOLDEN_LEVELS, GOLDEN_OUTCOMES)
     return [((GOLDEN / name).read_bytes(), (tmp_path / name).read_bytes()) for name in names]
 
 
@@ -236,7 +251,7 @@ def test_golden_parts_are_what_the_writer_writes(golden_pairs):
 
 
 def test_a_delta_holds_only_what_changed(golden_pairs):
-    base, following, _ = (parts_of(golden) for golden, _ in golden_pairs)
+    base, following, *_ = (parts_of(golden) for golden, _ in golden_pairs)
     changed = {part.topic for part in following}
     assert changed == {"/triquad/map", "/triquad/region", "/triquad/vertices", "/triquad/manifest"}
     assert not {part.payload for part in base} & {part.payload for part in following}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.writer import IndexType
-from support.map_records import SMALL, random_record, with_levels
+from support.map_records import SMALL, random_record, with_outcomes
 from support.mapfile_edit import (
     RawPart,
     edited,
@@ -97,9 +97,9 @@ def bomb_of_codes(count):
 
 
 def bomb_of_evidence(field, shape):
-    """A file whose evidence announces so many levels or times."""
+    """A file whose evidence announces so many levels, times or outcomes."""
     column = set_array(field, np.ones(shape, np.uint8))
-    return edited(file_bytes(with_levels(random_record(12))), EVIDENCE, column)
+    return edited(file_bytes(with_outcomes(random_record(12))), EVIDENCE, column)
 
 
 BOMBS = {
@@ -109,6 +109,7 @@ BOMBS = {
     "codes": lambda: bomb_of_codes(11 * 2**20),
     "levels": lambda: bomb_of_evidence("levels", (3, 3 * 2**20)),
     "times": lambda: bomb_of_evidence("seen_s", (1, 11 * 2**20)),
+    "outcomes": lambda: bomb_of_evidence("outcomes", (10, 2**20)),
     "parts": lambda: bomb_of_parts(2**18),
 }
 

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from support.map_records import random_record, with_integers, with_levels
+from support.map_records import random_record, with_integers, with_outcomes
 from support.mapfile_edit import (
     RawPart,
     all_of,
@@ -169,13 +169,21 @@ HOSTILE_LEVELS = {
     "times before 1970": (set_field("seen_from_s", -400), "seen_from_s = -400 is not a count"),
     "times beyond stamps": (set_field("seen_from_s", 9_223_372_037), "above 9223372036"),
     "times that pass the end": (set_field("seen_from_s", 9_223_372_036), "time lies outside"),
+    "outcomes of fewer voxels": (shorten("outcomes", 1), "outcomes: expected an array [10, 5]"),
+    "outcomes of nine planes": (shorten("outcomes", 0), "outcomes: expected an array [10, 5]"),
+    "outcomes of wide planes": (
+        set_array("outcomes", np.zeros((10, 5), "<i2")),
+        "outcomes: expected an array",
+    ),
+    "outcomes of nothing": (set_field("outcomes", None), "outcomes: expected an array"),
+    "outcomes of astronomic size": (set_field("outcomes", ASTRONOMIC), "outcomes: shape"),
 }
 
 
 @pytest.mark.parametrize("case", HOSTILE_LEVELS)
 def test_hostile_levels(case):
     edit, message = HOSTILE_LEVELS[case]
-    data = edited(file_bytes(with_levels(random_record(12))), EVIDENCE, edit)
+    data = edited(file_bytes(with_outcomes(random_record(12))), EVIDENCE, edit)
     assert_refused(data)
     with pytest.raises(DamagedMapFileError, match=re.escape(message).replace(r"\|", "|")):
         read_bytes(data)
@@ -183,7 +191,7 @@ def test_hostile_levels(case):
 
 @pytest.mark.parametrize("width", [0, 6, 8])
 def test_times_of_other_widths(width):
-    record = with_levels(random_record(12))
+    record = with_outcomes(random_record(12))
     touched = int(record.regions[0].evidence.surface.any(axis=1).sum())
     edit = set_array("seen_s", np.zeros((width, touched), np.uint8))
     data = edited(file_bytes(record), EVIDENCE, edit)

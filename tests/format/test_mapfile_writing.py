@@ -56,6 +56,26 @@ INVALID_EVIDENCE = {
     "half seconds": ("seen_s", np.full(38, 0.5), "seen_s: expected .* of <i8"),
     "a time before 1970": ("seen_s", np.full(38, -1), "seen_s: a time lies outside"),
     "a time beyond stamps": ("seen_s", np.full(38, MAX_SEEN_S + 1), "seen_s: a time lies outside"),
+    "outcomes of blocks": (
+        "outcomes",
+        np.zeros((38, 3), np.uint8),
+        r"outcomes: expected an array \[40, 3\]",
+    ),
+    "outcomes of two": (
+        "outcomes",
+        np.zeros((40, 2), np.uint8),
+        r"outcomes: expected an array \[40, 3\]",
+    ),
+    "more hits than the code has": (
+        "outcomes",
+        np.full((40, 3), 4, np.uint8),
+        "outcomes: a code exceeds",
+    ),
+    "more misses than the code has": (
+        "outcomes",
+        np.tile(np.array([3, 15, 16], np.uint8), (40, 1)),
+        "outcomes: a code exceeds",
+    ),
 }
 
 

@@ -18,6 +18,7 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.region import MapRecord
+from triquad_map.compiled.evidence.outcomes import outcome_counts
 from triquad_map.reference.evaluator import MapEvaluator
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -57,6 +58,9 @@ VARIANTS = {
     ),
     "levels": map_records.with_levels(
         map_records.random_record(10, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
+    ),
+    "outcomes": map_records.with_outcomes(
+        map_records.random_record(11, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
     ),
     "no vertices": map_records.random_record(9, points=0),
 }
@@ -110,10 +114,14 @@ def assert_same_support(answers: Map, record: MapRecord) -> None:
         seen_s = have.seen(blocks)[:, 0]
         np.testing.assert_array_equal(levels[bits], or_zeros(evidence.levels, bits.sum()))
         np.testing.assert_array_equal(seen_s, or_zeros(evidence.seen_s, len(blocks)))
+        outcomes = have.outcomes(blocks).reshape(*bits.shape, 3)
+        codes = or_zeros(evidence.outcomes, (bits.sum(), 3)).astype(np.uint8)
+        assert not outcomes[~bits].any()
+        np.testing.assert_array_equal(outcomes[bits].astype(np.int64), outcome_counts(codes))
 
 
-def or_zeros(column: NDArray | None, count: int) -> NDArray:
-    return np.zeros(count) if column is None else column
+def or_zeros(column: NDArray | None, shape: int | tuple[int, ...]) -> NDArray:
+    return np.zeros(shape) if column is None else column
 
 
 def write_variant(path: Path, name: str) -> Path:
@@ -122,7 +130,10 @@ def write_variant(path: Path, name: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["map_v1.triquad", "map_v1_next.triquad", "map_v1_levels.triquad"])
+SAMPLES = ("map_v1", "map_v1_next", "map_v1_levels", "map_v1_outcomes")
+
+
+@pytest.mark.parametrize("name", [f"{name}.triquad" for name in SAMPLES])
 def test_the_samples(name: str) -> None:
     answers = spec_reader.load(GOLDEN / name)
     points = probes(answers)
@@ -142,7 +153,9 @@ def test_maps_of_every_kind(tmp_path: Path, name: str) -> None:
     record = read_map(path)
     assert_agree(answers, record, points)
     assert_same_support(answers, record)
-    assert (record.regions[0].evidence.levels is not None) == (name == "levels")
+    evidence = record.regions[0].evidence
+    assert (evidence.levels is not None) == (name in ("levels", "outcomes"))
+    assert (evidence.outcomes is not None) == (name == "outcomes")
 
 
 # Section 9

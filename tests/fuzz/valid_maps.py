@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from support.map_records import random_record, with_integers, with_levels
+from support.map_records import random_record, with_integers, with_levels, with_outcomes
 from support.mapfile_edit import write_pair
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
@@ -61,11 +61,13 @@ def valid_maps(folder: Path) -> list[ValidMap]:
         "training": random_record(settings=TINY, points=3),
         "integers": with_integers(plain),
         "levels": with_levels(plain),
+        "outcomes": with_outcomes(plain),
     }
     maps = [_written(folder / kind, record) for kind, record in complete.items()]
     maps.append(_written_pair(folder / "delta", plain))
     maps.append(_copied(folder / "golden", "map_v1_next.triquad", "map_v1.triquad"))
     maps.append(_copied(folder / "golden-levels", "map_v1_levels.triquad"))
+    maps.append(_copied(folder / "golden-outcomes", "map_v1_outcomes.triquad"))
     return maps
 
 

@@ -5,10 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.region import seen_voxels
 from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.observations import Sighting
+from triquad_map.compiled.evidence.outcomes import outcome_counts
+from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 
 SIDE = 256
@@ -112,6 +114,28 @@ def test_what_is_hit_and_missed_by_turns_stays(share: float, seed: int) -> None:
         ends[through] = behind(ends[through], 120.0)
         watched.scan(ends)
     assert watched.believed(panel(rng, WALL_X, half=3.0)) > 0.97
+
+
+def test_a_record_keeps_what_became_of_rays(rng: np.random.Generator) -> None:
+    watched = Watched()
+    for _ in range(60):
+        ends = panel(rng, WALL_X, half=4.0, count=400)
+        through = (rng.random(len(ends)) > 0.3) & (ends[:, 1] > SENSOR[1])  # a wall beside a fence
+        ends[through] = behind(ends[through], 120.0)
+        watched.scan(ends)
+    record = watched.evidence.record()
+    assert record.outcomes is not None
+    voxels = seen_voxels(record, record.surface)
+    at_panel = voxels[:, 0] == int(WALL_X)
+    fence, wall = (side & at_panel for side in (voxels[:, 1] > 129, voxels[:, 1] < 128))
+    hits, passes, misses = outcome_counts(record.outcomes).T
+    assert np.median(hits[fence]) == np.median(hits[wall]) == 8
+    # Of a scan six rays reach a voxel, and four of them pass the fence.
+    assert 2 <= np.median(passes[fence] / hits[fence]) <= 8
+    assert np.median(misses[fence]) > 0
+    assert not np.median(passes[wall])
+    again = LiveEvidence.from_record(SIDE, record).record()
+    np.testing.assert_array_equal(again.outcomes, record.outcomes)
 
 
 def test_nothing_goes_while_no_ray_passes(rng: np.random.Generator) -> None:

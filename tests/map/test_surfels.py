@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from support import small_world
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.surfels.surfel_map import first_surfels
 from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples, in_one
-from triquad_map.surface import FieldSample, SurfelKind, fit_surfels
+from triquad_map.surface import FieldSample, SurfelKind, Surfels, fit_surfels, nothing_shown
 from triquad_server.mapping.mapper import Mapper
 
 SIDE = 64
@@ -54,6 +55,81 @@ def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
     surfels = fit_surfels(np.array([[5, 6, 7]]), flat, lambda asked: np.zeros(len(asked), bool))
     assert surfels.kinds[0] == SurfelKind.POINT
     np.testing.assert_array_equal(surfels.offsets[0], 0)
+
+
+def by_rays(kind, offset):
+    """What rays have shown of all voxels: a floor that lies so far above their middles."""
+
+    def shown(voxels):
+        offsets, normals = np.zeros((2, len(voxels), 3), np.float32)
+        offsets[:, 2], normals[:, 2] = offset, 1
+        return Surfels(offsets, normals, np.full(len(voxels), kind, np.uint8))
+
+    return shown
+
+
+@pytest.mark.parametrize("kind", [SurfelKind.RAY_DISC, SurfelKind.RAY_POINT])
+@pytest.mark.parametrize("height", [29.7, 20.0])  # of the field's surface, next door or far below
+def test_where_the_field_has_not_learnt_what_rays_saw_they_count(kind, height):
+    voxels, field = np.array([[30, 30, 30]]), plane(np.array([0.0, 0, 1]), height)
+    surfels = fit_surfels(
+        voxels, field, lambda asked: np.ones(len(asked), bool), by_rays(kind, 0.3)
+    )
+    assert surfels.kinds[0] == kind
+    np.testing.assert_allclose(surfels.offsets[0], (0, 0, 0.3), atol=1e-6)
+
+
+def test_the_field_takes_over_once_it_has_learnt_the_surface():
+    voxels, shown = np.array([[30, 30, 30]]), by_rays(SurfelKind.RAY_DISC, 0.3)
+    field = plane(np.array([0.0, 0, 1]), 30.75)
+    surfels = fit_surfels(voxels, field, lambda asked: np.ones(len(asked), bool), shown)
+    assert surfels.kinds[0] == SurfelKind.DISC
+    next_door = plane(np.array([0.0, 0, 1]), 31.1)  # and rays ended a little below it, too
+    shown = by_rays(SurfelKind.RAY_DISC, 0.45)
+    surfels = fit_surfels(voxels, next_door, lambda asked: np.ones(len(asked), bool), shown)
+    assert surfels.kinds[0] == SurfelKind.NONE
+
+
+def seen_by_rays(ends, normal=None):
+    """Evidence of one scan from above, and what its rays show of some voxels."""
+    evidence = LiveEvidence(SIDE)
+    sighting = Sighting(np.array([32.0, 32, 60]), 0.2, stamp_s=1, scan=1)
+    marks = evidence.mark_surface(ends, sighting)
+    normals = np.full(ends.shape, np.nan if normal is None else normal)
+    evidence.set_normals(marks, normals)
+    return evidence
+
+
+def test_rays_show_a_disc_that_faces_the_sensor():
+    ends = np.array([[30.3, 30.4, 30.1], [30.5, 30.6, 30.3]])
+    evidence = seen_by_rays(ends, (0.0, 0, -1))
+    shown = evidence.ray_surfels(np.array([[30, 30, 30], [9, 9, 9]]), since=1)
+    assert shown.kinds.tolist() == [SurfelKind.RAY_DISC, SurfelKind.NONE]
+    assert evidence.ray_surfels(np.array([[30, 30, 30]]), since=2).kinds[0] == SurfelKind.NONE
+    np.testing.assert_allclose(shown.offsets[0], ends.mean(axis=0) - 30.5, atol=1e-5)
+    np.testing.assert_allclose(shown.normals[0], (0, 0, 1))
+
+
+def test_where_no_normal_is_known_the_ends_around_may_lie_on_a_plane():
+    rng = np.random.default_rng(4)
+    slope = np.array([0.6, 0, 0.8])
+    ends = rng.uniform(28, 34, (400, 3))
+    ends[:, 2] = 30.5 - (ends[:, 0] - 30.5) * 0.75
+    shown = seen_by_rays(ends).ray_surfels(np.array([[30, 30, 30]]), since=1)
+    assert shown.kinds[0] == SurfelKind.RAY_DISC
+    np.testing.assert_allclose(shown.normals[0], slope, atol=0.05)
+    scattered = rng.uniform(28, 34, (400, 3))
+    shown = seen_by_rays(scattered).ray_surfels(np.array([[30, 30, 30]]), since=1)
+    assert shown.kinds[0] == SurfelKind.RAY_POINT
+
+
+def test_of_restored_evidence_rays_have_shown_nothing():
+    evidence = seen_by_rays(np.array([[30.3, 30.4, 30.1]]), (0.0, 0, 1))
+    restored = LiveEvidence.from_record(SIDE, evidence.freeze().record())
+    voxels = np.array([[30, 30, 30]])
+    assert restored.ray_surfels(voxels, since=0).kinds[0] == SurfelKind.NONE
+    restored.set_discs(voxels, nothing_shown(voxels))  # not even a disc of the field
+    assert restored.ray_surfels(voxels, since=0).kinds[0] == SurfelKind.NONE
 
 
 def nearest(surfels, points):
@@ -106,7 +182,7 @@ def surfels_of(region, mapper_settings):
     return first_surfels(region.evidence, samples, 1)
 
 
-def test_a_settled_map_answers_from_the_field_as_it_is():
+def test_a_settled_map_answers_as_if_fitted_anew():
     chosen = small_world.settings()
     drive = small_world.world(3)
     mapper = Mapper("test", chosen, "cpu")

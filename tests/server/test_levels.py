@@ -1,4 +1,4 @@
-"""Levels of surface voxels and times of their blocks, wherever evidence goes."""
+"""Levels and outcomes of surface voxels and times of their blocks, wherever evidence goes."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_records import SMALL, assert_same, random_record, with_levels
+from support.map_records import SMALL, assert_same, random_record, with_outcomes
 from support.mapfile_edit import (
     edited,
     file_bytes,
@@ -23,17 +23,26 @@ from triquad_format.records.crop import crop_record
 from triquad_format.records.region import MAX_SEEN_S, Evidence, masked, seen_voxels, surface_counts
 from triquad_format.records.seen_space import owned_evidence
 from triquad_format.recovery.recovered_map import recover
+from triquad_map.compiled.evidence.outcomes import outcome_codes
 
 CUBES = dataclasses.replace(SMALL, depth=9)
 """Two cubes to a side."""
 
-RECORD = with_levels(random_record(21, settings=CUBES, indices=((0, 0, 0), (1, 0, 0)), points=500))
+RECORD = with_outcomes(
+    random_record(21, settings=CUBES, indices=((0, 0, 0), (1, 0, 0)), points=500)
+)
 
 
 def level_of(evidence):
     """The level of each surface voxel."""
     voxels = seen_voxels(evidence, evidence.surface).tolist()
     return dict(zip(map(tuple, voxels), evidence.levels.tolist(), strict=True))
+
+
+def outcome_of(evidence):
+    """What became of rays at each surface voxel."""
+    voxels = seen_voxels(evidence, evidence.surface).tolist()
+    return dict(zip(map(tuple, voxels), map(tuple, evidence.outcomes.tolist()), strict=True))
 
 
 def time_of(evidence):
@@ -46,6 +55,7 @@ def time_of(evidence):
 def assert_part_of(some, whole):
     """Voxels and blocks kept what they had; blocks without surface have no time."""
     assert level_of(some).items() <= level_of(whole).items()
+    assert outcome_of(some).items() <= outcome_of(whole).items()
     assert time_of(some).items() <= time_of(whole).items()
     assert not some.seen_s[~some.surface.any(axis=1)].any()
 
@@ -67,6 +77,7 @@ def record_of(evidence):
 def test_files_hold_levels_and_times():
     evidence = RECORD.regions[0].evidence
     assert set(evidence.levels) == set(range(8))
+    assert evidence.outcomes.max(axis=0).tolist() == [3, 15, 15]
     assert (evidence.seen_s[evidence.surface.any(axis=1)] == 0).any()
     data = file_bytes(RECORD)
     assert len([part for part in parts_of(data) if part.topic == EVIDENCE]) == 16
@@ -85,11 +96,13 @@ def test_any_levels_and_times_come_back(seed, count, draw):
     counts = surface_counts(evidence.surface)
     size = int(counts.sum())
     levels = np.frombuffer(draw.draw(st.binary(min_size=size, max_size=size)), np.uint8) & 7
+    outcomes = np.random.default_rng(seed).integers(0, (4, 16, 16), (size, 3)).astype(np.uint8)
     seen_s = np.array(draw.draw(st.lists(TIMES, min_size=count, max_size=count)), np.int64)
     evidence = dataclasses.replace(
         evidence,
         levels=draw.draw(st.sampled_from([levels, None])),
         seen_s=draw.draw(st.sampled_from([np.where(counts > 0, seen_s, 0), None])),
+        outcomes=draw.draw(st.sampled_from([outcomes, outcomes * (seed % 2), None])),
     )
     (region,) = read_bytes(file_bytes(record_of(evidence))).regions
     assert_same(region.evidence, evidence)
@@ -110,6 +123,20 @@ def test_literal_bytes():
     assert body["seen_s"] == {"dtype": "|u1", "shape": [2, 2], "data": b"\x2d\x01\x01\x00"}
 
 
+def test_literal_bytes_of_outcomes():
+    """The example of the specification, from counts to bytes."""
+    surface = np.zeros((1, 64), np.uint8)
+    surface[0, 7] = 0b111
+    counts = np.array([[120, 0, 0], [40, 330, 75], [1, 0, 0]], np.int32)
+    evidence = Evidence(np.arange(1), surface, surface, outcomes=outcome_codes(counts))
+    assert evidence.outcomes.tolist() == [[0, 0, 0], [0, 7, 5], [1, 0, 0]]
+    data = file_bytes(record_of(evidence))
+    (part,) = (part for part in parts_of(data) if part.topic == EVIDENCE)
+    planes = b"\x00\x04\x00\x02\x00\x00\x00\x02\x02\x02"
+    stored = {"dtype": "|u1", "shape": [10, 1], "data": planes}
+    assert msgpack.unpackb(part.payload)["outcomes"] == stored
+
+
 def test_a_file_without_them_reads_as_not_known():
     record = random_record(21)
     data = file_bytes(record)
@@ -119,13 +146,14 @@ def test_a_file_without_them_reads_as_not_known():
     evidence = read_bytes(data).regions[0].evidence
     assert evidence.levels is None
     assert evidence.seen_s is None
+    assert evidence.outcomes is None
 
 
 def test_cubes_without_them_read_as_zero():
     """As where an older release went on with a map."""
 
     def older(body):
-        for key in ("levels", "seen_s", "seen_from_s"):
+        for key in ("levels", "seen_s", "seen_from_s", "outcomes"):
             del body[key]
 
     data = edited(file_bytes(RECORD), EVIDENCE, older, number=3)
@@ -138,13 +166,16 @@ def test_cubes_without_them_read_as_zero():
     voxels = np.repeat(lost, surface_counts(want.surface))
     assert want.levels[voxels].any()
     np.testing.assert_array_equal(have.levels, np.where(voxels, 0, want.levels))
+    assert want.outcomes[voxels].any()
+    outcomes = np.where(voxels[:, None], 0, want.outcomes)
+    np.testing.assert_array_equal(have.outcomes, outcomes)
     np.testing.assert_array_equal(have.seen_s, np.where(lost, 0, want.seen_s))
 
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 999))
 def test_masked_voxels_take_their_levels_with_them(seed):
-    evidence = with_levels(record_of(blocks(seed, 8)), seed).regions[0].evidence
+    evidence = with_outcomes(record_of(blocks(seed, 8)), seed).regions[0].evidence
     rng = np.random.default_rng(seed)
     mask = rng.integers(0, 256, evidence.surface.shape).astype(np.uint8)
     mask[rng.random(len(mask)) < 0.5] = 0
@@ -170,7 +201,7 @@ def test_a_crop_keeps_the_levels_of_what_it_keeps():
 
 def test_what_a_region_owns_keeps_its_levels():
     whole = random_record(4, points=4000)
-    region = with_levels(whole).regions[0]
+    region = with_outcomes(whole).regions[0]
     owned = owned_evidence(whole.settings, region)
     assert 0 < len(owned.levels) < len(region.evidence.levels)
     assert_part_of(owned, region.evidence)
@@ -204,7 +235,7 @@ def test_what_is_recovered_has_its_levels(tmp_path):
         assert_part_of(region.evidence, whole[region.index])
 
 
-@pytest.mark.parametrize("field", ["levels", "seen_s"])
+@pytest.mark.parametrize("field", ["levels", "seen_s", "outcomes"])
 def test_one_may_be_known_without_the_other(field):
     evidence = dataclasses.replace(RECORD.regions[0].evidence, **{field: None})
     region = dataclasses.replace(RECORD.regions[0], evidence=evidence)

@@ -46,7 +46,10 @@ class ExactView:
         world = closest @ self.map_from_scene[:3, :3].T + self.map_from_scene[:3, 3]
         world[~found] = 0.0
         distance = np.where(found, np.abs(sdf), max_distance_m)
-        return NearestSurface(found, distance, world, world, found.astype(np.float32))
+        confidence, normal = found.astype(np.float32), np.zeros(points.shape, np.float32)
+        return NearestSurface(
+            found, distance, world, world, confidence, np.ones_like(found), normal
+        )
 
     def nearest_unknown(self, points: NDArray[np.float64], max_distance_m: float) -> NearestUnknown:
         local = self._local(points)

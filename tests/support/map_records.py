@@ -10,6 +10,7 @@ from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, R
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
+    OUTCOME_BITS,
     Evidence,
     MapRecord,
     Mlp,
@@ -159,6 +160,23 @@ def _supported(rng: np.random.RandomState, evidence: Evidence) -> Evidence:
     seen_s = 1_700_000_000 + rng.randint(0, 400, len(counts), np.int64)
     seen_s *= (counts > 0) & (rng.randint(0, 4, len(counts), np.int64) > 0)
     return dataclasses.replace(evidence, levels=levels, seen_s=seen_s)
+
+
+def with_outcomes(record: MapRecord, seed: int = 0) -> MapRecord:
+    """The record with outcomes of rays at its surface voxels besides, half of them a wall's."""
+    rng = np.random.RandomState(seed)
+    regions = tuple(
+        dataclasses.replace(region, evidence=_missed(rng, region.evidence))
+        for region in with_levels(record, seed).regions
+    )
+    return dataclasses.replace(record, regions=regions)
+
+
+def _missed(rng: np.random.RandomState, evidence: Evidence) -> Evidence:
+    voxels = int(np.unpackbits(evidence.surface).sum())
+    columns = [rng.randint(0, 1 << bits, voxels, np.int64) for bits in OUTCOME_BITS]
+    outcomes = np.stack(columns, axis=1) * rng.randint(0, 2, (voxels, 1), np.int64)
+    return dataclasses.replace(evidence, outcomes=outcomes.astype(np.uint8))
 
 
 def assert_same(have: object, want: object, where: str = "record") -> None:

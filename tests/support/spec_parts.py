@@ -139,6 +139,7 @@ class Region:
         }
         self.surface, self.free = self._evidence(own, "surface"), self._evidence(own, "free")
         self.levels, self.seen = self._support(own)
+        self.outcomes = self._outcomes(own)
 
     def _table(self, own: dict[Key, Any], plane: int, i: int, scale: Array) -> Table:
         bits = 2 * (8 - (self.settings.sizes - 1 - i))
@@ -170,6 +171,16 @@ class Region:
                 times.append((blocks, times_of(part, surface.any(1))))
         return Table(levels, 512, "|u1"), Table(times, 1, "<i8")
 
+    def _outcomes(self, own: dict[Key, Any]) -> Table:
+        """Hits, passes and misses of each voxel of a block [1536], in the order of bits."""
+        chunks = []
+        for key, part in own.items():
+            if key[0] == "/triquad/evidence":
+                blocks = place(demorton(codes_of(part["codes"], key[3], 15), 3))
+                surface = np.unpackbits(plain(part["surface"]), axis=1, bitorder="little")
+                chunks.append((blocks, outcomes_of(part, surface.astype(bool))))
+        return Table(chunks, 3 * 512, "<f8")
+
 
 def is_of(key: Key, index: Index) -> bool:
     return key[1] == index and key[0] in (
@@ -194,6 +205,26 @@ def levels_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
         a, b, c = stored[:, : surface.sum()]
         levels[surface] = 4 * a + 2 * (a ^ b) + (a ^ b ^ c)
     return levels
+
+
+def outcomes_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
+    """Section 5.4: hits, passes and misses [B, 1536], where there are surface voxels; else 0."""
+    count = surface.sum()
+    counts = np.zeros((*surface.shape, 3))
+    codes = np.zeros((3, count), np.int64)
+    if "outcomes" in part:
+        stored = np.unpackbits(plain(part["outcomes"]), axis=1, bitorder="little")
+        check(stored.shape == (10, (count + 7) // 8 * 8), "outcomes of other voxels")
+        for row, (first, last) in enumerate([(0, 2), (2, 6), (6, 10)]):
+            bit = np.zeros(count, np.int64)
+            for plane in stored[first:last, :count]:
+                bit = plane ^ bit
+                codes[row] = 2 * codes[row] + bit
+    h, p, m = codes
+    hits = np.where(h == 0, 8, 2.0 ** (h - 1))
+    passes, misses = (np.where(c == 0, 0, hits * 2.0 ** (c - 4)) for c in (p, m))
+    counts[surface] = np.stack([hits, passes, misses], axis=1)
+    return counts.reshape(len(surface), -1)
 
 
 def times_of(part: dict[str, Any], touched: NDArray[np.bool_]) -> Array:

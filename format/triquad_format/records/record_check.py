@@ -17,6 +17,7 @@ from triquad_format.records.region import (
     MAX_LEVEL,
     MAX_SEEN_S,
     MLP_LAYERS,
+    OUTCOME_BITS,
     Evidence,
     MapRecord,
     Region,
@@ -105,6 +106,11 @@ def _check_evidence(settings: FieldSettings, evidence: Evidence) -> None:
         ArraySpec("|u1", (int(counts.sum()),)).check("evidence levels", evidence.levels)
         if evidence.levels.max(initial=0) > MAX_LEVEL:
             raise FormatError(f"evidence levels: one exceeds {MAX_LEVEL}")
+    if evidence.outcomes is not None:
+        shape = (int(counts.sum()), len(OUTCOME_BITS))
+        ArraySpec("|u1", shape).check("evidence outcomes", evidence.outcomes)
+        if (evidence.outcomes >> np.array(OUTCOME_BITS, np.uint8)).any():
+            raise FormatError(f"evidence outcomes: a code exceeds {OUTCOME_BITS} bits")
     if evidence.seen_s is not None:
         ArraySpec("<i8", counts.shape).check("evidence seen_s", evidence.seen_s)
         low, high = evidence.seen_s.min(initial=0), evidence.seen_s.max(initial=0)

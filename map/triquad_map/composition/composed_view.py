@@ -9,6 +9,7 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.composition.field_view import FieldView, in_one
 from triquad_map.composition.region import MapRegion, NearestSurfels, Split
+from triquad_map.surface import SurfelKind
 from triquad_map.view import NearestSurface, NearestUnknown
 
 _FARTHEST_CELL = 1 << 20
@@ -50,6 +51,8 @@ class ComposedView(FieldView):
             point=np.zeros((count, 3)),
             mean=np.zeros((count, 3)),
             confidence=np.zeros(count, np.float32),
+            learnt=np.ones(count, np.bool_),
+            normal=np.zeros((count, 3), np.float32),
         )
         # Here, not in the threads of the split: to make surfels may take all of these.
         near = [
@@ -112,6 +115,10 @@ class ComposedView(FieldView):
         age_s = np.maximum(self._newest_s - surfels.seen_s[rows], 0)
         faded = 0.5 ** (age_s / _HALF_LIFE_S)
         nearest.confidence[to] = surfels.confidence[rows] * faded.astype(np.float32)
+        kinds = surfels.surfels.kinds[rows]
+        nearest.learnt[to] = kinds < SurfelKind.RAY_DISC
+        facing = (kinds == SurfelKind.RAY_DISC)[:, None]
+        nearest.normal[to] = np.where(facing, surfels.surfels.normals[rows], 0.0)
 
     def _improve_unknown(self, found: NearestUnknown, points: Doubles) -> None:
         """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""

@@ -8,6 +8,8 @@ from typing import NamedTuple, Protocol
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
+from triquad_map.surface import Surfels
+
 
 @dataclass(frozen=True)
 class FieldValues:
@@ -58,6 +60,10 @@ class NearestSurfels(NamedTuple):
 
 class RegionSurfels(Protocol):
     """The surfels of a region: S of them."""
+
+    @property
+    def surfels(self) -> Surfels:
+        """All of them, by their numbers."""
 
     @property
     def confidence(self) -> Floats:

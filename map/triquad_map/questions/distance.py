@@ -9,6 +9,7 @@ from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
+from triquad_map.surface import DISC_RADIUS
 from triquad_map.view import MapView, NearestSurface
 
 _FIELD_VOXELS = 0.5
@@ -16,6 +17,9 @@ _FIELD_VOXELS = 0.5
 
 _SURFEL_VOXELS = 1.5
 """From here on the distance to the surfels counts alone."""
+
+_WIDENED_VOXELS = float(np.sqrt(0.5)) - DISC_RADIUS
+"""From the rim of a disc to where it meets those of the voxels beside it, at their corners."""
 
 
 class UnknownSpaceError(TriquadError):
@@ -76,6 +80,7 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
     gradient = np.where(nearest.found[:, None], _unit(points - nearest.mean, 0.0), 0.0)
     distance = nearest.distance.copy()
     _join_field(view, points, nearest, status=status, distance=distance, gradient=gradient)
+    _join_rays(view, points, nearest, status=status, distance=distance, gradient=gradient)
     unknown = None
     if options.unknown_distance:
         unknown = view.nearest_unknown(points, options.max_distance_m)
@@ -134,7 +139,8 @@ def _join_field(
 ) -> None:
     """Near a surface, take the side of it from the trained field, and gradually its value."""
     low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
-    rows = np.flatnonzero(nearest.found & (distance < high) & (status == Status.SURFACE))
+    near = nearest.found & nearest.learnt & (distance < high)
+    rows = np.flatnonzero(near & (status == Status.SURFACE))
     if not len(rows):
         return
     field = view.query(points[rows], gradient=True)
@@ -144,14 +150,56 @@ def _join_field(
     value = field.sdf[usable].astype(np.float64)
     slope = field.gradient[usable].astype(np.float64)
     slope /= np.linalg.norm(slope, axis=1, keepdims=True)
-    along = np.clip((distance[rows] - low) / (high - low), 0.0, 1.0)
-    share = along * along * (3.0 - 2.0 * along)
+    share = _smooth((distance[rows] - low) / (high - low))
     side = np.where(value < 0, -1.0, 1.0)
     # The field is no more than a bound where it saturates.
     value = np.clip(value, -high, distance[rows] + low)
     joined = share[:, None] * side[:, None] * gradient[rows] + (1 - share)[:, None] * slope
     distance[rows] = share * side * distance[rows] + (1 - share) * value
     gradient[rows] = _unit(joined, slope)
+
+
+def _join_rays(
+    view: MapView,
+    points: Doubles,
+    nearest: NearestSurface,
+    status: Bytes,
+    distance: Doubles,
+    gradient: Doubles,
+) -> None:
+    """Near a surface that the field has not learnt, tell its sides, and close its gaps.
+
+    A disc is widened there up to the corners of its voxel, where it meets those beside it.
+    """
+    low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
+    near = nearest.found & ~nearest.learnt & (distance < high)
+    rows = np.flatnonzero(near & (status == Status.SURFACE))
+    if not len(rows):
+        return
+    normal = nearest.normal[rows].astype(np.float64)
+    height = ((points[rows] - nearest.point[rows]) * normal).sum(axis=1)
+    beside = np.sqrt(np.maximum(distance[rows] ** 2 - height**2, 0.0))
+    beyond = np.maximum(beside - _WIDENED_VOXELS * view.voxel_m, 0.0)
+    close = np.hypot(height, beyond)
+    is_point = ~normal.any(axis=1)
+    close[is_point] = distance[rows[is_point]] - DISC_RADIUS * view.voxel_m
+    feet = points[rows] - height[:, None] * normal
+    ended = view.status(feet, reach_m=0.0) == Status.SURFACE  # else beyond an edge
+    behind = ended & (height < 0) & (height > -low) & (beyond == 0)
+    side = np.where(behind, -1.0, 1.0)
+    share = _smooth((distance[rows] - low) / (high - low))
+    distance[rows] = side * (share * distance[rows] + (1 - share) * close)
+    # Over the disc itself the direction is its normal's, which is 0 for a point.
+    upright = np.where(beyond == 0, (1 - share) * np.where(height < 0, -side, side), 0.0)
+    away = np.where((beyond == 0) & ~is_point, share, 1.0) * side
+    joined = away[:, None] * gradient[rows] + upright[:, None] * normal
+    gradient[rows] = _unit(joined, normal)
+
+
+def _smooth(share: Doubles) -> Doubles:
+    """From 0 to 1 as ``share`` [N] goes there, without a kink at either end."""
+    within = np.clip(share, 0.0, 1.0)
+    return np.asarray(within * within * (3.0 - 2.0 * within), np.float64)
 
 
 def _unit(vectors: Doubles, otherwise: Doubles | float) -> Doubles:

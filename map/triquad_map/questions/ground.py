@@ -15,9 +15,6 @@ _TOLERANCE_VOXELS = 0.5
 """How far above a point its ground may be, and how much above the ground need not be seen: a
 surface may cut the corner of a voxel in which no ray happened to end."""
 
-_OWN_VOXELS = 1.5
-"""So far above the ground, rays may have ended in voxels that it shares."""
-
 _BESIDE = 0.5
 """Of the normal's z, up to which a surface is a wall."""
 
@@ -123,7 +120,7 @@ def _seen_down(view: MapView, starts: Doubles, depths: Doubles) -> Doubles:
     """How far below ``starts`` [N, 3] rays have shown all, at most ``depths`` [N].
 
     Between two seen places half a voxel apart there is nothing unknown: voxels are twice as high.
-    A surface that the distances do not know yet, since it is new, is not seen through.
+    What rays have seen only just now may have gaps in what is known of it: it is not seen through.
     """
     seen_m = np.zeros(len(starts))
     at = np.zeros(len(starts))
@@ -140,15 +137,15 @@ def _seen_down(view: MapView, starts: Doubles, depths: Doubles) -> Doubles:
 
 
 def _is_new(view: MapView, places: Doubles, status: Bytes, left_m: Doubles) -> Bools:
-    """Whether rays ended in the voxels of ``places`` [N, 3], but not on a wall beside these.
+    """Whether rays ended in the voxels of ``places`` [N, 3] on what is new, and not on a wall.
 
-    ``left_m`` [N] is how far the first known surface below is: it needs some voxels itself.
+    ``left_m`` [N] is how far the first known surface below is, which needs a voxel itself.
     """
-    new: Bools = (status == Status.SURFACE) & (left_m > _OWN_VOXELS * view.voxel_m)
+    new: Bools = (status == Status.SURFACE) & (left_m > view.voxel_m)
     rows = np.flatnonzero(new)
-    nearest = distances(view, places[rows], DistanceOptions(2 * view.voxel_m))
-    beside = np.abs(nearest.gradient[:, 2]) < _BESIDE
-    new[rows] = ~beside | (nearest.distance_m > view.voxel_m)
+    nearest = view.nearest_surface(places[rows], view.voxel_m)
+    is_wall = nearest.normal.any(axis=1) & (np.abs(nearest.normal[:, 2]) < _BESIDE)
+    new[rows] = nearest.found & ~nearest.learnt & ~is_wall
     return new
 
 

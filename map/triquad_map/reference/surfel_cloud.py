@@ -33,13 +33,14 @@ class SurfelCloud:
 
         Each has a ``confidence`` [S], and was ``seen_s`` [S] last, seconds since 1970.
         """
+        self.surfels = surfels
         self.confidence = confidence
         self.seen_s = seen_s
         kept = np.flatnonzero(surfels.kinds != SurfelKind.NONE)
         self._rows = kept
         self._positions = voxels[kept] + 0.5 + surfels.offsets[kept]
         self._normals = surfels.normals[kept].astype(np.float64)
-        self._discs = surfels.kinds[kept] == SurfelKind.DISC
+        self._discs = np.isin(surfels.kinds[kept], (SurfelKind.DISC, SurfelKind.RAY_DISC))
         cells = voxels[kept] // BLOCK_VOXELS
         first = np.ones(len(cells), np.bool_)
         first[1:] = (cells[1:] != cells[:-1]).any(axis=1)

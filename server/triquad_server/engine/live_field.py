@@ -12,6 +12,7 @@ from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
 from triquad_map.compiled.field.quadtree import LiveQuadtree
 
@@ -179,7 +180,7 @@ def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> L
 def region_record(
     index: RegionIndex,
     field: LiveField | FrozenField,
-    evidence: FrozenEvidence,
+    evidence: FrozenEvidence | LiveEvidence,
     training: TrainingState | None,
 ) -> Region:
     """A region as plain arrays that share nothing with ``field`` and ``evidence``."""

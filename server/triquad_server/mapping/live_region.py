@@ -2,25 +2,25 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-import torch
 from torch import Tensor
 from triquad_format.records.arrays import Doubles, Ints, Longs
-from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
 from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.contradictions import Disbelief
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence, Marks
-from triquad_map.compiled.evidence.observations import Sighting
+from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
-from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples
+from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 
-from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
+from triquad_server.engine.compiled_trainer import CompiledTrainer
 from triquad_server.engine.live_field import (
     LiveField,
     Rates,
@@ -33,8 +33,8 @@ from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
-from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
 _CARVE_SHORT_M = 0.1
 _CLEAR_SHORT_M = 0.5
@@ -45,28 +45,11 @@ _VISITS = 4  # to each of them
 _OPEN_THINNED_AT = 0.25  # share of the length of rays that met nothing
 _CHECKPOINT_SAMPLES = 1_000_000
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
+_NEW_SCANS = 10
+"""So long after it was first seen, the field has had time to learn a surface."""
+
 _SURFELS_REFITTED = 8_000
 """With each epoch while the field is being trained: some 10 ms."""
-
-
-@dataclass(frozen=True)
-class RegionSetup:
-    """What the regions of a map have in common."""
-
-    field: FieldSettings
-    scan: ScanSettings
-    change: ChangeSettings
-    training: TrainingSettings
-    device: torch.device
-    sums: GradientSums
-    team: Team
-
-    def seeds(self, index: RegionIndex) -> tuple[int, int]:
-        """Seeds of a region's field and of its replay pool; no two regions share one."""
-        natural = tuple(2 * i if i >= 0 else -2 * i - 1 for i in index)
-        sequence = np.random.SeedSequence(self.training.seed, spawn_key=natural)
-        field, pool = sequence.generate_state(2, np.uint64).tolist()
-        return field, pool
 
 
 class LiveRegion:
@@ -234,12 +217,7 @@ class LiveRegion:
             self._gone.append(self.evidence.take_back_unseen(passed, rule, samples))
             self._passed.clear()
         evidence = self.evidence.freeze()
-        most = _SURFELS_REFITTED if self.budget_samples else None
-        surfels = (
-            first_surfels(evidence, samples, epoch)
-            if before is None
-            else before.surfels.updated(evidence, samples, epoch, most=most)
-        )
+        surfels = self._surfels(evidence, samples, epoch, before)
         if self._restored:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)
             self._restored = False
@@ -264,7 +242,20 @@ class LiveRegion:
             labels=samples.labels,
             budget_samples=self.budget_samples,
         )
-        return region_record(self.index, self.field, self.evidence.freeze(), training=state)
+        return region_record(self.index, self.field, self.evidence, training=state)
+
+    def _surfels(
+        self, evidence: FrozenEvidence, field: SampleField, epoch: int, before: FrozenRegion | None
+    ) -> SurfelMap:
+        """The surfels of an epoch; a region that has settled has all of them from its field."""
+        most: int | None = None
+        shown: ShownByRays = nothing_shown
+        if self.budget_samples:
+            most = _SURFELS_REFITTED
+            shown = partial(self.evidence.ray_surfels, since=self._scans - _NEW_SCANS)
+        if before is None:
+            return first_surfels(evidence, field, epoch, shown)
+        return before.surfels.updated(evidence, field, epoch, most=most, by_rays=shown)
 
     def _forget_gone(self, surfels: SurfelMap) -> None:
         """Unlearn the surface that was taken back: its rays, and what the field shows there."""

@@ -15,8 +15,9 @@ from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.epochs import Epoch, FrozenRegion
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
-from triquad_server.mapping.live_region import LiveRegion, RegionSetup
+from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.normals import SurfaceNormals
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.settings import Settings
 from triquad_server.source_settings import ANY_SOURCE
 from triquad_server.threads import Teams

@@ -8,6 +8,7 @@ fine grid serves where it has a plane, the coarse one where it has not.
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Ints, Longs
 from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import (
     Index,
@@ -20,9 +21,6 @@ from triquad_map.compiled.voxel_index import (
 )
 
 _FINE_M, _COARSE_M = 0.15, 0.5  # sides of the cells
-_MIN_POINTS = 6
-_MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
-_MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
 _FULL = 65_536  # points of a cell, above which older ones count for less
 _RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
 
@@ -37,7 +35,7 @@ def _add(
     rows: Ints,
     count: int,
 ) -> tuple[int, int]:
-    """Add points to the moments [cells, 10] of their cells, relative to the cells' centres."""
+    """Add points to the moments [cells, MOMENTS] of their cells, relative to the cells' centres."""
     for i in range(start, len(points)):
         x = int(np.floor(points[i, 0] / cell_m))
         y = int(np.floor(points[i, 1] / cell_m))
@@ -51,16 +49,7 @@ def _add(
         a = points[i, 0] - (x + 0.5) * cell_m
         b = points[i, 1] - (y + 0.5) * cell_m
         c = points[i, 2] - (z + 0.5) * cell_m
-        m[0] += 1
-        m[1] += a
-        m[2] += b
-        m[3] += c
-        m[4] += a * a
-        m[5] += a * b
-        m[6] += a * c
-        m[7] += b * b
-        m[8] += b * c
-        m[9] += c * c
+        add_points(m, (a, b, c), 1)
         if m[0] > _FULL:
             m *= np.float32(0.5)
     return len(points), count
@@ -93,45 +82,6 @@ def _gather(row: int, cell_m: float, index: Index, moments: Floats, total: Doubl
 
 
 @kernel()
-def _plane_normal(m: Doubles, normal: Doubles) -> bool:
-    """Normal of the plane through points with the moments ``m``; False where there is none."""
-    n = m[0]
-    if n < _MIN_POINTS:
-        return False
-    mx, my, mz = m[1] / n, m[2] / n, m[3] / n
-    xx, xy, xz = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - mx * mz
-    yy, yz, zz = m[7] / n - my * my, m[8] / n - my * mz, m[9] / n - mz * mz
-    # Eigenvalues of a symmetric 3 x 3 matrix (Smith 1961).
-    mean = (xx + yy + zz) / 3
-    off = xy * xy + xz * xz + yz * yz
-    spread = np.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off) / 6)
-    if spread <= 1e-12:
-        return False
-    a, b, c = (xx - mean) / spread, (yy - mean) / spread, (zz - mean) / spread
-    d, e, f = xy / spread, xz / spread, yz / spread
-    half_det = (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)) / 2
-    angle = np.arccos(min(1.0, max(-1.0, half_det))) / 3
-    greatest = mean + 2 * spread * np.cos(angle)
-    least = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
-    middle = 3 * mean - greatest - least
-    if least > _MAX_THICKNESS**2 * middle or middle < _MIN_WIDTH**2 * greatest:
-        return False
-    # The eigenvector is orthogonal to the rows of (A - least I): take their longest cross product.
-    rows = np.array([[xx - least, xy, xz], [xy, yy - least, yz], [xz, yz, zz - least]])
-    longest = 0.0
-    for i in range(3):
-        cross = np.cross(rows[i], rows[(i + 1) % 3])
-        length = (cross * cross).sum()
-        if length > longest:
-            longest = length
-            normal[:] = cross
-    if longest == 0.0:
-        return False
-    normal /= np.sqrt(longest)
-    return True
-
-
-@kernel()
 def _outdated(rows: Ints, normals: Doubles, moments: Floats, basis: Floats) -> Ints:
     """Cells of points without a normal whose own is of far fewer points than there are.
 
@@ -151,10 +101,10 @@ def _outdated(rows: Ints, normals: Doubles, moments: Floats, basis: Floats) -> I
 @kernel()
 def _estimate(rows: Ints, cell_m: float, index: Index, moments: Floats, normals: Floats) -> None:
     """Set the normals [cells, 3] of cells; NaN where there is no plane."""
-    total, normal = np.empty(10), np.empty(3)
+    total, normal = np.empty(MOMENTS), np.empty(3)
     for row in rows:
         _gather(row, cell_m, index, moments, total)
-        if not _plane_normal(total, normal):
+        if not plane_normal(total, normal):
             normal[:] = np.nan
         normals[row] = normal
 
@@ -175,7 +125,7 @@ class MomentGrid:
         self._team = team
         self._cell_m = cell_m
         self._cells = VoxelIndex(1024)
-        self._moments = np.zeros((1024, 10), np.float32)
+        self._moments = np.zeros((1024, MOMENTS), np.float32)
         self._normals = np.zeros((1024, 3), np.float32)
         # Points in each cell when its normal was estimated.
         self._basis = np.zeros(1024, np.float32)

@@ -7,8 +7,9 @@ from support.small_world import settings, settle, settled_mapper, surface_error,
 from triquad_format.records.status import Status
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.errors import ScanRefusedError
-from triquad_server.mapping.live_region import LiveRegion, RegionSetup
+from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.settings import Settings
 from triquad_server.threads import Teams
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
+    LEVEL_BITS,
     MOMENTS,
     PREFIX,
     REGION,
@@ -29,8 +30,9 @@ from triquad_format.mapfile.parts.part import (
     shuffle,
     shuffle_codes,
     shuffle_counts,
+    split_bits,
     split_integers,
-    split_levels,
+    split_outcomes,
     square_shift,
 )
 from triquad_format.records.arrays import Longs
@@ -181,11 +183,13 @@ def _pack_evidence(region: Region) -> Iterator[Part]:
             "surface": pack_array(surface),
             "free": pack_array(evidence.free[rows]),
         }
+        voxels = slice(first_voxel[rows.start], first_voxel[rows.stop])
         if evidence.levels is not None:
-            levels = evidence.levels[first_voxel[rows.start] : first_voxel[rows.stop]]
-            fields["levels"] = pack_array(split_levels(levels))
+            fields["levels"] = pack_array(split_bits(evidence.levels[voxels], LEVEL_BITS))
         if evidence.seen_s is not None:
             fields |= _seen_fields(evidence.seen_s[rows][surface.any(axis=1)])
+        if evidence.outcomes is not None:
+            fields["outcomes"] = pack_array(split_outcomes(evidence.outcomes[voxels]))
         yield _region_part(PartKey(EVIDENCE, region.index, cell=cell), fields)
 
 

@@ -14,7 +14,7 @@ from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Longs
 from triquad_format.records.crop import LeafBox, whole_region
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
-from triquad_format.records.region import AXES, FLOATS, MAX_LEVEL
+from triquad_format.records.region import AXES, FLOATS, MAX_LEVEL, OUTCOME_BITS
 
 PREFIX = "/triquad/"
 MAP = "/triquad/map"
@@ -205,23 +205,35 @@ def join_integers(planes: NDArray[np.int8]) -> NDArray[np.int16]:
     return np.ascontiguousarray(integers.T).astype(np.int16)
 
 
-def split_levels(levels: Bytes) -> Bytes:
-    """Bits [LEVEL_BITS, N] of levels [S], highest bits first, ``N`` being ``S / 8`` rounded up.
+def split_bits(numbers: Bytes, width: int) -> Bytes:
+    """Bits [width, N] of small numbers [S], highest bits first, ``N`` being ``S / 8`` rounded up.
 
     Each plane but the first is stored as its difference (xor) from the one above. Levels of
     neighbours are alike: two that differ by one differ in one stored bit, so that the planes shrink
     to a tenth less than bytes of one level each do.
     """
-    bits = np.arange(LEVEL_BITS, dtype=np.uint8)[::-1, None]
-    planes = np.packbits(levels >> bits & 1, axis=1, bitorder="little")
+    bits = np.arange(width, dtype=np.uint8)[::-1, None]
+    planes = np.packbits(numbers >> bits & 1, axis=1, bitorder="little")
     planes[1:] ^= planes[:-1].copy()
     return planes
 
 
-def join_levels(planes: Bytes, count: int) -> Bytes:
-    """``count`` levels; the inverse of :func:`split_levels`."""
-    levels = np.zeros(count, np.uint8)
+def join_bits(planes: Bytes, count: int) -> Bytes:
+    """``count`` numbers; the inverse of :func:`split_bits`."""
+    numbers = np.zeros(count, np.uint8)
     for plane in np.bitwise_xor.accumulate(planes, axis=0):
-        levels <<= 1
-        levels |= np.unpackbits(plane, count=count, bitorder="little")
-    return levels
+        numbers <<= 1
+        numbers |= np.unpackbits(plane, count=count, bitorder="little")
+    return numbers
+
+
+def split_outcomes(outcomes: Bytes) -> Bytes:
+    """Planes [sum of OUTCOME_BITS, N] of the codes [S, 3], one column after the other."""
+    columns = zip(outcomes.T, OUTCOME_BITS, strict=True)
+    return np.concatenate([split_bits(column, width) for column, width in columns])
+
+
+def join_outcomes(planes: Bytes, count: int) -> Bytes:
+    """Codes [count, 3]; the inverse of :func:`split_outcomes`."""
+    columns = np.split(planes, np.cumsum(OUTCOME_BITS)[:-1])
+    return np.stack([join_bits(column, count) for column in columns], axis=1)

@@ -4,7 +4,7 @@ Sizes are checked before anything is decoded, which takes more memory than a par
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,8 @@ from triquad_format.mapfile.parts.part import (
     PartKey,
     cube_shift,
     feature_column,
-    join_levels,
+    join_bits,
+    join_outcomes,
     moment_columns,
     square_shift,
     unshuffle_counts,
@@ -37,6 +38,7 @@ from triquad_format.records.region import (
     BLOCK_BYTES,
     MAX_SEEN_S,
     MLP_LAYERS,
+    OUTCOME_BITS,
     Evidence,
     Mlp,
     Region,
@@ -46,6 +48,8 @@ from triquad_format.records.region import (
 )
 
 _MAX_SEEN_BYTES = (MAX_SEEN_S.bit_length() + 7) // 8
+
+_Number = TypeVar("_Number", bound=np.number)
 
 _Columns = tuple[NDArray[Any], ...]
 """Columns of equal length: some rows of a table."""
@@ -191,13 +195,19 @@ def _read_evidence(body: PartBody, key: PartKey) -> Evidence:
     surface, free = (
         body.array(name, "|u1", (len(codes), BLOCK_BYTES)) for name in ("surface", "free")
     )
-    levels = None
+    count = int(surface_counts(surface).sum())
+    levels = outcomes = None
     if body.has("levels"):
-        count = int(surface_counts(surface).sum())
-        planes = body.array("levels", "|u1", (LEVEL_BITS, (count + 7) // 8))
-        levels = join_levels(planes, count)
+        levels = join_bits(_planes(body, "levels", LEVEL_BITS, count), count)
+    if body.has("outcomes"):
+        outcomes = join_outcomes(_planes(body, "outcomes", sum(OUTCOME_BITS), count), count)
     seen_s = _read_seen(body, surface) if body.has("seen_s") else None
-    return Evidence(codes, surface, free, levels=levels, seen_s=seen_s)
+    return Evidence(codes, surface, free, levels=levels, seen_s=seen_s, outcomes=outcomes)
+
+
+def _planes(body: PartBody, key: str, planes: int, count: int) -> Bytes:
+    """So many planes of bits of ``count`` surface voxels."""
+    return body.array(key, "|u1", (planes, (count + 7) // 8))
 
 
 def _read_seen(body: PartBody, surface: Bytes) -> Longs:
@@ -235,20 +245,33 @@ def _joined(topic: str, portions: Sequence[_Columns], empty: _Columns) -> _Colum
 def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
     """The evidence of a region from that of its cubes, in their order.
 
-    Where some of them tell no levels or times and others do, the former's are 0.
+    Where some of them tell no levels, times or outcomes and others do, the former's are 0.
     """
     if len(portions) == 1:
         return portions[0]
     codes, masks = np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8)
-    levels = [
-        np.zeros(int(surface_counts(p.surface).sum()), np.uint8) if p.levels is None else p.levels
-        for p in portions
-    ]
-    seen_s = [np.zeros(len(p.codes), np.int64) if p.seen_s is None else p.seen_s for p in portions]
+    blocks = [(len(portion.codes),) for portion in portions]
+    voxels = [(int(surface_counts(portion.surface).sum()),) for portion in portions]
+    pairs = [(*shape, len(OUTCOME_BITS)) for shape in voxels]
     return Evidence(
         np.concatenate([codes, *(portion.codes for portion in portions)]),
         np.concatenate([masks, *(portion.surface for portion in portions)]),
         np.concatenate([masks, *(portion.free for portion in portions)]),
-        levels=np.concatenate(levels) if any(p.levels is not None for p in portions) else None,
-        seen_s=np.concatenate(seen_s) if any(p.seen_s is not None for p in portions) else None,
+        levels=_joined_column([portion.levels for portion in portions], voxels),
+        seen_s=_joined_column([portion.seen_s for portion in portions], blocks),
+        outcomes=_joined_column([portion.outcomes for portion in portions], pairs),
     )
+
+
+def _joined_column(
+    columns: Sequence[NDArray[_Number] | None], shapes: Sequence[tuple[int, ...]]
+) -> NDArray[_Number] | None:
+    """Columns of these shapes in one, with zeros for those that are not known."""
+    known = next((column for column in columns if column is not None), None)
+    if known is None:
+        return None
+    filled = [
+        np.zeros(shape, known.dtype) if column is None else column
+        for column, shape in zip(columns, shapes, strict=True)
+    ]
+    return np.concatenate(filled)

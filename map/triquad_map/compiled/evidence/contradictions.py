@@ -13,24 +13,16 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Ints, Longs
 
 from triquad_map.compiled.evidence.observed import (
-    EARLIER_MISSES,
-    EARLIER_PASSES,
-    ENDS,
-    HIT_SCAN,
-    HITS,
-    MEAN,
-    MISSES,
-    PASS_SCANS,
-    PASSED_SCAN,
-    PASSES,
-    SECTORS,
-    WEIGHT,
     Observed,
-    row_of,
+    ObservedVoxel,
+    Voxel,
+    has_surface,
+    rows_around,
+    voxel_of,
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of, byte_of, unpack
+from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
 
 _PRIOR_HITS, _PRIOR_PASSES = 0.3, 0.7
 """What is taken to have been seen of a voxel before anything was: one ray in all."""
@@ -42,7 +34,11 @@ _OWN_RECORD_HITS = 3
 _LEAST_GONE = 3
 """So many voxels around must be gone to take one along that rays need not have passed."""
 
-_SCANS_AROUND = 2  # times those that a voxel's own record asks for
+_SOLID_HITS = 20
+"""A surface that was hit so many times for each time it was crossed has no gaps: crossings of all
+its voxels count together."""
+
+_SCANS_AROUND = 2  # times those that a voxel's own record asks for, where rays need not cross it
 
 
 class Disbelief(NamedTuple):
@@ -50,7 +46,7 @@ class Disbelief(NamedTuple):
 
     scans: int  # at least so many in a row, of which rays passed and none ended there
     own: float  # and so improbable are their crossings: logarithm of the probability
-    around: float  # or so improbable the passes of a voxel and all those around it
+    around: float  # or so improbable what passed a voxel and all those around it
     shared: float  # or so improbable its passes alone, where half of those around it are gone
     witnessed: float  # or so improbable its crossings, where the field shows no surface either
 
@@ -64,9 +60,6 @@ class Disbelief(NamedTuple):
         return cls(scans, own, around=3 * own, shared=own + math.log(2), witnessed=own / 2)
 
 
-Voxel = tuple[int, int, int]
-
-
 @kernel()
 def _improbability(passes: int, earlier: int, hits: int) -> float:
     """Logarithm of how probable so many passes in a row are, by what was seen earlier."""
@@ -78,23 +71,9 @@ def _improbability(passes: int, earlier: int, hits: int) -> float:
 
 
 @kernel()
-def _voxel_of(row: int, seen: SeenVoxels, observed: Observed) -> Voxel:
-    """The voxel of a row."""
-    owner = observed.owners[row]
-    x, y, z = unpack(seen.blocks.row_keys[owner >> (3 * SHIFT)])
-    return (
-        (x << SHIFT) + (owner >> (2 * SHIFT) & LOW),
-        (y << SHIFT) + (owner >> SHIFT & LOW),
-        (z << SHIFT) + (owner & LOW),
-    )
-
-
-@kernel()
-def _has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
-    """Whether the surface of a row is still believed."""
-    owner = observed.owners[row]
-    block = owner >> (3 * SHIFT)
-    return bool(seen.surface[block, owner >> SHIFT & (1 << (2 * SHIFT)) - 1] & bit_of(owner & LOW))
+def _own_improbability(voxel: ObservedVoxel) -> float:
+    """Logarithm of how probable the crossings of a voxel are by its own record."""
+    return _improbability(voxel.misses, voxel.earlier_misses, voxel.hits)
 
 
 class Around(NamedTuple):
@@ -103,6 +82,9 @@ class Around(NamedTuple):
     known: int  # of those around it
     gone: int  # of these, whose surface is not believed any more
     doubted: int  # of these, that are believed, and that rays passed since
+    scans: int  # most in a row of which rays passed one of them
+    misses: int
+    earlier_misses: int
     passes: int
     earlier_passes: int
     hits: int
@@ -111,61 +93,71 @@ class Around(NamedTuple):
 @kernel()
 def _around(row: int, seen: SeenVoxels, observed: Observed) -> Around:
     """What is known of a voxel and those around it."""
-    x, y, z = _voxel_of(row, seen, observed)
-    known = gone = doubted = passes = earlier = hits = 0
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                near = row_of(seen, observed, x + i, y + j, z + k)
-                if near == 0:
-                    continue
-                other = observed.counts[near]
-                passes += other[PASSES]
-                earlier += other[EARLIER_PASSES]
-                hits += other[HITS]
-                if near == row:
-                    continue
-                known += 1
-                if not _has_surface(near, seen, observed):
-                    gone += 1
-                elif other[PASS_SCANS] > 0:
-                    doubted += 1
-    return Around(known, gone, doubted, passes, earlier, hits)
+    known = gone = doubted = scans = misses = earlier_misses = passes = earlier_passes = hits = 0
+    for near in rows_around(row, seen, observed):
+        if near == 0:
+            continue
+        other = observed.voxels[near]
+        scans = max(scans, other.pass_scans)
+        misses += other.misses
+        earlier_misses += other.earlier_misses
+        passes += other.passes
+        earlier_passes += other.earlier_passes
+        hits += other.hits
+        if near == row:
+            continue
+        known += 1
+        if not has_surface(near, seen, observed):
+            gone += 1
+        elif other.pass_scans > 0:
+            doubted += 1
+    return Around(known, gone, doubted, scans, misses, earlier_misses, passes, earlier_passes, hits)
 
 
 @kernel()
-def _goes_along(counts: Ints, around: Around, rule: Disbelief) -> bool:
+def _goes_along(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
     """Whether a surface goes since those around it are gone.
 
-    Where two thirds of them are, no ray need have passed it: a thing goes as a whole.
+    A thing goes as a whole: no ray need pass each of its voxels. What has a record of its own goes
+    only if that speaks for it, or if no ray passed and two thirds are gone.
     """
-    if around.gone < _LEAST_GONE:
-        return bool(0 < around.gone == around.known and counts[PASS_SCANS] >= rule.scans)
-    if 3 * around.gone >= 2 * around.known:
-        return True
-    if 2 * around.gone < around.known:
+    if around.gone == 0 or 2 * around.gone < around.known:
         return False
-    if counts[HITS] < _OWN_RECORD_HITS:
+    all_gone = around.gone == around.known and voxel.pass_scans >= rule.scans
+    if around.gone < _LEAST_GONE and not all_gone:
+        return False
+    if voxel.hits < _OWN_RECORD_HITS:
         return True
-    share = (counts[EARLIER_PASSES] + 0.5) / (counts[HITS] + counts[EARLIER_PASSES] + 1.0)
-    return bool(counts[PASSES] * np.log(share) <= rule.shared)
+    if voxel.passes == 0:  # which says nothing either way
+        return bool(3 * around.gone >= 2 * around.known)
+    share = (voxel.earlier_passes + 0.5) / (voxel.hits + voxel.earlier_passes + 1.0)
+    return bool(voxel.passes * np.log(share) <= rule.shared)
+
+
+@kernel()
+def _is_doubted_around(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
+    """Whether no surface around a voxel is believed, and what passed all of it is improbable."""
+    if around.gone + around.doubted < around.known:
+        return False
+    is_solid = around.hits >= _SOLID_HITS * around.earlier_misses
+    if is_solid and voxel.misses and around.scans >= rule.scans:
+        crossed = _improbability(around.misses, around.earlier_misses, around.hits)
+        if crossed < rule.around:
+            return True
+    if voxel.pass_scans < _SCANS_AROUND * rule.scans:
+        return False
+    return _improbability(around.passes, around.earlier_passes, around.hits) < rule.around
 
 
 @kernel()
 def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
     """Whether the surface of a voxel is gone, by its own record or with those around it."""
-    counts = observed.counts[row]
-    scans = counts[PASS_SCANS]
-    if scans >= rule.scans and counts[MISSES] >= rule.scans:
-        own = _improbability(counts[MISSES], counts[EARLIER_MISSES], counts[HITS])
-        if own < rule.own:
-            return True
-    around = _around(row, seen, observed)
-    if _goes_along(counts, around, rule):
+    voxel = observed.voxels[row]
+    scans = min(voxel.pass_scans, voxel.misses)
+    if scans >= rule.scans and _own_improbability(voxel) < rule.own:
         return True
-    if scans < _SCANS_AROUND * rule.scans or around.gone + around.doubted < around.known:
-        return False
-    return _improbability(around.passes, around.earlier_passes, around.hits) < rule.around
+    around = _around(row, seen, observed)
+    return _goes_along(voxel, around, rule) or _is_doubted_around(voxel, around, rule)
 
 
 @kernel()
@@ -176,18 +168,15 @@ def _take_back(
 
     Those around it that were not hit since it was passed are added to ``waiting``.
     """
-    x, y, z = _voxel_of(row, seen, observed)
+    voxel = observed.voxels[row]
+    x, y, z = voxel_of(row, seen, observed)
     taken.append((x, y, z))
-    seen.surface[observed.owners[row] >> (3 * SHIFT), byte_of(x, y)] &= ~bit_of(z)
-    observed.shapes[row, WEIGHT] = observed.shapes[row, ENDS] = 0
-    observed.counts[row, SECTORS] = 0
-    passed_scan = observed.counts[row, PASSED_SCAN]
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                near = row_of(seen, observed, x + i, y + j, z + k)
-                if near != 0 and observed.counts[near, HIT_SCAN] < passed_scan:
-                    waiting.append(near)
+    seen.surface[voxel.owner >> (3 * SHIFT), byte_of(x, y)] &= ~bit_of(z)
+    voxel.weight = voxel.ends = 0
+    voxel.sectors = 0
+    for near in rows_around(row, seen, observed):
+        if near != 0 and observed.voxels[near].hit_scan < voxel.passed_scan:
+            waiting.append(near)
 
 
 @kernel()
@@ -199,13 +188,13 @@ def take_back(
     That of the rows ``gone`` is; that of ``passed``, by rays of the newest scan, may be. With what
     goes, those around it are asked once more.
     """
-    taken = [_voxel_of(0, seen, observed) for _ in range(0)]
-    waiting = [np.int64(row) for row in passed if observed.counts[row, PASS_SCANS] >= rule.scans]
+    taken = [voxel_of(0, seen, observed) for _ in range(0)]
+    waiting = [np.int64(row) for row in passed if observed.voxels[row].pass_scans >= rule.scans]
     for row in gone:
         _take_back(row, seen, observed, taken, waiting)
     while len(waiting):
         row = waiting.pop()
-        if _has_surface(row, seen, observed) and _is_gone(row, seen, observed, rule):
+        if has_surface(row, seen, observed) and _is_gone(row, seen, observed, rule):
             _take_back(row, seen, observed, taken, waiting)
     voxels = np.empty((len(taken), 3), np.int64)
     for number, (x, y, z) in enumerate(taken):
@@ -219,11 +208,10 @@ def doubted(passed: Ints, seen: SeenVoxels, observed: Observed, rule: Disbelief)
     chosen = np.empty(len(passed), np.int64)
     count = 0
     for row in passed:
-        counts = observed.counts[row]
-        if counts[MISSES] == 0 or not _has_surface(row, seen, observed):
+        voxel = observed.voxels[row]
+        if voxel.misses == 0 or not has_surface(row, seen, observed):
             continue
-        own = _improbability(counts[MISSES], counts[EARLIER_MISSES], counts[HITS])
-        if own < rule.witnessed:
+        if _own_improbability(voxel) < rule.witnessed:
             chosen[count] = row
             count += 1
     return chosen[:count]
@@ -234,8 +222,7 @@ def middles(rows: Longs, seen: SeenVoxels, observed: Observed) -> Doubles:
     """Where the surface of ``rows`` [N] was seen [N, 3], voxels."""
     places = np.empty((len(rows), 3))
     for i, row in enumerate(rows):
-        x, y, z = _voxel_of(row, seen, observed)
-        places[i, 0] = x + observed.shapes[row, MEAN]
-        places[i, 1] = y + observed.shapes[row, MEAN + 1]
-        places[i, 2] = z + observed.shapes[row, MEAN + 2]
+        voxel, mean = voxel_of(row, seen, observed), observed.voxels[row].mean
+        for axis in range(3):
+            places[i, axis] = voxel[axis] + mean[axis]
     return places

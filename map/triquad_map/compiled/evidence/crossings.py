@@ -8,23 +8,9 @@ for a disc, a ray that passes the voxel counts as a weaker sign.
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Floats, Ints
+from triquad_format.records.arrays import Ints
 
-from triquad_map.compiled.evidence.observed import (
-    EARLIER_MISSES,
-    EARLIER_PASSES,
-    ENDS,
-    HIT_SCAN,
-    MEAN,
-    MISSES,
-    NORMAL,
-    PASS_SCANS,
-    PASSED_SCAN,
-    PASSES,
-    SPREAD,
-    Observed,
-    Vector,
-)
+from triquad_map.compiled.evidence.observed import Observed, ObservedVoxel, Vector
 from triquad_map.compiled.kernel import kernel
 
 _SPREAD_SHARE = 0.8
@@ -51,25 +37,23 @@ class Passing(NamedTuple):
 
 
 @kernel(inline="always")
-def _crosses(ray: Passing, corner: Vector, row: int, shapes: Floats) -> bool:
+def _crosses(ray: Passing, corner: Vector, voxel: ObservedVoxel) -> bool:
     """Whether a ray crosses the disc of the surface in a voxel at its least ``corner``."""
-    way = ray.way
-    to_x = corner[0] + shapes[row, MEAN] - ray.start[0]
-    to_y = corner[1] + shapes[row, MEAN + 1] - ray.start[1]
-    to_z = corner[2] + shapes[row, MEAN + 2] - ray.start[2]
-    a, b, c = shapes[row, NORMAL], shapes[row, NORMAL + 1], shapes[row, NORMAL + 2]
+    way, mean, normal = ray.way, voxel.mean, voxel.normal
+    to_x = corner[0] + mean[0] - ray.start[0]
+    to_y = corner[1] + mean[1] - ray.start[1]
+    to_z = corner[2] + mean[2] - ray.start[2]
     along = to_x * way[0] + to_y * way[1] + to_z * way[2]
     radius = _LEAST_RADIUS
-    if a != 0 or b != 0 or c != 0:
-        facing = way[0] * a + way[1] * b + way[2] * c
+    if _is_flat(voxel):
+        facing = way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]
         if abs(facing) < _LEAST_COSINE:
             return False
-        along = (to_x * a + to_y * b + to_z * c) / facing
+        along = (to_x * normal[0] + to_y * normal[1] + to_z * normal[2]) / facing
         depth = _DEPTH if abs(facing) >= _GRAZING else _GRAZING_DEPTH
         if (ray.clear - along) * abs(facing) < depth:
             return False
-        spread = _SPREAD_SHARE * np.sqrt(shapes[row, SPREAD])
-        radius = min(max(spread, _LEAST_RADIUS), _GREATEST_RADIUS)
+        radius = min(max(_SPREAD_SHARE * np.sqrt(voxel.spread), _LEAST_RADIUS), _GREATEST_RADIUS)
     if not 0 <= along <= ray.clear:
         return False
     off_x, off_y, off_z = along * way[0] - to_x, along * way[1] - to_y, along * way[2] - to_z
@@ -77,10 +61,10 @@ def _crosses(ray: Passing, corner: Vector, row: int, shapes: Floats) -> bool:
 
 
 @kernel(inline="always")
-def _is_known_plane(row: int, shapes: Floats) -> bool:
-    """Whether enough rays ended on a plane in a voxel to count only rays that cross it."""
-    flat = shapes[row, NORMAL] != 0 or shapes[row, NORMAL + 1] != 0 or shapes[row, NORMAL + 2] != 0
-    return bool(flat and shapes[row, ENDS] >= _KNOWN_ENDS)
+def _is_flat(voxel: ObservedVoxel) -> bool:
+    """Whether the normal of the surface in a voxel is known."""
+    normal = voxel.normal
+    return bool(normal[0] != 0 or normal[1] != 0 or normal[2] != 0)
 
 
 @kernel()
@@ -90,22 +74,22 @@ def note_passes(ray: Passing, crossed: Ints, observed: Observed, passed: Ints) -
     ``passed`` collects rows that rays of this scan passed, and in which none of them ended; its
     first number is how many follow.
     """
-    shapes, counts = observed.shapes, observed.counts
     for i in range(len(crossed)):
         row = crossed[i, 3]
         if row == 0:
             continue
-        crossing = _crosses(ray, (crossed[i, 0], crossed[i, 1], crossed[i, 2]), row, shapes)
-        if not crossing and _is_known_plane(row, shapes):
+        voxel = observed.voxels[row]
+        crossing = _crosses(ray, (crossed[i, 0], crossed[i, 1], crossed[i, 2]), voxel)
+        if not crossing and voxel.ends >= _KNOWN_ENDS and _is_flat(voxel):
             continue
-        if counts[row, HIT_SCAN] == ray.scan:
-            counts[row, EARLIER_PASSES] += 1
-            counts[row, EARLIER_MISSES] += crossing
+        if voxel.hit_scan == ray.scan:
+            voxel.earlier_passes += 1
+            voxel.earlier_misses += crossing
             continue
-        counts[row, PASSES] += 1
-        counts[row, MISSES] += crossing
-        if counts[row, PASSED_SCAN] != ray.scan:
-            counts[row, PASSED_SCAN] = ray.scan
-            counts[row, PASS_SCANS] += 1
+        voxel.passes += 1
+        voxel.misses += crossing
+        if voxel.passed_scan != ray.scan:
+            voxel.passed_scan = ray.scan
+            voxel.pass_scans += 1
             passed[0] += 1
             passed[passed[0]] = row

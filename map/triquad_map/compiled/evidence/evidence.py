@@ -121,8 +121,11 @@ class FrozenEvidence:
         """Blocks [B, 3], in units of blocks, that hold any seen surface."""
         return self.cells[self.surface.any(axis=1)]
 
-    def record(self) -> EvidenceRecord:
-        """The evidence as the map file holds it; empty blocks are left out."""
+    def record(self, outcomes: Bytes | None = None) -> EvidenceRecord:
+        """The evidence as the map file holds it; empty blocks are left out.
+
+        ``outcomes`` [S, 3] are those of the voxels in ``surface``, in their order.
+        """
         surface, free = self.seen.surface, self.seen.free
         used = np.flatnonzero((surface | free).any(axis=1))
         codes = morton.encode(self.cells[used])
@@ -130,12 +133,19 @@ class FrozenEvidence:
         used = used[order]
         counts = surface_counts(surface)
         firsts = np.cumsum(counts) - counts
-        # The levels block by block, in the order of the record.
+        # The voxels block by block, in the order of the record.
         runs = np.repeat(firsts[used] - (np.cumsum(counts[used]) - counts[used]), counts[used])
-        levels = self.levels[runs + np.arange(len(runs))]
+        voxels = runs + np.arange(len(runs))
         # In whole minutes: else each scan would change every part that it sees.
         seen_s = np.where(counts > 0, self.seen_s // _SEEN_STEP_S * _SEEN_STEP_S, 0)
-        return EvidenceRecord(codes[order], surface[used], free[used], levels, seen_s[used])
+        return EvidenceRecord(
+            codes[order],
+            surface[used],
+            free[used],
+            levels=self.levels[voxels],
+            seen_s=seen_s[used],
+            outcomes=None if outcomes is None else outcomes[voxels],
+        )
 
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "FrozenEvidence":

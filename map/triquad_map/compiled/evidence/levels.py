@@ -1,26 +1,26 @@
 """How well each surface voxel is supported: the level that answers and files tell of."""
 
-from triquad_format.records.arrays import Bytes, Ints
+from triquad_format.records.arrays import Bytes
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 
-from triquad_map.compiled.evidence.observed import PASS_SCANS, SECTORS, WEIGHT, Observed
+from triquad_map.compiled.evidence.observed import Observed, ObservedVoxel
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import SHIFT
 from triquad_map.surface import LEAST_STRENGTH, LEVELS, SECTORS_COUNTED
 
 
 @kernel(inline="always")
-def _level(weight: float, counts: Ints) -> int:
+def _level(voxel: ObservedVoxel) -> int:
     """The level of a voxel; each scan in a row that contradicts it takes one off."""
     sectors = 0
     for sector in range(8):
-        sectors += counts[SECTORS] >> sector & 1
-    strength = weight * (0.5 + 0.5 * min(SECTORS_COUNTED, max(1, sectors)))
+        sectors += voxel.sectors >> sector & 1
+    strength = voxel.weight * (0.5 + 0.5 * min(SECTORS_COUNTED, max(1, sectors)))
     level = 0
     while level < LEVELS - 1 and strength >= LEAST_STRENGTH * (1 << level):
         level += 1
-    return max(min(1, level), level - int(counts[PASS_SCANS]))
+    return max(min(1, level), level - int(voxel.pass_scans))
 
 
 @kernel()
@@ -36,5 +36,5 @@ def fill_levels(surface: Bytes, observed: Observed, levels: Bytes) -> None:
             for z in range(BLOCK_VOXELS):
                 if bits >> z & 1:
                     row = observed.rows[place, byte << SHIFT | z]
-                    levels[at] = _level(observed.shapes[row, WEIGHT], observed.counts[row])
+                    levels[at] = _level(observed.voxels[row])
                     at += 1

@@ -16,8 +16,10 @@ from triquad_map.compiled.evidence.contradictions import (
     take_back,
 )
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.observations import Observations, Sighting
+from triquad_map.compiled.evidence.observations import Observations
+from triquad_map.compiled.evidence.ray_surfels import ray_surfels
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_ends
+from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
 from triquad_map.surface import SampleField, Surfels
 
@@ -82,6 +84,13 @@ class LiveEvidence:
         """
         self._observations.set_discs(voxels, surfels, self._seen)
 
+    def ray_surfels(self, voxels: Longs, since: int) -> Surfels:
+        """What rays alone show of surface that was first seen in scan ``since`` or later.
+
+        See :data:`triquad_map.surface.ShownByRays`.
+        """
+        return ray_surfels(voxels, since, self._seen, self._observations.arrays)
+
     def carve(self, origin: Doubles, ends: Doubles, reach: Reach) -> Ints:
         """Record the free space between ``origin`` [3] and ``ends`` [N, 3].
 
@@ -94,7 +103,7 @@ class LiveEvidence:
             What :meth:`take_back` asks for: where rays passed a surface.
         """
         self._frozen = None
-        passed = np.zeros(len(self._observations.arrays.owners), np.int32)
+        passed = np.zeros(len(self._observations.arrays.voxels), np.int32)
         done = 0
         while done < len(ends):
             done, self._blocks.count = mark_crossed(
@@ -175,13 +184,20 @@ class LiveEvidence:
             )
         return self._frozen
 
+    def record(self) -> EvidenceRecord:
+        """The evidence as the map file holds it, with what to go on from it takes."""
+        frozen = self.freeze()
+        return frozen.record(self._observations.outcomes(frozen.surface))
+
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "LiveEvidence":
         """The evidence of a record, of a region of ``side`` voxels."""
         evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
         evidence._seen = frozen.seen
-        evidence._observations = Observations.restore(frozen.surface, frozen.levels, frozen.seen_s)
+        evidence._observations = Observations.restore(
+            frozen.surface, frozen.levels, frozen.seen_s, outcomes=record.outcomes
+        )
         evidence._make_room()
         return evidence
 

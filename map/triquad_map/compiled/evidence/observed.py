@@ -1,46 +1,52 @@
-"""What is known of each voxel in which rays ended, as kernels take it: a row for each."""
+"""What is known of each voxel in which rays ended, as kernels take it: a record for each."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from triquad_format.records.arrays import Floats, Ints, Longs
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Ints, Longs
 
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block
+from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of, byte_of, find_block, unpack
 
-MEAN = 0  # and the two columns after it: middle of the ends, voxels, in the voxel
-NORMAL = 3  # and the two after it: of the surface; 0 where it is not known or not flat
-SPREAD = 6  # mean squared distance of the ends from their middle, voxels
-ENDS = 7  # rays that ended there, up to _COUNTED_ENDS
-WEIGHT = 8  # rays, the near ones counting more
-SHAPE_COLUMNS = 9
+OBSERVED_VOXEL = np.dtype(
+    [
+        ("owner", np.int64),  # the block's row in the evidence, and the voxel in the block
+        ("mean", np.float32, 3),  # of the ends, voxels, in the voxel
+        ("normal", np.float32, 3),  # of the surface; 0 where it is not known or not flat
+        ("towards", np.float32, 3),  # from the last end to the sensor, voxels
+        ("spread", np.float32),  # mean squared distance of the ends from their mean, voxels
+        ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
+        ("weight", np.float32),  # these rays, the near ones counting more
+        ("sectors", np.int32),  # a bit for each eighth of the horizon looked from
+        ("hits", np.int32),  # scans of which rays ended there
+        ("first_scan", np.int32),  # of which a ray ended on the surface that is there now
+        ("hit_scan", np.int32),  # the last of which a ray ended there
+        ("passed_scan", np.int32),  # the last of which a ray passed, and none ended there
+        ("pass_scans", np.int32),  # such scans in a row
+        ("passes", np.int32),  # rays of theirs that passed
+        ("misses", np.int32),  # rays of theirs that crossed the surface
+        ("earlier_passes", np.int32),  # as these two, before the last hit
+        ("earlier_misses", np.int32),
+    ],
+    align=True,
+)
 
-HIT_SCAN = 0  # the last scan of which a ray ended there
-HITS = 1  # scans of which rays ended there
-PASSED_SCAN = 2  # the last scan of which a ray passed, and none ended there
-PASS_SCANS = 3  # such scans in a row
-PASSES = 4  # rays of theirs that passed
-MISSES = 5  # rays of theirs that crossed the surface
-EARLIER_PASSES = 6  # rays that passed before the last hit
-EARLIER_MISSES = 7
-SECTORS = 8  # a bit for each eighth of the horizon looked from
-COUNT_COLUMNS = 9
+ObservedVoxel = Any
+"""A record of OBSERVED_VOXEL."""
 
 
 class Observed(NamedTuple):
-    """The arrays of the observations, as kernels take them.
-
-    A row is what is known of one voxel in which rays ended; row 0 is of none.
-    """
+    """The arrays of the observations, as kernels take them."""
 
     places: Ints  # [blocks] where in the next two a block of evidence stands; 0: nothing is known
-    rows: Ints  # [places, voxels] the row of each voxel; 0: no ray ended in it
+    rows: Ints  # [places, voxels] the row of each voxel in ``voxels``; 0: no ray ended in it
     seen_s: Longs  # [places] when the last ray ended in the block
-    owners: Longs  # [rows] the block's row in the evidence, and the voxel in the block
-    shapes: Floats  # [rows, SHAPE_COLUMNS]
-    counts: Ints  # [rows, COUNT_COLUMNS]
+    voxels: NDArray[np.void]  # [rows] OBSERVED_VOXEL; row 0 is of none
 
 
+Voxel = tuple[int, int, int]
 Vector = tuple[float, float, float]
 
 
@@ -51,3 +57,37 @@ def row_of(seen: SeenVoxels, observed: Observed, x: int, y: int, z: int) -> int:
     if block < 0:
         return 0
     return int(observed.rows[observed.places[block], byte_of(x, y) << SHIFT | (z & LOW)])
+
+
+@kernel()
+def voxel_of(row: int, seen: SeenVoxels, observed: Observed) -> Voxel:
+    """The voxel of a row."""
+    owner = observed.voxels[row].owner
+    x, y, z = unpack(seen.blocks.row_keys[owner >> (3 * SHIFT)])
+    return (
+        (x << SHIFT) + (owner >> (2 * SHIFT) & LOW),
+        (y << SHIFT) + (owner >> SHIFT & LOW),
+        (z << SHIFT) + (owner & LOW),
+    )
+
+
+@kernel()
+def has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
+    """Whether the surface of a row is still believed."""
+    owner = observed.voxels[row].owner
+    block = owner >> (3 * SHIFT)
+    return bool(seen.surface[block, owner >> SHIFT & (1 << (2 * SHIFT)) - 1] & bit_of(owner & LOW))
+
+
+@kernel()
+def rows_around(row: int, seen: SeenVoxels, observed: Observed) -> Ints:
+    """The rows [27] of the voxel of a row and those around it; 0 where no ray ended."""
+    x, y, z = voxel_of(row, seen, observed)
+    rows = np.empty(27, np.int32)
+    at = 0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                rows[at] = row_of(seen, observed, x + i, y + j, z + k)
+                at += 1
+    return rows

@@ -6,8 +6,9 @@ Surfels stand in the order of the evidence: block by block, and within a block v
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bytes, Doubles, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
@@ -21,10 +22,20 @@ from triquad_map.compiled.surfels.surfel_search import (
 )
 from triquad_map.compiled.voxel_index import LOW, SHIFT, VoxelIndex
 from triquad_map.composition.region import NearestSurfels
-from triquad_map.surface import SampleField, SurfelKind, Surfels, fit_surfels, support_confidence
+from triquad_map.surface import (
+    SampleField,
+    ShownByRays,
+    SurfelKind,
+    Surfels,
+    fit_surfels,
+    nothing_shown,
+    support_confidence,
+)
 
 _FAR = 1e6  # voxels
 _NEVER = -1
+
+Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -39,9 +50,11 @@ class SurfelPlaces:
 
 def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
     """Places for the voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks at ``cells`` [, 3]."""
-    starts = np.concatenate([[0], np.cumsum(surface_counts(surface))]).astype(np.int32)
-    voxels = surfel_voxels(cells, surface, int(starts[-1]))
-    return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface))
+    counts = surface_counts(surface)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    used = np.flatnonzero(counts)  # most blocks are of open air
+    voxels = surfel_voxels(cells[used], surface[used], int(starts[-1]))
+    return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface, used))
 
 
 def surfel_index(places: SurfelPlaces, surfels: Surfels) -> SurfelIndex:
@@ -120,9 +133,11 @@ def _block_boxes(cells: Longs, surface: Bytes, rows: Longs) -> Ints:
     return boxes
 
 
-def block_groups(cells: Longs, surface: Bytes) -> BlockGroups:
-    """The blocks at ``cells`` [blocks, 3] that hold any of ``surface``, in groups."""
-    used = np.flatnonzero(surface.any(axis=1))
+def block_groups(cells: Longs, surface: Bytes, used: NDArray[np.intp]) -> BlockGroups:
+    """The blocks ``used`` [N], of those at ``cells`` [blocks, 3], in groups.
+
+    They are those that hold any of ``surface`` [blocks, BLOCK_BYTES].
+    """
     codes, owners = np.unique(morton.encode(cells[used] >> GROUP_SHIFT), return_inverse=True)
     order = np.argsort(owners, kind="stable")
     starts = np.searchsorted(owners[order], np.arange(len(codes) + 1))
@@ -177,21 +192,29 @@ class SurfelMap:
         find_nearest(points, self._index, found)
 
     def updated(
-        self, evidence: FrozenEvidence, field: SampleField, epoch: int, most: int | None
+        self,
+        evidence: FrozenEvidence,
+        field: SampleField,
+        epoch: int,
+        most: int | None,
+        by_rays: ShownByRays = nothing_shown,
     ) -> "SurfelMap":
         """The surfels of a later epoch: new ones are fitted, and of the others the oldest.
 
         At most so many of the others are fitted; ``None``: all.
         """
-        return _fitted_again(
-            evidence, _carried(self._fitted, evidence), field, epoch=epoch, most=most
-        )
+        fitted = _carried(self._fitted, evidence)
+        rows = _outdated(fitted, most)
+        return _fitted_again(evidence, fitted, rows, field=field, by_rays=by_rays, epoch=epoch)
 
 
-def first_surfels(evidence: FrozenEvidence, field: SampleField, epoch: int) -> SurfelMap:
+def first_surfels(
+    evidence: FrozenEvidence, field: SampleField, epoch: int, by_rays: ShownByRays = nothing_shown
+) -> SurfelMap:
     """The surfels of all seen voxels, for an epoch."""
-    places = surfel_places(evidence.cells, evidence.surface)
-    return _fitted_again(evidence, _nothing_in(places), field, epoch=epoch, most=None)
+    fitted = _nothing_in(surfel_places(evidence.cells, evidence.surface))
+    rows = _outdated(fitted, None)
+    return _fitted_again(evidence, fitted, rows, field=field, by_rays=by_rays, epoch=epoch)
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
@@ -208,7 +231,11 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
         copies = {name: array.copy() for name, array in vars(before.surfels).items()}
         return _Fitted(old, Surfels(**copies), before.epochs.copy())
     after = _nothing_in(surfel_places(evidence.cells, evidence.surface))
-    rows = moved_rows(old.surface, old.starts, after.places.surface, len(after.epochs))
+    used = np.flatnonzero(np.diff(after.places.starts))
+    known = used[used < len(old.surface)]
+    rows = moved_rows(
+        old.surface[known], old.starts[known], evidence.surface[used], len(after.epochs)
+    )
     kept = np.flatnonzero(rows >= 0)
     rows = rows[kept]
     for name, array in vars(after.surfels).items():
@@ -217,16 +244,41 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
     return after
 
 
+def _outdated(fitted: _Fitted, most: int | None) -> Rows:
+    """What was never fitted, and at most so many of the rest, those longest ago.
+
+    Half of these are what the field has still to learn, of which there is little: so it takes over
+    soon after it has.
+    """
+    if most is None:
+        return np.arange(len(fitted.epochs))
+    never = fitted.epochs == _NEVER
+    unlearnt = ~never & (fitted.surfels.kinds >= SurfelKind.RAY_DISC)
+    first = _oldest(fitted, unlearnt, most // 2)
+    rest = _oldest(fitted, ~never & ~unlearnt, most - len(first))
+    return np.concatenate([np.flatnonzero(never), first, rest])
+
+
+def _oldest(fitted: _Fitted, chosen: Bools, most: int) -> Rows:
+    """Of the ``chosen`` [S] surfels at most so many, those that were fitted longest ago."""
+    rows = np.flatnonzero(chosen)
+    if len(rows) <= most:
+        return rows
+    return rows[np.argpartition(fitted.epochs[rows], most)[:most]]
+
+
 def _fitted_again(
-    evidence: FrozenEvidence, fitted: _Fitted, field: SampleField, *, epoch: int, most: int | None
+    evidence: FrozenEvidence,
+    fitted: _Fitted,
+    rows: Rows,
+    *,
+    field: SampleField,
+    by_rays: ShownByRays,
+    epoch: int,
 ) -> SurfelMap:
-    """Fit what was never fitted, and at most so many of the rest; changes ``fitted``."""
-    known = np.flatnonzero(fitted.epochs != _NEVER)
-    if most is not None and len(known) > most:
-        known = known[np.argpartition(fitted.epochs[known], most)[:most]]
-    chosen = np.concatenate([np.flatnonzero(fitted.epochs == _NEVER), known])
-    new = fit_surfels(fitted.places.voxels[chosen], field, evidence.ended_in)
+    """Fit the surfels in some rows; changes ``fitted``."""
+    new = fit_surfels(fitted.places.voxels[rows], field, evidence.ended_in, by_rays)
     for name, array in vars(new).items():
-        getattr(fitted.surfels, name)[chosen] = array
-    fitted.epochs[chosen] = epoch
+        getattr(fitted.surfels, name)[rows] = array
+    fitted.epochs[rows] = epoch
     return SurfelMap(evidence, fitted)

@@ -28,7 +28,7 @@ _STEPS = np.array(
 
 _NEIGHBOURS = len(_STEPS)
 _FARTHEST = CELL_LIMIT / 2
-_DISC = int(SurfelKind.DISC)
+_DISC, _RAY_DISC = int(SurfelKind.DISC), int(SurfelKind.RAY_DISC)
 _RADIUS = np.float32(DISC_RADIUS)
 
 _CANDIDATES = 128
@@ -132,7 +132,7 @@ def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) ->
         if squares[i] > far:
             continue
         surfel, square = start + i, squares[i]
-        if kinds[surfel] == _DISC:
+        if kinds[surfel] == _DISC or kinds[surfel] == _RAY_DISC:
             square = _disc_square(x - xs[i], y - ys[i], z - zs[i], normals[surfel], square)
         if square > near:
             continue
@@ -214,7 +214,7 @@ def _closest_point(index: SurfelIndex, surfel: int, member: int, at: Place) -> P
     qx = (int(boxes[0, member]) & ~LOW) + float(index.positions[0, surfel])
     qy = (int(boxes[1, member]) & ~LOW) + float(index.positions[1, surfel])
     qz = (int(boxes[2, member]) & ~LOW) + float(index.positions[2, surfel])
-    if index.kinds[surfel] != _DISC:
+    if index.kinds[surfel] != _DISC and index.kinds[surfel] != _RAY_DISC:
         return qx, qy, qz
     nx, ny, nz = index.normals[surfel, 0], index.normals[surfel, 1], index.normals[surfel, 2]
     a, b, c = at[0] - qx, at[1] - qy, at[2] - qz

@@ -1,0 +1,83 @@
+"""Surfels as the rays alone show them, where the field has still to learn what they saw."""
+
+import numpy as np
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
+
+from triquad_map.compiled.evidence.observed import Observed, row_of
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
+from triquad_map.surface import SurfelKind, Surfels, nothing_shown
+
+_RAY_DISC, _RAY_POINT = int(SurfelKind.RAY_DISC), int(SurfelKind.RAY_POINT)
+
+
+def ray_surfels(voxels: Longs, since: int, seen: SeenVoxels, observed: Observed) -> Surfels:
+    """The surfels of ``voxels`` [N, 3]; see :data:`triquad_map.surface.ShownByRays`.
+
+    Only where rays first ended in scan ``since`` or later: of the rest the field has learnt.
+    """
+    surfels = nothing_shown(voxels)
+    _fill(voxels, since, seen, observed, surfels.offsets, surfels.normals, surfels.kinds)
+    return surfels
+
+
+@kernel()
+def _normal_around(
+    voxel: Longs, row: int, seen: SeenVoxels, observed: Observed, normal: Doubles
+) -> bool:
+    """The normal of the ends in a voxel and those around it; False where they are not flat.
+
+    Only those count that rays have ended in since they did here, and not much more often: a floor
+    does not, on which something was put.
+    """
+    here = observed.voxels[row]
+    since, most = here.hit_scan - here.hits, 2 * here.hits + 1
+    moments = np.zeros(MOMENTS)
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                near = row_of(seen, observed, voxel[0] + i, voxel[1] + j, voxel[2] + k)
+                other = observed.voxels[near]
+                if near == 0 or other.ends == 0:
+                    continue
+                if other.hit_scan > since and other.hits <= most:
+                    at = (i + other.mean[0], j + other.mean[1], k + other.mean[2])
+                    add_points(moments, at, other.ends)
+    return bool(plane_normal(moments, normal))
+
+
+@kernel()
+def _set_normal(
+    voxel: Longs, row: int, seen: SeenVoxels, observed: Observed, normal: Doubles
+) -> bool:
+    """Set the normal of the surface in a voxel, to the sensor; False: it is the way there."""
+    towards = observed.voxels[row].towards
+    normal[:] = observed.voxels[row].normal
+    if not normal.any() and not _normal_around(voxel, row, seen, observed, normal):
+        normal[:] = towards / max(np.sqrt((towards * towards).sum()), 1e-6)
+        return False
+    if (normal * towards).sum() < 0:
+        normal *= -1
+    return True
+
+
+@kernel()
+def _fill(
+    voxels: Longs,
+    since: int,
+    seen: SeenVoxels,
+    observed: Observed,
+    offsets: Floats,
+    normals: Floats,
+    kinds: Bytes,
+) -> None:
+    normal = np.zeros(3)
+    for i in range(len(voxels)):
+        row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
+        here = observed.voxels[row]
+        if row == 0 or here.ends == 0 or here.first_scan < since:
+            continue
+        is_flat = _set_normal(voxels[i], row, seen, observed, normal)
+        kinds[i] = _RAY_DISC if is_flat else _RAY_POINT
+        offsets[i], normals[i] = here.mean - np.float32(0.5), normal

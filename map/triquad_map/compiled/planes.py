@@ -1,0 +1,73 @@
+"""Planes through points, by the moments of these.
+
+The moments [10] of points are their number and the sums of x, y, z, xx, xy, xz, yy, yz and zz.
+"""
+
+import numpy as np
+from triquad_format.records.arrays import Doubles
+
+from triquad_map.compiled.kernel import kernel
+
+MOMENTS = 10
+
+_MIN_POINTS = 6
+_MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
+_MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
+
+
+@kernel(inline="always")
+def add_points(m: Doubles, at: tuple[float, float, float], count: float) -> None:
+    """Add so many points at one place to the moments ``m``."""
+    a, b, c = at
+    m[0] += count
+    m[1] += count * a
+    m[2] += count * b
+    m[3] += count * c
+    m[4] += count * a * a
+    m[5] += count * a * b
+    m[6] += count * a * c
+    m[7] += count * b * b
+    m[8] += count * b * c
+    m[9] += count * c * c
+
+
+@kernel()
+def plane_normal(m: Doubles, normal: Doubles) -> bool:
+    """The unit normal, of either sign, of the plane of points with the moments ``m``.
+
+    False: they lie in none, and ``normal`` [3] means nothing.
+    """
+    n = m[0]
+    if n < _MIN_POINTS:
+        return False
+    mx, my, mz = m[1] / n, m[2] / n, m[3] / n
+    xx, xy, xz = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - mx * mz
+    yy, yz, zz = m[7] / n - my * my, m[8] / n - my * mz, m[9] / n - mz * mz
+    # Eigenvalues of a symmetric 3 x 3 matrix (Smith 1961).
+    mean = (xx + yy + zz) / 3
+    off = xy * xy + xz * xz + yz * yz
+    spread = np.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off) / 6)
+    if spread <= 1e-12:
+        return False
+    a, b, c = (xx - mean) / spread, (yy - mean) / spread, (zz - mean) / spread
+    d, e, f = xy / spread, xz / spread, yz / spread
+    half_det = (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)) / 2
+    angle = np.arccos(min(1.0, max(-1.0, half_det))) / 3
+    greatest = mean + 2 * spread * np.cos(angle)
+    least = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
+    middle = 3 * mean - greatest - least
+    if least > _MAX_THICKNESS**2 * middle or middle < _MIN_WIDTH**2 * greatest:
+        return False
+    # The eigenvector is orthogonal to the rows of (A - least I): take their longest cross product.
+    rows = np.array([[xx - least, xy, xz], [xy, yy - least, yz], [xz, yz, zz - least]])
+    longest = 0.0
+    for i in range(3):
+        cross = np.cross(rows[i], rows[(i + 1) % 3])
+        length = (cross * cross).sum()
+        if length > longest:
+            longest = length
+            normal[:] = cross
+    if longest == 0.0:
+        return False
+    normal /= np.sqrt(longest)
+    return True

@@ -1,0 +1,31 @@
+"""What the regions of a map have in common."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_map.compiled.team import Team
+
+from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
+
+
+@dataclass(frozen=True)
+class RegionSetup:
+    """What the regions of a map have in common."""
+
+    field: FieldSettings
+    scan: ScanSettings
+    change: ChangeSettings
+    training: TrainingSettings
+    device: torch.device
+    sums: GradientSums
+    team: Team
+
+    def seeds(self, index: RegionIndex) -> tuple[int, int]:
+        """Seeds of a region's field and of its replay pool; no two regions share one."""
+        natural = tuple(2 * i if i >= 0 else -2 * i - 1 for i in index)
+        sequence = np.random.SeedSequence(self.training.seed, spawn_key=natural)
+        field, pool = sequence.generate_state(2, np.uint64).tolist()
+        return field, pool

@@ -1,0 +1,109 @@
+"""What has just appeared is known at once: after one scan, before the field has learnt it."""
+
+import numpy as np
+import pytest
+from support.small_world import settings, settle
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.status import Status
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.ground import ground
+from triquad_map.questions.rays import RayOptions, rays
+from triquad_map.questions.segments import SegmentOptions, segments
+from triquad_map.questions.spheres import spheres
+from triquad_server.epochs import Epoch
+from triquad_server.mapping.mapper import Mapper
+from triquad_tools.simulation.lidar import Lidar
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.solids import Solid, box, half_space
+
+VOXEL_M = 0.2
+BOUNDS = (np.array([-9.0, -9, -1]), np.array([9.0, 9, 5]))
+EMPTY = (
+    half_space(0.0),
+    box((8.0, 0.0, 2.0), (0.2, 8.0, 2.0)),
+    box((0.0, 7.0, 2.0), (8.0, 0.2, 2.0)),
+    box((0.0, -7.0, 2.0), (8.0, 0.2, 2.0)),
+)
+NEW = {
+    "wall": box((4.1, 0.0, 1.0), (0.15, 3.0, 1.0)),
+    "slab": box((2.5, 0.0, 0.125), (1.0, 1.0, 0.125)),
+    "box": box((3.0, 0.5, 0.45), (0.5, 0.6, 0.45)),
+}
+
+
+class Seen:
+    """A map of an empty place in which something has just been seen by one scan."""
+
+    def __init__(self, solid: Solid, steps: int) -> None:
+        mapper = Mapper("test", settings(samples_per_ray=6.0), "cpu")
+        pose = np.eye(4)
+        lidar = Lidar(columns=1024, elevation_min_deg=-45.0)
+        for number in range(8):
+            pose[:3, 3] = (0.1 * number - 1.0, 0.1, 1.4)
+            scan = lidar.scan(Scene(EMPTY, BOUNDS), pose, np.random.default_rng(number))
+            mapper.ingest(scan.points, pose, stamp_s=number)
+        settle(mapper)
+        mapper.publish()
+        self.scene = Scene((*EMPTY, solid), BOUNDS)
+        scan = lidar.scan(self.scene, pose, np.random.default_rng(99))
+        mapper.ingest(scan.points, pose, stamp_s=8)
+        for _ in range(steps):
+            mapper.train()
+        self.epoch: Epoch = mapper.publish()
+        on_it = np.abs(Scene((solid,), BOUNDS).sdf(scan.true_hits)) < 1e-3
+        # The lowest voxels are those of the floor, too, and have one surfel.
+        self.hits: Doubles = scan.true_hits[on_it & (scan.true_hits[:, 2] > VOXEL_M)]
+        self.normals: Doubles = self.scene.gradient(self.hits)
+
+
+@pytest.fixture(scope="module", params=[(n, s) for n in NEW for s in (0, 3)], ids=str)
+def seen(request: pytest.FixtureRequest) -> Seen:
+    name, steps = request.param
+    return Seen(NEW[name], steps)
+
+
+def test_segments_through_it_are_blocked(seen: Seen) -> None:
+    starts, ends = seen.hits + 0.5 * seen.normals, seen.hits - 0.15 * seen.normals
+    for radius_m, least in ((0.0, 0.9), (0.1, 0.99)):
+        found = segments(seen.epoch, starts, ends, SegmentOptions(radius_m, 1.0))
+        assert found.blocked.mean() > least
+
+
+def test_rays_end_on_it(seen: Seen) -> None:
+    found = rays(seen.epoch, seen.hits + 0.5 * seen.normals, -seen.normals, RayOptions(2.0, True))
+    assert (found.status == Status.SURFACE).mean() > 0.97
+    assert (np.abs(found.range_m - 0.5) < VOXEL_M / 2).mean() > 0.9
+
+
+def test_balls_at_it_meet_it(seen: Seen) -> None:
+    found = spheres(
+        seen.epoch, seen.hits + 0.05 * seen.normals, np.full(len(seen.hits), VOXEL_M / 2)
+    )
+    assert (found.status == Status.SURFACE).mean() > 0.99
+
+
+def test_distances_are_right_within_half_a_voxel(seen: Seen) -> None:
+    for height_m in (0.0, 0.05, 0.1, 0.3, 0.6):
+        points = seen.hits + height_m * seen.normals
+        found = distances(seen.epoch, points, DistanceOptions(2.0))
+        error_m = np.abs(found.distance_m - seen.scene.sdf(points))
+        assert (error_m < VOXEL_M / 2).mean() > 0.98
+        assert np.median(error_m) < 0.02
+
+
+def test_close_behind_it_distances_are_negative(seen: Seen) -> None:
+    behind = distances(seen.epoch, seen.hits - 0.04 * seen.normals, DistanceOptions(2.0))
+    assert (behind.distance_m < 0).mean() > 0.85
+    towards = (behind.gradient * seen.normals).sum(axis=1)
+    assert np.median(towards) > 0.98
+
+
+def test_its_top_bears_and_never_what_lies_below(seen: Seen) -> None:
+    tops = seen.hits[seen.normals[:, 2] > 0.9]
+    if not len(tops):
+        pytest.skip("a wall's top was not seen")
+    found = ground(seen.epoch, tops + (0, 0, 0.5), 2.0)
+    stands = found.status == Status.SURFACE
+    assert stands.mean() > 0.8
+    assert (np.abs(found.height_m - tops[:, 2])[stands] < VOXEL_M / 2).mean() > 0.95
+    assert (found.height_m > 0.05).all()
