@@ -4,12 +4,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from triquad_format.mapfile.parts.part import (
+    LEVEL_BITS,
+    join_bits,
     join_integers,
-    join_levels,
     shuffle,
     shuffle_codes,
+    split_bits,
     split_integers,
-    split_levels,
     unshuffle,
     unshuffle_codes,
 )
@@ -37,10 +38,14 @@ def test_literal_bytes_of_columns():
     assert split_integers(np.array([[1, -128], [2, 127]])).tolist() == [[[1, 2], [-128, 127]]]
     wide = np.array([[128, -300, MAX_INTEGER]])
     assert split_integers(wide).tolist() == [[[-128], [-44], [127]], [[1], [-1], [127]]]
-    assert split_levels(np.array([0, 3, 4, 6], np.uint8)).tolist() == [[0x0C], [0x06], [0x08]]
+    assert split_bits(np.array([0, 3, 4, 6], np.uint8), LEVEL_BITS).tolist() == [
+        [0x0C],
+        [0x06],
+        [0x08],
+    ]
 
 
 @given(st.lists(st.integers(0, MAX_LEVEL)))
 def test_levels_round_trip(levels):
     array = np.array(levels, np.uint8)
-    np.testing.assert_array_equal(join_levels(split_levels(array), len(array)), array)
+    np.testing.assert_array_equal(join_bits(split_bits(array, LEVEL_BITS), len(array)), array)

@@ -190,6 +190,24 @@ def test_a_restored_map_stays_until_rays_contradict_it() -> None:
     assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.15
 
 
+def test_an_hour_elsewhere_takes_nothing_back() -> None:
+    watched = Watched()
+    watched.scan(BOX, count=8)
+    watched.restart()
+    region = main_region(watched.mapper.publish())
+    voxels = surface_voxels(region.evidence)
+    voxels = voxels[voxel_centres(region, voxels)[:, 0] < 10.0]
+    elsewhere = Scene((half_space(0.0), box((30.0, 0.0, 2.0), (0.2, 8.0, 2.0))), BOUNDS)
+    pose = np.eye(4)
+    for minute in range(60):
+        pose[:3, 3] = (22.0 + 0.1 * minute, 0.0, 1.4)
+        points = Lidar(columns=1024).scan(elsewhere, pose, np.random.default_rng(minute)).points
+        points = points[points[:, 0] + pose[0, 3] > 12.0]
+        watched.mapper.ingest(points, pose, stamp_s=60 * minute)
+        watched.mapper.train()
+    assert main_region(watched.mapper.publish()).evidence.ended_in(voxels).all()
+
+
 def fence_voxels(epoch: Epoch) -> Longs:
     """Voxels [N, 3] in which rays ended on the bars, away from all else."""
     region = main_region(epoch)

@@ -25,7 +25,7 @@ EMPTY = (
     box((0.0, -7.0, 2.0), (8.0, 0.2, 2.0)),
 )
 NEW = {
-    "wall": box((4.1, 0.0, 1.0), (0.15, 3.0, 1.0)),
+    "wall": box((4.1, 0.0, 0.5), (0.15, 3.0, 0.5)),
     "slab": box((2.5, 0.0, 0.125), (1.0, 1.0, 0.125)),
     "box": box((3.0, 0.5, 0.45), (0.5, 0.6, 0.45)),
 }
@@ -100,8 +100,6 @@ def test_close_behind_it_distances_are_negative(seen: Seen) -> None:
 
 def test_its_top_bears_and_never_what_lies_below(seen: Seen) -> None:
     tops = seen.hits[seen.normals[:, 2] > 0.9]
-    if not len(tops):
-        pytest.skip("a wall's top was not seen")
     found = ground(seen.epoch, tops + (0, 0, 0.5), 2.0)
     stands = found.status == Status.SURFACE
     assert stands.mean() > 0.8
