@@ -2,21 +2,25 @@
 
 import numpy as np
 import pytest
-from triquad_tools.benchmarks.moving import Followed, follow, thin_kept
+from triquad_format.records.arrays import Doubles, Longs
+from triquad_tools.benchmarks.moving import Followed, Look, follow
 from triquad_tools.simulation.lidar import Lidar
-from triquad_tools.simulation.traffic import Traffic, street_traffic
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.traffic import Traffic, street_traffic, thin_things
 
 BUSY, EMPTY = 6, 10
+LIDAR = Lidar(beams=32, columns=512)
+THIN = tuple(thin_things(6.0, -2.5))
 
 
 @pytest.fixture(scope="module")
 def traffic() -> Traffic:
-    return street_traffic(1, BUSY, BUSY + EMPTY, Lidar(beams=32, columns=512))
+    return street_traffic(1, BUSY, BUSY + EMPTY, LIDAR).among(THIN)
 
 
 @pytest.fixture(scope="module")
 def followed(traffic: Traffic) -> Followed:
-    return follow(traffic, (0, EMPTY))
+    return follow(traffic, THIN, (0, EMPTY))
 
 
 def test_a_map_is_looked_at_when_it_should_be(traffic: Traffic, followed: Followed) -> None:
@@ -31,8 +35,14 @@ def test_the_trail_is_where_only_moving_things_were(followed: Followed) -> None:
     look = followed.looks[0]
     assert len(look.trail) > 100
     assert look.scene.sdf(look.trail).min() > 0.35
-    both = np.concatenate([look.trail, look.static])
-    assert len(np.unique(np.rint(both / look.epoch.voxel_m - 0.5), axis=0)) == len(both)
+    assert len(together(look, look.trail, look.static)) == len(look.trail) + len(look.static)
+
+
+def test_thin_things_are_among_what_stands(followed: Followed) -> None:
+    look = followed.looks[EMPTY]
+    assert len(look.thin) > 50
+    assert np.abs(Scene(THIN, look.scene.bounds).sdf(look.thin)).max() < 0.2
+    assert len(together(look, look.thin, look.static)) == len(look.static)
 
 
 def test_what_moved_is_forgotten_and_what_stands_is_kept(followed: Followed) -> None:
@@ -40,10 +50,19 @@ def test_what_moved_is_forgotten_and_what_stands_is_kept(followed: Followed) -> 
     assert busy.trail_left > 0.8
     assert empty.trail_left < 0.2
     assert empty.static_kept > 0.99
+    assert 0.5 < empty.thin_kept <= 1.0
     assert empty.air_in_trail > busy.air_in_trail
     assert busy.ghost_m2 > 5.0
     assert empty.ghost_m2 < 0.1 * busy.ghost_m2
 
 
-def test_most_of_thin_things_is_kept(traffic: Traffic) -> None:
-    assert 0.5 < thin_kept(traffic) <= 1.0
+def test_the_lane_is_free_once_nothing_drives_there(followed: Followed) -> None:
+    busy, empty = followed.looks.values()
+    assert busy.lane_blocked_m > 3
+    assert empty.lane_blocked_m < busy.lane_blocked_m
+
+
+def together(look: Look, *voxels: Doubles) -> Longs:
+    """The voxels that have some of these centres."""
+    cells = np.rint(np.concatenate(voxels) / look.epoch.voxel_m - 0.5).astype(np.int64)
+    return np.unique(cells, axis=0)

@@ -36,6 +36,14 @@ OFFSETS = (Offset(0.5, 5.0), Offset(1.0, 10.0), Offset(2.0, 15.0))
 
 
 @dataclass(frozen=True)
+class RecordedScans:
+    """Scans of a recorded drive: those to map, and those that the map is not to see."""
+
+    mapped: tuple[PosedScan, ...]
+    withheld: tuple[PosedScan, ...]
+
+
+@dataclass(frozen=True)
 class PlacedScans:
     """A map and scans that it has not seen."""
 
@@ -85,13 +93,23 @@ def on_street(made: BenchStreet) -> PlacedScans:
 
 def recorded(path: Path, scans: int | None = None) -> PlacedScans:
     """The map of a recorded folder (of its first ``scans``) without every 7th, and those."""
+    of_folder = recorded_scans(path, scans)
+    return PlacedScans(settled_mapper(path.name, of_folder.mapped).publish(), of_folder.withheld)
+
+
+def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
+    """The scans of a folder (the first ``scans`` of them), every 7th apart.
+
+    Raises:
+        ToolError: the folder cannot be read.
+    """
     folder = read_folder(path)
     mapped: list[PosedScan] = []
     withheld: list[PosedScan] = []
     for index, pose in enumerate(folder.poses[:scans]):
         scan = PosedScan(points_in_range(folder.read_points(index), _RANGE_MIN_M), pose)
         (withheld if is_withheld(index, _SKIP_EVERY) else mapped).append(scan)
-    return PlacedScans(settled_mapper(path.name, mapped).publish(), tuple(withheld))
+    return RecordedScans(tuple(mapped), tuple(withheld))
 
 
 def attempts(placed: PlacedScans, offset: Offset, tries: int = _TRIES) -> list[Attempt]:

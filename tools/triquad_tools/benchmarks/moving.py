@@ -1,30 +1,40 @@
 """``triquad-bench`` of a world that moves: what a map forgets of it, and what it keeps.
 
-Things move along a street and then are gone. The map trains and publishes between scans, as a
-server's does.
+On a simulated street things move among others that stand, some of them thin, and then are gone.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from triquad_client import Mesh
-from triquad_format.records.arrays import Bools, Doubles, Longs
-from triquad_format.records.status import Status
+from triquad_format.records.arrays import Bools, Doubles
+from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_server.epochs import Epoch
-from triquad_server.intake.rays import usable_rays
 from triquad_server.launch import warm_up
-from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.marching_cubes import centroids
 from triquad_server.mesh.mesher import mesh_tile, tile_lattice
 from triquad_server.settings import MeshSettings, Settings
 
-from triquad_tools.benchmarks.figures import Figure, seconds, typical
+from triquad_tools.benchmarks.ended_voxels import (
+    EndedVoxels,
+    end_keys,
+    surface_share,
+    voxel_centres,
+    voxel_keys,
+)
+from triquad_tools.benchmarks.figures import Figure, typical
+from triquad_tools.benchmarks.revisited import revisited_figures
+from triquad_tools.benchmarks.street import StreamedMap
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import mesh_area_m2
+from triquad_tools.recordings.kitti import read_folder
 from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.solids import Solid
 from triquad_tools.simulation.traffic import (
+    LANE_M,
     Traffic,
     TrafficScan,
     lies_on,
@@ -33,30 +43,50 @@ from triquad_tools.simulation.traffic import (
 )
 
 BUSY_SCANS = 60
-LOOKS = (0, 10, 30, 100)  # scans of the empty street
+LOOKS = (0, 10, 30, 100, 300)  # scans of the empty street
 _LEFT_AT_MOST = {10: 2.0, 30: 0.5}  # per cent of the trail, after so many of them
-_STEPS = 14  # of training between two scans
-_PUBLISHED = 5  # one scan in so many
+_KEPT = (100, 300)  # scans of it after which what stands is to be there
+_AFTER = 30  # scans of it after which the rest is told
 _TRAIL_CLEAR_M = 0.35  # from anything static: no voxel of the trail touches it
 _GHOST_CLEAR_M = 0.2
 _AIR_M = 0.05
 _THIN_X_M, _THIN_Y_M = 6.0, -2.5  # beside the lane
-_KEY_SIDE = 1 << 20  # voxels along an axis that keys can tell apart
+_ROBOT = SegmentOptions(radius_m=0.4, max_distance_m=1.0)
+_ROBOT_Z_M = 0.6
+_WAY_M = 25  # of the lane, in which the car drove
 
 
-def measure_moving(seed: int) -> list[Figure]:
-    """Figures of street ``seed`` with things that move, and of thin things that stand there."""
+def measure_moving(seed: int, folder: Path | None) -> list[Figure]:
+    """Figures of street ``seed`` with things that move, and, if given, of a recorded folder.
+
+    Raises:
+        ToolError: the folder cannot be read.
+    """
+    if folder is None:
+        print("moving: recorded scans are left out: give --recorded FOLDER", file=sys.stderr)
+    else:
+        read_folder(folder)  # before all else, which takes minutes
     warm_up(Settings(), "cpu")
-    traffic = street_traffic(seed, BUSY_SCANS, BUSY_SCANS + LOOKS[-1])
-    followed = follow(traffic, LOOKS)
-    last, after_30 = followed.looks[100], followed.looks[30]
-    air = 100 * after_30.air_in_trail
+    thin = tuple(thin_things(_THIN_X_M, _THIN_Y_M))
+    traffic = street_traffic(seed, BUSY_SCANS, BUSY_SCANS + LOOKS[-1]).among(thin)
+    figures = _street_figures(follow(traffic, thin, LOOKS))
+    return figures if folder is None else figures + revisited_figures(folder)
+
+
+def _street_figures(followed: "Followed") -> list[Figure]:
+    looks = followed.looks
+    after, name = looks[_AFTER], f"after {_AFTER}"
+    figures = [_left(empty, look) for empty, look in looks.items()]
+    for empty in _KEPT:
+        lost, thin = 100 * (1 - looks[empty].static_kept), 100 * (1 - looks[empty].thin_kept)
+        figures.append(Figure(f"static voxels lost after {empty}", lost, "%", at_most=0.3))
+        figures.append(Figure(f"voxels of thin things alone lost after {empty}", thin, "%"))
     return [
-        *(_left(empty, look) for empty, look in followed.looks.items()),
-        Figure("static voxels kept after 100", 100 * last.static_kept, "%", at_least=99.7),
-        Figure("voxels of thin things kept after 100", 100 * thin_kept(traffic), "%"),
-        Figure("mesh left in the trail after 30", after_30.ghost_m2, "m2", at_most=0.5),
-        Figure("trail in the air for the field after 30", air, "%"),
+        *figures,
+        Figure(f"mesh left in the trail {name}", after.ghost_m2, "m2", at_most=0.5),
+        Figure(f"trail in the air for the field {name}", 100 * after.air_in_trail, "%"),
+        Figure("lane blocked after 0", looks[0].lane_blocked_m, "m"),
+        Figure(f"lane blocked {name}", after.lane_blocked_m, "m", at_most=0),
         Figure("take in a scan, things moving", 1e3 * typical(followed.ingest_s), "ms"),
     ]
 
@@ -73,22 +103,34 @@ class Look:
     epoch: Epoch
     scene: Scene  # of what is static
     static: Doubles  # [N, 3] centres of the voxels in which rays ended on that
+    thin: Doubles  # [L, 3] of those of them in which rays ended on thin things alone
     trail: Doubles  # [M, 3] of those in which rays ended on moving things alone, clear of it
 
     @property
     def trail_left(self) -> float:
         """The share of the trail that is taken for surface."""
-        return _surface_share(self.epoch, self.trail)
+        return surface_share(self.epoch, self.trail)
 
     @property
     def static_kept(self) -> float:
         """The share of static voxels that are taken for surface."""
-        return _surface_share(self.epoch, self.static)
+        return surface_share(self.epoch, self.static)
+
+    @property
+    def thin_kept(self) -> float:
+        """The share of the voxels of thin things alone that are taken for surface."""
+        return surface_share(self.epoch, self.thin)
 
     @property
     def air_in_trail(self) -> float:
         """The share of the trail where the field knows that it is in the air."""
         return float((self.epoch.query(self.trail).sdf > _AIR_M).mean())
+
+    @property
+    def lane_blocked_m(self) -> int:
+        """How many metres of the lane a robot cannot pass for what it takes for surface."""
+        starts = np.array([(x, LANE_M, _ROBOT_Z_M) for x in range(_WAY_M)])
+        return int(segments(self.epoch, starts, starts + (1.0, 0, 0), _ROBOT).blocked.sum())
 
     @property
     def ghost_m2(self) -> float:
@@ -107,7 +149,7 @@ class Look:
     def _ghosts(self, middles: Doubles) -> Bools:
         """Which of faces with such middles [F, 3] lie in the trail."""
         voxel_m = self.epoch.voxel_m
-        inside = np.isin(_keys(middles, voxel_m), _keys(self.trail, voxel_m))
+        inside = np.isin(voxel_keys(middles, voxel_m), voxel_keys(self.trail, voxel_m))
         return np.asarray(inside & (self.scene.sdf(middles) > _GHOST_CLEAR_M))
 
 
@@ -119,92 +161,49 @@ class Followed:
     ingest_s: list[float]  # [n] of each scan
 
 
-def follow(traffic: Traffic, looks: Sequence[int]) -> Followed:
-    """Map a street, and look at the map after some numbers of scans of the empty street."""
-    settings = Settings()
-    mapper = Mapper("bench", settings, "cpu")
-    ended = _Ended(settings, lambda scan: scan.moving)
-    scene = traffic.standing.scene
-    followed = Followed({}, [])
+def follow(traffic: Traffic, thin: tuple[Solid, ...], looks: Sequence[int]) -> Followed:
+    """Map a street, and look at the map after some numbers of scans of the empty street.
+
+    ``thin`` are those of the things that stand there whose voxels are told apart.
+    """
+    streamed = StreamedMap(Settings())
+    seen = _Seen(traffic.standing.scene, Scene(thin, traffic.standing.scene.bounds))
+    found: dict[int, Look] = {}
     with progress("things that move", len(traffic)) as report:
         for number, scan in enumerate(traffic, start=1):
-            ended.add(scan)
-            ingest = partial(mapper.ingest, scan.points, scan.world_from_sensor)
-            followed.ingest_s.append(seconds(ingest))
-            for _ in range(_STEPS):
-                mapper.train()
-            if number % _PUBLISHED == 0:
-                mapper.publish()
+            seen.add(scan, streamed.settings)
+            streamed.take_in(scan)
             empty = number - traffic.busy_scans
             if empty in looks:
-                trail = ended.only_marked
-                trail = trail[scene.sdf(trail) > _TRAIL_CLEAR_M]
-                look = Look(mapper.publish(), scene, static=ended.others, trail=trail)
-                followed.looks[empty] = look
+                found[empty] = seen.look(streamed.mapper.publish())
             report(number, f"{number} of {len(traffic)} scans")
-    return followed
+    return Followed(found, streamed.ingest_s)
 
 
-def thin_kept(traffic: Traffic) -> float:
-    """The share of the voxels of thin things alone that a map has in the end; nothing is trained.
+class _Seen:
+    """Where rays ended on a street so far, by what they ended on."""
 
-    They stand on the same street, with the same things moving.
-    """
-    settings = Settings()
-    mapper = Mapper("bench", settings, "cpu")
-    things = tuple(thin_things(_THIN_X_M, _THIN_Y_M))
-    scene = Scene(things, traffic.standing.scene.bounds)
-    ended = _Ended(settings, lambda scan: lies_on(scene, scan.true_hits))
-    with progress("thin things", len(traffic)) as report:
-        for number, scan in enumerate(traffic.among(things), start=1):
-            ended.add(scan)
-            mapper.ingest(scan.points, scan.world_from_sensor)
-            report(number, f"{number} of {len(traffic)} scans")
-    return _surface_share(mapper.publish(), ended.only_marked)
+    def __init__(self, scene: Scene, thin: Scene) -> None:
+        """``scene`` is that of all that stands, ``thin`` of some of it."""
+        self._scene, self._thin = scene, thin
+        self._on_moving, self._on_thin, self._on_others = (EndedVoxels() for _ in range(3))
 
+    def add(self, scan: TrafficScan, settings: Settings) -> None:
+        keys, thin = end_keys(scan, settings), lies_on(self._thin, scan.true_hits)
+        self._on_moving.add(keys[scan.moving])
+        self._on_thin.add(keys[thin])
+        self._on_others.add(keys[~scan.moving & ~thin])
 
-@dataclass
-class _Ended:
-    """Voxels in which rays ended so far, on things that are marked and on others."""
-
-    settings: Settings
-    mark: Callable[[TrafficScan], Bools]  # which points [N] lie on things to be marked
-    _marked: Longs = field(default_factory=lambda: np.zeros(0, np.int64))
-    _others: Longs = field(default_factory=lambda: np.zeros(0, np.int64))
-
-    @property
-    def only_marked(self) -> Doubles:
-        """Centres [N, 3] of the voxels in which rays ended on marked things alone."""
-        return _centres(np.setdiff1d(self._marked, self._others), self.settings.field.leaf_m)
-
-    @property
-    def others(self) -> Doubles:
-        """Centres [N, 3] of the voxels in which rays ended on anything else."""
-        return _centres(self._others, self.settings.field.leaf_m)
-
-    def add(self, scan: TrafficScan) -> None:
-        """Enter the voxels in which rays end that the map uses."""
-        pose, leaf_m = scan.world_from_sensor, self.settings.field.leaf_m
-        points = scan.points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        ends = usable_rays(scan.points, pose, self.settings.scan).ends
-        keys, marked = _keys(points, leaf_m), self.mark(scan)
-        used = np.isin(keys, _keys(ends, leaf_m))
-        self._marked = np.union1d(self._marked, keys[used & marked])
-        self._others = np.union1d(self._others, keys[used & ~marked])
-
-
-def _surface_share(epoch: Epoch, centres: Doubles) -> float:
-    """The share of voxels in which rays are taken to have ended."""
-    return float((epoch.status(centres, reach_m=0.0) == Status.SURFACE).mean())
-
-
-def _keys(points: Doubles, voxel_m: float) -> Longs:
-    """One number [N] for the voxel of each point [N, 3]."""
-    cells = np.floor(points / voxel_m).astype(np.int64) + _KEY_SIDE // 2
-    return np.asarray(cells @ np.array([_KEY_SIDE**2, _KEY_SIDE, 1]))
-
-
-def _centres(keys: Longs, voxel_m: float) -> Doubles:
-    """The middles [N, 3] of voxels."""
-    cells = np.stack([keys // _KEY_SIDE**2, keys // _KEY_SIDE % _KEY_SIDE, keys % _KEY_SIDE], 1)
-    return np.asarray((cells - _KEY_SIDE // 2 + 0.5) * voxel_m)
+    def look(self, epoch: Epoch) -> Look:
+        """A map, and the truth so far."""
+        moving, thin, others = self._on_moving, self._on_thin, self._on_others
+        static = np.union1d(thin.keys(), others.keys())
+        trail = voxel_centres(np.setdiff1d(moving.keys(), static), epoch.voxel_m)
+        alone = np.setdiff1d(thin.keys(), np.union1d(moving.keys(), others.keys()))
+        return Look(
+            epoch,
+            self._scene,
+            static=voxel_centres(static, epoch.voxel_m),
+            thin=voxel_centres(alone, epoch.voxel_m),
+            trail=trail[self._scene.sdf(trail) > _TRAIL_CLEAR_M],
+        )

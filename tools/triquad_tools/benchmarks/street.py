@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
@@ -9,6 +10,7 @@ from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
+from triquad_tools.benchmarks.figures import seconds
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
 from triquad_tools.evaluation.metrics import (
@@ -25,6 +27,8 @@ from triquad_tools.simulation.street import street
 SCANS = 100
 LENGTH_M = 110.0  # so that the map has some 2 million parameters
 _COLUMNS = 1024  # some 60,000 points a scan
+_STEPS = 14  # of training between two scans that a map streams in
+_PUBLISHED = 5  # one such scan in so many
 
 
 @dataclass(frozen=True)
@@ -65,3 +69,21 @@ def settled_mapper(
             mapper.train()
         report(len(scans) + 1, "settled")
     return mapper
+
+
+class StreamedMap:
+    """A map that trains and publishes between scans, as a server's does."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.mapper = Mapper("bench", settings, "cpu")
+        self.ingest_s: list[float] = []  # of each scan
+
+    def take_in(self, scan: PosedScan) -> None:
+        """Take in a scan, and train."""
+        ingest = partial(self.mapper.ingest, scan.points, scan.world_from_sensor)
+        self.ingest_s.append(seconds(ingest))
+        for _ in range(_STEPS):
+            self.mapper.train()
+        if len(self.ingest_s) % _PUBLISHED == 0:
+            self.mapper.publish()

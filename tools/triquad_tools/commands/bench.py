@@ -92,7 +92,7 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
     measures: dict[str, Callable[[int], list[Figure]]] = {
         "growth": _growth,
         "air": measure_air,
-        "moving": measure_moving,
+        "moving": partial(measure_moving, folder=options.recorded),
         "ablation": partial(measure_ablation, scans=options.scans, step_m=options.step),
     }
     return [figure for part in parts for figure in measures[part](options.seed)]
@@ -162,7 +162,12 @@ def _parser() -> argparse.ArgumentParser:
         help=f"of {', '.join(PARTS)} (default: all but the ablation)",
     )
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
-    add("--recorded", type=Path, metavar="FOLDER", help="KITTI-style scans to align, too")
+    add(
+        "--recorded",
+        type=Path,
+        metavar="FOLDER",
+        help="KITTI-style scans to align, and to map twice over, too",
+    )
     add("--scans", type=count, default=60, metavar="N", help="of the ablation (default: 60)")
     add("--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)")
     add("--json", type=Path, metavar="FILE", help="write the figures there, too")

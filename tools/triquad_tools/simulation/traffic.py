@@ -15,7 +15,7 @@ from triquad_tools.simulation.street import ROAD_HALF_WIDTH_M, street
 _PERIOD_S = 0.1  # from scan to scan
 _STEP_M = 0.15  # of the sensor from scan to scan
 _ON_SURFACE_M = 1e-6
-_LANE_M = 1.6  # where cars drive, to the left of the middle of the road
+LANE_M = 1.6  # where cars drive, to the left of the middle of the road
 
 Movers = Callable[[float], list[Solid]]
 """The things that move, at a time in seconds from the start; none where all are gone."""
@@ -89,8 +89,8 @@ def street_traffic(seed: int, busy_scans: int, scans: int, lidar: Lidar | None =
         walked_m = 1.4 * time_s
         angle = 0.5 * math.pi * min(1.0, time_s / (0.5 * end_s))
         return [
-            *_car(-10.0 + speed_m_s * time_s, _LANE_M),
-            *_car(parked_x + leaves_m, _LANE_M + (0.0 if leaves_m else 0.6)),
+            *_car(-10.0 + speed_m_s * time_s, LANE_M),
+            *_car(parked_x + leaves_m, LANE_M + (0.0 if leaves_m else 0.6)),
             cylinder((first_x, -ROAD_HALF_WIDTH_M + walked_m, 0.9), 0.25, 0.85),
             cylinder((second_x + walked_m, ROAD_HALF_WIDTH_M - 1.6, 0.9), 0.25, 0.85),
             _door(hinge_x, angle),
