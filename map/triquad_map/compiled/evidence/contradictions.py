@@ -72,8 +72,13 @@ def _improbability(passes: int, earlier: int, hits: int) -> float:
 
 @kernel()
 def _own_improbability(voxel: ObservedVoxel) -> float:
-    """Logarithm of how probable the crossings of a voxel are by its own record."""
-    return _improbability(voxel.misses, voxel.earlier_misses, voxel.hits)
+    """Logarithm of how probable the crossings of a voxel are by its own record.
+
+    As many in a row, at any time so far: each hit gave chance another try (Bonferroni).
+    """
+    tries = max(1, voxel.hits)
+    own = _improbability(voxel.misses, voxel.earlier_misses, voxel.hits)
+    return float(own + np.log(tries))
 
 
 class Around(NamedTuple):
@@ -131,7 +136,7 @@ def _goes_along(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
     if voxel.passes == 0:  # which says nothing either way
         return bool(3 * around.gone >= 2 * around.known)
     share = (voxel.earlier_passes + 0.5) / (voxel.hits + voxel.earlier_passes + 1.0)
-    return bool(voxel.passes * np.log(share) <= rule.shared)
+    return bool(voxel.passes * np.log(share) + np.log(voxel.hits) <= rule.shared)
 
 
 @kernel()
