@@ -70,10 +70,9 @@ def _part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[flo
 def _walk(
     ray: Passing, reach: float, seen: SeenVoxels, count: int, observed: Observed, crossed: Ints
 ) -> tuple[int, int]:
-    """Set the bits of the voxels on a way (Amanatides and Woo 1987).
+    """Set the bits of the voxels on a way (Amanatides and Woo 1987); returns (blocks, rows) used.
 
-    Those of them in which rays ended go to ``crossed`` [, 4], with their rows: to note them here
-    would slow every step. Returns (blocks in use, voxels in ``crossed``).
+    The rows of voxels in which rays ended go to ``crossed``: noted here, they slow each step.
     """
     side, index, surface, masks = seen
     at, way = ray.start, ray.way
@@ -81,8 +80,7 @@ def _walk(
     step_x, apart_x, next_x = _crossing(at[0], way[0])
     step_y, apart_y, next_y = _crossing(at[1], way[1])
     step_z, apart_z, next_z = _crossing(at[2], way[2])
-    row, place, travelled, found = -1, 0, 0.0, 0
-    entered = True  # another block
+    row, place, travelled, found, entered = -1, 0, 0.0, 0, True  # another block
     while travelled <= reach:
         if entered:
             row = -1
@@ -96,8 +94,7 @@ def _walk(
             byte, bit = byte_of(x, y), bit_of(z)
             masks[row, byte] |= bit
             if place and surface[row, byte] & bit and travelled < ray.clear:
-                crossed[found, 0], crossed[found, 1], crossed[found, 2] = x, y, z
-                crossed[found, 3] = observed.rows[place, byte << SHIFT | (z & LOW)]
+                crossed[found] = observed.rows[place, byte << SHIFT | (z & LOW)]
                 found += 1
         if next_x <= next_y and next_x <= next_z:
             travelled = next_x
@@ -133,7 +130,7 @@ def mark_crossed(
     Returns (rays done, blocks in use).
     """
     at = (origin[0], origin[1], origin[2])
-    crossed = np.empty((3 * seen.side + 3, 4), np.int32)  # no way has more voxels
+    crossed = np.empty(3 * seen.side + 3, np.int32)  # no way has more voxels
     for i in range(start, len(ends)):
         dx, dy, dz = ends[i, 0] - at[0], ends[i, 1] - at[1], ends[i, 2] - at[2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -151,5 +148,5 @@ def mark_crossed(
             return i, count
         count = used
         if found:
-            note_passes(ray, crossed[:found], observed, passed)
+            note_passes(ray, crossed[:found], seen, observed, passed)
     return len(ends), count

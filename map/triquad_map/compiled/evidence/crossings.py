@@ -10,7 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Ints
 
-from triquad_map.compiled.evidence.observed import Observed, ObservedVoxel, Vector
+from triquad_map.compiled.evidence.observed import (
+    Observed,
+    ObservedVoxel,
+    Vector,
+    Voxel,
+    voxel_of,
+)
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
 
 _SPREAD_SHARE = 0.8
@@ -37,7 +44,7 @@ class Passing(NamedTuple):
 
 
 @kernel(inline="always")
-def _crosses(ray: Passing, corner: Vector, voxel: ObservedVoxel) -> bool:
+def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> bool:
     """Whether a ray crosses the disc of the surface in a voxel at its least ``corner``."""
     way, mean, normal = ray.way, voxel.mean, voxel.normal
     to_x = corner[0] + mean[0] - ray.start[0]
@@ -68,18 +75,19 @@ def _is_flat(voxel: ObservedVoxel) -> bool:
 
 
 @kernel()
-def note_passes(ray: Passing, crossed: Ints, observed: Observed, passed: Ints) -> None:
-    """Count a ray that passes through the voxels ``crossed`` [N, 4], in whose rows rays ended.
+def note_passes(
+    ray: Passing, crossed: Ints, seen: SeenVoxels, observed: Observed, passed: Ints
+) -> None:
+    """Count a ray that passes through the voxels of the rows ``crossed`` [N], in which rays ended.
 
     ``passed`` collects rows that rays of this scan passed, and in which none of them ended; its
     first number is how many follow.
     """
-    for i in range(len(crossed)):
-        row = crossed[i, 3]
+    for row in crossed:
         if row == 0:
             continue
         voxel = observed.voxels[row]
-        crossing = _crosses(ray, (crossed[i, 0], crossed[i, 1], crossed[i, 2]), voxel)
+        crossing = _crosses(ray, voxel_of(row, seen, observed), voxel)
         if not crossing and voxel.ends >= _KNOWN_ENDS and _is_flat(voxel):
             continue
         if voxel.hit_scan == ray.scan:

@@ -97,9 +97,8 @@ def record_ends(
     The row of each ray's voxel goes to ``found`` [N]; 0 outside the region.
     """
     for i in range(start, len(voxels)):
-        x = int(np.floor(voxels[i, 0]))
-        y = int(np.floor(voxels[i, 1]))
-        z = int(np.floor(voxels[i, 2]))
+        end = (voxels[i, 0], voxels[i, 1], voxels[i, 2])
+        x, y, z = int(np.floor(end[0])), int(np.floor(end[1])), int(np.floor(end[2]))
         block = find_block(seen.blocks, x, y, z, seen.side)
         found[i] = 0
         if block < 0:  # outside the region
@@ -122,7 +121,6 @@ def record_ends(
             rows += 1
         found[i] = row
         observed.seen_s[place] = max(observed.seen_s[place], sighting.stamp_s)
-        end = (voxels[i, 0], voxels[i, 1], voxels[i, 2])
         known = observed.voxels[row]
         _add_ray(known, end, sighting)
         _begin_hit(known, sighting.scan)
