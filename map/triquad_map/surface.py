@@ -113,11 +113,13 @@ def fit_surfels(
     surfels = _surfels_of_field(voxels, field, seen)
     rows = np.flatnonzero(surfels.kinds != SurfelKind.DISC)
     shown = by_rays(voxels[rows])
-    places: Doubles = (voxels[rows] + 0.5 + shown.offsets).astype(np.float64)
-    unlearnt = (shown.kinds != SurfelKind.NONE) & (field(places).values > _TOUCHES)
-    unlearnt &= field(places - _BEHIND * shown.normals).values > 0
+    known = np.flatnonzero(shown.kinds != SurfelKind.NONE)  # few: only there the field is asked
+    rows = rows[known]
+    places = (voxels[rows] + 0.5 + shown.offsets[known]).astype(np.float64)
+    unlearnt = field(places).values > _TOUCHES
+    unlearnt &= field(places - _BEHIND * shown.normals[known]).values > 0
     for name, array in vars(surfels).items():
-        array[rows[unlearnt]] = getattr(shown, name)[unlearnt]
+        array[rows[unlearnt]] = getattr(shown, name)[known[unlearnt]]
     return surfels
 
 

@@ -141,7 +141,7 @@ class LiveEvidence:
             Voxels [M, 3]; they are free.
         """
         seen, observed = self._seen, self._observations.arrays
-        rows = doubted(np.unique(passed), seen, observed, rule)
+        rows = np.unique(doubted(passed, seen, observed, rule))
         if len(rows):
             rows = rows[field(middles(rows, seen, observed)).values > _FIELD_FREE]
             self._frozen = None
