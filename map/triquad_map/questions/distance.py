@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
@@ -20,6 +21,9 @@ _SURFEL_VOXELS = 1.5
 
 _WIDENED_VOXELS = float(np.sqrt(0.5)) - DISC_RADIUS
 """From the rim of a disc to where it meets those of the voxels beside it, at their corners."""
+
+
+Rows = NDArray[np.intp]
 
 
 class UnknownSpaceError(TriquadError):
@@ -79,8 +83,10 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
     status = view.status(points)
     gradient = np.where(nearest.found[:, None], _unit(points - nearest.mean, 0.0), 0.0)
     distance = nearest.distance.copy()
-    _join_field(view, points, nearest, status=status, distance=distance, gradient=gradient)
-    _join_rays(view, points, nearest, status=status, distance=distance, gradient=gradient)
+    near = nearest.found & (distance < _SURFEL_VOXELS * view.voxel_m) & (status == Status.SURFACE)
+    learnt, unlearnt = np.flatnonzero(near & nearest.learnt), np.flatnonzero(near & ~nearest.learnt)
+    _join_field(view, points, learnt, distance=distance, gradient=gradient)
+    _join_rays(view, points, unlearnt, nearest=nearest, distance=distance, gradient=gradient)
     unknown = None
     if options.unknown_distance:
         unknown = view.nearest_unknown(points, options.max_distance_m)
@@ -130,19 +136,12 @@ def with_unknown(answer: Distances, points: Doubles, unknown: Unknown) -> Distan
 
 
 def _join_field(
-    view: MapView,
-    points: Doubles,
-    nearest: NearestSurface,
-    status: Bytes,
-    distance: Doubles,
-    gradient: Doubles,
+    view: MapView, points: Doubles, rows: Rows, distance: Doubles, gradient: Doubles
 ) -> None:
-    """Near a surface, take the side of it from the trained field, and gradually its value."""
-    low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
-    near = nearest.found & nearest.learnt & (distance < high)
-    rows = np.flatnonzero(near & (status == Status.SURFACE))
+    """At the ``rows`` near a surface, take its side from the field, and gradually its value."""
     if not len(rows):
         return
+    low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
     field = view.query(points[rows], gradient=True)
     assert field.gradient is not None
     usable = np.isfinite(field.sdf) & (np.abs(field.gradient).max(axis=1) > 0)
@@ -150,7 +149,7 @@ def _join_field(
     value = field.sdf[usable].astype(np.float64)
     slope = field.gradient[usable].astype(np.float64)
     slope /= np.linalg.norm(slope, axis=1, keepdims=True)
-    share = _smooth((distance[rows] - low) / (high - low))
+    share = _surfel_share(view, distance[rows])
     side = np.where(value < 0, -1.0, 1.0)
     # The field is no more than a bound where it saturates.
     value = np.clip(value, -high, distance[rows] + low)
@@ -162,18 +161,15 @@ def _join_field(
 def _join_rays(
     view: MapView,
     points: Doubles,
+    rows: Rows,
     nearest: NearestSurface,
-    status: Bytes,
     distance: Doubles,
     gradient: Doubles,
 ) -> None:
-    """Near a surface that the field has not learnt, tell its sides, and close its gaps.
+    """At the ``rows`` near a surface that the field has not learnt, tell sides and close gaps.
 
     A disc is widened there up to the corners of its voxel, where it meets those beside it.
     """
-    low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
-    near = nearest.found & ~nearest.learnt & (distance < high)
-    rows = np.flatnonzero(near & (status == Status.SURFACE))
     if not len(rows):
         return
     normal = nearest.normal[rows].astype(np.float64)
@@ -185,9 +181,9 @@ def _join_rays(
     close[is_point] = distance[rows[is_point]] - DISC_RADIUS * view.voxel_m
     feet = points[rows] - height[:, None] * normal
     ended = view.status(feet, reach_m=0.0) == Status.SURFACE  # else beyond an edge
-    behind = ended & (height < 0) & (height > -low) & (beyond == 0)
+    behind = ended & (height < 0) & (height > -_FIELD_VOXELS * view.voxel_m) & (beyond == 0)
     side = np.where(behind, -1.0, 1.0)
-    share = _smooth((distance[rows] - low) / (high - low))
+    share = _surfel_share(view, distance[rows])
     distance[rows] = side * (share * distance[rows] + (1 - share) * close)
     # Over the disc itself the direction is its normal's, which is 0 for a point.
     upright = np.where(beyond == 0, (1 - share) * np.where(height < 0, -side, side), 0.0)
@@ -196,10 +192,11 @@ def _join_rays(
     gradient[rows] = _unit(joined, normal)
 
 
-def _smooth(share: Doubles) -> Doubles:
-    """From 0 to 1 as ``share`` [N] goes there, without a kink at either end."""
-    within = np.clip(share, 0.0, 1.0)
-    return np.asarray(within * within * (3.0 - 2.0 * within), np.float64)
+def _surfel_share(view: MapView, distance: Doubles) -> Doubles:
+    """How much the distance to the surfels counts there [N]: from 0 to 1, without a kink."""
+    low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
+    share = np.clip((distance - low) / (high - low), 0.0, 1.0)
+    return np.asarray(share * share * (3.0 - 2.0 * share), np.float64)
 
 
 def _unit(vectors: Doubles, otherwise: Doubles | float) -> Doubles:
