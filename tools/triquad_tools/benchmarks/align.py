@@ -73,10 +73,7 @@ def measure_align(made: BenchStreet, folder: Path | None) -> list[Figure]:
     Raises:
         ToolError: the folder cannot be read.
     """
-    if folder is None:
-        print("align: recorded scans are left out: give --recorded FOLDER", file=sys.stderr)
-    else:
-        read_folder(folder)  # before all else, which takes minutes
+    check_recorded("align", folder)
     figures = _figures("street", on_street(made))
     return figures if folder is None else figures + _figures(folder.name, recorded(folder))
 
@@ -95,6 +92,18 @@ def recorded(path: Path, scans: int | None = None) -> PlacedScans:
     """The map of a recorded folder (of its first ``scans``) without every 7th, and those."""
     of_folder = recorded_scans(path, scans)
     return PlacedScans(settled_mapper(path.name, of_folder.mapped).publish(), of_folder.withheld)
+
+
+def check_recorded(part: str, folder: Path | None) -> None:
+    """Try a folder before all else, which takes minutes; tell where a part has none.
+
+    Raises:
+        ToolError: it cannot be read.
+    """
+    if folder is None:
+        print(f"{part}: recorded scans are left out: give --recorded FOLDER", file=sys.stderr)
+    else:
+        read_folder(folder)
 
 
 def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:

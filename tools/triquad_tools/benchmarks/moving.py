@@ -3,7 +3,6 @@
 On a simulated street things move among others that stand, some of them thin, and then are gone.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from triquad_server.mesh.marching_cubes import centroids
 from triquad_server.mesh.mesher import mesh_tile, tile_lattice
 from triquad_server.settings import MeshSettings, Settings
 
+from triquad_tools.benchmarks.align import check_recorded
 from triquad_tools.benchmarks.ended_voxels import (
     EndedVoxels,
     end_keys,
@@ -30,7 +30,6 @@ from triquad_tools.benchmarks.revisited import revisited_figures
 from triquad_tools.benchmarks.street import StreamedMap
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import mesh_area_m2
-from triquad_tools.recordings.kitti import read_folder
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid
 from triquad_tools.simulation.traffic import (
@@ -62,10 +61,7 @@ def measure_moving(seed: int, folder: Path | None) -> list[Figure]:
     Raises:
         ToolError: the folder cannot be read.
     """
-    if folder is None:
-        print("moving: recorded scans are left out: give --recorded FOLDER", file=sys.stderr)
-    else:
-        read_folder(folder)  # before all else, which takes minutes
+    check_recorded("moving", folder)
     warm_up(Settings(), "cpu")
     thin = tuple(thin_things(_THIN_X_M, _THIN_Y_M))
     traffic = street_traffic(seed, BUSY_SCANS, BUSY_SCANS + LOOKS[-1]).among(thin)
