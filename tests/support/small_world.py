@@ -10,7 +10,18 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive
 from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.solids import box, half_space
 from triquad_tools.simulation.street import street
+
+WALLED = (
+    half_space(0.0),
+    box((8.0, 0.0, 2.0), (0.2, 8.0, 2.0)),
+    box((0.0, 7.0, 2.0), (8.0, 0.2, 2.0)),
+    box((0.0, -7.0, 2.0), (8.0, 0.2, 2.0)),
+)
+"""An empty place between three walls, for things that come and go."""
+
+WALLED_BOUNDS = (np.array([-9.0, -9, -1]), np.array([9.0, 9, 5]))
 
 
 @dataclass(frozen=True)

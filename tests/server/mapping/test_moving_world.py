@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from support.mapfile_edit import file_bytes, read_bytes
-from support.small_world import settings
+from support.small_world import WALLED, WALLED_BOUNDS, settings
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.region import Region
@@ -24,13 +24,6 @@ from triquad_tools.simulation.solids import Solid, box, cylinder, half_space
 
 CENTRE, HALF = np.array([5.0, 0.5, 0.45]), np.array([0.6, 0.9, 0.45])
 BOX = box((5.0, 0.5, 0.45), (0.6, 0.9, 0.45))
-BOUNDS = (np.array([-9.0, -9, -1]), np.array([9.0, 9, 5]))
-STANDING = (
-    half_space(0.0),
-    box((8.0, 0.0, 2.0), (0.2, 8.0, 2.0)),
-    box((0.0, 7.0, 2.0), (8.0, 0.2, 2.0)),
-    box((0.0, -7.0, 2.0), (8.0, 0.2, 2.0)),
-)
 BARS = [cylinder((4.0, y, 1.0), 0.004, 1.0) for y in np.arange(-3.0, 3.0, 0.3)]
 """So thin and so far apart that many scans miss them."""
 
@@ -45,7 +38,7 @@ class Watched:
 
     def scan(self, *there: Solid, count: int, steps: int = 4) -> Epoch:
         """Take in some scans of the place with what is ``there`` besides, and publish."""
-        scene = Scene((*STANDING, *there), BOUNDS)
+        scene = Scene((*WALLED, *there), WALLED_BOUNDS)
         for _ in range(count):
             pose = np.eye(4)
             pose[:3, 3] = (0.5 * np.sin(0.7 * self.scans), 0.3 * np.cos(self.scans), 1.4)
@@ -155,7 +148,7 @@ def test_what_stands_keeps_its_surface() -> None:
     voxels = surface_voxels(main_region(watched.mapper.publish()).evidence)
     now = main_region(watched.scan(count=30))
     centres = voxel_centres(now, voxels)
-    standing = Scene(STANDING, BOUNDS).sdf(centres) < 0.05
+    standing = Scene(WALLED, WALLED_BOUNDS).sdf(centres) < 0.05
     away = (np.abs(centres - CENTRE) > HALF + 0.4).any(axis=1)
     assert now.evidence.ended_in(voxels[standing & away]).mean() > 0.997
 
@@ -205,7 +198,7 @@ def test_an_hour_elsewhere_takes_nothing_back() -> None:
     region = main_region(watched.mapper.publish())
     voxels = surface_voxels(region.evidence)
     voxels = voxels[voxel_centres(region, voxels)[:, 0] < 10.0]
-    elsewhere = Scene((half_space(0.0), box((30.0, 0.0, 2.0), (0.2, 8.0, 2.0))), BOUNDS)
+    elsewhere = Scene((half_space(0.0), box((30.0, 0.0, 2.0), (0.2, 8.0, 2.0))), WALLED_BOUNDS)
     pose = np.eye(4)
     for minute in range(60):
         pose[:3, 3] = (22.0 + 0.1 * minute, 0.0, 1.4)
@@ -221,8 +214,8 @@ def fence_voxels(epoch: Epoch) -> Longs:
     region = main_region(epoch)
     voxels = surface_voxels(region.evidence)
     centres = voxel_centres(region, voxels)
-    on_bars = Scene(tuple(BARS), BOUNDS).sdf(centres) < 0.12
-    return voxels[on_bars & (Scene(STANDING, BOUNDS).sdf(centres) > 0.3)]
+    on_bars = Scene(tuple(BARS), WALLED_BOUNDS).sdf(centres) < 0.12
+    return voxels[on_bars & (Scene(WALLED, WALLED_BOUNDS).sdf(centres) > 0.3)]
 
 
 def test_a_restored_fence_is_not_doubted_like_a_wall() -> None:

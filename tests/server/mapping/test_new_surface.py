@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.small_world import settings, settle
+from support.small_world import WALLED, WALLED_BOUNDS, settings, settle
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.questions.distance import DistanceOptions, distances
@@ -14,16 +14,9 @@ from triquad_server.epochs import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.solids import Solid, box, half_space
+from triquad_tools.simulation.solids import Solid, box
 
 VOXEL_M = 0.2
-BOUNDS = (np.array([-9.0, -9, -1]), np.array([9.0, 9, 5]))
-EMPTY = (
-    half_space(0.0),
-    box((8.0, 0.0, 2.0), (0.2, 8.0, 2.0)),
-    box((0.0, 7.0, 2.0), (8.0, 0.2, 2.0)),
-    box((0.0, -7.0, 2.0), (8.0, 0.2, 2.0)),
-)
 NEW = {
     "wall": box((4.1, 0.0, 0.5), (0.15, 3.0, 0.5)),
     "slab": box((2.5, 0.0, 0.125), (1.0, 1.0, 0.125)),
@@ -40,17 +33,17 @@ class Seen:
         lidar = Lidar(columns=1024, elevation_min_deg=-45.0)
         for number in range(8):
             pose[:3, 3] = (0.1 * number - 1.0, 0.1, 1.4)
-            scan = lidar.scan(Scene(EMPTY, BOUNDS), pose, np.random.default_rng(number))
+            scan = lidar.scan(Scene(WALLED, WALLED_BOUNDS), pose, np.random.default_rng(number))
             mapper.ingest(scan.points, pose, stamp_s=number)
         settle(mapper)
         mapper.publish()
-        self.scene = Scene((*EMPTY, solid), BOUNDS)
+        self.scene = Scene((*WALLED, solid), WALLED_BOUNDS)
         scan = lidar.scan(self.scene, pose, np.random.default_rng(99))
         mapper.ingest(scan.points, pose, stamp_s=8)
         for _ in range(steps):
             mapper.train()
         self.epoch: Epoch = mapper.publish()
-        on_it = np.abs(Scene((solid,), BOUNDS).sdf(scan.true_hits)) < 1e-3
+        on_it = np.abs(Scene((solid,), WALLED_BOUNDS).sdf(scan.true_hits)) < 1e-3
         # The lowest voxels are those of the floor, too, and have one surfel.
         self.hits: Doubles = scan.true_hits[on_it & (scan.true_hits[:, 2] > VOXEL_M)]
         self.normals: Doubles = self.scene.gradient(self.hits)
