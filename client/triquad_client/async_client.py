@@ -68,7 +68,7 @@ class AsyncClient(AsyncMapQueries):
         return await self._run(self._scans.flush(timeout_s, pending))
 
     async def settle(self, timeout_s: float = 600.0) -> ServerStatus:
-        return await self._run(admin.settle(timeout_s))
+        return await self._run(self._scans.settle(timeout_s))
 
     async def pinned(self) -> AsyncPinnedMap:
         return AsyncPinnedMap(self._run, await self._run(questions.pin_newest()))

@@ -91,12 +91,12 @@ class Client(MapQueries):
         return self._run(self._scans.flush(timeout_s, pending))
 
     def settle(self, timeout_s: float = 600.0) -> ServerStatus:
-        """Wait until the server has nothing left to learn from the scans that reached it.
+        """Wait until what this client published is dealt with and nothing is left to learn.
 
         Raises:
             RequestTimeoutError: it still had some after ``timeout_s``.
         """
-        return self._run(admin.settle(timeout_s))
+        return self._run(self._scans.settle(timeout_s))
 
     def pinned(self) -> PinnedMap:
         """The map as it is now, for queries that belong together."""

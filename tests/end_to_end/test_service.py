@@ -55,6 +55,13 @@ def test_a_settled_map_has_learnt_the_surface(client):
     assert client.query_sdf(PROBES).epoch == result.epoch == status.epoch
 
 
+def test_settling_begins_with_what_was_just_published(client):
+    large = servers.sphere(400_000)  # long on its way
+    for count in range(1, 7):
+        client.publish_scan(large, np.eye(4))
+        assert client.settle(servers.WAIT_S).scans_taken == count
+
+
 def test_flush_with_nothing_published_returns_at_once(client):
     report = client.flush()
     assert (report.taken, report.refused, report.lost, report.last_refusal) == (0, 0, 0, None)

@@ -8,17 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from triquad_format.errors import FormatError
+from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
-from triquad_format.wire.messages import FlushReply, FlushRequest, Scan
+from triquad_format.wire.messages import FlushReply, FlushRequest, Scan, ServerStatus
 
 from triquad_client import checks
-from triquad_client.errors import InvalidInputError, InvalidScanError
-from triquad_client.net.call import Ask, Call, ask_each
+from triquad_client.calls import admin
+from triquad_client.errors import InvalidInputError, InvalidScanError, RequestTimeoutError
+from triquad_client.net.call import Ask, Call, Pause, ask_each
 from triquad_client.net.connection import Connection
 
 _REPLY_MARGIN_S = 5.0
 """By how much the server's answer that the time is over may be late."""
+
+_SETTLE_FLUSH_S = 5.0
+_SETTLE_PAUSE_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,28 @@ class ScanPublisher:
             last_refusal="; ".join(refusals) or None,
         )
 
+    def settle(self, timeout_s: float) -> Call[ServerStatus]:
+        """Wait for the scans and what is learnt from them; as ``Client.settle``."""
+        deadline = checks.deadline(timeout_s)
+        # A status that overtakes the last scan would say that there is nothing left to learn.
+        while not (yield from self._dealt_with_by(deadline)):
+            _check_time(deadline, timeout_s)
+        while not (now := (yield from admin.status())).settled:
+            _check_time(deadline, timeout_s)
+            yield Pause(_SETTLE_PAUSE_S)
+        return now
+
+    def _dealt_with_by(self, deadline: float) -> Call[bool]:
+        """Whether the scans are, after some waiting: servers bound the time that one may ask."""
+        wait_s = min(max(deadline - time.monotonic(), 0.0), _SETTLE_FLUSH_S)
+        try:
+            yield from self.flush(wait_s, pending=0)
+        except RefusedError as error:
+            if error.code != "timeout":
+                raise
+            return False
+        return True
+
     def _requests(self, timeout_s: float, pending: int) -> Iterator[FlushRequest]:
         """One request per source; the scans that may be pending are shared out among them."""
         with self._lock:
@@ -131,3 +157,8 @@ class ScanPublisher:
 def _ask_flush(request: FlushRequest) -> Ask[FlushReply]:
     wait_s = request.timeout_s + _REPLY_MARGIN_S
     return Ask(keys.FLUSH, request, FlushReply, min_timeout_s=wait_s)
+
+
+def _check_time(deadline: float, timeout_s: float) -> None:
+    if time.monotonic() > deadline:
+        raise RequestTimeoutError(f"the server still learns after {timeout_s:g} s")
