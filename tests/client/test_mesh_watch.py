@@ -426,6 +426,10 @@ def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
                 assert int(frozen.stdout.readline()) > 100_000
                 os.kill(frozen.pid, signal.SIGSTOP)
                 statuses = collect_statuses(server.endpoint)
+                for _ in range(20):  # while Zenoh gives up the frozen one, and after
+                    with client.watch_mesh() as late:
+                        late.catch_up(servers.WAIT_S)
+                        assert digests(late) == digests(watch)
                 for _ in range(200):
                     assert len(client.query_sdf(servers.sphere(500)).sdf) == 500
                 learn(client, half(-1))

@@ -1,6 +1,7 @@
 """Where the server listens, as a Zenoh configuration."""
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,14 @@ import zenoh
 from triquad_server.errors import ListenError, ServerError
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+
+_ZENOH_THREADS = "(tx: (worker_threads: 4))"
+"""Of Zenoh's threads, as its environment variable ``ZENOH_RUNTIME`` has them.
+
+Zenoh gives up a client that takes nothing after five seconds, and the thread that sends to it then
+waits for whoever else has something for it. By default all clients share one such thread: replies
+to others were late as well, and their links were closed in turn.
+"""
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,7 @@ def open_session(options: NetworkOptions) -> zenoh.Session:
         config = _configuration(options)
     except (zenoh.ZError, ValueError, OSError) as error:
         raise ServerError(f"Zenoh configuration: {_first_line(error)}") from error
+    os.environ.setdefault("ZENOH_RUNTIME", _ZENOH_THREADS)  # read once, by the first session
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
