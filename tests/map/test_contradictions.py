@@ -157,3 +157,36 @@ def test_support_falls_while_a_surface_is_contradicted(rng: np.random.Generator)
     wall = voxels[:, 0] == int(WALL_X)
     assert wall.any()
     assert frozen.levels[wall].astype(float).mean() < before - 0.5
+
+
+def lattice(rng: np.random.Generator, x: float, rows: Doubles) -> Doubles:
+    """Where rays as far apart as those of a lidar meet a thing at ``x``: one end for each ray."""
+    y, z = np.meshgrid(np.arange(-4.5, 4.5, 0.7), rows, indexing="ij")
+    y = y.ravel() + rng.uniform(-0.3, 0.3)
+    return np.stack([np.full(y.size, x), SENSOR[1] + y, SENSOR[2] + z.ravel()], 1)
+
+
+def test_a_far_thing_goes_as_a_whole_though_rays_meet_nothing_above_it(
+    rng: np.random.Generator,
+) -> None:
+    """The back of a car, seen once: below rays reach the road behind it, above it is open sky."""
+    watched, high, low = Watched(), np.array([1.5, 3.0, 4.5]), np.array([-3.0, -1.5, 0.0])
+    back = lattice(rng, 180.5, np.concatenate([low, high]))
+    watched.scan(back)
+    assert watched.believed(back) == 1.0
+    for _ in range(10):
+        watched.scan(behind(lattice(rng, 180.5, low), 240.0))
+    assert watched.believed(back) < 0.02
+
+
+def test_a_wall_stays_where_rays_go_along_it(rng: np.random.Generator) -> None:
+    """Seen once at a grazing angle; later rays miss it narrowly, and pass its voxels."""
+    watched = Watched()
+    x, z = np.meshgrid(np.arange(100.0, 140.0, 0.9), np.arange(-4.0, 4.0, 0.8))
+    wall = np.stack([x.ravel(), np.full(x.size, SENSOR[1] + 5.55), SENSOR[2] + z.ravel()], 1)
+    watched.scan(wall)
+    sensor = SENSOR + [0.0, 4.9, 0.0]
+    for _ in range(5):
+        y, z = SENSOR[1] + rng.uniform(4.9, 5.4, 300), SENSOR[2] + rng.uniform(-6, 6, 300)
+        watched.scan(np.stack([np.full(300, 200.0), y, z], 1), sensor=sensor)
+    assert watched.believed(wall) > 0.99

@@ -21,6 +21,7 @@ from triquad_map.compiled.evidence.observed import (
     voxel_of,
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.evidence.surroundings import Around, depth_around, seen_around
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
 
@@ -40,13 +41,23 @@ its voxels count together."""
 
 _SCANS_AROUND = 2  # times those that a voxel's own record asks for, where rays need not cross it
 
+_GROUP_REACH = 2
+"""Voxels around one without a record of its own, that are looked at with it: few rays reach a far
+thing, and leave voxels between them out."""
+
+_GROUP_GONE = 0.25
+"""The share of such a group that takes the rest of it along."""
+
+_GROUP_FLAT = 0.7
+"""A group that is deeper than this along the rays, voxels, rays may pass without crossing it."""
+
 
 class Disbelief(NamedTuple):
     """When a surface counts as gone."""
 
     scans: int  # at least so many in a row, of which rays passed and none ended there
     own: float  # and so improbable are their crossings: logarithm of the probability
-    around: float  # or so improbable what passed a voxel and all those around it
+    around: float  # or so improbable what passed a voxel and those around it
     shared: float  # or so improbable its passes alone, where half of those around it are gone
     witnessed: float  # or so improbable its crossings, where the field shows no surface either
 
@@ -79,44 +90,6 @@ def _own_improbability(voxel: ObservedVoxel) -> float:
     tries = max(1, voxel.hits)
     own = _improbability(voxel.misses, voxel.earlier_misses, voxel.hits)
     return float(own + np.log(tries))
-
-
-class Around(NamedTuple):
-    """A voxel and those around it in which rays ended, together."""
-
-    known: int  # of those around it
-    gone: int  # of these, whose surface is not believed any more
-    doubted: int  # of these, that are believed, and that rays passed since
-    scans: int  # most in a row of which rays passed one of them
-    misses: int
-    earlier_misses: int
-    passes: int
-    earlier_passes: int
-    hits: int
-
-
-@kernel()
-def _around(row: int, seen: SeenVoxels, observed: Observed) -> Around:
-    """What is known of a voxel and those around it."""
-    known = gone = doubted = scans = misses = earlier_misses = passes = earlier_passes = hits = 0
-    for near in rows_around(row, seen, observed):
-        if near == 0:
-            continue
-        other = observed.voxels[near]
-        scans = max(scans, other.pass_scans)
-        misses += other.misses
-        earlier_misses += other.earlier_misses
-        passes += other.passes
-        earlier_passes += other.earlier_passes
-        hits += other.hits
-        if near == row:
-            continue
-        known += 1
-        if not has_surface(near, seen, observed):
-            gone += 1
-        elif other.pass_scans > 0:
-            doubted += 1
-    return Around(known, gone, doubted, scans, misses, earlier_misses, passes, earlier_passes, hits)
 
 
 @kernel()
@@ -155,14 +128,36 @@ def _is_doubted_around(voxel: ObservedVoxel, around: Around, rule: Disbelief) ->
 
 
 @kernel()
+def _goes_with_group(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
+    """Whether a surface without a record of its own goes with what was seen two voxels around.
+
+    A hit there that came later, and that no ray passed since, speaks for all of it.
+    """
+    voxel, group = observed.voxels[row], seen_around(row, _GROUP_REACH, seen, observed)
+    if group.later > 0:
+        return False
+    if group.gone >= _LEAST_GONE and group.gone >= _GROUP_GONE * group.known:
+        return True
+    if voxel.pass_scans < rule.scans:
+        return False
+    if _improbability(group.passes, group.earlier_passes, group.hits) >= rule.around:
+        return False
+    return depth_around(row, _GROUP_REACH, seen, observed) < _GROUP_FLAT
+
+
+@kernel()
 def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
     """Whether the surface of a voxel is gone, by its own record or with those around it."""
     voxel = observed.voxels[row]
     scans = min(voxel.pass_scans, voxel.misses)
     if scans >= rule.scans and _own_improbability(voxel) < rule.own:
         return True
-    around = _around(row, seen, observed)
-    return _goes_along(voxel, around, rule) or _is_doubted_around(voxel, around, rule)
+    around = seen_around(row, 1, seen, observed)
+    if _goes_along(voxel, around, rule) or _is_doubted_around(voxel, around, rule):
+        return True
+    if voxel.hits >= _OWN_RECORD_HITS or around.later > 0:
+        return False
+    return _goes_with_group(row, seen, observed, rule)
 
 
 @kernel()
@@ -171,7 +166,7 @@ def _take_back(
 ) -> None:
     """Clear the surface bit of a row, whose support begins anew, and add its voxel to ``taken``.
 
-    Those around it that were not hit since it was passed are added to ``waiting``.
+    Those near it that were not hit since are added to ``waiting``.
     """
     voxel = observed.voxels[row]
     x, y, z = voxel_of(row, seen, observed)
@@ -179,8 +174,9 @@ def _take_back(
     seen.surface[voxel.owner >> (3 * SHIFT), byte_of(x, y)] &= ~bit_of(z)
     voxel.weight = voxel.ends = 0
     voxel.sectors = 0
-    for near in rows_around(row, seen, observed):
-        if near != 0 and observed.voxels[near].hit_scan < voxel.passed_scan:
+    since = max(voxel.passed_scan, voxel.hit_scan + 1)
+    for near in rows_around(row, _GROUP_REACH, seen, observed):
+        if near != 0 and observed.voxels[near].hit_scan < since:
             waiting.append(near)
 
 
@@ -191,7 +187,7 @@ def take_back(
     """Take back the surface of voxels that are contradicted; returns them [M, 3].
 
     That of the rows ``gone`` is; that of ``passed``, by rays of the newest scan, may be. With what
-    goes, those around it are asked once more.
+    goes, those near it are asked once more.
     """
     taken = [voxel_of(0, seen, observed) for _ in range(0)]
     waiting = [np.int64(row) for row in passed if observed.voxels[row].pass_scans >= rule.scans]

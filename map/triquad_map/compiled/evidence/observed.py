@@ -80,14 +80,14 @@ def has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
 
 
 @kernel()
-def rows_around(row: int, seen: SeenVoxels, observed: Observed) -> Ints:
-    """The rows [27] of the voxel of a row and those around it; 0 where no ray ended."""
+def rows_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> Ints:
+    """The rows of the voxel of a row and those up to ``reach`` around it; 0 where no ray ended."""
     x, y, z = voxel_of(row, seen, observed)
-    rows = np.empty(27, np.int32)
+    rows = np.empty((2 * reach + 1) ** 3, np.int32)
     at = 0
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            for k in range(-reach, reach + 1):
                 rows[at] = row_of(seen, observed, x + i, y + j, z + k)
                 at += 1
     return rows
