@@ -176,7 +176,7 @@ def _take_back(
     voxel.sectors = 0
     since = max(voxel.passed_scan, voxel.hit_scan + 1)
     for near in rows_around(row, _GROUP_REACH, seen, observed):
-        if near != 0 and observed.voxels[near].hit_scan < since:
+        if observed.voxels[near].hit_scan < since:
             waiting.append(near)
 
 

@@ -81,13 +81,34 @@ def has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
 
 @kernel()
 def rows_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> Ints:
-    """The rows of the voxel of a row and those up to ``reach`` around it; 0 where no ray ended."""
-    x, y, z = voxel_of(row, seen, observed)
+    """The rows of the voxel of a row and those up to ``reach`` around it in which rays ended."""
+    middle = voxel_of(row, seen, observed)
+    x, y, z = middle
     rows = np.empty((2 * reach + 1) ** 3, np.int32)
-    at = 0
-    for i in range(-reach, reach + 1):
-        for j in range(-reach, reach + 1):
-            for k in range(-reach, reach + 1):
-                rows[at] = row_of(seen, observed, x + i, y + j, z + k)
-                at += 1
-    return rows
+    count = 0
+    for i in range((x - reach) >> SHIFT, ((x + reach) >> SHIFT) + 1):
+        for j in range((y - reach) >> SHIFT, ((y + reach) >> SHIFT) + 1):
+            for k in range((z - reach) >> SHIFT, ((z + reach) >> SHIFT) + 1):
+                corner = (i << SHIFT, j << SHIFT, k << SHIFT)
+                block = find_block(seen.blocks, corner[0], corner[1], corner[2], seen.side)
+                if block >= 0:
+                    of_block = observed.rows[observed.places[block]]
+                    count = _add_rows(of_block, corner, middle, reach, rows, count)
+    return rows[:count]
+
+
+@kernel()
+def _add_rows(
+    of_block: Ints, corner: Voxel, middle: Voxel, reach: int, rows: Ints, count: int
+) -> int:
+    """Add the rows of a block that :func:`rows_around` asks for; returns how many there are now."""
+    (x, y, z), (low_x, low_y, low_z) = middle, corner
+    for i in range(max(x - reach, low_x), min(x + reach, low_x + LOW) + 1):
+        for j in range(max(y - reach, low_y), min(y + reach, low_y + LOW) + 1):
+            column = byte_of(i, j) << SHIFT
+            for k in range(max(z - reach, low_z), min(z + reach, low_z + LOW) + 1):
+                row = of_block[column | (k & LOW)]
+                if row != 0:
+                    rows[count] = row
+                    count += 1
+    return count

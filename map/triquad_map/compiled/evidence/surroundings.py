@@ -35,8 +35,6 @@ def seen_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> A
     known = gone = doubted = later = scans = 0
     misses = earlier_misses = passes = earlier_passes = hits = 0
     for near in rows_around(row, reach, seen, observed):
-        if near == 0:
-            continue
         other = observed.voxels[near]
         scans = max(scans, other.pass_scans)
         misses += other.misses
@@ -72,8 +70,6 @@ def depth_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> 
     x, y, z = voxel_of(row, seen, observed)
     count, total, squares = 0, 0.0, 0.0
     for near in rows_around(row, reach, seen, observed):
-        if near == 0:
-            continue
         i, j, k = voxel_of(near, seen, observed)
         mean = observed.voxels[near].mean
         along = (i - x + mean[0]) * towards[0]
