@@ -51,6 +51,9 @@ _GROUP_GONE = 0.25
 _GROUP_FLAT = 0.7
 """A group that is deeper than this along the rays, voxels, rays may pass without crossing it."""
 
+_GROUP_SPAN = 2
+"""A group that was hit over more scans than this may be leaves, between which rays pass."""
+
 
 class Disbelief(NamedTuple):
     """When a surface counts as gone."""
@@ -138,7 +141,7 @@ def _goes_with_group(row: int, seen: SeenVoxels, observed: Observed, rule: Disbe
         return False
     if group.gone >= _LEAST_GONE and group.gone >= _GROUP_GONE * group.known:
         return True
-    if voxel.pass_scans < rule.scans:
+    if voxel.pass_scans < rule.scans or group.hit_span > _GROUP_SPAN:
         return False
     if _improbability(group.passes, group.earlier_passes, group.hits) >= rule.around:
         return False

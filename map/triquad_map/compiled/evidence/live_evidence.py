@@ -25,7 +25,7 @@ from triquad_map.surface import SampleField, Surfels
 
 _MIN_CAPACITY = 256
 
-_FIELD_FREE = 0.5
+_FIELD_FREE = 0.3
 """A field of more voxels than this, where a surface was seen, shows none."""
 
 

@@ -21,6 +21,7 @@ class Around(NamedTuple):
     gone: int  # of these, whose surface is not believed any more
     doubted: int  # of these, that are believed, and that rays passed since
     later: int  # of these, that are believed, were hit later than the voxel and not passed since
+    hit_span: int  # scans from the first to the last of those that hit one of them last
     scans: int  # most in a row of which rays passed one of them
     misses: int
     earlier_misses: int
@@ -33,10 +34,12 @@ class Around(NamedTuple):
 def seen_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> Around:
     """What is known of the voxel of a row and those up to ``reach`` around it."""
     known = gone = doubted = later = scans = 0
+    first = last = observed.voxels[row].hit_scan
     misses = earlier_misses = passes = earlier_passes = hits = 0
     for near in rows_around(row, reach, seen, observed):
         other = observed.voxels[near]
         scans = max(scans, other.pass_scans)
+        first, last = min(first, other.hit_scan), max(last, other.hit_scan)
         misses += other.misses
         earlier_misses += other.earlier_misses
         passes += other.passes
@@ -52,7 +55,17 @@ def seen_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> A
         elif other.hit_scan > observed.voxels[row].hit_scan:
             later += 1
     return Around(
-        known, gone, doubted, later, scans, misses, earlier_misses, passes, earlier_passes, hits
+        known,
+        gone,
+        doubted,
+        later,
+        last - first,
+        scans,
+        misses,
+        earlier_misses,
+        passes,
+        earlier_passes,
+        hits,
     )
 
 
