@@ -26,8 +26,9 @@ from triquad_client.calls.changes import ChangedBox, ChangeKind, ChangeReport
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.questions import SdfResult
 from triquad_client.calls.scans import FlushReport
-from triquad_client.checks import Bounds
+from triquad_client.checks import Bounds, PoseLike
 from triquad_client.client import Client, connect
+from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
@@ -46,6 +47,7 @@ from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.offline_map import OfflineMap, open_map
 from triquad_client.offline.synced_map import AsyncSyncedMap, SyncedMap, SyncReport
 from triquad_client.organised_cloud import empty_returns
+from triquad_client.pose import Pose
 
 __all__ = [
     "Alignment",
@@ -70,6 +72,7 @@ __all__ = [
     "KnownTiles",
     "InvalidInputError",
     "InvalidScanError",
+    "Intrinsics",
     "MapFileError",
     "MapInfo",
     "MapQueries",
@@ -81,6 +84,8 @@ __all__ = [
     "OfflineMap",
     "PinnedMap",
     "Polyline",
+    "Pose",
+    "PoseLike",
     "RayRanges",
     "RefusedError",
     "RequestTimeoutError",
@@ -99,6 +104,7 @@ __all__ = [
     "__version__",
     "connect",
     "connect_async",
+    "depth_points",
     "empty_returns",
     "open_map",
 ]

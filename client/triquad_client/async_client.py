@@ -14,8 +14,9 @@ from triquad_client.calls import admin, changes, download, questions
 from triquad_client.calls.async_queries import AsyncMapQueries, AsyncPinnedMap
 from triquad_client.calls.changes import ChangeReport
 from triquad_client.calls.scans import FlushReport, ScanPublisher
-from triquad_client.checks import Bounds
+from triquad_client.checks import Bounds, PoseLike
 from triquad_client.client import Client
+from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.documentation import documented_as
 from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
@@ -53,7 +54,7 @@ class AsyncClient(AsyncMapQueries):
     async def publish_scan(
         self,
         points: ArrayLike,
-        world_from_sensor: ArrayLike,
+        world_from_sensor: PoseLike,
         stamp_s: float | None = None,
         source: str = "default",
         no_return: ArrayLike | None = None,
@@ -61,6 +62,25 @@ class AsyncClient(AsyncMapQueries):
         await self._driver.in_order(
             lambda: self._scans.publish(
                 points, world_from_sensor, stamp_s, source=source, no_return=no_return
+            )
+        )
+
+    async def publish_depth(
+        self,
+        depth: ArrayLike,
+        intrinsics: Intrinsics,
+        world_from_camera: PoseLike,
+        stamp_s: float | None = None,
+        source: str = "default",
+        stride: int = 1,
+    ) -> None:
+        await self._driver.in_order(
+            lambda: self._scans.publish(
+                depth_points(depth, intrinsics, stride),
+                world_from_camera,
+                stamp_s,
+                source=source,
+                no_return=None,
             )
         )
 

@@ -19,6 +19,10 @@ from triquad_map.questions.distance import Unknown
 from triquad_map.questions.grid import GridShape
 
 from triquad_client.errors import InvalidInputError, InvalidScanError
+from triquad_client.pose import Pose
+
+PoseLike: TypeAlias = ArrayLike | Pose
+"""A rigid pose in the map frame: a matrix [4, 4], or a position and a quaternion."""
 
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
@@ -28,6 +32,7 @@ LONGEST_S = 1e6  # that a request may take
 _NO_NUMBER = (TypeError, ValueError, OverflowError)
 """What conversions raise: Python's integers may be larger than any float."""
 
+_MAX_COLUMNS = 16  # of a scan's points: more is rather an array that was transposed
 _MAX_CELLS = 100_000_000  # of a grid
 
 
@@ -48,8 +53,11 @@ def query_points(points: ArrayLike) -> Doubles:
 
 
 def scan_points(points: ArrayLike, *, least: int = 1) -> Floats:
-    """Points [N, 3] of a scan as float32; points that are not finite may be among them."""
-    array = _points(points, np.float32, InvalidScanError)
+    """Points [N, 3] of a scan as float32; points that are not finite may be among them.
+
+    Columns after the third, such as intensities and colours, are left out.
+    """
+    array = _points(points, np.float32, InvalidScanError, columns=_MAX_COLUMNS)
     if len(array) < least:
         raise InvalidScanError("the scan has no points")
     return array
@@ -72,8 +80,10 @@ def open_directions(vectors: ArrayLike) -> Floats:
     return unit
 
 
-def rigid_pose(world_from_sensor: ArrayLike) -> Doubles:
+def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
     """A pose [4, 4] as float64: a rotation and a translation, within 1e-3."""
+    if isinstance(world_from_sensor, Pose):
+        return world_from_sensor.matrix()
     try:
         pose = np.asarray(world_from_sensor, np.float64)
     except _NO_NUMBER as error:
@@ -253,17 +263,23 @@ def organised(name: str, values: ArrayLike) -> Doubles:
 
 
 def _points(
-    points: ArrayLike, dtype: Any, error: type[InvalidInputError], *, what: str = "points"
+    points: ArrayLike,
+    dtype: Any,
+    error: type[InvalidInputError],
+    *,
+    what: str = "points",
+    columns: int = 3,
 ) -> NDArray[Any]:
+    """The first three of up to so many columns."""
     try:
         array = _real_numbers(points, dtype)
     except _NO_NUMBER as cause:
         raise error(f"{what} are not an array [N, 3] of real numbers: {cause}") from cause
     if array.size == 0 and array.ndim == 1:
         array = array.reshape(0, 3)
-    if array.ndim != 2 or array.shape[1] != 3:
+    if array.ndim != 2 or not 3 <= array.shape[1] <= columns:
         raise error(f"{what} are {list(array.shape)}, not [N, 3]")
-    return array
+    return array[:, :3]
 
 
 def _real_numbers(values: ArrayLike, dtype: Any) -> NDArray[Any]:

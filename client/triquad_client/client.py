@@ -10,7 +10,8 @@ from triquad_client.calls import admin, changes, download, questions
 from triquad_client.calls.changes import ChangeReport
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport, ScanPublisher
-from triquad_client.checks import Bounds
+from triquad_client.checks import Bounds, PoseLike
+from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.mesh.mesh_watch import MeshWatch
@@ -52,7 +53,7 @@ class Client(MapQueries):
     def publish_scan(
         self,
         points: ArrayLike,
-        world_from_sensor: ArrayLike,
+        world_from_sensor: PoseLike,
         stamp_s: float | None = None,
         source: str = "default",
         no_return: ArrayLike | None = None,
@@ -60,8 +61,10 @@ class Client(MapQueries):
         """Send a scan to be learnt. Returns once it is handed to the network.
 
         Args:
-            points: [N, 3] metres, sensor frame; points that are not finite are left out.
-            world_from_sensor: [4, 4] rigid pose of the sensor in the map frame.
+            points: [N, 3] metres, sensor frame; points that are not finite are left out, and so
+                are up to 13 more columns, such as intensities.
+            world_from_sensor: rigid pose of the sensor in the map frame: [4, 4], or a
+                :class:`Pose` of position and quaternion.
             stamp_s: seconds since 1970, never running backwards within a source; ``None``: now.
             source: name of the sensor.
             no_return: directions [M, 3], sensor frame, of any length but 0, of rays that met
@@ -73,6 +76,37 @@ class Client(MapQueries):
             InvalidScanError: the scan cannot be used; nothing was sent.
         """
         self._scans.publish(points, world_from_sensor, stamp_s, source=source, no_return=no_return)
+
+    def publish_depth(
+        self,
+        depth: ArrayLike,
+        intrinsics: Intrinsics,
+        world_from_camera: PoseLike,
+        stamp_s: float | None = None,
+        source: str = "default",
+        stride: int = 1,
+    ) -> None:
+        """Send a depth image to be learnt. Returns once it is handed to the network.
+
+        Servers ignore what is nearer than 1.5 m unless told otherwise: see ``range_min_m`` in
+        docs/settings.md, which each source can have for itself.
+
+        Args:
+            depth: [rows, columns] along the optical axis: metres as floating numbers, or
+                millimetres as ``uint16``. A pixel that is 0 or not finite shows nothing.
+            intrinsics: of the camera; the image must be rectified.
+            world_from_camera: pose of the camera's optical frame (x to the right, y down, z
+                forward) in the map frame, as in :meth:`publish_scan`.
+            stamp_s: as in :meth:`publish_scan`.
+            source: name of the camera.
+            stride: take every so many-th row and column, where an image has more pixels than a
+                scan may have points.
+
+        Raises:
+            InvalidScanError: the image cannot be used; nothing was sent.
+        """
+        points = depth_points(depth, intrinsics, stride)
+        self.publish_scan(points, world_from_camera, stamp_s, source)
 
     def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
         """Wait until what this client published is dealt with and queries see it.
@@ -250,7 +284,8 @@ def connect(
     """Connect to a map server.
 
     Args:
-        endpoint: Zenoh endpoint of the server, or of a router that leads to it.
+        endpoint: of the server, or of a router that leads to it: a host such as ``robot`` or
+            ``robot:7447``, or an endpoint of Zenoh.
         map: name of the map.
         timeout_s: for connecting and for each request.
         config: Zenoh configuration file (JSON5), for TLS or credentials; the endpoint is added.
@@ -258,6 +293,6 @@ def connect(
     Raises:
         ConnectError: nothing listens at the endpoint, or it does not let us in.
         UnknownMapError: no server there has this map.
-        InvalidInputError: there cannot be a map of this name.
+        InvalidInputError: there cannot be an endpoint or a map of this name.
     """
     return Client(open_connection(endpoint, map, timeout_s, config=config))

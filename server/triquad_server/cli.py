@@ -11,6 +11,7 @@ from pathlib import Path
 
 import triquad_format
 from triquad_format.errors import FormatError
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 from triquad_format.wire.keys import check_name
 
 OK, UNEXPECTED, USAGE, CANNOT_LISTEN, STORE = 0, 1, 2, 3, 4
@@ -84,8 +85,8 @@ def _run(options: argparse.Namespace) -> int:
     from triquad_server.launch import LaunchOptions, run_server
 
     network = NetworkOptions(
-        listen=tuple(options.listen),
-        connect=tuple(options.connect),
+        listen=tuple(map(full_endpoint, options.listen)),
+        connect=tuple(map(full_endpoint, options.connect)),
         mode=options.mode,
         config_file=options.config,
         multicast_scouting=False if options.no_multicast_scouting else None,
@@ -154,7 +155,8 @@ def _add_network(group: argparse._ArgumentGroup) -> None:
         action="append",
         default=[],
         metavar="ENDPOINT",
-        help="such as tcp/0.0.0.0:7447, repeatable (default: tcp/127.0.0.1:7447)",
+        help="HOST:PORT or an endpoint of Zenoh, such as tcp/0.0.0.0:7447, repeatable "
+        f"(default: {DEFAULT_ENDPOINT})",
     )
     add(
         "-e",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import Client, InvalidInputError, InvalidScanError
+from triquad_client import Client, InvalidInputError, InvalidScanError, Status
 
 POSE = np.eye(4)
 CLOUD = np.ones((10, 3), np.float32)
@@ -25,6 +25,7 @@ def client() -> Iterator[Client]:
         (np.zeros((0, 3)), "no points"),
         (np.zeros((5, 2)), r"\[5, 2\], not \[N, 3\]"),
         (np.zeros(3), r"\[3\], not"),
+        (np.zeros((3, 500)), r"\[3, 500\], not"),  # transposed
         (np.zeros((2, 3), complex), "complex128"),
         (np.full((2, 3), "x"), "dtype"),
         ([[1, 2, 3], [4, 5]], "points are not"),
@@ -34,6 +35,13 @@ def client() -> Iterator[Client]:
 def test_points_that_are_no_scan_are_refused_here(client: Client, points: Any, text: str) -> None:
     with pytest.raises(InvalidScanError, match=text):
         client.publish_scan(points, POSE)
+
+
+def test_columns_after_the_third_are_left_out(client: Client) -> None:
+    cloud = np.concatenate([servers.sphere(), np.full((len(servers.sphere()), 2), 1e9)], axis=1)
+    client.publish_scan(cloud, POSE, source="coloured")
+    assert client.flush(servers.WAIT_S).taken == 1
+    assert (client.query_sdf(servers.sphere(50)).status == Status.SURFACE).all()
 
 
 @pytest.mark.parametrize(

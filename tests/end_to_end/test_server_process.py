@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
+from triquad_client import InvalidInputError
 from triquad_format.mapfile.reader import read_map
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
@@ -188,12 +189,28 @@ def test_settings_that_are_wrong_are_exit_code_2(settings, toml, text):
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--map", "a/b"], ["--mode", "boat"], ["--config", "missing.json5"], ["--no-such-option"]],
+    [
+        ["--map", "a/b"],
+        ["--mode", "boat"],
+        ["--config", "missing.json5"],
+        ["--listen", "robot:http"],
+        ["--connect", "7447"],
+        ["--no-such-option"],
+    ],
 )
 def test_wrong_usage_is_exit_code_2(arguments):
     server = run(arguments)
     assert server.process.returncode == 2
     assert "Traceback" not in server.log
+
+
+def test_a_host_and_a_port_are_enough(settings):
+    host = servers.free_endpoint().removeprefix("tcp/")
+    with servers.server_process(["--settings", settings], endpoint=host):
+        with triquad_client.connect(host) as client:
+            assert client.status().map_name == servers.MAP
+        with pytest.raises(InvalidInputError, match="'http' is not a port"):
+            triquad_client.connect("robot:http")
 
 
 def test_a_zenoh_configuration_file_is_used(tmp_path, settings):

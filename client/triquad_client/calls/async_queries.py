@@ -12,7 +12,7 @@ from triquad_map.questions.spheres import Spheres
 from triquad_client.calls import questions
 from triquad_client.calls.queries import MapQueries
 from triquad_client.calls.questions import SdfResult
-from triquad_client.checks import Bounds
+from triquad_client.checks import Bounds, PoseLike
 from triquad_client.documentation import documented_as
 from triquad_client.net.call import AsyncRun
 
@@ -105,7 +105,7 @@ class AsyncMapQueries:
     async def align(
         self,
         points: ArrayLike,
-        world_from_sensor_guess: ArrayLike,
+        world_from_sensor_guess: PoseLike,
         max_distance_m: float = 6.0,
         at_epoch: int | None = None,
     ) -> Alignment:

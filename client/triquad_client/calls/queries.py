@@ -11,7 +11,7 @@ from triquad_map.questions.spheres import Spheres
 
 from triquad_client.calls import questions
 from triquad_client.calls.questions import SdfResult
-from triquad_client.checks import Bounds
+from triquad_client.checks import Bounds, PoseLike
 from triquad_client.net.call import Run
 
 
@@ -164,7 +164,7 @@ class MapQueries:
     def align(
         self,
         points: ArrayLike,
-        world_from_sensor_guess: ArrayLike,
+        world_from_sensor_guess: PoseLike,
         max_distance_m: float = 6.0,
         at_epoch: int | None = None,
     ) -> Alignment:

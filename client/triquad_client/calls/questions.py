@@ -39,7 +39,7 @@ from triquad_map.questions.spheres import Spheres
 
 from triquad_client import checks
 from triquad_client.calls.parts import in_parts, joined, offsets_from, origin_of
-from triquad_client.checks import Bounds
+from triquad_client.checks import Bounds, PoseLike
 from triquad_client.errors import InvalidInputError
 from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried
 
@@ -238,7 +238,7 @@ def grid(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | N
 
 
 def align(
-    points: ArrayLike, guess: ArrayLike, options: AlignOptions, at_epoch: int | None
+    points: ArrayLike, guess: PoseLike, options: AlignOptions, at_epoch: int | None
 ) -> Call[Alignment]:
     """The pose of ``points`` [N, 3], metres, sensor frame, near a guess [4, 4]."""
     epoch = checks.chosen_epoch(at_epoch)

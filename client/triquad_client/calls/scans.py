@@ -14,6 +14,7 @@ from triquad_format.wire.messages import FlushReply, FlushRequest, Scan, ServerS
 
 from triquad_client import checks
 from triquad_client.calls import admin
+from triquad_client.checks import PoseLike
 from triquad_client.errors import InvalidInputError, InvalidScanError, RequestTimeoutError
 from triquad_client.net.call import Ask, Call, Pause, ask_each
 from triquad_client.net.connection import Connection
@@ -56,7 +57,7 @@ class ScanPublisher:
     def publish(
         self,
         points: ArrayLike,
-        world_from_sensor: ArrayLike,
+        world_from_sensor: PoseLike,
         stamp_s: float | None,
         *,
         source: str,

@@ -10,6 +10,7 @@ import zenoh
 from triquad_format.errors import FormatError, RefusedError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
+from triquad_format.wire.endpoints import full_endpoint
 from triquad_format.wire.messages import ErrorReply
 
 from triquad_client import checks
@@ -206,6 +207,7 @@ def open_connection(
     timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
     try:
         keys.check_name("map", map_name)
+        endpoint = full_endpoint(endpoint)
     except FormatError as error:
         raise InvalidInputError(str(error)) from error
     try:

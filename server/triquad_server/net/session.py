@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 from triquad_server.errors import ListenError, ServerError
-
-DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
 _ZENOH_THREADS = "(tx: (worker_threads: 4))"
 """Of Zenoh's threads, as its environment variable ``ZENOH_RUNTIME`` has them.
@@ -57,7 +56,7 @@ def listen_endpoints(options: NetworkOptions) -> tuple[str, ...]:
     """The endpoints given, or the default; () where the file decides, or a client."""
     if options.listen or options.config_file is not None or options.mode == "client":
         return options.listen
-    return (DEFAULT_LISTEN,)
+    return (DEFAULT_ENDPOINT,)
 
 
 def _configuration(options: NetworkOptions) -> zenoh.Config:

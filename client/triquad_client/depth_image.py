@@ -1,0 +1,94 @@
+"""Depth images turned into the points of a scan."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from triquad_format.records.arrays import Floats
+
+from triquad_client.errors import InvalidScanError
+
+_MILLIMETRES_PER_M = 1000.0
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera: its focal lengths and the middle of its image, pixels.
+
+    The centre of the first pixel lies at 0, 0. The image must be rectified.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if not np.isfinite(values).all() or self.fx <= 0 or self.fy <= 0:
+            raise InvalidScanError(
+                f"intrinsics {values}: fx, fy, cx and cy are finite, the first two above 0"
+            )
+
+    @classmethod
+    def from_matrix(cls, camera_matrix: ArrayLike) -> "Intrinsics":
+        """Those of a camera matrix [3, 3], as OpenCV's ``K`` or the ``k`` of ``CameraInfo``.
+
+        Raises:
+            InvalidScanError: it is no such matrix, or has skew.
+        """
+        try:
+            matrix = np.asarray(camera_matrix, np.float64).reshape(3, 3)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InvalidScanError(f"the camera matrix is not [3, 3]: {error}") from error
+        (fx, skew, cx), (zero, fy, cy), last = matrix
+        if skew != 0 or zero != 0 or list(last) != [0, 0, 1]:
+            raise InvalidScanError(
+                f"the camera matrix is {matrix.tolist()}, not [[fx, 0, cx], [0, fy, cy], "
+                "[0, 0, 1]]; rectify the images"
+            )
+        return cls(fx, fy, cx, cy)
+
+
+def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> Floats:
+    """The points [N, 3] that a depth image shows, row by row.
+
+    Args:
+        depth: [rows, columns] along the optical axis: metres as floating numbers, or millimetres
+            as integers without sign (``16UC1``). A pixel that is 0 or not finite shows nothing.
+        intrinsics: of the camera.
+        stride: take every so many-th row and column.
+
+    Returns:
+        Metres, in the camera's optical frame: x to the right, y down, z forward.
+
+    Raises:
+        InvalidScanError: the image is not one, shows nothing, or the stride is below 1.
+    """
+    image = _metres(depth)
+    if isinstance(stride, bool) or not isinstance(stride, int) or stride < 1:
+        raise InvalidScanError(f"stride = {stride!r}: use 1 or more")
+    image = image[::stride, ::stride]
+    if (image < 0).any():
+        raise InvalidScanError(f"depth {image.min():g} m is negative: depths lie before the camera")
+    rows, columns = np.nonzero(np.isfinite(image) & (image > 0))
+    if len(rows) == 0:
+        raise InvalidScanError("the depth image shows nothing: each pixel is 0 or not finite")
+    z = image[rows, columns]
+    x = (columns * stride - intrinsics.cx) / intrinsics.fx * z
+    y = (rows * stride - intrinsics.cy) / intrinsics.fy * z
+    return np.stack([x, y, z], axis=1).astype(np.float32)
+
+
+def _metres(depth: ArrayLike) -> NDArray[np.floating]:
+    image = np.asarray(depth)
+    if image.ndim != 2 or image.size == 0:
+        raise InvalidScanError(f"depth is {list(image.shape)}, not [rows, columns]")
+    if image.dtype.kind == "f":
+        return image
+    if image.dtype.kind == "u" and image.dtype.itemsize > 1:
+        metres: NDArray[np.floating] = image / np.float32(_MILLIMETRES_PER_M)
+        return metres
+    raise InvalidScanError(
+        f"depth is {image.dtype}: use floating metres, or millimetres as uint16 or uint32"
+    )

@@ -1,0 +1,40 @@
+"""Where a server listens and is found, as people write it and as Zenoh takes it."""
+
+from triquad_format.errors import FormatError
+
+DEFAULT_PORT = 7447
+DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
+
+_FORMS = "use HOST, HOST:PORT or an endpoint of Zenoh such as tcp/robot:7447"
+
+
+def full_endpoint(text: str) -> str:
+    """The endpoint of Zenoh that ``text`` stands for.
+
+    A host, such as ``robot``, ``192.168.0.7:7448`` or ``[::1]:7447``, is reached by TCP, on port
+    7447 unless it names one. What has a ``/`` is an endpoint already and comes back as it is.
+
+    Raises:
+        FormatError: it is neither.
+    """
+    if not isinstance(text, str) or not text.strip() or text != text.strip():
+        raise FormatError(f"endpoint {text!r}: {_FORMS}")
+    if "/" in text:
+        return text
+    host, port = _host_and_port(text)
+    if not host or host.isdigit() or any(c.isspace() or c in "#?;" for c in host):
+        raise FormatError(f"endpoint {text!r}: {host!r} is not a host; {_FORMS}")
+    if not (port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):
+        raise FormatError(f"endpoint {text!r}: {port!r} is not a port from 1 to 65535; {_FORMS}")
+    return f"tcp/{host}:{port}"
+
+
+def _host_and_port(text: str) -> tuple[str, str]:
+    """A host and its port; an address of IPv6 is in brackets then."""
+    if text.startswith("["):
+        host, _, rest = text.partition("]")
+        return f"{host}]", rest.removeprefix(":") if rest else str(DEFAULT_PORT)
+    if text.count(":") > 1:  # IPv6 without brackets has no room for a port
+        return f"[{text}]", str(DEFAULT_PORT)
+    host, colon, port = text.partition(":")
+    return host, port if colon else str(DEFAULT_PORT)

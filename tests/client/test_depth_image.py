@@ -1,0 +1,115 @@
+"""Depth images, from the client to what the map answers."""
+
+import asyncio
+from typing import Any
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import Intrinsics, InvalidScanError, Status, depth_points
+
+CAMERA = Intrinsics(fx=60.0, fy=50.0, cx=39.5, cy=29.5)
+SHAPE = (60, 80)
+FORWARD = np.array([[0.0, 0, 1, 5], [-1, 0, 0, 6], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+"""A camera at 5, 6, 1.5 that looks along x; its image's down is the map's."""
+
+
+def wall_depth(distance_m: float = 4.0) -> np.ndarray:
+    return np.full(SHAPE, distance_m, np.float32)
+
+
+def test_a_wall_stands_where_the_camera_saw_it() -> None:
+    with servers.service_and_client() as client:
+        depth = wall_depth()
+        depth[:30, :40] = 0  # nothing is known of the upper left quarter
+        client.publish_depth(depth, CAMERA, FORWARD)
+        client.settle(servers.WAIT_S)
+        # At x = 9; the image's right is towards -y, its down towards -z.
+        asked = [[9, 5, 0.5], [9, 7, 0.5], [9, 5, 2.5], [9, 7, 2.5], [7, 5.5, 1]]
+        surface, free, unknown = Status.SURFACE, Status.FREE, Status.UNKNOWN
+        expected = [surface, surface, surface, unknown, free]
+        assert client.query_sdf(asked).status.tolist() == expected
+        assert abs(client.query_sdf([[9, 5.2, 1.1]]).sdf[0]) < 0.05
+
+
+def test_pixels_are_projected_by_the_pinhole_model() -> None:
+    depth = np.zeros(SHAPE)
+    depth[12, 70], depth[50, 3] = 2.0, 5.0
+    points = depth_points(depth, CAMERA)
+    assert points.dtype == np.float32
+    pixels = points[:, :2] / points[:, 2:] * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)
+    np.testing.assert_allclose(pixels, [[70, 12], [3, 50]], atol=1e-4)
+    np.testing.assert_array_equal(points[:, 2], [2.0, 5.0])
+
+
+def test_millimetres_and_metres_are_told_apart_by_their_type() -> None:
+    metres = np.random.default_rng(1).uniform(0.5, 9, SHAPE)
+    millimetres = np.round(1000 * metres).astype(np.uint16)
+    np.testing.assert_allclose(
+        depth_points(millimetres, CAMERA), depth_points(metres, CAMERA), atol=1e-3
+    )
+
+
+def test_what_shows_nothing_is_left_out_and_a_stride_thins() -> None:
+    depth = wall_depth()
+    depth[0, 0], depth[2, 2], depth[1, 1] = np.nan, np.inf, 0
+    assert len(depth_points(depth, CAMERA)) == depth.size - 3
+    thinned = depth_points(depth, CAMERA, stride=2)
+    whole = depth_points(wall_depth(), CAMERA).reshape(*SHAPE, 3)
+    np.testing.assert_array_equal(
+        thinned, np.delete(whole[::2, ::2].reshape(-1, 3), [0, SHAPE[1] // 2 + 1], axis=0)
+    )
+
+
+def test_a_camera_matrix_gives_the_intrinsics() -> None:
+    matrix = [[60, 0, 39.5], [0, 50, 29.5], [0, 0, 1]]
+    assert Intrinsics.from_matrix(matrix) == CAMERA
+    assert Intrinsics.from_matrix(np.ravel(matrix)) == CAMERA  # as CameraInfo has it
+
+
+def test_the_async_client_sends_them_too() -> None:
+    async def status_of_wall(endpoint: str) -> int:
+        async with triquad_client.connect_async(endpoint) as client:
+            await client.publish_depth(wall_depth(), CAMERA, FORWARD, source="camera", stride=2)
+            await client.flush(servers.WAIT_S)
+            return int((await client.query_sdf([[9, 6, 1.5]])).status[0])
+
+    with servers.running_service() as endpoint:
+        assert asyncio.run(status_of_wall(endpoint)) == Status.SURFACE
+
+
+@pytest.mark.parametrize(
+    ("depth", "stride", "text"),
+    [
+        (np.zeros((60, 80, 3)), 1, r"depth is \[60, 80, 3\], not \[rows, columns\]"),
+        (np.zeros((0, 80)), 1, r"depth is \[0, 80\]"),
+        (np.zeros(SHAPE), 1, "shows nothing"),
+        (np.full(SHAPE, np.nan), 1, "shows nothing"),
+        (np.full(SHAPE, -2.0), 1, "depth -2 m is negative"),
+        (np.ones(SHAPE, np.uint8), 1, "depth is uint8: use floating metres, or millimetres"),
+        (np.ones(SHAPE, int), 1, "depth is int64"),
+        ("depth", 1, r"depth is \[\]"),
+        (np.ones(SHAPE), 0, "stride = 0: use 1 or more"),
+        (np.ones(SHAPE), 1.5, "stride = 1.5"),
+    ],
+)
+def test_what_is_no_depth_image_is_refused(depth: Any, stride: Any, text: str) -> None:
+    with pytest.raises(InvalidScanError, match=text):
+        depth_points(depth, CAMERA, stride)
+
+
+@pytest.mark.parametrize(
+    "values", [(0.0, 1, 1, 1), (1, -1, 1, 1), (1, 1, np.nan, 1), (1, np.inf, 1, 1)]
+)
+def test_what_is_no_camera_is_refused(values: tuple[float, ...]) -> None:
+    with pytest.raises(InvalidScanError, match="intrinsics .*finite, the first two above 0"):
+        Intrinsics(*values)
+
+
+@pytest.mark.parametrize(
+    "matrix", [np.eye(4), "K", [[60, 1, 39], [0, 50, 29], [0, 0, 1]], np.zeros((3, 3))]
+)
+def test_what_is_no_camera_matrix_is_refused(matrix: Any) -> None:
+    with pytest.raises(InvalidScanError, match="camera matrix"):
+        Intrinsics.from_matrix(matrix)
