@@ -146,6 +146,15 @@ def test_without_a_store_it_says_that_the_map_is_not_kept(settings):
         assert server.wait() == 0
 
 
+def test_nobody_to_connect_to_is_exit_code_3():
+    nobody = servers.free_endpoint()
+    server = run(["--connect", nobody])
+    assert server.process.returncode == 3
+    assert f"cannot connect to {nobody}" in server.log
+    assert "Start a router there first." in server.log
+    assert "ready" not in server.log
+
+
 def test_a_port_in_use_is_exit_code_3():
     endpoint = servers.free_endpoint()
     with servers.raw_session("router", listen=endpoint):

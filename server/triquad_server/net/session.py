@@ -10,6 +10,8 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 from triquad_server.errors import ListenError, ServerError
 
+_CONNECT_MS = 5000  # a router that was started together with the server may need a moment
+
 _ZENOH_THREADS = "(tx: (worker_threads: 4))"
 """Of Zenoh's threads, as its environment variable ``ZENOH_RUNTIME`` has them.
 
@@ -45,11 +47,18 @@ def open_session(options: NetworkOptions) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        endpoints = ", ".join(listen_endpoints(options)) or "the configured endpoints"
-        raise ListenError(
-            f"cannot open {endpoints}: {_first_line(error)} (is another server running there? "
-            "choose another endpoint with --listen)"
-        ) from error
+        raise ListenError(_what_failed(options, _first_line(error))) from error
+
+
+def _what_failed(options: NetworkOptions, reason: str) -> str:
+    if reason.startswith("Unable to connect"):
+        endpoints = ", ".join(options.connect) or "the configured endpoints"
+        return f"cannot connect to {endpoints}: {reason} Start a router there first."
+    endpoints = ", ".join(listen_endpoints(options)) or "the configured endpoints"
+    return (
+        f"cannot open {endpoints}: {reason} (is another server running there? "
+        "choose another endpoint with --listen)"
+    )
 
 
 def listen_endpoints(options: NetworkOptions) -> tuple[str, ...]:
@@ -74,6 +83,9 @@ def _configuration(options: NetworkOptions) -> zenoh.Config:
         config.insert_json5("listen/exit_on_failure", "true")
     if options.connect:
         config.insert_json5("connect/endpoints", json.dumps(options.connect))
+        # By default a router goes on without, and says nothing.
+        config.insert_json5("connect/timeout_ms", str(_CONNECT_MS))
+        config.insert_json5("connect/exit_on_failure", "true")
     if options.mode is not None:
         config.insert_json5("mode", json.dumps(options.mode))
     if options.multicast_scouting is not None:

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from triquad_tools.console.arguments import count, positive, seed
+from triquad_tools.console.arguments import add_version, count, positive, seed
 from triquad_tools.console.command import (
     BAD_INPUT,
     OK,
@@ -172,4 +172,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)")
     add("--json", type=Path, metavar="FILE", help="write the figures there, too")
     add("--record", type=Path, metavar="FILE.md", help="add a table to this page")
+    add_version(parser)
     return parser

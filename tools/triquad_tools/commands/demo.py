@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from triquad_tools.console.arguments import count, seed
+from triquad_tools.console.arguments import add_version, count, seed
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, sigterm_interrupts
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo import steps
@@ -114,4 +114,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
     add("--scans", type=count, default=60, metavar="N", help="a metre apart (default: 60)")
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
+    add_version(parser)
     return parser

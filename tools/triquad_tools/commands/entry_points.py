@@ -13,6 +13,9 @@ def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, .
             if importlib.util.find_spec(name) is None:
                 raise ModuleNotFoundError(name=name)
         return int(importlib.import_module(f"triquad_tools.commands.{module}").main())
+    except KeyboardInterrupt:  # while libraries are imported
+        print(f"{command}: interrupted", file=sys.stderr)
+        return 130
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("triquad"):
             raise

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.console.arguments import count, not_negative, positive, seed
+from triquad_tools.console.arguments import add_version, count, not_negative, positive, seed
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.report import Row, centimetres, json_text, percent, print_rows
 from triquad_tools.evaluation.map_scores import (
@@ -173,6 +173,7 @@ def _parser() -> argparse.ArgumentParser:
     kinds = parser.add_subparsers(required=True, metavar="{mesh,map}")
     _add_mesh(kinds.add_parser("mesh", help="score a mesh file"))
     _add_map(kinds.add_parser("map", help="score a map file, or the map of a running server"))
+    add_version(parser)
     return parser
 
 

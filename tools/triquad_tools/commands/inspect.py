@@ -9,7 +9,7 @@ from pathlib import Path
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.reader import MapFile
 
-from triquad_tools.console.arguments import count, positive
+from triquad_tools.console.arguments import add_version, count, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
@@ -57,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--limit", type=count, metavar="N", help=f"rows of each table of --diff ({_ROWS})")
     add("--json", action="store_true", help="print JSON")
     _add_slice(parser.add_argument_group("slices"))
+    add_version(parser)
     return parser
 
 

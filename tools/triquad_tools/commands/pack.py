@@ -13,7 +13,7 @@ from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTIC
 from triquad_format.records.field_settings import check_range
 from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 
-from triquad_tools.console.arguments import error_limit, positive
+from triquad_tools.console.arguments import add_version, error_limit, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.mapfiles.grid import export_grid
 from triquad_tools.mapfiles.packing import chosen_precision, pack_map
@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_source(parser.add_argument)
     _add_content(parser.add_argument)
     _add_target(parser.add_argument)
+    add_version(parser)
     return parser
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from triquad_client import Client, FlushReport, connect
 
-from triquad_tools.console.arguments import count, not_negative, positive
+from triquad_tools.console.arguments import add_version, count, not_negative, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, run
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
@@ -169,4 +169,5 @@ def _parser() -> argparse.ArgumentParser:
         help="do not send nearer points: the vehicle's own body (default: 0)",
     )
     add("--settle", action="store_true", help="wait until the server has learnt all of it")
+    add_version(parser)
     return parser

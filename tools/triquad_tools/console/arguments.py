@@ -4,8 +4,16 @@ import argparse
 import math
 import re
 
+import triquad_format
+
 _PER_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
 _LEAST_ERROR_M, _LARGEST_ERROR_M = 1e-5, 0.1
+
+
+def add_version(parser: argparse.ArgumentParser) -> None:
+    """Let a command tell its version."""
+    version = f"triquad {triquad_format.__version__}"
+    parser.add_argument("--version", action="version", version=version)
 
 
 def positive(text: str) -> float:

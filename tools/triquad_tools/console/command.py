@@ -1,5 +1,6 @@
 """How every command ends: with an exit status, and one line for what went wrong."""
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -8,8 +9,8 @@ from contextlib import contextmanager
 from triquad_format.errors import FormatError, TriquadError
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
-INTERRUPTED = 130
-"""As shells have it: 128 and the number of SIGINT."""
+INTERRUPTED, NOBODY_READS = 130, 141
+"""As shells have it: 128 and the number of SIGINT, or of SIGPIPE."""
 
 
 class ToolError(TriquadError):
@@ -32,16 +33,31 @@ def run(
         interrupted: what the line says after Ctrl-C.
     """
     try:
-        return work()
+        status = work()
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        # As in `... | head`. Python would complain when it writes out the rest at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NOBODY_READS
     except failures as error:
         return complain(command, error, FAILED)
-    except (ToolError, FormatError, OSError) as error:
+    except OSError as error:
+        return complain(command, _in_words(error), BAD_INPUT)
+    except (ToolError, FormatError) as error:
         return complain(command, error, BAD_INPUT)
     except TriquadError as error:
         # What the client refuses to send is a ValueError, too; all else is the server's failure.
         return complain(command, error, BAD_INPUT if isinstance(error, ValueError) else FAILED)
     except KeyboardInterrupt:
         return complain(command, interrupted, INTERRUPTED)
+
+
+def _in_words(error: OSError) -> str:
+    """An error of the system without its number, such as ``map.triquad: no such file``."""
+    if error.filename is None or error.strerror is None:
+        return str(error)
+    return f"{error.filename}: {error.strerror[:1].lower()}{error.strerror[1:]}"
 
 
 def complain(command: str, message: object, status: int) -> int:
