@@ -57,6 +57,21 @@ def test_meshes_lie_on_the_surface(map_file, tmp_path):
     assert len(mesh.edges_unique) < 2 * len(ply.faces)  # tiles are joined
 
 
+@pytest.mark.parametrize("name", ["crop.triquad", "crop.ply", "crop.npz"])
+def test_of_a_box_in_which_there_is_nothing_nothing_is_written(map_file, tmp_path, name, capsys):
+    box = ["--crop", "9000", "0", "0", "9001", "1", "1"]
+    assert main([str(map_file), str(tmp_path / name), *box]) == 1
+    assert "nothing of the map lies in the box of --crop" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_without_faces_is_not_written(map_file, tmp_path, capsys):
+    air = ["--crop", "4", "-0.5", "1.5", "5", "0.5", "2"]
+    assert main([str(map_file), str(tmp_path / "air.ply"), *air]) == 1
+    assert "no surface was seen in the box of --crop" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("suffix", [".obj", ".stl"])
 def test_other_programs_meshes_are_the_same(map_file, tmp_path, suffix):
     options = ("--cell", "0.4")

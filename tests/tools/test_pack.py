@@ -161,7 +161,7 @@ def test_tool_refuses(map_file, tmp_path, capsys):
     assert out.read_bytes() == b"precious"
     refused(1, "box", map_file, out, "--force", "--crop", *["900", "0", "0", "901", "1", "1"])
     refused(2, "box", map_file, out, "--force", "--crop", *["1", "0", "0", "0", "1", "1"])
-    refused(2, "No such file", tmp_path / "none", out, "--force")
+    refused(2, "no such file", tmp_path / "none", out, "--force")
     broken = tmp_path / "broken"
     broken.write_bytes(before[:-50])
     refused(1, "incomplete", broken, out, "--force")

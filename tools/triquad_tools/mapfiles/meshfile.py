@@ -10,7 +10,7 @@ from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.mapfiles.source import Box
+from triquad_tools.mapfiles.source import Box, NothingLeftError
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")
 
@@ -52,11 +52,14 @@ def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -
 
     Raises:
         InvalidInputError: the mesh is too large, or a library is missing.
+        NothingLeftError: no surface was seen in the box.
         OSError: the file cannot be written.
     """
     bounds = None if box is None else (box[0].tolist(), box[1].tolist())
     with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
         mesh = opened.mesh(bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"))
+    if box is not None and len(mesh.faces) == 0:
+        raise NothingLeftError(f"{path} is not written: no surface was seen in the box of --crop")
     packed = mesh.file_bytes(path.suffix)
     with replacing(path) as stream:
         stream.write(packed)

@@ -25,7 +25,7 @@ class MissingFilesError(ToolError):
 
 
 class NothingLeftError(ToolError):
-    """A box in which a map has nothing."""
+    """A box in which a map has nothing, or nothing of what is asked for."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,11 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
 
 def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
     """The map within a box, with or without training state; errors as :func:`read_source`."""
-    record = source.record if box is None else crop_record(source.record, box[0], box[1])
-    if source.record.has_evidence and not record.has_evidence:
-        raise NothingLeftError("nothing of the map lies in the box")
+    record = source.record
+    if box is not None:
+        record = crop_record(record, box[0], box[1])
+        if not record.regions or (source.record.has_evidence and not record.has_evidence):
+            raise NothingLeftError("nothing of the map lies in the box of --crop")
     return SourceMap(record if training else without_training(record), source.stamp_ns)
 
 
