@@ -142,7 +142,7 @@ def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder):
     assert "has no faces" in refusal("mesh", cloud, "--reference", cloud)
     assert "no.ply" in refusal("mesh", mesh, "--reference", tmp_path / "no.ply")
     assert "holds no poses.txt" in refusal("mesh", mesh, "--reference", tmp_path)
-    assert "No such file" in refusal("map", tmp_path / "no.triquad", "--street", 1, "--scans", 1)
+    assert "no such file" in refusal("map", tmp_path / "no.triquad", "--street", 1, "--scans", 1)
     assert "plate.ply" in refusal("map", mesh, "--withheld", sphere_folder)
     far_apart = ("map", mesh, "--withheld", sphere_folder, "--skip-every", SCANS + 1)
     assert f"--skip-every {SCANS + 1} withholds none of its {SCANS} scans" in refusal(*far_apart)
