@@ -180,7 +180,7 @@ def test_a_restored_map_stays_until_rays_contradict_it() -> None:
     assert same.ended_in(voxels).mean() > 0.997
     watched.restart()
     watched.mapper.publish()
-    assert share(watched.scan(count=30), Status.SURFACE, front=True) < 0.4  # few rays go so far5
+    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.15
 
 
 def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
@@ -188,7 +188,7 @@ def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
     near = chosen.model_copy(update={"scan": chosen.scan.model_copy(update={"range_max_m": 6.5})})
     watched = Watched(near)
     assert share(watched.scan(BOX, count=8), Status.SURFACE, front=True) > 0.95
-    assert share(watched.scan(count=30), Status.SURFACE, front=True) < 0.4  # few rays go so far
+    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.1
 
 
 def test_an_hour_elsewhere_takes_nothing_back() -> None:
@@ -232,7 +232,7 @@ def test_a_restored_fence_is_not_doubted_like_a_wall() -> None:
         return float(after.evidence.ended_in(fence).mean())
 
     assert kept(lambda region: region) > 0.93
-    assert kept(without_outcomes) < 0.9
+    assert kept(without_outcomes) < 0.85
 
 
 def test_confidence_falls_before_it_is_gone() -> None:
