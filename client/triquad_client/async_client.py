@@ -8,6 +8,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
 from triquad_client.calls import admin, changes, download, questions
@@ -171,7 +172,7 @@ class Connecting:
 
 
 def connect_async(
-    endpoint: str = "tcp/127.0.0.1:7447",
+    endpoint: str = DEFAULT_ENDPOINT,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
     timeout_s: float = 10.0,

@@ -18,7 +18,7 @@ from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
 from triquad_map.questions.distance import Unknown
 from triquad_map.questions.grid import GridShape
 
-from triquad_client.errors import InvalidInputError, InvalidScanError
+from triquad_client.errors import NO_NUMBER, InvalidInputError, InvalidScanError
 from triquad_client.pose import Pose
 
 PoseLike: TypeAlias = ArrayLike | Pose
@@ -29,8 +29,6 @@ Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 
 FARTHEST_M = 1e9
 LONGEST_S = 1e6  # that a request may take
-_NO_NUMBER = (TypeError, ValueError, OverflowError)
-"""What conversions raise: Python's integers may be larger than any float."""
 
 _MAX_COLUMNS = 16  # of a scan's points: more is rather an array that was transposed
 _MAX_CELLS = 100_000_000  # of a grid
@@ -86,7 +84,7 @@ def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
         return world_from_sensor.matrix()
     try:
         pose = np.asarray(world_from_sensor, np.float64)
-    except _NO_NUMBER as error:
+    except NO_NUMBER as error:
         raise InvalidScanError(f"world_from_sensor is not a matrix: {error}") from error
     if pose.shape != (4, 4):
         raise InvalidScanError(f"world_from_sensor is {list(pose.shape)}, not [4, 4]")
@@ -110,7 +108,7 @@ def stamp_ns(stamp_s: float) -> int:
     """A stamp in seconds since 1970 as nanoseconds."""
     try:
         seconds = _number(stamp_s)
-    except _NO_NUMBER:
+    except NO_NUMBER:
         seconds = math.nan
     if not 0 <= seconds < 2**63 / 1e9:
         raise InvalidScanError(f"stamp_s = {_shown(stamp_s)} is not a time in seconds since 1970")
@@ -145,7 +143,7 @@ def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
         return np.full(3, -np.inf), np.full(3, np.inf)
     try:
         minimum, maximum = (np.asarray(corner, np.float64) for corner in bounds)
-    except _NO_NUMBER as error:
+    except NO_NUMBER as error:
         raise InvalidInputError(f"bounds = {_shown(bounds)}: give (minimum, maximum)") from error
     if minimum.shape != (3,) or maximum.shape != (3,):
         raise InvalidInputError(f"bounds = {bounds!r}: each corner has three coordinates")
@@ -207,7 +205,7 @@ def within(
     """A number from ``least`` to ``most``."""
     try:
         number = _number(value)
-    except _NO_NUMBER as error:
+    except NO_NUMBER as error:
         raise InvalidInputError(f"{name} = {_shown(value)} is not a number") from error
     if not least <= number <= most:
         raise InvalidInputError(f"{name} = {_shown(value)}: use {least:g} to {most:g}")
@@ -218,7 +216,7 @@ def radii(values: ArrayLike, count: int) -> Floats:
     """Radii [count], from as many or a single one."""
     try:
         array = np.broadcast_to(np.asarray(values, np.float32), (count,))
-    except _NO_NUMBER as error:
+    except NO_NUMBER as error:
         raise InvalidInputError(f"radii_m are not one number or {count}: {error}") from error
     bad = ~((array >= 0) & (array <= MAX_DISTANCE_M))
     if bad.any():
@@ -254,8 +252,8 @@ def ray_origins(origins: ArrayLike, count: int) -> Doubles:
 def organised(name: str, values: ArrayLike) -> Doubles:
     """An array [rows, columns, 3] as float64; values that are not finite may be in it."""
     try:
-        array = _real_numbers(values, np.float64)
-    except _NO_NUMBER as error:
+        array = _real_numbers(values).astype(np.float64, copy=False)
+    except NO_NUMBER as error:
         raise InvalidScanError(f"{name}: not an array of real numbers: {error}") from error
     if array.ndim != 3 or array.shape[2] != 3:
         raise InvalidScanError(f"{name}: {list(array.shape)} is not [rows, columns, 3]")
@@ -272,21 +270,21 @@ def _points(
 ) -> NDArray[Any]:
     """The first three of up to so many columns."""
     try:
-        array = _real_numbers(points, dtype)
-    except _NO_NUMBER as cause:
+        array = _real_numbers(points)
+    except NO_NUMBER as cause:
         raise error(f"{what} are not an array [N, 3] of real numbers: {cause}") from cause
     if array.size == 0 and array.ndim == 1:
         array = array.reshape(0, 3)
     if array.ndim != 2 or not 3 <= array.shape[1] <= columns:
         raise error(f"{what} are {list(array.shape)}, not [N, 3]")
-    return array[:, :3]
+    return array[:, :3].astype(dtype, copy=False)
 
 
-def _real_numbers(values: ArrayLike, dtype: Any) -> NDArray[Any]:
+def _real_numbers(values: ArrayLike) -> NDArray[Any]:
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"dtype {array.dtype} is not one of real numbers")
-    return array.astype(dtype, copy=False)
+    return array
 
 
 def _number(value: Any) -> float:

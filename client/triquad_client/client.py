@@ -4,6 +4,7 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 
 from triquad_client.calls import admin, changes, download, questions
@@ -275,7 +276,7 @@ class Client(MapQueries):
 
 
 def connect(
-    endpoint: str = "tcp/127.0.0.1:7447",
+    endpoint: str = DEFAULT_ENDPOINT,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
     timeout_s: float = 10.0,

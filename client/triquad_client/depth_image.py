@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.records.arrays import Floats
 
-from triquad_client.errors import InvalidScanError
+from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 _MILLIMETRES_PER_M = 1000.0
 
@@ -39,7 +39,7 @@ class Intrinsics:
         """
         try:
             matrix = np.asarray(camera_matrix, np.float64).reshape(3, 3)
-        except (TypeError, ValueError, OverflowError) as error:
+        except NO_NUMBER as error:
             raise InvalidScanError(f"the camera matrix is not [3, 3]: {error}") from error
         (fx, skew, cx), (zero, fy, cy), last = matrix
         if skew != 0 or zero != 0 or list(last) != [0, 0, 1]:

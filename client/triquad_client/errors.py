@@ -2,6 +2,9 @@
 
 from triquad_format.errors import TriquadError
 
+NO_NUMBER = (TypeError, ValueError, OverflowError)
+"""What conversions to numbers raise: Python's integers may be larger than any float."""
+
 
 class ConnectError(TriquadError):
     """No server, or one that does not let us in, at the endpoint."""

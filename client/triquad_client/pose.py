@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
 
-from triquad_client.errors import InvalidScanError
+from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 _UNIT_TOLERANCE = 1e-2
 """By how much a quaternion's length may be off: files of three digits are."""
@@ -34,7 +34,7 @@ class Pose:
 def _numbers(name: str, values: ArrayLike, count: int) -> Doubles:
     try:
         array = np.asarray(values, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
+    except NO_NUMBER as error:
         raise InvalidScanError(f"{name} = {values!r} are not {count} numbers: {error}") from error
     if array.shape != (count,):
         raise InvalidScanError(f"{name} is {list(array.shape)}, not [{count}]")

@@ -2,8 +2,9 @@
 
 import importlib
 import importlib.util
-import sys
 from functools import partial
+
+from triquad_tools.console.command import BAD_INPUT, INTERRUPTED, complain
 
 
 def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, ...] = ()) -> int:
@@ -14,14 +15,12 @@ def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, .
                 raise ModuleNotFoundError(name=name)
         return int(importlib.import_module(f"triquad_tools.commands.{module}").main())
     except KeyboardInterrupt:  # while libraries are imported
-        print(f"{command}: interrupted", file=sys.stderr)
-        return 130
+        return complain(command, "interrupted", INTERRUPTED)
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("triquad"):
             raise
         library = error.name.partition(".")[0]
-        print(f"{command}: {library} is missing: install triquad[{extra}]", file=sys.stderr)
-        return 2
+        return complain(command, f"{library} is missing: install triquad[{extra}]", BAD_INPUT)
 
 
 _run_with_server = partial(_run, extra="demo", needs=("torch", "foxglove_schemas_protobuf"))

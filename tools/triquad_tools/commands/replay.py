@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from triquad_client import Client, FlushReport, connect
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 from triquad_tools.console.arguments import add_version, count, not_negative, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, run
@@ -141,9 +142,9 @@ def _parser() -> argparse.ArgumentParser:
     add("folder", type=Path, metavar="FOLDER", help="poses.txt, scans and perhaps times.txt")
     add(
         "--connect",
-        default="tcp/127.0.0.1:7447",
+        default=DEFAULT_ENDPOINT,
         metavar="ENDPOINT",
-        help="of the server (default: tcp/127.0.0.1:7447)",
+        help=f"of the server (default: {DEFAULT_ENDPOINT})",
     )
     add("--map", default="default", metavar="NAME", help="default: default")
     add("--source", default="default", metavar="NAME", help="name of the sensor (default: default)")

@@ -158,7 +158,7 @@ def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) ->
     around = seen_around(row, 1, seen, observed)
     if _goes_along(voxel, around, rule) or _is_doubted_around(voxel, around, rule):
         return True
-    if voxel.hits >= _OWN_RECORD_HITS or around.later > 0:
+    if voxel.hits >= _OWN_RECORD_HITS or around.later > 0:  # which spares looking farther
         return False
     return _goes_with_group(row, seen, observed, rule)
 

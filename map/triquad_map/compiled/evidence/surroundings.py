@@ -4,12 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from triquad_map.compiled.evidence.observed import (
-    Observed,
-    has_surface,
-    rows_around,
-    voxel_of,
-)
+from triquad_map.compiled.evidence.observed import Observed, has_surface, rows_around, voxel_of
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
 
