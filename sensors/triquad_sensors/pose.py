@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
 
-from triquad_client.errors import NO_NUMBER, InvalidScanError
+from triquad_sensors.errors import NO_NUMBER, InvalidScanError
 
 _UNIT_TOLERANCE = 1e-2
 """By how much a quaternion's length may be off: files of three digits are."""
@@ -25,10 +25,35 @@ class Pose:
         Raises:
             InvalidScanError: it is not 3 and 4 finite numbers, or no rotation.
         """
-        pose = np.eye(4)
-        pose[:3, :3] = _rotation(_numbers("quaternion_xyzw", self.quaternion_xyzw, 4))
-        pose[:3, 3] = _numbers("position_m", self.position_m, 3)
-        return pose
+        position = _numbers("position_m", self.position_m, 3)
+        quaternion = _numbers("quaternion_xyzw", self.quaternion_xyzw, 4)
+        length = float(np.linalg.norm(quaternion))
+        if abs(length - 1.0) > _UNIT_TOLERANCE:
+            raise InvalidScanError(
+                f"quaternion_xyzw = {quaternion.tolist()} has the length {length:.4g}, not 1"
+            )
+        return pose_matrices(position, quaternion / length)
+
+
+def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
+    """Poses [..., 4, 4] of positions [..., 3] and unit quaternions [..., 4] x, y, z, w.
+
+    Diebel 2006, "Representing attitude", section 5.6.
+    """
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    poses = np.zeros((*x.shape, 4, 4))
+    poses[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    poses[..., 0, 1] = 2 * (x * y - z * w)
+    poses[..., 0, 2] = 2 * (x * z + y * w)
+    poses[..., 1, 0] = 2 * (x * y + z * w)
+    poses[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    poses[..., 1, 2] = 2 * (y * z - x * w)
+    poses[..., 2, 0] = 2 * (x * z - y * w)
+    poses[..., 2, 1] = 2 * (y * z + x * w)
+    poses[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    poses[..., :3, 3] = positions
+    poses[..., 3, 3] = 1.0
+    return poses
 
 
 def _numbers(name: str, values: ArrayLike, count: int) -> Doubles:
@@ -41,20 +66,3 @@ def _numbers(name: str, values: ArrayLike, count: int) -> Doubles:
     if not np.isfinite(array).all():
         raise InvalidScanError(f"{name} = {array.tolist()} has values that are not finite")
     return array
-
-
-def _rotation(quaternion: Doubles) -> Doubles:
-    """The rotation [3, 3] of a quaternion x, y, z, w (Diebel 2006, section 5.6)."""
-    length = float(np.linalg.norm(quaternion))
-    if abs(length - 1.0) > _UNIT_TOLERANCE:
-        raise InvalidScanError(
-            f"quaternion_xyzw = {quaternion.tolist()} has the length {length:.4g}, not 1"
-        )
-    x, y, z, w = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
