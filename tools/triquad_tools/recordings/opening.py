@@ -4,6 +4,7 @@ from pathlib import Path
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import find_bag
+from triquad_tools.recordings.kitti import is_kitti_folder, read_folder
 from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_options import RosOptions
 from triquad_tools.recordings.ros_recording import RosRecording
@@ -20,4 +21,9 @@ def open_recording(path: Path, options: RosOptions) -> Recording:
     bag = find_bag(path)
     if bag is not None:
         return RosRecording(bag, options)
-    raise ToolError(f"{path}: no recording that is understood")
+    if is_kitti_folder(path):
+        return read_folder(path)
+    raise ToolError(
+        f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
+        "docs/tools.md describes them"
+    )
