@@ -163,6 +163,16 @@ def test_a_cloud_is_placed_as_each_of_its_points_was_measured(tmp_path: Path) ->
     assert np.abs(placed - world).max() < 2e-3
 
 
+def test_a_cloud_of_the_whole_map_is_no_scan(tmp_path: Path) -> None:
+    messages = a_drive()
+    whole = ROS2.cloud(SCANS[0], STAMPS[0], "map")
+    messages.append(Recorded("/map_cloud", CLOUD, STAMPS[0], whole))
+    recording = opened(tmp_path, messages)
+    assert {entry.source for entry in recording.entries} == {"lidar.points"}
+    streams = {stream.name: stream for stream in recording.streams}
+    assert streams["/map_cloud"].use == "other scans: --topics /map_cloud"
+
+
 def test_missing_poses_and_transforms_are_named_with_the_remedy(tmp_path: Path) -> None:
     nothing = opened(tmp_path / "a", without(a_drive(), "/tf"))
     assert not nothing.entries

@@ -24,6 +24,7 @@ from triquad_tools.recordings.recording import ScanEntry
 from triquad_tools.recordings.selection import (
     Selection,
     add_recording,
+    flags_of,
     open_from,
     open_selected,
 )
@@ -76,7 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _replay(options: argparse.Namespace) -> int:
     if options.list:
-        return OK if print_contents(options.recording, open_from(options)) else FAILED
+        recording = open_from(options)
+        mappable = print_contents(options.recording, recording, flags_of(options))
+        return OK if mappable else FAILED
     selection = open_selected(options)
     with connect(options.connect, options.map) as client:
         report = _publish_all(client, selection, options)

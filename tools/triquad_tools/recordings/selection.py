@@ -143,6 +143,19 @@ def open_from(options: argparse.Namespace) -> Recording:
     )
 
 
+def flags_of(options: argparse.Namespace) -> list[str]:
+    """The flags among the arguments that say how a recording is read."""
+    flags: list[str] = []
+    for name in ("poses", "map_frame", "body_frame"):
+        if (value := getattr(options, name)) is not None:
+            flags += [f"--{name.replace('_', '-')}", value]
+    for transform in options.transform:
+        flags += ["--transform", transform]
+    if options.recorder_clock:
+        flags.append("--recorder-clock")
+    return [*flags, "--topics", *options.topics] if options.topics else flags
+
+
 def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:
     """The numbers of the scans within the times, every Nth of each sensor, and not withheld."""
     first_ns = min(entry.stamp_ns for entry in entries)
