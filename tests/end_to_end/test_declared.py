@@ -14,6 +14,7 @@ else:
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DISTRIBUTIONS = {
+    "PIL": "pillow",
     "zenoh": "eclipse-zenoh",
     "google": "protobuf",
     "skimage": "scikit-image",
