@@ -1,0 +1,29 @@
+"""Telling what kind of recording a path is."""
+
+from pathlib import Path
+
+from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.bag import find_bag
+from triquad_tools.recordings.kitti import is_kitti_folder, read_folder
+from triquad_tools.recordings.recording import Recording
+from triquad_tools.recordings.ros_options import RosOptions
+from triquad_tools.recordings.ros_recording import RosRecording
+
+
+def open_recording(path: Path, options: RosOptions) -> Recording:
+    """A recording, after all of it was looked through.
+
+    Raises:
+        ToolError: there is none, it is damaged, or does not hold what ``options`` ask for.
+    """
+    if not path.exists():
+        raise ToolError(f"{path}: no such file or folder")
+    bag = find_bag(path)
+    if bag is not None:
+        return RosRecording(bag, options)
+    if is_kitti_folder(path):
+        return read_folder(path)
+    raise ToolError(
+        f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
+        "docs/tools.md describes them"
+    )
