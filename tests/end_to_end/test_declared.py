@@ -67,9 +67,9 @@ def imported(folder: str) -> set[str]:
         ("client", ("mesh",)),
         ("map", ("fast",)),
         ("server", ("fast", "preview", "server")),
-        ("tools", ("fast", "mesh", "preview", "server", "tools")),
+        ("tools", ("fast", "mesh", "preview", "ros", "server", "tools")),
         *(
-            (f"tools/triquad_tools/{room}", ("fast", "mesh", "preview", "tools"))
+            (f"tools/triquad_tools/{room}", ("fast", "mesh", "preview", "ros", "tools"))
             for room in WITHOUT_TORCH
         ),
     ],

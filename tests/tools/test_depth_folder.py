@@ -11,12 +11,12 @@ from support.depth_images import CAMERA, HALF_ROOM_M, room_depth, write_depth, w
 from support.trajectories import drive, matrices, write_log, write_tum
 from triquad_sensors.depth_image import Intrinsics
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.depth_folder import (
+from triquad_tools.recordings.folders.depth_folder import (
     DepthOptions,
     is_depth_folder,
     read_depth_folder,
 )
-from triquad_tools.recordings.depth_png import check_depth, read_depth
+from triquad_tools.recordings.folders.depth_png import check_depth, read_depth
 from triquad_tools.recordings.recording import Recording
 
 START_NS = 1_305_031_102_160_407_000

@@ -11,18 +11,18 @@ from triquad_sensors.depth_image import Intrinsics, depth_points
 from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.camera import Camera, check_fits, choose_camera
-from triquad_tools.recordings.depth_png import check_depth, read_depth
-from triquad_tools.recordings.file_names import in_order
-from triquad_tools.recordings.placed_files import (
+from triquad_tools.recordings.folders.camera import Camera, check_fits, choose_camera
+from triquad_tools.recordings.folders.depth_png import check_depth, read_depth
+from triquad_tools.recordings.folders.file_names import in_order
+from triquad_tools.recordings.folders.placed_files import (
     PlacedFiles,
     choose_trajectory,
     place_by_time,
     place_files,
 )
+from triquad_tools.recordings.folders.trajectory import Trajectory, read_trajectory
 from triquad_tools.recordings.recording import ScanEntry, Stream
 from triquad_tools.recordings.text_lines import parse_stamp, read_lines
-from triquad_tools.recordings.trajectory import Trajectory, read_trajectory
 
 _LIST_NAME = "depth.txt"  # of TUM RGB-D
 _FOLDER_NAME = "depth"  # of Open3D

@@ -8,7 +8,7 @@ from triquad_sensors.depth_image import Intrinsics
 from triquad_sensors.errors import NO_NUMBER, InvalidScanError
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.depth_png import ImageSize
+from triquad_tools.recordings.folders.depth_png import ImageSize
 
 INTRINSICS_NAMES = ("camera_intrinsic.json", "intrinsic.json", "camera_primesense.json")
 """Names that Open3D and its data give them."""
