@@ -14,10 +14,10 @@ else:
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DISTRIBUTIONS = {
+    "PIL": "pillow",
     "zenoh": "eclipse-zenoh",
     "google": "protobuf",
     "skimage": "scikit-image",
-    "PIL": "pillow",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
     "pydantic_core": "pydantic",
     "pydantic_settings": "pydantic-settings",

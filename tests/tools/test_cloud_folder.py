@@ -6,7 +6,7 @@ import pytest
 from support.point_files import columns, write_las, write_pcd, write_ply
 from support.trajectories import drive, matrices, write_log, write_tum
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.cloud_folder import (
+from triquad_tools.recordings.folders.cloud_folder import (
     CloudOptions,
     is_cloud_folder,
     read_cloud_folder,

@@ -15,9 +15,9 @@ from support.point_files import (
     write_ply,
 )
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.point_files.las import check_las, read_las
-from triquad_tools.recordings.point_files.pcd import check_pcd, read_pcd
-from triquad_tools.recordings.point_files.ply import check_ply, read_ply
+from triquad_tools.recordings.folders.point_files.las import check_las, read_las
+from triquad_tools.recordings.folders.point_files.pcd import check_pcd, read_pcd
+from triquad_tools.recordings.folders.point_files.ply import check_ply, read_ply
 
 CHECKS = {".ply": check_ply, ".pcd": check_pcd, ".las": check_las, ".laz": check_las}
 READERS = {".ply": read_ply, ".pcd": read_pcd, ".las": read_las, ".laz": read_las}

@@ -8,7 +8,8 @@ import pytest
 from support.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
 from support.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.opening import open_recording
+from triquad_tools.recordings.opening import RecordingOptions
+from triquad_tools.recordings.opening import open_recording as open_any
 from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_options import RosOptions, parse_transform
 
@@ -19,6 +20,10 @@ RNG = np.random.default_rng(5)
 SCANS = [RNG.normal(size=(30 + i, 3)).astype(np.float32) for i in range(COUNT)]
 LIDAR = np.eye(4)
 LIDAR[:3, 3] = 0.3, 0, 1.5
+
+
+def open_recording(path: Path, ros: RosOptions) -> Recording:
+    return open_any(path, RecordingOptions(ros))
 
 
 def poses(count: int = COUNT) -> np.ndarray:

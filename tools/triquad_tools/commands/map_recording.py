@@ -19,7 +19,8 @@ from triquad_tools.console.progress import progress
 from triquad_tools.mapping.mapping_run import MappingRun, stop_requests
 from triquad_tools.mapping.output import SUFFIXES, write_output
 from triquad_tools.mapping.unfinished import MAP_NAME, UnfinishedMap, mapping_key
-from triquad_tools.recordings.selection import Selection, add_recording, open_selected
+from triquad_tools.recordings.arguments import add_recording
+from triquad_tools.recordings.selection import Selection, open_selected
 
 _COMMAND = "triquad-map"
 

@@ -14,6 +14,7 @@ from triquad_sensors.sweep import PosedScan
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.progress import progress
+from triquad_tools.recordings.arguments import add_recording, flags_of, open_from
 from triquad_tools.recordings.listing import print_contents
 from triquad_tools.recordings.publishing import (
     FLUSH_TIMEOUT_S,
@@ -21,13 +22,7 @@ from triquad_tools.recordings.publishing import (
     wait_until_settled,
 )
 from triquad_tools.recordings.recording import ScanEntry
-from triquad_tools.recordings.selection import (
-    Selection,
-    add_recording,
-    flags_of,
-    open_from,
-    open_selected,
-)
+from triquad_tools.recordings.selection import Selection, open_selected
 
 _COMMAND = "triquad-replay"
 _LOOK_PERIOD_S = 1.0  # between questions how many scans were lost

@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.point_files.file_points import (
+from triquad_tools.recordings.folders.point_files.file_points import (
     FilePoints,
     check_bytes,
     check_lines,

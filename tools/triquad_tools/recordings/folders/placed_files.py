@@ -9,9 +9,13 @@ from triquad_format.records.arrays import Doubles
 from triquad_sensors.errors import NoTransformError
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.file_names import stamps_of_names
+from triquad_tools.recordings.folders.file_names import stamps_of_names
+from triquad_tools.recordings.folders.trajectory import (
+    TRAJECTORY_NAMES,
+    Trajectory,
+    find_trajectories,
+)
 from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry
-from triquad_tools.recordings.trajectory import TRAJECTORY_NAMES, Trajectory, find_trajectories
 
 _WHY = {
     "pose_early": "before the first pose",

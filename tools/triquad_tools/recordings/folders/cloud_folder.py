@@ -14,19 +14,19 @@ from triquad_sensors.ros.point_times import offsets_s
 from triquad_sensors.sweep import PosedScan, Sweep
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.file_names import in_order
-from triquad_tools.recordings.placed_files import (
+from triquad_tools.recordings.folders.file_names import in_order
+from triquad_tools.recordings.folders.placed_files import (
     PlacedFile,
     PlacedFiles,
     choose_trajectory,
     place_files,
 )
-from triquad_tools.recordings.point_files.file_points import FilePoints
-from triquad_tools.recordings.point_files.las import check_las, read_las
-from triquad_tools.recordings.point_files.pcd import check_pcd, read_pcd
-from triquad_tools.recordings.point_files.ply import check_ply, read_ply
+from triquad_tools.recordings.folders.point_files.file_points import FilePoints
+from triquad_tools.recordings.folders.point_files.las import check_las, read_las
+from triquad_tools.recordings.folders.point_files.pcd import check_pcd, read_pcd
+from triquad_tools.recordings.folders.point_files.ply import check_ply, read_ply
+from triquad_tools.recordings.folders.trajectory import SENSOR, WORLD, Trajectory, read_trajectory
 from triquad_tools.recordings.recording import ScanEntry, Stream
-from triquad_tools.recordings.trajectory import SENSOR, WORLD, Trajectory, read_trajectory
 
 
 class _Format(NamedTuple):

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.point_files.file_points import FilePoints, check_bytes
+from triquad_tools.recordings.folders.point_files.file_points import FilePoints, check_bytes
 
 _RECORD_COUNTS = {100: 54, 243: 60}
 """Where the header says how many records follow it, or the points, and bytes of the least one."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.point_files.file_points import (
+from triquad_tools.recordings.folders.point_files.file_points import (
     FilePoints,
     check_bytes,
     check_lines,
