@@ -112,13 +112,7 @@ def _add_folder(add: _Add) -> None:
         metavar="N",
         help="of pixels of depth (default: 5000 for TUM RGB-D, 1000 for others)",
     )
-    add(
-        "--stride",
-        type=count,
-        default=1,
-        metavar="N",
-        help="take every Nth row and column of depth",
-    )
+    add("--stride", type=count, metavar="N", help="take every Nth row and column of depth images")
 
 
 def _intrinsics(text: str) -> Intrinsics:
