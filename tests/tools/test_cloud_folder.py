@@ -179,7 +179,7 @@ def test_another_trajectory_can_be_chosen(tmp_path):
     _timed(tmp_path)
     other = write_tum(tmp_path / "groundtruth.txt", STAMPS, drive(COUNT, step_m=9.0))
     (remark,) = read_cloud_folder(tmp_path).remarks
-    assert remark.startswith("poses are those of trajectory.txt; --trajectory chooses another")
+    assert remark.startswith("poses are those of trajectory.txt, not of groundtruth.txt: ")
     recording = read_cloud_folder(tmp_path, CloudOptions(trajectory=other))
     assert not recording.remarks
     _, second = recording.read([0, 1])

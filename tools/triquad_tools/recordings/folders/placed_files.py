@@ -81,7 +81,7 @@ def choose_trajectory(folder: Path, given: Path | None) -> ChosenTrajectory:
             "it with --trajectory"
         )
     others = ", ".join(path.name for path in found[1:])
-    remark = f"poses are those of {found[0].name}; --trajectory chooses another of {others}"
+    remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"
     return ChosenTrajectory(found[0], (remark,) if others else ())
 
 
