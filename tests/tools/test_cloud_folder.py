@@ -179,7 +179,7 @@ def test_another_trajectory_can_be_chosen(tmp_path):
     _timed(tmp_path)
     other = write_tum(tmp_path / "groundtruth.txt", STAMPS, drive(COUNT, step_m=9.0))
     (remark,) = read_cloud_folder(tmp_path).remarks
-    assert remark.startswith("poses are those of trajectory.txt; --trajectory chooses another")
+    assert remark.startswith("poses are those of trajectory.txt, not of groundtruth.txt: ")
     recording = read_cloud_folder(tmp_path, CloudOptions(trajectory=other))
     assert not recording.remarks
     _, second = recording.read([0, 1])
@@ -209,6 +209,13 @@ def test_what_is_missing_or_too_much_is_named(tmp_path):
     _counted(tmp_path / "map", 1)
     with pytest.raises(ToolError, match=r"clouds lie in .* \(4\), .*map \(1\): leave only"):
         read_cloud_folder(tmp_path)
+
+
+def test_hidden_files_are_no_clouds(tmp_path):
+    _timed(tmp_path)
+    (tmp_path / "clouds" / f"._{_name(STAMPS[0])}.ply").write_bytes(b"of macOS")
+    assert len(read_cloud_folder(tmp_path).entries) == COUNT
+    assert not is_cloud_folder(tmp_path / "trajectory.txt")
 
 
 def test_clocks_that_differ_are_told_with_both_times(tmp_path):

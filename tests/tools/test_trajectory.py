@@ -71,6 +71,25 @@ def test_what_is_no_trajectory_is_refused_with_its_place(tmp_path, text, words):
         read_trajectory(path)
 
 
+words = st.sampled_from(["0", "1", "-1", "2.5", "nan", "1e400", "x", "#"]) | st.text(max_size=4)
+texts = st.lists(st.lists(words, max_size=13).map(" ".join), max_size=8).map("\n".join)
+
+
+@given(texts | st.text())
+def test_whatever_a_file_says_it_is_poses_or_one_line(tmp_path_factory, text):
+    path = tmp_path_factory.mktemp("any") / "trajectory.txt"
+    path.write_text(text, errors="replace")
+    try:
+        read = read_trajectory(path)
+    except ToolError as error:
+        told = str(error)
+    else:
+        told = f"{path}"
+        assert np.isfinite(read.poses).all()
+    assert told.startswith(str(path))
+    assert "\n" not in told
+
+
 def test_commas_and_comments_are_allowed(tmp_path):
     path = tmp_path / "a.tum"
     path.write_text("# t, x\n1.5,1,2,3,0,0,0,1\n\n  # more\n2.5, 2,2,3, 0,0,0,1\n")

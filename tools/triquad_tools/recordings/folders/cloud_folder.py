@@ -19,6 +19,7 @@ from triquad_tools.recordings.folders.placed_files import (
     PlacedFile,
     PlacedFiles,
     choose_trajectory,
+    look_through,
     place_files,
 )
 from triquad_tools.recordings.folders.point_files.file_points import FilePoints
@@ -110,7 +111,7 @@ class CloudFolder:
 
 def is_cloud_folder(folder: Path) -> bool:
     """Whether a folder, or one in it, holds files of points."""
-    return bool(_folders_of_clouds(folder))
+    return folder.is_dir() and bool(_folders_of_clouds(folder))
 
 
 def read_cloud_folder(folder: Path, options: CloudOptions | None = None) -> CloudFolder:
@@ -124,8 +125,7 @@ def read_cloud_folder(folder: Path, options: CloudOptions | None = None) -> Clou
     paths = _cloud_paths(folder)
     chosen = choose_trajectory(folder, options.trajectory)
     trajectory = read_trajectory(chosen.path)
-    points = sum([_FORMATS[path.suffix.lower()].check(path) for path in paths])
-    if points == 0:
+    if sum(look_through(paths, _FORMATS[paths[0].suffix.lower()].check)) == 0:
         raise ToolError(f"{paths[0].parent}: none of the {len(paths)} files holds any points")
     recording = CloudFolder(place_files(paths, trajectory), trajectory, options, chosen.remarks)
     if options.points_in is None:
@@ -137,10 +137,10 @@ def _folders_of_clouds(folder: Path) -> dict[Path, list[Path]]:
     """The files of points in a folder and in those in it."""
     folders = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
     found = {
-        each: [path for path in each.iterdir() if path.suffix.lower() in _FORMATS]
+        each: in_order(path for path in each.iterdir() if path.suffix.lower() in _FORMATS)
         for each in folders
     }
-    return {each: in_order(paths) for each, paths in found.items() if paths}
+    return {each: paths for each, paths in found.items() if paths}
 
 
 def _cloud_paths(folder: Path) -> list[Path]:

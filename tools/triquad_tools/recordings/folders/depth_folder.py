@@ -17,6 +17,7 @@ from triquad_tools.recordings.folders.file_names import in_order
 from triquad_tools.recordings.folders.placed_files import (
     PlacedFiles,
     choose_trajectory,
+    look_through,
     place_by_time,
     place_files,
 )
@@ -109,8 +110,8 @@ def read_depth_folder(folder: Path, options: DepthOptions | None = None) -> Dept
     camera = choose_camera(folder, options.intrinsics)
     chosen = choose_trajectory(folder, options.trajectory)
     trajectory = read_trajectory(chosen.path)
-    for path in images.paths:
-        check_fits(camera, check_depth(path), path)
+    for path, size in zip(images.paths, look_through(images.paths, check_depth), strict=True):
+        check_fits(camera, size, path)
     if images.stamps_ns is None:
         placed = place_files(images.paths, trajectory)
     else:

@@ -16,8 +16,12 @@ _PLACES = (3, 6, 9)  # decimal places of milliseconds, microseconds and nanoseco
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
-    """Paths in the order of the numbers in their names: 2 before 10, however they are padded."""
-    return sorted(paths, key=lambda path: _key(path.name))
+    """Paths in the order of the numbers in their names: 2 before 10, however they are padded.
+
+    Hidden files are left out: macOS adds one to each that it copies.
+    """
+    shown = (path for path in paths if not path.name.startswith("."))
+    return sorted(shown, key=lambda path: _key(path.name))
 
 
 def _key(name: str) -> list[tuple[int, str]]:

@@ -1,14 +1,15 @@
 """Files of one scan each, and the poses that belong to them."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from triquad_format.records.arrays import Doubles
 from triquad_sensors.errors import NoTransformError
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.progress import progress
 from triquad_tools.recordings.folders.file_names import stamps_of_names
 from triquad_tools.recordings.folders.trajectory import (
     TRAJECTORY_NAMES,
@@ -16,6 +17,8 @@ from triquad_tools.recordings.folders.trajectory import (
     find_trajectories,
 )
 from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry
+
+_Found = TypeVar("_Found")
 
 _WHY = {
     "pose_early": "before the first pose",
@@ -51,6 +54,16 @@ class ChosenTrajectory(NamedTuple):
     remarks: tuple[str, ...]  # on those that are not
 
 
+def look_through(paths: Sequence[Path], check: Callable[[Path], _Found]) -> list[_Found]:
+    """What a check finds of each file, with progress: there may be many."""
+    found: list[_Found] = []
+    with progress("looking through the recording", len(paths)) as report:
+        for path in paths:
+            found.append(check(path))
+            report(len(found), f"{len(found)} of {len(paths)} files")
+    return found
+
+
 def choose_trajectory(folder: Path, given: Path | None) -> ChosenTrajectory:
     """The trajectory that was given, or that a folder holds.
 
@@ -68,7 +81,7 @@ def choose_trajectory(folder: Path, given: Path | None) -> ChosenTrajectory:
             "it with --trajectory"
         )
     others = ", ".join(path.name for path in found[1:])
-    remark = f"poses are those of {found[0].name}; --trajectory chooses another of {others}"
+    remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"
     return ChosenTrajectory(found[0], (remark,) if others else ())
 
 
