@@ -43,10 +43,10 @@ def open_recording(path: Path, options: RecordingOptions) -> Recording:
         return RosRecording(bag, options.ros)
     if is_kitti_folder(path):
         return read_folder(path)
-    if is_cloud_folder(path):
-        return read_cloud_folder(path, options.clouds)
     if is_depth_folder(path):
         return read_depth_folder(path, options.depth)
+    if is_cloud_folder(path):
+        return read_cloud_folder(path, options.clouds)
     raise ToolError(
         f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
         "docs/tools.md describes them"
