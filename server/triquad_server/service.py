@@ -42,6 +42,8 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.net.requests import Handler, RequestHandlers, answering, payload_limit
+from triquad_server.ros2.intake import Ros2Intake
+from triquad_server.ros2.node import Node
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
@@ -129,6 +131,8 @@ class Service:
         )
         self._parts.callback(self._mapper.rest)
         self._open_intake()
+        if self._settings.ros2.enabled:
+            self._open_ros2()
         self._parts.callback(Heartbeat(self._session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
@@ -148,6 +152,19 @@ class Service:
             self._scans,
             max_points=self._settings.scan.max_points,
             arrived=self._mapper.wake,
+        )
+        self._parts.callback(intake.close)
+
+    def _open_ros2(self) -> None:
+        node = Node(self._session, self._settings.ros2.domain)
+        self._parts.callback(node.close)
+        intake = Ros2Intake(
+            self._session,
+            self._settings.ros2,
+            self._scans,
+            max_points=self._settings.scan.max_points,
+            arrived=self._mapper.wake,
+            node=node,
         )
         self._parts.callback(intake.close)
 

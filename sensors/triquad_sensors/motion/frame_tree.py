@@ -71,6 +71,20 @@ class FrameTree:
             quaternion = np.asarray(transform.pose.quaternion_xyzw, np.float64)
             edge.track.add(transform.stamp_ns, pose[:3, 3], quaternion / np.linalg.norm(quaternion))
 
+    def knows(self, child: str) -> bool:
+        """Whether a transform says where a frame is."""
+        return child in self._edges
+
+    def __len__(self) -> int:
+        """How many frames there are of which a transform says where they are."""
+        return len(self._edges)
+
+    def forget_moving(self) -> None:
+        """Forget all poses of frames but of those that always hold."""
+        self._edges = {
+            child: edge for child, edge in self._edges.items() if edge.standing is not None
+        }
+
     def root(self, frame: str) -> str:
         """The frame above all others that ``frame`` hangs on; itself where it hangs on none."""
         return self._path(frame)[-1]

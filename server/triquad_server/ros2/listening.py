@@ -1,0 +1,136 @@
+"""Listening to topics: those that are known from the start, and those that are found."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from triquad_server.ros2.feeds import Choice, Feed, Role
+from triquad_server.ros2.inbox import Arrival
+from triquad_server.ros2.node import Node
+from triquad_server.ros2.topics import (
+    ANY_HASH,
+    Announcement,
+    Delivery,
+    End,
+    Topic,
+    bridge_key,
+    bridge_tokens,
+    read_token,
+    rmw_tokens,
+    rmw_topic_name,
+)
+
+_log = logging.getLogger("triquad_server.ros2")
+
+MAX_TOPICS = 64
+"""Topics that are listened to at most, of those that are found."""
+
+_RING = 256  # emptied at once by a thread that does nothing else
+_HISTORY = 100  # messages of static transforms, of each who publishes some
+_LISTENS = Delivery(reliable=False)  # which suits every publisher
+
+
+class Listening:
+    """Passes on what arrives on all wanted topics, on a thread for each feed."""
+
+    def __init__(
+        self, session: zenoh.Session, choice: Choice, node: Node, arrived: Callable[[Arrival], None]
+    ) -> None:
+        """``arrived`` is called with each message, and must not wait."""
+        self._session = session
+        self._choice = choice
+        self._node = node
+        self._arrived = arrived
+        self._lock = threading.Lock()
+        self._closed = False
+        self._feeds: dict[str, Any] = {}  # subscriber by key
+        self._announced: set[tuple[str, str]] = set()
+        self._threads: list[threading.Thread] = []
+        self.found: set[Topic] = set()  # that tokens told of
+        for feed in choice.feeds():
+            self._open(feed)
+        self._tokens = [self._watch(key) for key in self._token_keys()]
+
+    def close(self) -> None:
+        """Pass on nothing more."""
+        with self._lock:
+            self._closed = True
+        for subscriber in [*self._tokens, *self._feeds.values()]:
+            subscriber.undeclare()
+        for thread in self._threads:
+            thread.join()
+
+    def _token_keys(self) -> list[str]:
+        return [rmw_tokens(self._choice.domain, End.PUBLISHER), bridge_tokens(End.PUBLISHER)]
+
+    def _open(self, feed: Feed) -> None:
+        """Listen to a feed, unless it is listened to."""
+        with self._lock:
+            if feed.key in self._feeds or self._closed:
+                return
+            ring = zenoh.handlers.RingChannel(_RING)
+            subscriber: Any
+            if feed.role is Role.TF_STATIC:
+                # Published once: who publishes it keeps it for those that come later.
+                subscriber = zenoh.ext.declare_advanced_subscriber(
+                    self._session,
+                    feed.key,
+                    ring,
+                    history=zenoh.ext.HistoryConfig(
+                        detect_late_publishers=True, max_samples=_HISTORY
+                    ),
+                )
+            else:
+                subscriber = self._session.declare_subscriber(feed.key, ring)
+            self._feeds[feed.key] = subscriber
+            self._start(lambda: self._pass_on(feed, subscriber), f"ros2-{feed.key}")
+
+    def _pass_on(self, feed: Feed, subscriber: Any) -> None:
+        for sample in subscriber:
+            name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
+            self._arrived(Arrival(feed.role, name, sample.payload, time.time_ns()))
+
+    def _watch(self, key: str) -> Any:
+        """See who publishes."""
+        tokens = self._session.liveliness().declare_subscriber(
+            key, zenoh.handlers.FifoChannel(_RING), history=True
+        )
+        self._start(lambda: self._find_all(tokens), f"ros2-{key}")
+        return tokens
+
+    def _find_all(self, tokens: Any) -> None:
+        for sample in tokens:
+            if sample.kind == zenoh.SampleKind.PUT:
+                announcement = read_token(str(sample.key_expr))
+                if announcement is not None:
+                    self._find(announcement)
+
+    def _find(self, announcement: Announcement) -> None:
+        """Somebody publishes on a topic."""
+        topic = announcement.topic
+        role = self._choice.wants(topic)
+        if topic in self.found or len(self.found) >= 10 * MAX_TOPICS:
+            return
+        self.found.add(topic)
+        if role is None:
+            return
+        if len(self._feeds) >= MAX_TOPICS:
+            _log.warning("ros2: %s is left out: more than %d topics", topic.name, MAX_TOPICS)
+            return
+        _log.info("ros2: found %s (%s)", topic.name, topic.type_name)
+        if announcement.type_hash == ANY_HASH:
+            self._open(Feed(role, bridge_key(topic.name), topic.name))
+        else:
+            # Drivers that publish only while somebody listens see it by this.
+            what = Announcement(End.SUBSCRIPTION, topic, announcement.type_hash)
+            self._node.announce(what, _LISTENS)
+
+    def _start(self, run: Callable[[], None], name: str) -> None:
+        thread = threading.Thread(target=run, name=name)
+        self._threads.append(thread)
+        thread.start()
