@@ -39,15 +39,23 @@ class Wire(Protocol):
 class RmwZenoh:
     """As rmw_zenoh publishes: a typed key with a hash, and an attachment."""
 
-    def __init__(self, session: zenoh.Session, messages: RosMessages, domain: int = 0) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        messages: RosMessages,
+        domain: int = 0,
+        namespace: str = "",
+    ) -> None:
         self._session = session
         self._messages = messages
         self._domain = domain
+        self._namespace = namespace
         self._publishers: dict[str, Any] = {}
         self._tokens: list[Any] = []
         self._sequence = itertools.count(1)
 
     def publish(self, topic: str, type_name: str, payload: bytes, latched: bool = False) -> None:
+        topic = self._namespace + topic
         package, _, name = type_name.split("/")
         dds = f"{package}::msg::dds_::{name}_"
         hash_ = self._messages.types.hash_rihs01(type_name)

@@ -20,6 +20,7 @@ from triquad_server.ros2.node import Node
 from triquad_server.ros2.placement import Placement
 from triquad_server.ros2.reading import Reader
 from triquad_server.ros2.scans import ScanMaker
+from triquad_server.ros2.silence import Silence
 from triquad_server.ros2_settings import Ros2Settings
 
 _log = logging.getLogger("triquad_server.ros2")
@@ -61,16 +62,17 @@ class Ros2Intake:
             by_arrival=settings.clock == "arrival",
         )
         self._placement = Placement(
-            self._motion.frames,
+            self._motion,
             map_frame=settings.map_frame,
             limit=settings.waiting_clouds,
             timeout_s=settings.waiting_s,
         )
         self._inbox = Inbox(_SCANS_WAITING, _OTHERS_WAITING, self._pushed_out)
+        self._silence = Silence(choice, time.monotonic())
         self._stopping = threading.Event()
+        self._listening = Listening(session, choice, node, self._receive)
         self._thread = threading.Thread(target=self._run, name="ros2-intake")
         self._thread.start()
-        self._listening = Listening(session, choice, node, self._receive)
 
     @property
     def map_frame(self) -> str:
@@ -109,6 +111,7 @@ class Ros2Intake:
             for placed in self._placement.settle(time.monotonic()):
                 self._guard(placed.topic_name, partial(self._scans.enter, placed))
                 self._arrived()
+            self._silence.check(self._listening.found, time.monotonic())
 
     def _guard(self, topic_name: str, step: Callable[[], None]) -> None:
         """Do something with a message; whatever its bytes are must not stop the intake."""
@@ -129,6 +132,7 @@ class Ros2Intake:
             self._read_motion(arrival)
 
     def _read_sweep(self, arrival: Arrival) -> None:
+        self._silence.end(arrival.topic_name)
         sweep = self._reader.sweep(arrival)
         if self._scans.begins_anew(arrival.topic_name, sweep):
             _log.warning("ros2: %s: time went back, poses so far are forgotten", arrival.topic_name)
@@ -138,5 +142,3 @@ class Ros2Intake:
     def _read_motion(self, arrival: Arrival) -> None:
         is_body = arrival.role is Role.POSE
         self._motion.add(self._reader.transforms(arrival), is_body=is_body)
-        if is_body and not self._placement.map_frame:
-            self._placement.map_frame = self._motion.body_parent or ""

@@ -30,6 +30,7 @@ _log = logging.getLogger("triquad_server.ros2")
 MAX_TOPICS = 64
 """Topics that are listened to at most, of those that are found."""
 
+_MAX_FOUND = 1000  # that are remembered, whether they are wanted or not
 _RING = 256  # emptied at once by a thread that does nothing else
 _HISTORY = 100  # messages of static transforms, of each who publishes some
 _LISTENS = Delivery(reliable=False)  # which suits every publisher
@@ -49,12 +50,17 @@ class Listening:
         self._lock = threading.Lock()
         self._closed = False
         self._feeds: dict[str, Any] = {}  # subscriber by key
-        self._announced: set[tuple[str, str]] = set()
         self._threads: list[threading.Thread] = []
-        self.found: set[Topic] = set()  # that tokens told of
+        self._found: set[Announcement] = set()
         for feed in choice.feeds():
             self._open(feed)
         self._tokens = [self._watch(key) for key in self._token_keys()]
+
+    @property
+    def found(self) -> list[Topic]:
+        """The topics that somebody publishes, wanted or not."""
+        with self._lock:
+            return list({each.topic for each in self._found})
 
     def close(self) -> None:
         """Pass on nothing more."""
@@ -114,9 +120,10 @@ class Listening:
         """Somebody publishes on a topic."""
         topic = announcement.topic
         role = self._choice.wants(topic)
-        if topic in self.found or len(self.found) >= 10 * MAX_TOPICS:
-            return
-        self.found.add(topic)
+        with self._lock:
+            if announcement in self._found or len(self._found) >= _MAX_FOUND:
+                return
+            self._found.add(announcement)
         if role is None:
             return
         if len(self._feeds) >= MAX_TOPICS:

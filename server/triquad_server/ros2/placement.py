@@ -1,14 +1,19 @@
 """Sweeps that wait until it is known where they were taken."""
 
+import logging
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from triquad_sensors.errors import NoScanError, NoTransformError
-from triquad_sensors.motion.frame_tree import ROOT_NAMES, FrameTree
+from triquad_sensors.motion.frame_tree import ROOT_NAMES
 from triquad_sensors.motion.placing import place
 from triquad_sensors.sweep import PosedScan, Sweep
+
+from triquad_server.ros2.motion import Motion
+
+_log = logging.getLogger("triquad_server.ros2")
 
 _SETTLE_S = 1.0
 """So long after frames could first be placed, a better one to map in may still turn up."""
@@ -34,14 +39,14 @@ class _Waiting:
 class Placement:
     """Places sweeps in the map frame, those of each topic in the order in which they came."""
 
-    def __init__(self, frames: FrameTree, *, map_frame: str, limit: int, timeout_s: float) -> None:
-        """``frames`` are changed by others in the meantime, from the same thread.
+    def __init__(self, motion: Motion, *, map_frame: str, limit: int, timeout_s: float) -> None:
+        """``motion`` is added to by others in the meantime, on the same thread.
 
         Without a ``map_frame`` it is chosen, once, as the transforms come. At most ``limit``
         sweeps wait, for ``timeout_s`` each.
         """
         self.map_frame = map_frame
-        self._frames = frames
+        self._motion = motion
         self._limit = limit
         self._timeout_s = timeout_s
         self._waiting: dict[str, deque[_Waiting]] = {}
@@ -86,7 +91,7 @@ class Placement:
 
     def _scan(self, entry: _Waiting, now_s: float) -> PosedScan:
         frame = entry.sweep.frame
-        target = self.map_frame or self._choose(frame, now_s)
+        target = self.map_frame or self._best_frame(frame, now_s)
         if frame in (target, *ROOT_NAMES):
             raise NoScanError(
                 "registered",
@@ -94,14 +99,19 @@ class Placement:
                 "choose the topic of the sensor itself with ros2.clouds",
             )
         # Asked first, since it is quick, and most that wait will wait on.
-        self._frames.poses(target, frame, np.array(entry.needs_ns, np.int64))
-        return place(entry.sweep, self._frames, target)
+        frames = self._motion.frames
+        frames.poses(target, frame, np.array(entry.needs_ns, np.int64))
+        scan = place(entry.sweep, frames, target)
+        if not self.map_frame:
+            _log.info("ros2: mapping in the frame %r", target)
+            self.map_frame = target
+        return scan
 
-    def _choose(self, frame: str, now_s: float) -> str:
-        """The frame to map in, from now on."""
-        found = self._frames.fixed_frame(frame)
-        if frame in ROOT_NAMES:
-            return frame
+    def _best_frame(self, frame: str, now_s: float) -> str:
+        """The frame to map in, as far as is known by now."""
+        if self._motion.body_parent is not None:
+            return self._motion.body_parent
+        found = self._motion.frames.fixed_frame(frame)
         if found not in ROOT_NAMES:
             above = "no transform names it" if found == frame else f"it is in {found!r}"
             raise NoTransformError(
@@ -113,5 +123,4 @@ class Placement:
             self._choose_s = now_s + min(_SETTLE_S, self._timeout_s / 2)
         if found != ROOT_NAMES[0] and now_s < self._choose_s:
             raise NoTransformError("no_transform", f"no frame above {found!r} yet", late=True)
-        self.map_frame = found
         return found
