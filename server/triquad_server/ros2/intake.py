@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 import zenoh
-from triquad_format.records.arrays import Doubles
 from triquad_sensors.errors import NoScanError
 
 from triquad_server.intake.scan_queue import ScanQueue
@@ -19,7 +19,7 @@ from triquad_server.ros2.motion import Motion
 from triquad_server.ros2.node import Node
 from triquad_server.ros2.placement import Placement
 from triquad_server.ros2.reading import Reader
-from triquad_server.ros2.scans import ScanMaker
+from triquad_server.ros2.scans import Place, ScanMaker
 from triquad_server.ros2.silence import Silence
 from triquad_server.ros2_settings import Ros2Settings
 
@@ -51,6 +51,8 @@ class Ros2Intake:
         """
         choice = Choice.of_settings(settings)
         self._arrived = arrived
+        frame = settings.map_frame
+        self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self._max_bytes = max_points * _POINT_BYTES + _OTHER_BYTES
         self._losses = Losses(queue.dropped)
         self._scans = ScanMaker(queue, self._losses, max_points=max_points, max_sources=MAX_TOPICS)
@@ -75,14 +77,9 @@ class Ros2Intake:
         self._thread.start()
 
     @property
-    def map_frame(self) -> str:
-        """The frame in which the map is made, empty before that is known."""
-        return self._placement.map_frame
-
-    @property
-    def position_m(self) -> Doubles | None:
-        """Where the newest scan was taken [3], map frame."""
-        return self._scans.position_m
+    def place(self) -> Place | None:
+        """Where the newest scan was taken; None before there is one, and no map frame is set."""
+        return self._scans.place or self._start
 
     def close(self) -> None:
         """Take no more messages."""

@@ -12,6 +12,7 @@ import zenoh.ext
 from triquad_server.ros2.feeds import Choice, Feed, Role
 from triquad_server.ros2.inbox import Arrival
 from triquad_server.ros2.node import Node
+from triquad_server.ros2.token_watch import TokenWatch
 from triquad_server.ros2.topics import (
     ANY_HASH,
     Announcement,
@@ -19,9 +20,6 @@ from triquad_server.ros2.topics import (
     End,
     Topic,
     bridge_key,
-    bridge_tokens,
-    read_token,
-    rmw_tokens,
     rmw_topic_name,
 )
 
@@ -54,7 +52,7 @@ class Listening:
         self._found: set[Announcement] = set()
         for feed in choice.feeds():
             self._open(feed)
-        self._tokens = [self._watch(key) for key in self._token_keys()]
+        self._watch = TokenWatch(session, choice.domain, End.PUBLISHER, self._find)
 
     @property
     def found(self) -> list[Topic]:
@@ -66,13 +64,11 @@ class Listening:
         """Pass on nothing more."""
         with self._lock:
             self._closed = True
-        for subscriber in [*self._tokens, *self._feeds.values()]:
+        self._watch.close()
+        for subscriber in self._feeds.values():
             subscriber.undeclare()
         for thread in self._threads:
             thread.join()
-
-    def _token_keys(self) -> list[str]:
-        return [rmw_tokens(self._choice.domain, End.PUBLISHER), bridge_tokens(End.PUBLISHER)]
 
     def _open(self, feed: Feed) -> None:
         """Listen to a feed, unless it is listened to."""
@@ -94,27 +90,16 @@ class Listening:
             else:
                 subscriber = self._session.declare_subscriber(feed.key, ring)
             self._feeds[feed.key] = subscriber
-            self._start(lambda: self._pass_on(feed, subscriber), f"ros2-{feed.key}")
+            thread = threading.Thread(
+                target=self._pass_on, args=(feed, subscriber), name=f"ros2-{feed.key}"
+            )
+            self._threads.append(thread)
+            thread.start()
 
     def _pass_on(self, feed: Feed, subscriber: Any) -> None:
         for sample in subscriber:
             name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
             self._arrived(Arrival(feed.role, name, sample.payload, time.time_ns()))
-
-    def _watch(self, key: str) -> Any:
-        """See who publishes."""
-        tokens = self._session.liveliness().declare_subscriber(
-            key, zenoh.handlers.FifoChannel(_RING), history=True
-        )
-        self._start(lambda: self._find_all(tokens), f"ros2-{key}")
-        return tokens
-
-    def _find_all(self, tokens: Any) -> None:
-        for sample in tokens:
-            if sample.kind == zenoh.SampleKind.PUT:
-                announcement = read_token(str(sample.key_expr))
-                if announcement is not None:
-                    self._find(announcement)
 
     def _find(self, announcement: Announcement) -> None:
         """Somebody publishes on a topic."""
@@ -136,8 +121,3 @@ class Listening:
             # Drivers that publish only while somebody listens see it by this.
             what = Announcement(End.SUBSCRIPTION, topic, announcement.type_hash)
             self._node.announce(what, _LISTENS)
-
-    def _start(self, run: Callable[[], None], name: str) -> None:
-        thread = threading.Thread(target=run, name=name)
-        self._threads.append(thread)
-        thread.start()

@@ -26,6 +26,7 @@ class Placed:
     topic_name: str
     sweep: Sweep
     outcome: PosedScan | NoScanError
+    map_frame: str
 
 
 @dataclass
@@ -87,7 +88,7 @@ class Placement:
             outcome = error
         except Exception as error:  # whatever numbers came must not stop the others
             outcome = NoScanError("internal", repr(error))
-        return Placed(entry.topic_name, entry.sweep, outcome)
+        return Placed(entry.topic_name, entry.sweep, outcome, self.map_frame)
 
     def _scan(self, entry: _Waiting, now_s: float) -> PosedScan:
         frame = entry.sweep.frame

@@ -26,6 +26,15 @@ def _new_session() -> int:
     return secrets.randbits(48)
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where the robot is."""
+
+    map_frame: str
+    position_m: Doubles  # [3] map frame
+    stamp_ns: int
+
+
 @dataclass
 class _Source:
     """A topic of which scans are made."""
@@ -41,7 +50,7 @@ class ScanMaker:
 
     def __init__(self, queue: ScanQueue, losses: Losses, *, max_points: int, max_sources: int):
         """Scans of more than ``max_points`` points, and of further sources, are refused."""
-        self.position_m: Doubles | None = None  # [3] where the newest scan was taken, map frame
+        self.place: Place | None = None  # where the newest scan was taken
         self._queue = queue
         self._losses = losses
         self._max_points = max_points
@@ -77,7 +86,7 @@ class ScanMaker:
             self._queue.refuse(scan, error.reason, str(error))
             self._losses.say(placed.topic_name, error.reason, error)
             return
-        self.position_m = scan.world_from_sensor[:3, 3]
+        self.place = Place(placed.map_frame, scan.world_from_sensor[:3, 3], scan.stamp_ns)
         self._queue.put(scan)
 
     def _scan(self, source: _Source, placed: Placed) -> Scan:
