@@ -66,9 +66,9 @@ def finds_sphere(client: Client, centre: tuple[float, float, float]) -> bool:
     return bool(is_surface.mean() > 0.95 and np.abs(answer.sdf).mean() < 0.1)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_clouds_and_transforms_become_a_map(way: str) -> None:
-    with serving() as (endpoint, client), robot(endpoint, way) as r2:
+@pytest.mark.parametrize(("way", "mode"), [("rmw", "peer"), ("bridge", "client")])
+def test_clouds_and_transforms_become_a_map(way: str, mode: str) -> None:
+    with serving() as (endpoint, client), robot(endpoint, way, mode) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
         for number in range(4):
@@ -188,10 +188,14 @@ def test_poses_come_from_a_topic(kind: str, way: str) -> None:
         assert finds_sphere(client, (AT[0], AT[1], AT[2] + 0.5))
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_a_server_that_starts_late_learns_the_static_transforms(way: str) -> None:
+@pytest.mark.parametrize(
+    ("way", "options"), [("rmw", {}), ("bridge", {}), ("bridge", {"old": True})]
+)
+def test_a_server_that_starts_late_learns_the_static_transforms(
+    way: str, options: dict[str, bool]
+) -> None:
     router = servers.free_endpoint()
-    with servers.raw_session("router", listen=router), robot(router, way) as r2:
+    with servers.raw_session("router", listen=router), robot(router, way, **options) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         with serving(connect=(router,)) as (_, client):
             stand(r2, 0, 1)

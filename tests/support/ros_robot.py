@@ -78,28 +78,39 @@ class RmwZenoh:
 class Bridge:
     """As zenoh-bridge-ros2dds publishes: the topic alone as the key, the type in a token."""
 
-    def __init__(self, session: zenoh.Session, namespace: str = "", tokens: bool = True) -> None:
+    def __init__(self, session: zenoh.Session, namespace: str = "", old: bool = False) -> None:
+        """``old`` bridges, up to 1.5, keep latched messages in a cache of their own."""
         self._session = session
         self._namespace = namespace
-        self._with_tokens = tokens
+        self._is_old = old
+        self._caches: list[Any] = []
         self._publishers: dict[str, Any] = {}
         self._tokens: list[Any] = []
 
     def publish(self, topic: str, type_name: str, payload: bytes, latched: bool = False) -> None:
         key = f"{self._namespace}{topic}".lstrip("/")
+        if latched and self._is_old:
+            self._keep(key, payload)
         if key not in self._publishers:
-            self._publishers[key] = _publisher(self._session, key, latched)
+            self._publishers[key] = _publisher(self._session, key, latched and not self._is_old)
             qos = f":1:{int(latched)}:0,1"
             token = f"{key.replace('/', '§')}/{type_name.replace('/', '§')}/{qos}"
-            if self._with_tokens:
-                self._tokens.append(
-                    self._session.liveliness().declare_token(
-                        f"@/{self._session.zid()}/@ros2_lv/MP/{token}"
-                    )
+            self._tokens.append(
+                self._session.liveliness().declare_token(
+                    f"@/{self._session.zid()}/@ros2_lv/MP/{token}"
                 )
+            )
             if not latched:
                 _wait_until_heard(self._publishers[key])
         self._publishers[key].put(payload)
+
+    def _keep(self, key: str, payload: bytes) -> None:
+        self._caches.append(
+            self._session.declare_queryable(
+                f"@/{self._session.zid()}/@ros2_pub_cache/{key}",
+                zenoh.handlers.Callback(lambda query: query.reply(key, payload), indirect=False),
+            )
+        )
 
 
 def _wait_until_heard(publisher: Any) -> None:
@@ -165,10 +176,10 @@ def shifted(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
 
 
 @contextmanager
-def robot(endpoint: str, way: str = "rmw", **options: Any) -> Iterator[Robot]:
+def robot(endpoint: str, way: str = "rmw", mode: str = "client", **options: Any) -> Iterator[Robot]:
     """A robot on a network, that speaks as rmw_zenoh (``rmw``) or a ``bridge`` does."""
     messages = RosMessages()
-    with raw_session(connect=endpoint, timestamps=True) as session:
+    with raw_session(mode, connect=endpoint, timestamps=True) as session:
         wire: Wire = (
             RmwZenoh(session, messages, **options) if way == "rmw" else Bridge(session, **options)
         )

@@ -20,6 +20,7 @@ from triquad_server.ros2.topics import (
     End,
     Topic,
     bridge_key,
+    old_bridge_cache,
     rmw_topic_name,
 )
 
@@ -31,6 +32,7 @@ MAX_TOPICS = 64
 _MAX_FOUND = 1000  # that are remembered, whether they are wanted or not
 _RING = 256  # emptied at once by a thread that does nothing else
 _HISTORY = 100  # messages of static transforms, of each who publishes some
+_ASK_S = 2.0
 _LISTENS = Delivery(reliable=False)  # which suits every publisher
 
 
@@ -105,6 +107,8 @@ class Listening:
         """Somebody publishes on a topic."""
         topic = announcement.topic
         role = self._choice.wants(topic)
+        if role is Role.TF_STATIC and announcement.type_hash == ANY_HASH:
+            self._ask_old_bridges(topic.name)
         with self._lock:
             if announcement in self._found or len(self._found) >= _MAX_FOUND:
                 return
@@ -121,3 +125,18 @@ class Listening:
             # Drivers that publish only while somebody listens see it by this.
             what = Announcement(End.SUBSCRIPTION, topic, announcement.type_hash)
             self._node.announce(what, _LISTENS)
+
+    def _ask_old_bridges(self, topic_name: str) -> None:
+        """Take in what they published before they were listened to."""
+        replies = self._session.get(
+            old_bridge_cache(topic_name),
+            zenoh.handlers.FifoChannel(_RING),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=_ASK_S,
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                payload = reply.ok.payload
+                self._arrived(Arrival(Role.TF_STATIC, topic_name, payload, time.time_ns()))

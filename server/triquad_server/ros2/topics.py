@@ -58,6 +58,14 @@ def bridge_key(topic_name: str) -> str:
     return topic_name.lstrip("/")
 
 
+def old_bridge_cache(topic_name: str) -> str:
+    """Where bridges up to 1.5 answer with what they published last on a latched topic.
+
+    Later ones, as rmw_zenoh, do so in the way of Zenoh's advanced publishers.
+    """
+    return f"@/*/@ros2_pub_cache/{bridge_key(topic_name)}"
+
+
 def source_name(topic_name: str) -> str:
     """The source of scans as which a topic counts: ``lidar.points`` of ``/lidar/points``."""
     return topic_name.strip("/").replace("/", ".")
