@@ -40,6 +40,8 @@ def _allowed(schema: dict[str, Any]) -> str:
         return "[" + ", ".join(_allowed(item) for item in schema["prefixItems"]) + "]"
     if schema["type"] == "boolean":
         return "`true`, `false`"
+    if schema["type"] in ("array", "string"):
+        return "texts" if schema["type"] == "array" else "a text"
     return f"{schema['minimum']} to {schema['maximum']}"
 
 

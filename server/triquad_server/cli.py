@@ -74,7 +74,7 @@ def _run(options: argparse.Namespace) -> int:
     from triquad_server.stop import Stop, Stops
 
     check_name("map", options.map)
-    settings = load_settings(options.settings, options.set)
+    settings = load_settings(options.settings, [*options.set, *_implied(options)])
     if options.print_settings:
         sys.stdout.write(settings_toml(settings))
         return OK
@@ -104,6 +104,11 @@ def _run(options: argparse.Namespace) -> int:
     return OK if why is Stop.ASKED else UNEXPECTED
 
 
+def _implied(options: argparse.Namespace) -> list[str]:
+    """The settings that flags stand for."""
+    return ["ros2.enabled=true"] if options.ros2 else []
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="triquad-server",
@@ -119,6 +124,12 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="DIR",
         help="folder for checkpoints, in a folder per map; without it the map is not kept",
+    )
+    add(
+        "--ros2",
+        action="store_true",
+        help="take in clouds and poses of ROS 2 nodes (rmw_zenoh, zenoh-bridge-ros2dds), and "
+        "publish the map to them: docs/guides/ros2.md",
     )
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
     _add_settings(parser.add_argument_group("settings (docs/settings.md)"))

@@ -42,6 +42,7 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.net.requests import Handler, RequestHandlers, answering, payload_limit
+from triquad_server.ros2.connection import Ros2Connection, ServedParts
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
@@ -115,7 +116,7 @@ class Service:
         )
         self._serve_queries()
         self._serve_changes(health.server)
-        self._serve_mesh(health.server)
+        tiles = self._serve_mesh(health.server)
         self._serve_status(health)
         self._serve_downloads()
         checkpoints.start()
@@ -129,6 +130,8 @@ class Service:
         )
         self._parts.callback(self._mapper.rest)
         self._open_intake()
+        if self._settings.ros2.enabled:
+            self._open_ros2(tiles)
         self._parts.callback(Heartbeat(self._session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
@@ -150,6 +153,18 @@ class Service:
             arrived=self._mapper.wake,
         )
         self._parts.callback(intake.close)
+
+    def _open_ros2(self, tiles: TileFeed) -> None:
+        parts = ServedParts(
+            scans=self._scans,
+            scan_arrived=self._mapper.wake,
+            max_points=self._settings.scan.max_points,
+            epochs=self._mapper.epochs,
+            tiles=tiles,
+            team=self._served.teams.meshing,
+        )
+        connection = Ros2Connection(self._session, self._settings.ros2, parts)
+        self._parts.callback(connection.close)
 
     def _serve_queries(self) -> None:
         limits = self._settings.service
@@ -180,8 +195,8 @@ class Service:
         queries = ChangeQueries(self._mapper.epochs, self._mapper.surface, server)
         self._serve({keys.CHANGES: answering(ChangesRequest, queries.changes)})
 
-    def _serve_mesh(self, server: str) -> None:
-        """Queries of mesh tiles, and following them."""
+    def _serve_mesh(self, server: str) -> TileFeed:
+        """Queries of mesh tiles, and following them; the feed of what changes."""
         cache = TileCache(self._settings.mesh, self._served.teams.meshing)
         feed = TileFeed(
             cache,
@@ -200,6 +215,7 @@ class Service:
             _TILE_WORKERS,
         )
         self._serve({keys.TILE_UPDATES: feed.add})
+        return feed
 
     def _serve_status(self, health: Health) -> None:
         """How the server is doing, and whether scans are in the map."""

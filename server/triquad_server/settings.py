@@ -10,7 +10,8 @@ from triquad_format.errors import FormatError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
-from triquad_server.source_settings import SourceSettings, check_robot_box
+from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.source_settings import SourceSettings, check_range, check_robot_box
 
 _RECORD = ConfigDict(
     frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
@@ -19,14 +20,6 @@ _RECORD = ConfigDict(
 _SECTION = _RECORD | ConfigDict(strict=True)
 
 SOURCE_SECTION = "sources.NAME"
-
-
-def _check_range(section: str, scan: "ScanSettings") -> None:
-    if scan.range_max_m < scan.range_min_m:
-        raise ValueError(
-            f"{section}.range_max_m = {scan.range_max_m:g} is less than "
-            f"{section}.range_min_m = {scan.range_min_m:g}: use at least that"
-        )
 
 
 class ScanSettings(BaseModel):
@@ -64,7 +57,7 @@ class ScanSettings(BaseModel):
 
     @model_validator(mode="after")
     def _range_is_not_empty(self) -> "ScanSettings":
-        _check_range("scan", self)
+        check_range("scan", self.range_min_m, self.range_max_m)
         return self
 
 
@@ -239,6 +232,7 @@ class Settings(BaseModel):
     mesh: MeshSettings = MeshSettings()
     store: StoreSettings = StoreSettings()
     service: ServiceSettings = ServiceSettings()
+    ros2: Ros2Settings = Ros2Settings()
     sources: dict[str, SourceSettings] = {}
 
     @model_validator(mode="after")
@@ -260,7 +254,7 @@ class Settings(BaseModel):
             except FormatError as error:
                 raise ValueError(f"sources: {error}") from error
             section, scan = f"sources.{name}", self.scan_of(source)
-            _check_range(section, scan)
+            check_range(section, scan.range_min_m, scan.range_max_m)
             self._check_reach(section, scan)
             if source.robot_box_m is not None:
                 check_robot_box(f"{section}.robot_box_m", source.robot_box_m, self.field.leaf_m)

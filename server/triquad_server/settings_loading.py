@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Json, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 from pydantic_settings import (
     BaseSettings,
@@ -26,6 +26,7 @@ _READERS: dict[str, TypeAdapter[Any]] = {
     "integer": TypeAdapter(int),
     "number": TypeAdapter(float),
     "boolean": TypeAdapter(bool),
+    "array": TypeAdapter(Json[list[Any]]),
 }
 """What reads text, by the type in a setting's schema."""
 
@@ -200,6 +201,10 @@ def _problem(details: ErrorDetails, name: str) -> str:
             return f"{name} = {value}: write two corners, [[x, y, z], [x, y, z]]"
         case "greater_than_equal" | "less_than_equal" | "finite_number":
             return f"{name} = {value} is out of range: use {_allowed(location)}"
+        case "list_type":
+            return f'{name} = {value}: write a list, such as ["/points"]'
+        case "string_pattern_mismatch":
+            return f"{name} = {value} is no topic: use names of letters, digits and _ behind /"
         case "int_type" | "float_type":
             return f"{name} = {value} is of another type: use {_allowed(location)}"
         case _:

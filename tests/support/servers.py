@@ -110,8 +110,10 @@ def raw_session(
     mode: str = "client",
     connect: str | None = None,
     listen: str | None = None,
+    timestamps: bool = False,
 ) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
+    config.insert_json5("timestamping/enabled", json.dumps(timestamps))
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("transport/shared_memory/enabled", "false")

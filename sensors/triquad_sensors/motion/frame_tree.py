@@ -76,6 +76,20 @@ class FrameTree:
         tree._edges = {**self._edges, child: _Edge(parent, None, track)}
         return tree
 
+    def knows(self, child: str) -> bool:
+        """Whether a transform says where a frame is."""
+        return child in self._edges
+
+    def __len__(self) -> int:
+        """How many frames there are of which a transform says where they are."""
+        return len(self._edges)
+
+    def forget_moving(self) -> None:
+        """Forget all poses of frames but of those that always hold."""
+        self._edges = {
+            child: edge for child, edge in self._edges.items() if edge.standing is not None
+        }
+
     def root(self, frame: str) -> str:
         """The frame above all others that ``frame`` hangs on; itself where it hangs on none."""
         return self._path(frame)[-1]

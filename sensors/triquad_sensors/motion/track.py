@@ -28,7 +28,6 @@ class Track:
         self._limit = limit
         self._stamps = array("q")
         self._values = array("d")  # position and unit quaternion of each
-        self._arrays: tuple[Longs, Doubles] | None = None
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -48,7 +47,6 @@ class Track:
         self._values[_WIDTH * at : _WIDTH * end] = array("d", [*position_m, *quaternion])
         if self._limit is not None and len(self._stamps) > self._limit:
             del self._stamps[0], self._values[:_WIDTH]
-        self._arrays = None
 
     def poses(self, stamps_ns: Longs) -> Doubles:
         """Poses [M, 4, 4] at times [M].
@@ -56,8 +54,8 @@ class Track:
         Raises:
             NoTransformError: a time lies before the first pose, after the last, or in a gap.
         """
-        stamps, values = self._as_arrays()
         self._check_covered(stamps_ns)
+        stamps, values = self._around(int(stamps_ns.min()), int(stamps_ns.max()))
         after = np.clip(np.searchsorted(stamps, stamps_ns), 1, len(stamps) - 1)
         if len(stamps) == 1:
             after = np.zeros_like(after)
@@ -69,11 +67,12 @@ class Track:
         positions = first[:, :3] + share * (second[:, :3] - first[:, :3])
         return pose_matrices(positions, _slerp(first[:, 3:], second[:, 3:], share))
 
-    def _as_arrays(self) -> tuple[Longs, Doubles]:
-        if self._arrays is None:
-            stamps = np.array(self._stamps, np.int64)
-            self._arrays = stamps, np.array(self._values, np.float64).reshape(-1, _WIDTH)
-        return self._arrays
+    def _around(self, first_ns: int, last_ns: int) -> tuple[Longs, Doubles]:
+        """Stamps [K] and values [K, 7] of the poses from one time to another, and around them."""
+        low = max(0, bisect_left(self._stamps, first_ns) - 1)
+        high = bisect_left(self._stamps, last_ns) + 1
+        values = np.array(self._values[_WIDTH * low : _WIDTH * high], np.float64)
+        return np.array(self._stamps[low:high], np.int64), values.reshape(-1, _WIDTH)
 
     def _check_covered(self, stamps_ns: Longs) -> None:
         first, last = self.span_ns

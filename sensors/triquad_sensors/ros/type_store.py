@@ -16,6 +16,8 @@ TF = "tf2_msgs/msg/TFMessage"
 TF_OF_ROS_1 = "tf/msg/tfMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
+MARKER = "visualization_msgs/msg/Marker"
+OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 
 
 @cache
@@ -35,3 +37,8 @@ def decode_cdr(payload: bytes, type_name: str) -> Any:
     # Whatever the decoder raises: bytes of another type lead it anywhere.
     except (SerdeError, ValueError, IndexError, MemoryError, TypeError) as error:
         raise NoScanError("decode", f"no {type_name}: {error}") from error
+
+
+def encode_cdr(message: Any, type_name: str) -> bytes:
+    """The bytes of a message, as ROS 2 sends them."""
+    return bytes(type_store().serialize_cdr(message, type_name))

@@ -10,6 +10,7 @@ import time
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from triquad_format.errors import FormatError, RefusedError
@@ -21,7 +22,6 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.mesh.mesher import TileIndex, TileLattice, check_box, check_level
 from triquad_server.mesh.tile_cache import CachedTile
-from triquad_server.net.requests import Request
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import NICENESS
 
@@ -36,11 +36,27 @@ BURST_S = 1.0
 """A client that asked for nothing for so long may be sent as many seconds' worth at once."""
 
 
+class Asker(Protocol):
+    """Who asks for updates and gets one answer: a request of the network, or of this process."""
+
+    def read(self, kind: type[TileUpdatesRequest]) -> TileUpdatesRequest:
+        """What is asked for."""
+
+    def answer(self, message: TileUpdates) -> None:
+        """Give the answer."""
+
+    def refuse(self, code: str, text: str) -> None:
+        """Say why there is none."""
+
+    def fail(self, error: Exception) -> None:
+        """Say that an internal error, which is being handled, is why there is none."""
+
+
 @dataclass
 class Follower:
     """A pending request for what changed."""
 
-    request: Request
+    request: Asker
     asks: TileUpdatesRequest
     needs_epoch: int  # the newest epoch when it came
     deadline_s: float  # monotonic
@@ -52,7 +68,7 @@ class Follower:
 
 
 def new_follower(
-    request: Request, asks: TileUpdatesRequest, *, server: str, epoch: int, settings: MeshSettings
+    request: Asker, asks: TileUpdatesRequest, *, server: str, epoch: int, settings: MeshSettings
 ) -> Follower:
     """A request that begins to wait; it has passed its checks.
 

@@ -12,6 +12,7 @@ from triquad_map.compiled.team import lower_priority
 from triquad_server.epochs import EpochHistory
 from triquad_server.mesh.followers import (
     BURST_S,
+    Asker,
     Follower,
     TileReply,
     TileSenders,
@@ -20,7 +21,6 @@ from triquad_server.mesh.followers import (
 )
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
-from triquad_server.net.requests import Request
 from triquad_server.settings import MeshSettings
 from triquad_server.threads import NICENESS
 
@@ -74,7 +74,7 @@ class TileFeed:
         self._thread.join()
         self._senders.close()
 
-    def add(self, request: Request) -> None:
+    def add(self, request: Asker) -> None:
         """Take over a request for updates; it is answered once there are some, or in time.
 
         Raises:

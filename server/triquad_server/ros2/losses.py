@@ -1,0 +1,63 @@
+"""Messages that came to nothing: counted, and said in the log, but not each of them."""
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from triquad_server.counter import Counter
+
+_log = logging.getLogger("triquad_server.ros2")
+
+LOG_PERIOD_S = 10.0
+_MAX_REMEMBERED = 1000
+
+REMEDIES = {
+    "no_transform": "is /tf published, and in the same ros2.domain and ros2.namespace? "
+    "ros2.map_frame names the frame to map in, ros2.poses another source of poses",
+    "pose_late": "transforms come too late: raise ros2.waiting_s, or, where the clocks of sensor "
+    'and poses differ, set ros2.clock = "arrival"',
+    "pose_early": 'some at the start are usual; else the clocks differ: set ros2.clock = "arrival"',
+    "pose_gap": "poses came too seldom or not at all for a while",
+    "pushed_out": "clouds come faster than they are read: choose fewer topics with ros2.clouds",
+    "too_large": "raise scan.max_points",
+    "decode": "is it another type, or was it cut off? The topic is left out with ros2.clouds",
+}
+
+
+@dataclass
+class _Kind:
+    """One reason for which messages of one topic are lost."""
+
+    logged_s: float
+    since: int = 0  # lost since it was logged
+
+
+class Losses:
+    """Counts by reason; the log has the first of each topic and reason, then one line a while."""
+
+    def __init__(self, counter: Counter, clock: Callable[[], float] = time.monotonic) -> None:
+        """Counts go into ``counter``; ``clock`` tells seconds."""
+        self._counter = counter
+        self._clock = clock
+        self._kinds: dict[tuple[str, str], _Kind] = {}
+
+    def add(self, topic_name: str, reason: str, text: object) -> None:
+        """Count a message that is lost, and why."""
+        self._counter.add(reason)
+        self.say(topic_name, reason, text)
+
+    def say(self, topic_name: str, reason: str, text: object) -> None:
+        """As :meth:`add`, for what is counted elsewhere."""
+        now_s = self._clock()
+        kind = self._kinds.get((topic_name, reason))
+        if kind is None:
+            if len(self._kinds) >= _MAX_REMEMBERED:
+                return
+            kind = self._kinds[topic_name, reason] = _Kind(now_s - LOG_PERIOD_S)
+        kind.since += 1
+        if now_s - kind.logged_s < LOG_PERIOD_S:
+            return
+        remedy = f" ({REMEDIES[reason]})" if reason in REMEDIES else ""
+        _log.warning("ros2: %s: %d lost, %s: %s%s", topic_name, kind.since, reason, text, remedy)
+        kind.logged_s, kind.since = now_s, 0

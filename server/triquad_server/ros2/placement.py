@@ -1,0 +1,127 @@
+"""Sweeps that wait until it is known where they were taken."""
+
+import logging
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from triquad_sensors.errors import NoScanError, NoTransformError
+from triquad_sensors.motion.frame_tree import ROOT_NAMES
+from triquad_sensors.motion.placing import place
+from triquad_sensors.sweep import PosedScan, Sweep
+
+from triquad_server.ros2.motion import Motion
+
+_log = logging.getLogger("triquad_server.ros2")
+
+_SETTLE_S = 1.0
+"""So long after frames could first be placed, a better one to map in may still turn up."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A sweep with what became of it: a scan, or why there is none."""
+
+    topic_name: str
+    sweep: Sweep
+    outcome: PosedScan | NoScanError
+    map_frame: str
+
+
+@dataclass
+class _Waiting:
+    topic_name: str
+    sweep: Sweep
+    needs_ns: tuple[int, int]  # first and last time at which the sensor's pose is needed
+    give_up_s: float  # monotonic
+
+
+class Placement:
+    """Places sweeps in the map frame, those of each topic in the order in which they came."""
+
+    def __init__(self, motion: Motion, *, map_frame: str, limit: int, timeout_s: float) -> None:
+        """``motion`` is added to by others in the meantime, on the same thread.
+
+        Without a ``map_frame`` it is chosen, once, as the transforms come. At most ``limit``
+        sweeps wait, for ``timeout_s`` each.
+        """
+        self.map_frame = map_frame
+        self._motion = motion
+        self._limit = limit
+        self._timeout_s = timeout_s
+        self._waiting: dict[str, deque[_Waiting]] = {}
+        self._choose_s: float | None = None  # when the map frame is chosen at the latest
+
+    def __len__(self) -> int:
+        return sum(map(len, self._waiting.values()))
+
+    def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
+        """Have a sweep placed; where too many wait, the one that waits for longest gives up."""
+        offsets = np.zeros(1) if sweep.offsets_s is None else sweep.offsets_s
+        first, last = offsets.min(initial=0), offsets.max(initial=0)
+        needs = (sweep.stamp_ns + round(first * 1e9), sweep.stamp_ns + round(last * 1e9))
+        entry = _Waiting(topic_name, sweep, needs, now_s + self._timeout_s)
+        self._waiting.setdefault(topic_name, deque()).append(entry)
+        if len(self) > self._limit:
+            heads = [entries[0] for entries in self._waiting.values()]
+            min(heads, key=lambda head: head.give_up_s).give_up_s = now_s
+
+    def settle(self, now_s: float) -> Iterator[Placed]:
+        """Those that wait no longer, with what became of them."""
+        for topic_name, entries in list(self._waiting.items()):
+            while entries and (placed := self._try(entries[0], now_s)) is not None:
+                entries.popleft()
+                yield placed
+            if not entries:
+                del self._waiting[topic_name]
+
+    def _try(self, entry: _Waiting, now_s: float) -> Placed | None:
+        """What becomes of a sweep; None where it waits on."""
+        try:
+            outcome: PosedScan | NoScanError = self._scan(entry, now_s)
+        except NoTransformError as error:
+            if error.late and now_s < entry.give_up_s:
+                return None
+            outcome = error
+        except NoScanError as error:
+            outcome = error
+        except Exception as error:  # whatever numbers came must not stop the others
+            outcome = NoScanError("internal", repr(error))
+        return Placed(entry.topic_name, entry.sweep, outcome, self.map_frame)
+
+    def _scan(self, entry: _Waiting, now_s: float) -> PosedScan:
+        frame = entry.sweep.frame
+        target = self.map_frame or self._best_frame(frame, now_s)
+        if frame in (target, *ROOT_NAMES):
+            raise NoScanError(
+                "registered",
+                f"the cloud is in the frame {frame!r}, so where the sensor was is not known: "
+                "choose the topic of the sensor itself with ros2.clouds",
+            )
+        # Asked first, since it is quick, and most that wait will wait on.
+        frames = self._motion.frames
+        frames.poses(target, frame, np.array(entry.needs_ns, np.int64))
+        scan = place(entry.sweep, frames, target)
+        if not self.map_frame:
+            _log.info("ros2: mapping in the frame %r", target)
+            self.map_frame = target
+        return scan
+
+    def _best_frame(self, frame: str, now_s: float) -> str:
+        """The frame to map in, as far as is known by now."""
+        if self._motion.body_parent is not None:
+            return self._motion.body_parent
+        found = self._motion.frames.fixed_frame(frame)
+        if found not in ROOT_NAMES:
+            above = "no transform names it" if found == frame else f"it is in {found!r}"
+            raise NoTransformError(
+                "no_transform",
+                f"{frame!r} is in none of the frames {', '.join(ROOT_NAMES)}: {above}",
+                late=True,
+            )
+        if self._choose_s is None:
+            self._choose_s = now_s + min(_SETTLE_S, self._timeout_s / 2)
+        if found != ROOT_NAMES[0] and now_s < self._choose_s:
+            raise NoTransformError("no_transform", f"no frame above {found!r} yet", late=True)
+        return found

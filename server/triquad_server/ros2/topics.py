@@ -1,0 +1,159 @@
+"""Topics of ROS 2 in Zenoh: their keys, and the liveliness tokens of who publishes and listens.
+
+There are two ways to write them: that of rmw_zenoh (its docs/design.md), and that of
+zenoh-bridge-ros2dds (its liveliness_mgt.rs).
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+from triquad_sensors.ros.type_store import type_store
+
+ANY_HASH = "*"
+NO_HASH = "TypeHashNotSupported"
+"""What ROS 2 Humble, which knows no hashes of types, writes in their place."""
+
+
+class End(Enum):
+    """An end of a topic, as tokens call it."""
+
+    PUBLISHER = "MP"
+    SUBSCRIPTION = "MS"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic and the type of its messages."""
+
+    name: str  # with a leading slash
+    type_name: str  # such as sensor_msgs/msg/PointCloud2
+
+
+@dataclass(frozen=True)
+class Announcement:
+    """What a token says: that somebody publishes on a topic, or listens to it."""
+
+    end: End
+    topic: Topic
+    type_hash: str = ANY_HASH  # as it stands in the keys of rmw_zenoh
+
+
+def type_hash(type_name: str) -> str:
+    """The hash of a type, RIHS01 (REP 2016)."""
+    return str(type_store().hash_rihs01(type_name))
+
+
+def rmw_key(domain: int, topic: Topic, type_hash: str = ANY_HASH) -> str:
+    """The key of a topic in rmw_zenoh; the name may be ``/**``."""
+    return f"{domain}{topic.name}/{_dds_type(topic.type_name)}/{type_hash}"
+
+
+def rmw_topic_name(key: str) -> str:
+    """The name of the topic that has a key of rmw_zenoh."""
+    return "/" + "/".join(key.split("/")[1:-2])
+
+
+def bridge_key(topic_name: str) -> str:
+    """The key of a topic at a bridge, which has no type."""
+    return topic_name.lstrip("/")
+
+
+def old_bridge_cache(topic_name: str) -> str:
+    """Where bridges up to 1.5 answer with what they published last on a latched topic.
+
+    Later ones, as rmw_zenoh, do so in the way of Zenoh's advanced publishers.
+    """
+    return f"@/*/@ros2_pub_cache/{bridge_key(topic_name)}"
+
+
+def source_name(topic_name: str) -> str:
+    """The source of scans as which a topic counts: ``lidar.points`` of ``/lidar/points``."""
+    return topic_name.strip("/").replace("/", ".")
+
+
+def rmw_tokens(domain: int, end: End) -> str:
+    """Key expression of all tokens of rmw_zenoh for one end of topics."""
+    return f"@ros2_lv/{domain}/*/*/*/{end.value}/**"
+
+
+def bridge_tokens(end: End) -> str:
+    """Key expression of all tokens of bridges for one end of topics."""
+    return f"@/*/@ros2_lv/{end.value}/**"
+
+
+def read_token(key: str) -> Announcement | None:
+    """What a token of either way says; None where it says nothing about a topic."""
+    parts = key.split("/")
+    try:
+        if parts[0] == "@ros2_lv" and len(parts) == 13:
+            topic = Topic(parts[9].replace("%", "/"), _ros_type(parts[10]))
+            return Announcement(End(parts[5]), topic, parts[11])
+        if parts[0] == "@" and parts[2] == "@ros2_lv" and len(parts) == 7:
+            topic = Topic("/" + parts[4].replace("§", "/"), parts[5].replace("§", "/"))
+            return Announcement(End(parts[3]), topic)
+    except (ValueError, IndexError):  # of another kind, as a service
+        return None
+    return None
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """How messages are delivered, as tokens have it: quality of service."""
+
+    reliable: bool = True
+    latched: bool = False  # who comes late gets the last ones too: TRANSIENT_LOCAL
+    depth: int = 10
+
+    @property
+    def of_rmw(self) -> str:
+        """As rmw_zenoh writes it, which leaves out what is as usual there."""
+        return f"{'' if self.reliable else 2}:{1 if self.latched else ''}:,{self.depth}:,:,:,,"
+
+    def of_bridge(self, type_hash: str) -> str:
+        """As a bridge writes it, with the user data that DDS nodes expect since Iron."""
+        kinds = f":{int(self.reliable)}:{int(self.latched)}:0,{self.depth}"
+        return f"{kinds}:typehash={type_hash};"
+
+
+@dataclass(frozen=True)
+class Entity:
+    """Who has one end of a topic, in the graph that nodes of rmw_zenoh put together."""
+
+    session_id: str
+    node: str
+    number: int  # 0 is the node itself
+
+    def rmw_prefix(self, domain: int, kind: str) -> str:
+        """What all its tokens begin with; it has no enclave and no namespace."""
+        return f"@ros2_lv/{domain}/{self.session_id}/0/{self.number}/{kind}/%/%/{self.node}"
+
+
+def rmw_node_token(domain: int, entity: Entity) -> str:
+    """The token that says that there is a node."""
+    return entity.rmw_prefix(domain, "NN")
+
+
+def rmw_token(domain: int, entity: Entity, what: Announcement, delivery: Delivery) -> str:
+    """The token that says to nodes of rmw_zenoh what :func:`read_token` reads."""
+    name = what.topic.name.replace("/", "%")
+    type_key = f"{_dds_type(what.topic.type_name)}/{what.type_hash}"
+    prefix = entity.rmw_prefix(domain, what.end.value)
+    return f"{prefix}/{name}/{type_key}/{delivery.of_rmw}"
+
+
+def bridge_token(session_id: str, what: Announcement, delivery: Delivery) -> str:
+    """The token that says to bridges what :func:`read_token` reads."""
+    key = bridge_key(what.topic.name).replace("/", "§")
+    type_key = what.topic.type_name.replace("/", "§")
+    qos = delivery.of_bridge(what.type_hash)
+    return f"@/{session_id}/@ros2_lv/{what.end.value}/{key}/{type_key}/{qos}"
+
+
+def _dds_type(type_name: str) -> str:
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def _ros_type(dds_type: str) -> str:
+    package, kind, _, name = dds_type.split("::")
+    return f"{package}/{kind}/{name.removesuffix('_')}"

@@ -1,0 +1,279 @@
+"""Robots with ROS 2 and a server, over Zenoh: clouds and poses in, a map to ask."""
+
+import itertools
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from support.ros_messages import CLOUD
+from support.ros_robot import T0, Robot, robot, shifted
+from triquad_client import Client, ServerStatus, Status
+from triquad_server.ros2 import silence
+from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.source_settings import SourceSettings
+
+WAYS = ["rmw", "bridge"]
+AT = (20.0, -3.0, 1.0)  # of the robot in the map
+MAST = shifted(z=0.5)  # of the lidar on the robot
+
+
+@contextmanager
+def serving(
+    connect: tuple[str, ...] = (),
+    sources: dict[str, SourceSettings] | None = None,
+    **ros2: object,
+) -> Iterator[tuple[str, Client]]:
+    """A server that listens to ROS 2, and a client of it."""
+    update = {"ros2": Ros2Settings(enabled=True, **ros2), "sources": sources or {}}
+    with (
+        servers.running_service(
+            servers.SMALL.model_copy(update=update), connect=connect
+        ) as endpoint,
+        triquad_client.connect(endpoint) as client,
+    ):
+        yield endpoint, client
+
+
+def until(client: Client, holds: Callable[[ServerStatus], bool]) -> ServerStatus:
+    """The server's status, once something holds of it."""
+    deadline = time.monotonic() + servers.WAIT_S
+    while not holds(status := client.status()):
+        assert time.monotonic() < deadline, status
+        time.sleep(0.02)
+    return status
+
+
+def accounted(status: ServerStatus) -> int:
+    return status.scans_taken + sum(status.scans_dropped.values())
+
+
+def stand(robot: Robot, *seconds: float) -> None:
+    """The robot stands where it is, at several times."""
+    for second in seconds:
+        robot.tf(second, ("map", "odom", shifted()), ("odom", "base_link", shifted(*AT)))
+
+
+def finds_sphere(client: Client, centre: tuple[float, float, float]) -> bool:
+    """Whether the map has the sphere that the lidar sees around it."""
+    until(client, lambda status: status.settled)
+    answer = client.query_sdf(np.array(centre) + servers.sphere(500))
+    is_surface = answer.status == Status.SURFACE
+    return bool(is_surface.mean() > 0.95 and np.abs(answer.sdf).mean() < 0.1)
+
+
+@pytest.mark.parametrize(("way", "mode"), [("rmw", "peer"), ("bridge", "client")])
+def test_clouds_and_transforms_become_a_map(way: str, mode: str) -> None:
+    with serving() as (endpoint, client), robot(endpoint, way, mode) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 0, 1)
+        for number in range(4):
+            r2.cloud(0.2 * number + 0.1, servers.sphere())
+        status = until(client, lambda status: accounted(status) == 4)
+        assert status.scans_taken == 4, status
+        assert finds_sphere(client, (AT[0], AT[1], AT[2] + 0.5))
+
+
+def test_clouds_wait_for_their_transforms_and_stay_in_order() -> None:
+    with serving() as (endpoint, client), robot(endpoint) as r2:
+        for number in range(4):
+            r2.cloud(0.2 * number + 0.1, servers.sphere())
+        stand(r2, 1)  # the later pose before the earlier one, and both after the clouds
+        stand(r2, 0)
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        status = until(client, lambda status: accounted(status) == 4)
+        assert (status.scans_taken, status.scans_lost) == (4, {}), status
+
+
+def test_what_cannot_be_placed_is_counted_by_its_reason(caplog: pytest.LogCaptureFixture) -> None:
+    with serving(waiting_s=0.2) as (endpoint, client), robot(endpoint) as r2:
+        r2.cloud(0, servers.sphere())
+        until(client, lambda status: status.scans_dropped.get("no_transform") == 1)
+        stand(r2, 10, 10.1, 20)
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        for second in (5, 15, 25):
+            r2.cloud(second, servers.sphere())
+        status = until(client, lambda status: accounted(status) == 4)
+    assert status.scans_dropped == {
+        "no_transform": 1,
+        "pose_early": 1,
+        "pose_gap": 1,
+        "pose_late": 1,
+    }
+    assert status.scans_lost == {}
+    assert "/points: 1 lost, no_transform: " in caplog.text
+    assert "set ros2.clock" in caplog.text
+
+
+def test_clouds_that_are_no_scans_are_refused_with_the_reason(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with serving() as (endpoint, client), robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 0, 1)
+        flat = r2.messages.cloud(servers.sphere(10), T0)
+        flat.fields = flat.fields[:2]
+        r2.send("/points", CLOUD, flat)
+        r2.cloud(0.1, servers.sphere(), topic="/registered", frame="map")
+        r2.cloud(0.1, np.full((10, 3), np.nan), topic="/empty")
+        r2.cloud(0.1, servers.sphere(), topic="/" + 70 * "x")
+        r2.wire.publish("/points", CLOUD, b"\0\1\0\0 no cloud")
+        status = until(client, lambda status: accounted(status) == 5)
+        r2.cloud(0.2, servers.sphere())
+        until(client, lambda status: status.scans_taken == 1)
+    assert status.scans_dropped == {
+        "no_xyz": 1,
+        "registered": 1,
+        "empty": 1,
+        "bad_source": 1,
+        "decode": 1,
+    }
+    assert "the cloud has no field z" in caplog.text
+
+
+def test_only_chosen_topics_are_mapped_and_others_are_named(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(silence, "AFTER_S", 1.0)
+    caplog.set_level(logging.INFO)
+    with serving(clouds=["/front/points"]) as (endpoint, client), robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 0, 1)
+        r2.cloud(0.1, servers.sphere(), topic="/rear/points")
+        while "wanted are /front/points" not in caplog.text:
+            time.sleep(0.02)
+        assert "/rear/points (sensor_msgs/msg/PointCloud2)" in caplog.text
+        r2.cloud(0.2, servers.sphere(), topic="/front/points")
+        status = until(client, lambda status: accounted(status) == 1)
+        assert status.scans_taken == 1
+        assert client.flush().taken == 0  # nothing of the client's own
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_sensors_are_sources_of_their_own(way: str) -> None:
+    box = {"lidar.front": SourceSettings(range_max_m=2.0), "rear": SourceSettings()}
+    with serving(sources=box) as (endpoint, client), robot(endpoint, way) as r2:
+        r2.tf(0, ("base_link", "front", shifted(x=5)), static=True)
+        r2.tf(0, ("base_link", "rear", shifted(x=-5)), static=True)
+        stand(r2, 0, 1)
+        for number in range(3):
+            r2.cloud(0.1 * number, servers.sphere(), topic="/lidar/front", frame="front")
+            r2.cloud(0.1 * number, servers.sphere(), topic="/rear", frame="rear")
+        status = until(client, lambda status: accounted(status) == 6)
+        assert status.scans_taken == 6, status
+        assert finds_sphere(client, (AT[0] - 5, AT[1], AT[2]))
+        # Of the front one, all lies beyond the range that its own section sets.
+        assert not finds_sphere(client, (AT[0] + 5, AT[1], AT[2]))
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("kind", ["odometry", "pose"])
+def test_poses_come_from_a_topic(kind: str, way: str) -> None:
+    topic = {"odometry": "/odom", "pose": "/pose"}[kind]
+    with serving(poses=topic, body_frame="body") as (endpoint, client), robot(endpoint, way) as r2:
+        r2.tf(0, ("body", "lidar", MAST), static=True)
+        for second in (0, 1):
+            # What transforms say of the body does not count then.
+            r2.tf(second, ("map", "body", shifted(x=99)))
+            if kind == "odometry":
+                r2.odometry(second, shifted(*AT), "body")
+            else:
+                r2.pose(second, shifted(*AT))
+        r2.cloud(0.5, servers.sphere())
+        until(client, lambda status: status.scans_taken == 1)
+        assert finds_sphere(client, (AT[0], AT[1], AT[2] + 0.5))
+
+
+@pytest.mark.parametrize(
+    ("way", "options"), [("rmw", {}), ("bridge", {}), ("bridge", {"old": True})]
+)
+def test_a_server_that_starts_late_learns_the_static_transforms(
+    way: str, options: dict[str, bool]
+) -> None:
+    router = servers.free_endpoint()
+    with servers.raw_session("router", listen=router), robot(router, way, **options) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        with serving(connect=(router,)) as (_, client):
+            stand(r2, 0, 1)
+            r2.cloud(0.5, servers.sphere())
+            status = until(client, lambda status: accounted(status) == 1)
+            assert status.scans_taken == 1, status
+
+
+def test_depth_images_are_mapped_with_the_camera_beside_them() -> None:
+    matrix = np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
+    forward = shifted(*AT)
+    forward[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # the optical axis is the map's x
+    wall = np.full((120, 160), 3000, np.uint16)
+    with serving(depth=["/camera/depth"]) as (endpoint, client), robot(endpoint) as r2:
+        for second in (0, 1):
+            r2.tf(second, ("map", "optical", forward))
+        r2.depth(0.1, wall)
+        until(client, lambda status: status.scans_dropped == {"no_camera_info": 1})
+        r2.camera(0.2, wall.shape, matrix)
+        r2.depth(0.2, wall)
+        until(client, lambda status: status.scans_taken == 1 and status.settled)
+        at_wall = np.array([[AT[0] + 3, AT[1] + y, AT[2] + z] for y in (-1, 0, 1) for z in (-1, 1)])
+        assert (client.query_sdf(at_wall).status == Status.SURFACE).all()
+
+
+def test_a_simulation_may_begin_anew(caplog: pytest.LogCaptureFixture) -> None:
+    with serving() as (endpoint, client), robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 100, 101)
+        r2.cloud(100.5, servers.sphere())
+        until(client, lambda status: status.scans_taken == 1)
+        r2.cloud(0.5, servers.sphere())
+        stand(r2, 0, 1)
+        status = until(client, lambda status: accounted(status) == 2)
+        assert status.scans_taken == 2, status
+    assert "time went back" in caplog.text
+
+
+def test_clocks_that_differ_do_not_matter_by_arrival() -> None:
+    with serving(clock="arrival") as (endpoint, client), robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 5)
+        r2.cloud(-1e9, servers.sphere())
+        later = itertools.count(6)
+
+        def is_taken(status: ServerStatus) -> bool:
+            stand(r2, next(later))
+            return status.scans_taken == 1
+
+        until(client, is_taken)
+
+
+def test_other_domains_and_namespaces_are_not_heard() -> None:
+    ours: list[tuple[str, dict[str, object]]] = [
+        ("rmw", {"domain": 7, "namespace": "/robot1"}),
+        ("bridge", {"namespace": "robot1"}),
+    ]
+    others: list[tuple[str, dict[str, object]]] = [
+        ("rmw", {"domain": 0, "namespace": "/robot1"}),
+        ("rmw", {"domain": 7}),
+        ("bridge", {}),
+    ]
+    with serving(domain=7, namespace="/robot1") as (endpoint, client):
+        for way, options in [*others, *ours]:
+            with robot(endpoint, way, **options) as r2:
+                r2.tf(0, ("base_link", "lidar", MAST), static=True)
+                stand(r2, 0, 1)
+                r2.cloud(0.5, servers.sphere())
+        status = until(client, lambda status: accounted(status) == 2)
+        assert (status.scans_taken, status.scans_dropped) == (2, {}), status
+
+
+def test_clouds_that_wait_are_bounded_and_all_accounted_for() -> None:
+    with serving(waiting_clouds=3, waiting_s=60.0) as (endpoint, client), robot(endpoint) as r2:
+        for number in range(10):
+            r2.cloud(0.1 * number, servers.sphere(), topic=f"/lidar{number % 2}")
+        until(client, lambda status: status.scans_dropped == {"no_transform": 7})
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 0, 1)
+        status = until(client, lambda status: accounted(status) == 10)
+        assert (status.scans_taken, status.scans_lost) == (3, {}), status
