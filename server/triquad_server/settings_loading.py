@@ -18,7 +18,9 @@ from pydantic_settings import (
 )
 from triquad_format.errors import SettingsError
 
-from triquad_server.settings import SOURCE_SECTION, Settings, setting_schemas
+from triquad_server.leaf_lengths import follows_leaf
+from triquad_server.setting_schemas import SOURCE_SECTION, setting_schemas
+from triquad_server.settings import Settings, UnfitSettingsError
 
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
 
@@ -87,9 +89,19 @@ def settings_toml(settings: Settings) -> str:
     tables = settings.model_dump(exclude_none=True)
     # A name in quotes may hold points.
     tables |= {f'sources."{name}"': table for name, table in tables.pop("sources").items()}
+    followers = {
+        (section, key)
+        for section in ("scan", "mesh")
+        for key in tables[section]
+        if follows_leaf(getattr(settings, section), key)
+    }
     lines: list[str] = []
     for section, table in tables.items():
-        lines += [f"[{section}]", *(f"{key} = {json.dumps(table[key])}" for key in table), ""]
+        lines.append(f"[{section}]")
+        for key, value in table.items():
+            follows = "  # follows field.leaf_m" if (section, key) in followers else ""
+            lines.append(f"{key} = {json.dumps(value)}{follows}")
+        lines.append("")
     return "\n".join(lines)
 
 
@@ -171,7 +183,9 @@ def _with_values(table: Any) -> Any:
 def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:
     """What is wrong with a setting, and what is right."""
     location = details["loc"]
-    givers = [origin for origin in origins if origin.gives(location)]
+    cause = details.get("ctx", {}).get("error")
+    keys = cause.keys if isinstance(cause, UnfitSettingsError) else [location]
+    givers = [origin for origin in origins if any(map(origin.gives, keys))]
     problem = _problem(details, ".".join(map(str, location)))
     if not givers:
         return problem

@@ -55,7 +55,7 @@ class Mapper:
         if self._device.type == "cpu":
             # Its threads spin between operations, and would take the cores from the kernels.
             torch.set_num_threads(1)
-        self._normals = SurfaceNormals(self._teams.mapping)
+        self._normals = SurfaceNormals(self._field_settings.leaf_m, self._teams.mapping)
         self._setup = RegionSetup(
             field=self._field_settings,
             scan=settings.scan,
