@@ -1,4 +1,4 @@
-"""Where settings come from: a TOML file, over it the environment, over that the command line."""
+"""Where settings come from: a preset, over it a TOML file, the environment, the command line."""
 
 import difflib
 import json
@@ -23,6 +23,13 @@ from triquad_server.setting_schemas import SOURCE_SECTION, setting_schemas
 from triquad_server.settings import Settings, UnfitSettingsError
 
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
+
+_PRESET_FOLDER = Path(__file__).with_name("presets")
+
+PRESETS = ("street", "indoor", "tabletop", "long-range")
+"""Settings that fit a kind of place and sensor; each is a file in the folder ``presets``."""
+
+_FILE = 1  # its place among the origins
 
 _READERS: dict[str, TypeAdapter[Any]] = {
     "integer": TypeAdapter(int),
@@ -58,18 +65,23 @@ class _Origin(NamedTuple):
         return bool(location)
 
 
-def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> Settings:
+def load_settings(
+    file: Path | None = None, assignments: Iterable[str] = (), *, preset: str | None = None
+) -> Settings:
     """The effective settings.
 
     Args:
-        file: a TOML file; what it leaves out keeps its default.
+        file: a TOML file; what it leaves out is as in the preset, or keeps its default.
         assignments: of the command line, such as ``training.batch=4096``.
+        preset: one of :data:`PRESETS`, below all else.
 
     Raises:
-        SettingsError: the file cannot be read, or a setting is unknown, of the wrong type or out
-            of range. The text names the setting, where it comes from and what is allowed.
+        SettingsError: the file cannot be read, there is no such preset, or a setting is unknown,
+            of the wrong type or out of range. The text names the setting, where it comes from
+            and what is allowed.
     """
     origins = [
+        _Origin(f"preset {preset}", {} if preset is None else _read_preset(preset)),
         _Origin(f"settings file {file}", {} if file is None else _read_file(file)),
         _Origin("environment", _as_in_a_file(_read_environment())),
         _Origin("--set", _as_in_a_file(_parse_assignments(assignments))),
@@ -112,6 +124,12 @@ def _merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
         if isinstance(tables[key], dict) and isinstance(over[key], dict):
             both[key] = _merged(tables[key], over[key])
     return both
+
+
+def _read_preset(name: str) -> dict[str, Any]:
+    if name not in PRESETS:
+        raise SettingsError(f"there is no preset {name!r}: use {', '.join(PRESETS)}")
+    return _read_file(_PRESET_FOLDER / f"{name}.toml")
 
 
 def _read_file(file: Path) -> dict[str, Any]:
@@ -191,7 +209,7 @@ def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:
         return problem
     # The last has the last word, and only a file has numbers beside text.
     is_number = details["type"] in ("int_type", "float_type")
-    quoted = is_number and isinstance(details["input"], str) and givers == origins[:1]
+    quoted = is_number and isinstance(details["input"], str) and givers[-1] == origins[_FILE]
     return f"{givers[-1].name}: {problem}" + (", without quotes" if quoted else "")
 
 

@@ -10,7 +10,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_server import cli
 from triquad_server.setting_schemas import setting_schemas
 from triquad_server.settings import MeshSettings, Settings
-from triquad_server.settings_loading import load_settings, settings_toml
+from triquad_server.settings_loading import PRESETS, load_settings, settings_toml
 from triquad_server.source_settings import SourceSettings
 
 ROOT = Path(__file__).parents[2]
@@ -57,6 +57,41 @@ def test_a_file_has_numbers_and_text_stands_for_them(
     assert settings.training.learning_rate == 1.0
     assert settings.field.leaf_m == 1.0
     assert (settings.scan.max_points, settings.scan.spread_m) == (4096, 0.1)
+
+
+def test_a_preset_lies_below_all_else(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[training]\nbatch = 1\n[scan]\nthin_m = 0.03\n")
+    settings = load_settings(path, ["training.seed=3"], preset="indoor")
+    indoor = load_settings(preset="indoor")
+    assert indoor.field.leaf_m < Settings().field.leaf_m
+    assert settings.field == indoor.field
+    assert (settings.training.batch, settings.training.seed) == (1, 3)
+    assert (settings.scan.thin_m, settings.scan.spread_m) == (0.03, indoor.scan.spread_m)
+
+
+def test_the_street_is_what_there_is_without_a_preset() -> None:
+    assert load_settings(preset="street") == Settings()
+
+
+def test_presets_are_all_that_lie_in_their_folder_and_each_is_valid() -> None:
+    folder = ROOT / "server" / "triquad_server" / "presets"
+    assert {path.stem for path in folder.iterdir()} == set(PRESETS)
+    leaves = {name: load_settings(preset=name).field.leaf_m for name in PRESETS}
+    assert leaves["tabletop"] < leaves["indoor"] < leaves["street"] < leaves["long-range"]
+
+
+def test_an_unknown_preset_is_named_with_those_there_are(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    assert cli.main(["--preset", "../indoor", "--print-settings"]) == cli.USAGE
+    assert "there is no preset '../indoor': use street, indoor, tabletop, long-range" in caplog.text
+
+
+def test_errors_tell_what_a_preset_gave(tmp_path: Path) -> None:
+    leaf_m = load_settings(preset="indoor").field.leaf_m
+    with pytest.raises(SettingsError, match=f"--set: mesh.cell_m = 2 .*leaf_m = {leaf_m:g}"):
+        load_settings(assignments=["mesh.cell_m=2"], preset="indoor")
 
 
 def test_lengths_follow_the_leaf_from_wherever_it_is_set(
