@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
@@ -57,15 +57,17 @@ class FlushHandler:
         publish_soon: Callable[[], None],
         timeout_max_s: float,
         limit: int,
+        warnings: Callable[[str], str | None] = lambda _: None,
     ) -> None:
         """Begin to answer; ``publish_soon`` asks the mapper for an epoch.
 
-        At most ``limit`` requests are pending.
+        At most ``limit`` requests are pending. ``warnings`` are those about a source.
         """
         self._ledger = ledger
         self._publish_soon = publish_soon
         self._timeout_max_s = timeout_max_s
         self._limit = limit
+        self._warnings = warnings
         self._pending: list[_Pending] = []
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="flush")
@@ -123,6 +125,8 @@ class FlushHandler:
                     why = RefusedError("timeout", "the server is stopping")
                     decided = [(entry, why) for entry in self._pending]
             for entry, outcome in decided:
+                if isinstance(outcome, FlushReply):
+                    outcome = replace(outcome, warnings=self._warnings(entry.asks.source))
                 entry.send(outcome)
 
     def _decided(self) -> list[tuple[_Pending, Outcome]]:
