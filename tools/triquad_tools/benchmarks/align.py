@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from triquad_format.records.arrays import Doubles
 from triquad_map.questions.align import Alignment, AlignOptions, align
 from triquad_map.view import MapView
+from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
-from triquad_tools.recordings.cloud import PosedScan, is_withheld, points_in_range
+from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.kitti import read_folder
 
 _SKIP_EVERY = 7

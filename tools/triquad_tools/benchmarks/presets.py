@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from triquad_client import Client, Mesh
 from triquad_format.records.arrays import Doubles
+from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.served import served, stream
@@ -18,7 +19,7 @@ from triquad_tools.evaluation.metrics import (
     ScoreSettings,
     score_against_scene,
 )
-from triquad_tools.recordings.cloud import PosedScan, merged
+from triquad_tools.recordings.cloud import merged
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.room import room_by_camera, room_by_lidar

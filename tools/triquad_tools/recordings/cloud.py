@@ -1,23 +1,13 @@
 """Clouds of points: those of recorded scans in the world frame, and thinner ones."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_tools.recordings.kitti import KittiFolder
 
 _MERGED_POINTS = 2_000_000  # fewer are not worth a merge
-
-
-@dataclass(frozen=True)
-class PosedScan:
-    """A scan, and where it was taken."""
-
-    points: NDArray[np.floating]  # [N, 3] metres, sensor frame
-    world_from_sensor: Doubles  # [4, 4]
 
 
 def is_withheld(index: int, every: int) -> bool:
