@@ -34,13 +34,13 @@ class _Pending:
         """Source, session and sequence of the scan."""
         return self.asks.source, self.asks.session, self.asks.sequence
 
-    def send(self, outcome: Outcome) -> None:
+    def send(self, outcome: Outcome, warnings: Callable[[str], str | None]) -> None:
         """Answer the request; an internal error ends this one only, not the thread of all."""
         try:
             if isinstance(outcome, RefusedError):
                 self.request.refuse(outcome.code, str(outcome))
             else:
-                self.request.answer(outcome)
+                self.request.answer(replace(outcome, warnings=warnings(self.asks.source)))
         except Exception as error:
             self.request.fail(error)
 
@@ -125,9 +125,7 @@ class FlushHandler:
                     why = RefusedError("timeout", "the server is stopping")
                     decided = [(entry, why) for entry in self._pending]
             for entry, outcome in decided:
-                if isinstance(outcome, FlushReply):
-                    outcome = replace(outcome, warnings=self._warnings(entry.asks.source))
-                entry.send(outcome)
+                entry.send(outcome, self._warnings)
 
     def _decided(self) -> list[tuple[_Pending, Outcome]]:
         """The requests that can be answered now, and how; they are no longer pending."""

@@ -21,14 +21,16 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 30.0, 3600.0
 
 _STANDS_S = 60.0  # for so long after its cause was last met, clients are told a warning
 _SCANS = 10  # of a source that are judged together
-_NOTICEABLE = 0.1  # share of the points
+_TOO_NEAR_SHARE, _TOO_FAR_SHARE = 0.1, 0.5
+"""Of the points, above which their loss is told. What is too far still shows free space."""
 _MAX_SOURCES = 256  # that are remembered; the one heard of longest ago goes
 _MAX_WARNINGS = 1024  # that are remembered, the same way
 _MAX_TOLD = 50  # warnings for a client at once
 _RANGES = 1000  # of a scan, at most, of which the median is taken
 
-_NEAR_LEAVES, _GOOD_LEAVES = 12.0, 40.0
-"""Median ranges that are too near for the leaf, and that suit it."""
+_NEAR_LEAVES, _GOOD_LEAVES = 18.0, 40.0
+"""Median ranges that are too near for the leaf, and that suit it: lidars in streets have 28 to 55
+leaves with the presets for them, sensors in rooms 15 with the leaf of streets."""
 
 _TABLETOP_LEAF_M = 0.035  # finer leaves than this are those of the preset tabletop
 
@@ -139,12 +141,16 @@ class ScanWarnings:
     def _check_ranges(self, source: str, points: _Points) -> None:
         own = self._settings.sources.get(source, ANY_SOURCE)
         scan = self._settings.scan_of(own)
-        for reason, key, less in (
-            ("too_near", "range_min_m", "less"),
-            ("too_far", "range_max_m", "more"),
+        for reason, key, less, most in (
+            ("too_near", "range_min_m", "less", _TOO_NEAR_SHARE),
+            ("too_far", "range_max_m", "more", _TOO_FAR_SHARE),
         ):
             share = points.dropped[reason] / max(1, points.sent)
-            if share <= _NOTICEABLE or getattr(own, key) is not None:  # then it is meant
+            # What is given for the source is meant, and so is a background that is cut off.
+            meant = getattr(own, key) is not None or (
+                reason == "too_far" and key in self._settings.scan.model_fields_set
+            )
+            if share <= most or meant:
                 continue
             limit_m = getattr(scan, key)
             self._warn(

@@ -8,6 +8,7 @@ from triquad_server.intake.rays import usable_rays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.settings import Settings
+from triquad_server.settings_loading import load_settings
 from triquad_server.source_settings import SourceSettings
 
 SETTINGS = Settings()
@@ -53,9 +54,9 @@ def test_points_that_range_min_m_takes_are_told_with_the_setting_to_change() -> 
     )
 
 
-def test_a_few_near_points_are_no_reason_to_warn() -> None:
+def test_a_few_near_points_and_a_background_are_no_reason_to_warn() -> None:
     warnings = watch()
-    take_in(warnings, cloud((920, 8.0), (80, 1.0)))
+    take_in(warnings, cloud((500, 8.0), (80, 1.0), (420, 90.0)))
     assert warnings.of("cam") is None
 
 
@@ -68,11 +69,26 @@ def test_most_points_beyond_the_range_are_told() -> None:
     assert "sources.cam.range_max_m to more" in text
 
 
-def test_a_range_of_the_source_itself_is_meant() -> None:
-    settings = Settings(sources={"cam": SourceSettings(range_max_m=50.0)})
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Settings(sources={"cam": SourceSettings(range_min_m=1.5, range_max_m=50.0)}),
+        load_settings(assignments=["scan.range_max_m=50", "sources.cam.range_min_m=1.5"]),
+    ],
+)
+def test_what_is_given_for_the_source_and_a_background_that_is_cut_off_are_meant(
+    settings: Settings,
+) -> None:
     warnings = watch(settings)
-    take_in(warnings, cloud((400, 20.0), (600, 80.0)), settings)
+    take_in(warnings, cloud((200, 1.0), (200, 20.0), (600, 80.0)), settings)
     assert warnings.of("cam") is None
+
+
+def test_a_near_range_that_is_given_for_all_sources_may_not_suit_each() -> None:
+    settings = load_settings(assignments=["scan.range_min_m=2"])
+    warnings = watch(settings)
+    take_in(warnings, cloud((800, 8.0), (200, 1.0)), settings)
+    assert "range_min_m = 2 drops 20 % of its points" in (warnings.of("cam") or "")
 
 
 def test_pixels_without_depth_are_not_near_points() -> None:

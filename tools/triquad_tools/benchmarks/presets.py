@@ -1,12 +1,12 @@
 """``triquad-bench`` of the presets: places and sensors that each is for, streamed at 10 Hz."""
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from triquad_client import Client, Mesh
+from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 from triquad_sensors.sweep import PosedScan
 
@@ -66,15 +66,15 @@ PLACES = (
     Place(
         "street, 64 beams", "street", partial(_street_by, Lidar(columns=1024)), {0.1: 98.0}, 0.05
     ),
-    Place("street, 16 beams", "street", partial(_street_by, _SIXTEEN), {0.1: None}, 0.05),
+    Place("street, 16 beams", "street", partial(_street_by, _SIXTEEN), {0.1: 98.0}, 0.05),
     Place(
         "tabletop, depth camera",
         "tabletop",
         partial(tabletop_by_camera, scans=_SCANS),
-        {0.005: None, 0.01: None, 0.02: None},
+        {0.005: None, 0.01: 98.0, 0.02: None},
         0.0025,
     ),
-    Place("long street, 128 beams", "long-range", _long_street, {0.1: None, 0.2: None}, 0.05),
+    Place("long street, 128 beams", "long-range", _long_street, {0.1: None, 0.2: 99.0}, 0.05),
 )
 
 
@@ -96,58 +96,51 @@ def _driven(place: Place, seed: int) -> _Driven:
     made = place.make(seed)
     low, high = made.scene.bounds
     scans: list[PosedScan] = []
-    hits = [np.empty((0, 3))]
-    with progress(f"{place.name}: simulating", len(made)) as report:
-        for scan in made:
-            scans.append(PosedScan(scan.points, scan.world_from_sensor))
-            inside = ((scan.true_hits >= low) & (scan.true_hits <= high)).all(axis=1)
-            hits.append(scan.true_hits[inside])
-            if len(hits) > 16:  # a camera's are too many to keep
-                hits = [merged(hits, place.voxel_m)]
-            report(len(scans), f"{len(scans)} of {len(made)} scans")
-    return _Driven(made, scans, merged(hits, place.voxel_m))
+
+    def hits() -> Iterator[Doubles]:
+        with progress(f"{place.name}: simulating", len(made)) as report:
+            for scan in made:
+                scans.append(PosedScan(scan.points, scan.world_from_sensor))
+                report(len(scans), f"{len(scans)} of {len(made)} scans")
+                yield scan.true_hits[((scan.true_hits >= low) & (scan.true_hits <= high)).all(1)]
+
+    visible = merged(hits(), place.voxel_m)
+    return _Driven(made, scans, visible)
 
 
-def _place_figures(place: Place, seed: int, arguments: tuple[str, ...] = ()) -> list[Figure]:
+def _place_figures(place: Place, seed: int) -> list[Figure]:
     driven = _driven(place, seed)
-    with served(arguments=("--preset", place.preset, *arguments)) as server:
+    with served(arguments=("--preset", place.preset)) as server:
         client = server.client
         stream(client, driven.scans, f"{place.name}: streaming at 10 Hz")
         report = client.flush(FLUSH_TIMEOUT_S)
         started = time.monotonic()
-        wait_until_settled(client, _SETTLE_LIMIT_S)
+        status = wait_until_settled(client, _SETTLE_LIMIT_S)
         settled_s = time.monotonic() - started
         mesh = client.mesh(driven.drive.scene.box)
-        figures = _figures_of(client)
     points = float(np.mean([len(scan.points) for scan in driven.scans]))
     lost = report.lost + report.refused
-    return [
-        Figure(f"{place.name}: points of a scan", points, ""),
-        Figure(f"{place.name}: scans lost of {len(driven.scans)}", lost, "", at_most=0),
+    figures = [
+        Figure("points of a scan", points, ""),
+        Figure(f"scans lost of {len(driven.scans)}", lost, "", at_most=0),
         *_f_figures(place, driven, mesh),
-        Figure(f"{place.name}: from the last scan until settled", settled_s, "s"),
-        *(Figure(f"{place.name}: {f.name}", f.value, f.unit) for f in figures),
-    ]
-
-
-def _figures_of(client: Client) -> list[Figure]:
-    status = client.status()
-    return [
+        Figure("from the last scan until settled", settled_s, "s"),
         Figure("parameters", status.parameters / 1e6, "M"),
         Figure("resident memory of the server", status.memory_bytes / 1e6, "MB"),
     ]
+    return [replace(figure, name=f"{place.name}: {figure.name}") for figure in figures]
 
 
 def _f_figures(place: Place, driven: _Driven, mesh: Mesh) -> list[Figure]:
     figures = []
     for within_m, wanted in place.f_scores.items():
         scores = _scores(place, driven, mesh, within_m)
-        name = f"{place.name}: F-score at {100 * within_m:g} cm"
+        name = f"F-score at {100 * within_m:g} cm"
         figures.append(Figure(name, 100 * scores.f_score, "%", at_least=wanted))
     return [
         *figures,
-        Figure(f"{place.name}: accuracy, mean", 100 * scores.accuracy_m, "cm"),
-        Figure(f"{place.name}: samples beyond 20 cm", 100 * scores.outlier_ratio, "%"),
+        Figure("accuracy, mean", 100 * scores.accuracy_m, "cm"),
+        Figure("samples beyond 20 cm", 100 * scores.outlier_ratio, "%"),
     ]
 
 
