@@ -5,7 +5,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from triquad_server.settings import setting_schemas
+from triquad_server.leaf_lengths import IN_LEAVES
+from triquad_server.setting_schemas import setting_schemas
 
 PAGE = Path(__file__).with_name("settings.md")
 
@@ -28,6 +29,8 @@ def with_tables(page: str) -> str:
 def _row(key: str, schema: dict[str, Any]) -> str:
     default, meaning = json.dumps(schema["default"]), " ".join(schema["description"].split())
     shown = "none" if schema["default"] is None else f"`{default}`"
+    if IN_LEAVES in schema:
+        shown += f", {schema[IN_LEAVES]:g} leaves"
     return f"| `{key}` | {shown} | {_allowed(schema)} | {meaning} |\n"
 
 

@@ -74,7 +74,8 @@ def _run(options: argparse.Namespace) -> int:
     from triquad_server.stop import Stop, Stops
 
     check_name("map", options.map)
-    settings = load_settings(options.settings, [*options.set, *_implied(options)])
+    assignments = [*options.set, *_implied(options)]
+    settings = load_settings(options.settings, assignments, preset=options.preset)
     if options.print_settings:
         sys.stdout.write(settings_toml(settings))
         return OK
@@ -146,6 +147,12 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_settings(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
+    add(
+        "--preset",
+        metavar="NAME",
+        help="settings that fit a kind of place and sensor, below all others: street (as without "
+        "any), indoor, tabletop or long-range",
+    )
     add("--settings", type=Path, metavar="FILE", help="settings of the server, TOML")
     add(
         "--set",

@@ -12,6 +12,7 @@ from triquad_format.wire.messages import ServerStatus
 
 from triquad_server.counter import Counter
 from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.memory import resident_bytes
 from triquad_server.store.checkpoint_thread import CheckpointThread
@@ -31,6 +32,7 @@ class Health:
     device: str
     requests_refused: Counter
     scans: ScanQueue
+    warnings: ScanWarnings
     mapper: MapperThread
     checkpoints: CheckpointThread
     started_s: float = field(default_factory=time.monotonic)  # monotonic
@@ -62,6 +64,7 @@ class Health:
             uptime_s=time.monotonic() - self.started_s,
             last_checkpoint=self.checkpoints.last,
             store_error=self.checkpoints.error,
+            warnings=self.warnings.all(),
         )
 
 
@@ -94,6 +97,7 @@ class Heartbeat:
         while not self._stopping.wait(STATUS_PERIOD_S):
             beat += 1
             try:
+                self._health.warnings.check()
                 status = self._health.status()
                 self._publisher.put(codec.encode(status))
             except Exception:

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from triquad_format.errors import SettingsError
+from triquad_format.records.region import MapRecord
 from triquad_map.questions.distance import DistanceOptions, distances
 
 from triquad_server.errors import ServerError
@@ -61,17 +63,20 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     give_back_early()
     with ExitStack() as stack:
+        settings = options.settings
         store = None
         restored = None
         if options.store is not None:
-            store = Store(options.store, options.map_name, options.settings.store)
+            store = Store(options.store, options.map_name, settings.store)
             stack.enter_context(closing(store))
             restored = _restored(store, options)
+        if restored is not None:
+            settings = _settings_of(restored.record, settings)
         teams = Teams()
-        _prepare(options.settings, device, teams)
+        _prepare(settings, device, teams)
         mapper = Mapper(
             options.map_name,
-            options.settings,
+            settings,
             device,
             record=restored.record if restored else None,
             teams=teams,
@@ -86,7 +91,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
             teams=teams,
         )
         failed = functools.partial(stops.put, Stop.INTERNAL_ERROR)
-        service = Service(session, served, options.settings, failed=failed)
+        service = Service(session, served, settings, failed=failed)
         stack.enter_context(closing(service))
         spare_from_collection()
         _log_ready(options, service.epoch, device)
@@ -105,9 +110,29 @@ def _restored(store: Store, options: LaunchOptions) -> ValidCheckpoint | None:
     _log.info("restoring epoch %d from %s", record.epoch, restored.path)
     if record.name != options.map_name:
         _log.warning("the checkpoint is of a map named '%s'", record.name)
-    if record.settings != options.settings.field:
-        _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
     return restored
+
+
+def _settings_of(record: MapRecord, settings: Settings) -> Settings:
+    """The settings for a restored map, which keeps its own field.
+
+    Raises:
+        SettingsError: lengths that are given do not go with it.
+    """
+    if record.settings == settings.field:
+        return settings
+    _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
+    try:
+        kept = settings.with_field(record.settings)
+    except SettingsError as error:
+        raise SettingsError(f"for the restored map: {error}") from error
+    if record.settings.leaf_m != settings.field.leaf_m:
+        _log.warning(
+            "lengths that are not set follow its leaf_m = %g, not the %g that is set",
+            record.settings.leaf_m,
+            settings.field.leaf_m,
+        )
+    return kept
 
 
 def choose_device(wanted: str) -> str:

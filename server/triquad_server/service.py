@@ -36,6 +36,7 @@ from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan import ScanIntake
 from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
@@ -80,6 +81,7 @@ class Service:
         self._settings = settings
         self._requests_refused = Counter()
         self._scans = ScanQueue(settings.service.scan_queue)
+        self._warnings = ScanWarnings(self._scans, settings)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
             self._open(failed)
@@ -111,6 +113,7 @@ class Service:
             device=self._served.device,
             requests_refused=self._requests_refused,
             scans=self._scans,
+            warnings=self._warnings,
             mapper=self._mapper,
             checkpoints=checkpoints,
         )
@@ -138,7 +141,11 @@ class Service:
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
         mapper = MapperThread(
-            self._served.mapper, self._scans, self._settings.service, failed=failed
+            self._served.mapper,
+            self._scans,
+            self._settings.service,
+            failed=failed,
+            warnings=self._warnings,
         )
         mapper.start()
         self._parts.callback(mapper.close)
@@ -224,6 +231,7 @@ class Service:
             self._mapper.publish_soon,
             timeout_max_s=self._settings.service.flush_timeout_max_s,
             limit=self._settings.service.request_queue,
+            warnings=self._warnings.of,
         )
         self._parts.callback(flush.close)
         self._serve(

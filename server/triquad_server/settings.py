@@ -3,15 +3,17 @@
 :mod:`triquad_server.settings_loading` reads them from a file, the environment and the command line.
 """
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-from triquad_format.errors import FormatError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from triquad_format.errors import FormatError, SettingsError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
+from triquad_server.leaf_lengths import DEFAULT_LEAF_M, at_leaf, follows_leaf, length
 from triquad_server.ros2_settings import Ros2Settings
-from triquad_server.source_settings import SourceSettings, check_range, check_robot_box
+from triquad_server.scan_settings import ScanSettings
+from triquad_server.source_settings import SourceSettings, check_robot_box
 
 _RECORD = ConfigDict(
     frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
@@ -19,46 +21,10 @@ _RECORD = ConfigDict(
 # Neither text nor a truth value is a number.
 _SECTION = _RECORD | ConfigDict(strict=True)
 
-SOURCE_SECTION = "sources.NAME"
+Key = tuple[str, ...]
+"""A setting: its section, for a source its name, and its key."""
 
-
-class ScanSettings(BaseModel):
-    """Which points of a scan are used, and where its rays are sampled."""
-
-    model_config = _SECTION
-
-    range_min_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
-    """Nearer points are dropped."""
-
-    range_max_m: Annotated[float, Field(ge=0, le=1e4)] = 50.0
-    """How far rays reach: farther points are dropped, and the space up to this range is free, as
-    on rays without a return. At least `range_min_m`."""
-
-    thin_m: Annotated[float, Field(ge=1e-3, le=10)] = 0.05
-    """One point is kept per voxel of this side."""
-
-    surface_share: Annotated[float, Field(ge=0.01, le=1)] = 0.5
-    """Share of the training samples that lie around end points; the others lie in free space."""
-
-    spread_m: Annotated[float, Field(ge=1e-3, le=10)] = 0.08
-    """Standard deviation of the distance of samples from their end point, along the ray."""
-
-    truncation_m: Annotated[float, Field(ge=0.01, le=10)] = 0.3
-    """Largest distance of such samples from their end point."""
-
-    free_from: Annotated[float, Field(ge=0, le=1)] = 0.3
-    """Samples of free space begin at this share of the range."""
-
-    behind_m: Annotated[float, Field(ge=0, le=100)] = 0.8
-    """Samples of free space end so far behind the end point."""
-
-    max_points: Annotated[int, Field(ge=1, le=20_000_000)] = 500_000
-    """A larger scan is refused."""
-
-    @model_validator(mode="after")
-    def _range_is_not_empty(self) -> "ScanSettings":
-        check_range("scan", self.range_min_m, self.range_max_m)
-        return self
+_RANGES = ("range_min_m", "range_max_m")
 
 
 class TrainingSettings(BaseModel):
@@ -131,17 +97,17 @@ class MeshSettings(BaseModel):
 
     model_config = _SECTION
 
-    cell_m: Annotated[float, Field(ge=0.01, le=10)] = 0.1
+    cell_m: float = length(0.1, least_m=0.005, most_m=10)
     """Side of the cells of marching cubes."""
 
     tile_cells: Annotated[int, Field(ge=4, le=256)] = 64
     """Cells along the side of a tile."""
 
-    reach_m: Annotated[float, Field(ge=0, le=1)] = 0.02
+    reach_m: float = length(0.02, least_m=0, most_m=1)
     """Centres of faces lie at most this far from voxels with seen surface; twice and four times as
     far on levels of detail 1 and 2."""
 
-    tolerance_m: Annotated[float, Field(ge=0, le=1)] = 0.01
+    tolerance_m: float = length(0.01, least_m=0, most_m=1)
     """A tile changes where its surface moved by more."""
 
     update_period_s: Annotated[float, Field(ge=0.01, le=3600)] = 0.5
@@ -220,8 +186,19 @@ class ServiceSettings(BaseModel):
     """Longest time that a client may ask to wait in a flush."""
 
 
+class UnfitSettingsError(ValueError):
+    """Settings that do not go together."""
+
+    def __init__(self, text: str, keys: tuple[Key, ...]) -> None:
+        super().__init__(text)
+        self.keys = keys  # that decide
+
+
 class Settings(BaseModel):
-    """All settings; each part of the server receives its own section."""
+    """All settings; each part of the server receives its own section.
+
+    Lengths that are not given are in proportion to ``field.leaf_m``.
+    """
 
     model_config = _RECORD
 
@@ -236,13 +213,22 @@ class Settings(BaseModel):
     sources: dict[str, SourceSettings] = {}
 
     @model_validator(mode="after")
+    def _lengths_follow_the_leaf(self) -> "Settings":
+        # Not yet in anyone's hands, so this is no change of what is frozen.
+        for name in ("scan", "mesh"):
+            self.__dict__[name] = at_leaf(self.__dict__[name], self.field.leaf_m)
+        return self
+
+    @model_validator(mode="after")
     def _sections_fit(self) -> "Settings":
-        self._check_reach("scan", self.scan)
-        if self.mesh.cell_m + self.mesh.reach_m > 4 * self.field.leaf_m:
-            raise ValueError(
-                f"mesh.cell_m = {self.mesh.cell_m:g} and mesh.reach_m = {self.mesh.reach_m:g} are "
-                f"too coarse for field.leaf_m = {self.field.leaf_m:g}: "
-                f"together, use at most {4 * self.field.leaf_m:g}"
+        self._check_ranges(*(("scan", key) for key in _RANGES))
+        cell, reach = ("mesh", "cell_m"), ("mesh", "reach_m")
+        most_m = 4 * self.field.leaf_m
+        if self._value(cell) + self._value(reach) > most_m:
+            raise UnfitSettingsError(
+                f"{self._said(cell)} and {self._said(reach)} are too coarse for field.leaf_m = "
+                f"{self.field.leaf_m:g}: together, use at most {most_m:g}",
+                keys=(cell, reach),
             )
         return self
 
@@ -253,42 +239,67 @@ class Settings(BaseModel):
                 check_name("source", name)
             except FormatError as error:
                 raise ValueError(f"sources: {error}") from error
-            section, scan = f"sources.{name}", self.scan_of(source)
-            check_range(section, scan.range_min_m, scan.range_max_m)
-            self._check_reach(section, scan)
+            self._check_ranges(
+                *(
+                    ("scan", key) if getattr(source, key) is None else ("sources", name, key)
+                    for key in _RANGES
+                )
+            )
             if source.robot_box_m is not None:
-                check_robot_box(f"{section}.robot_box_m", source.robot_box_m, self.field.leaf_m)
+                section = f"sources.{name}.robot_box_m"
+                check_robot_box(section, source.robot_box_m, self.field.leaf_m)
         return self
 
     def scan_of(self, source: SourceSettings) -> ScanSettings:
         """The section ``[scan]`` with the ranges of a source."""
-        ranges = source.model_dump(include={"range_min_m", "range_max_m"}, exclude_none=True)
+        ranges = source.model_dump(include=set(_RANGES), exclude_none=True)
         return self.scan.model_copy(update=ranges)
 
-    def _check_reach(self, section: str, scan: ScanSettings) -> None:
-        reach_m, most_m = scan.range_max_m, 8 * self.field.region_pitch_m
-        if reach_m > most_m:
-            raise ValueError(
-                f"{section}.range_max_m = {reach_m:g} reaches over too many regions of field.leaf_m"
-                f" = {self.field.leaf_m:g} and field.depth = {self.field.depth}: "
-                f"use at most {most_m:g}, or larger regions"
+    def with_field(self, field: FieldSettings) -> "Settings":
+        """The same for another field, whose leaf the lengths follow that are not given.
+
+        Raises:
+            SettingsError: those that are given do not go with it.
+        """
+        try:
+            return Settings(**dict(self) | {"field": field})
+        except ValidationError as error:
+            texts = [str(details["ctx"]["error"]) for details in error.errors()]
+            raise SettingsError("; ".join(texts)) from error
+
+    def _check_ranges(self, nearest: Key, farthest: Key) -> None:
+        low_m, high_m, thin = self._value(nearest), self._value(farthest), ("scan", "thin_m")
+        if high_m < low_m:
+            raise UnfitSettingsError(
+                f"{self._said(farthest)} is less than {self._said(nearest)}: use at least that",
+                keys=(nearest, farthest),
             )
-        if scan.thin_m * 1e6 < reach_m:
-            raise ValueError(
-                f"scan.thin_m = {scan.thin_m:g} is too fine for {section}.range_max_m = "
-                f"{reach_m:g}: use at least {reach_m * 1e-6:g}"
+        most_m = 8 * self.field.region_pitch_m
+        if high_m > most_m:
+            raise UnfitSettingsError(
+                f"{self._said(farthest)} reaches over too many regions of field.leaf_m = "
+                f"{self.field.leaf_m:g} and field.depth = {self.field.depth}: use at most "
+                f"{most_m:g}, or larger regions",
+                keys=(farthest,),
+            )
+        if self._value(thin) * 1e6 < high_m:
+            raise UnfitSettingsError(
+                f"{self._said(thin)} is too fine for {self._said(farthest)}: use at least "
+                f"{high_m * 1e-6:g}",
+                keys=(thin, farthest),
             )
 
+    def _value(self, key: Key) -> float:
+        return float(getattr(self._table(key), key[-1]))
 
-def setting_schemas() -> dict[str, dict[str, Any]]:
-    """The JSON schema of each setting: by section, then by key.
+    def _said(self, key: Key) -> str:
+        """A setting with its value, and where that comes from if nobody gave it."""
+        said = f"{'.'.join(key)} = {self._value(key):g}"
+        leaf_m = self.field.leaf_m
+        if leaf_m == DEFAULT_LEAF_M or not follows_leaf(self._table(key), key[-1]):
+            return said
+        return f"{said} (which follows field.leaf_m = {leaf_m:g})"
 
-    The sections of all sources are one, ``sources.NAME``.
-    """
-    schema = Settings.model_json_schema()
-    references = {**schema["properties"]}
-    references[SOURCE_SECTION] = references.pop("sources")["additionalProperties"]
-    return {
-        section: schema["$defs"][reference["$ref"].rpartition("/")[2]]["properties"]
-        for section, reference in references.items()
-    }
+    def _table(self, key: Key) -> BaseModel:
+        table: BaseModel = getattr(self, key[0]) if len(key) == 2 else self.sources[key[1]]
+        return table

@@ -1,4 +1,4 @@
-"""Where settings come from: a TOML file, over it the environment, over that the command line."""
+"""Where settings come from: a preset, over it a TOML file, the environment, the command line."""
 
 import difflib
 import json
@@ -18,9 +18,18 @@ from pydantic_settings import (
 )
 from triquad_format.errors import SettingsError
 
-from triquad_server.settings import SOURCE_SECTION, Settings, setting_schemas
+from triquad_server.leaf_lengths import follows_leaf
+from triquad_server.setting_schemas import SOURCE_SECTION, setting_schemas
+from triquad_server.settings import Settings, UnfitSettingsError
 
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
+
+_PRESET_FOLDER = Path(__file__).with_name("presets")
+
+PRESETS = ("street", "indoor", "tabletop", "long-range")
+"""Settings that fit a kind of place and sensor; each is a file in the folder ``presets``."""
+
+_FILE = 1  # its place among the origins
 
 _READERS: dict[str, TypeAdapter[Any]] = {
     "integer": TypeAdapter(int),
@@ -57,18 +66,23 @@ class _Origin(NamedTuple):
         return bool(location)
 
 
-def load_settings(file: Path | None = None, assignments: Iterable[str] = ()) -> Settings:
+def load_settings(
+    file: Path | None = None, assignments: Iterable[str] = (), *, preset: str | None = None
+) -> Settings:
     """The effective settings.
 
     Args:
-        file: a TOML file; what it leaves out keeps its default.
+        file: a TOML file; what it leaves out is as in the preset, or keeps its default.
         assignments: of the command line, such as ``training.batch=4096``.
+        preset: one of :data:`PRESETS`, below all else.
 
     Raises:
-        SettingsError: the file cannot be read, or a setting is unknown, of the wrong type or out
-            of range. The text names the setting, where it comes from and what is allowed.
+        SettingsError: the file cannot be read, there is no such preset, or a setting is unknown,
+            of the wrong type or out of range. The text names the setting, where it comes from
+            and what is allowed.
     """
     origins = [
+        _Origin(f"preset {preset}", {} if preset is None else _read_preset(preset)),
         _Origin(f"settings file {file}", {} if file is None else _read_file(file)),
         _Origin("environment", _as_in_a_file(_read_environment())),
         _Origin("--set", _as_in_a_file(_parse_assignments(assignments))),
@@ -88,9 +102,19 @@ def settings_toml(settings: Settings) -> str:
     tables = settings.model_dump(exclude_none=True)
     # A name in quotes may hold points.
     tables |= {f'sources."{name}"': table for name, table in tables.pop("sources").items()}
+    followers = {
+        (section, key)
+        for section in ("scan", "mesh")
+        for key in tables[section]
+        if follows_leaf(getattr(settings, section), key)
+    }
     lines: list[str] = []
     for section, table in tables.items():
-        lines += [f"[{section}]", *(f"{key} = {json.dumps(table[key])}" for key in table), ""]
+        lines.append(f"[{section}]")
+        for key, value in table.items():
+            follows = "  # follows field.leaf_m" if (section, key) in followers else ""
+            lines.append(f"{key} = {json.dumps(value)}{follows}")
+        lines.append("")
     return "\n".join(lines)
 
 
@@ -101,6 +125,12 @@ def _merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
         if isinstance(tables[key], dict) and isinstance(over[key], dict):
             both[key] = _merged(tables[key], over[key])
     return both
+
+
+def _read_preset(name: str) -> dict[str, Any]:
+    if name not in PRESETS:
+        raise SettingsError(f"there is no preset {name!r}: use {', '.join(PRESETS)}")
+    return _read_file(_PRESET_FOLDER / f"{name}.toml")
 
 
 def _read_file(file: Path) -> dict[str, Any]:
@@ -172,13 +202,15 @@ def _with_values(table: Any) -> Any:
 def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:
     """What is wrong with a setting, and what is right."""
     location = details["loc"]
-    givers = [origin for origin in origins if origin.gives(location)]
+    cause = details.get("ctx", {}).get("error")
+    keys = cause.keys if isinstance(cause, UnfitSettingsError) else [location]
+    givers = [origin for origin in origins if any(map(origin.gives, keys))]
     problem = _problem(details, ".".join(map(str, location)))
     if not givers:
         return problem
     # The last has the last word, and only a file has numbers beside text.
     is_number = details["type"] in ("int_type", "float_type")
-    quoted = is_number and isinstance(details["input"], str) and givers == origins[:1]
+    quoted = is_number and isinstance(details["input"], str) and givers[-1] == origins[_FILE]
     return f"{givers[-1].name}: {problem}" + (", without quotes" if quoted else "")
 
 

@@ -42,19 +42,6 @@ ANY_SOURCE = SourceSettings()
 """Of a source that has no section."""
 
 
-def check_range(section: str, range_min_m: float, range_max_m: float) -> None:
-    """Refuse ranges between which nothing lies.
-
-    Raises:
-        ValueError: it names ``section``.
-    """
-    if range_max_m < range_min_m:
-        raise ValueError(
-            f"{section}.range_max_m = {range_max_m:g} is less than "
-            f"{section}.range_min_m = {range_min_m:g}: use at least that"
-        )
-
-
 def check_robot_box(name: str, box: Box, leaf_m: float) -> None:
     """Refuse a box that holds nothing, or very many voxels of side ``leaf_m``.
 

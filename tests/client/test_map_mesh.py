@@ -83,7 +83,7 @@ def test_progress_is_told() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"cell_m": 0.001}, r"cell_m = 0\.001: use 0\.01 to 10"),
+        ({"cell_m": 0.001}, r"cell_m = 0\.001: use 0\.005 to 10"),
         ({"cell_m": "fine"}, "cell_m = 'fine' is not a number"),
         ({"bounds": ((0, 0, 0), (-1, 1, 1))}, "the minimum must not exceed the maximum"),
         ({"bounds": ((0, 0), (1, 1))}, "each corner has three coordinates"),

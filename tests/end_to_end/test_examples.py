@@ -187,7 +187,7 @@ def test_a_costmap_keeps_the_robot_off_what_it_would_touch(run: Run, tmp_path: P
 
 
 def test_a_scan_finds_its_place(run: Run, tmp_path: Path) -> None:
-    scan = DRIVE.lidar.scan(SCENE, TRUE_POSE, np.random.default_rng(5))
+    scan = DRIVE.sensor.scan(SCENE, TRUE_POSE, np.random.default_rng(5))
     np.save(tmp_path / "scan.npy", scan.points)
     for arguments in ([], ["--scan", tmp_path / "scan.npy"]):
         output = run("localise.py", *arguments)

@@ -71,6 +71,23 @@ def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(tmp_pa
         assert_same_map(before, ask(server.endpoint))
 
 
+def test_a_restored_map_keeps_its_leaf_and_lengths_that_are_not_set_follow_it(arguments):
+    with servers.server_process(arguments) as server:
+        learn(server.endpoint)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    fine = [*arguments, "--set", "field.leaf_m=0.05"]
+    with (
+        servers.server_process(fine) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        assert "lengths that are not set follow its leaf_m = 0.2, not the 0.05" in server.log
+        assert client.tiles().tile_side_m == pytest.approx(6.4)
+    unfit = run([*arguments, "--set", "field.leaf_m=0.4", "--set", "mesh.cell_m=1"])
+    assert unfit.wait() == 2
+    assert "for the restored map: mesh.cell_m = 1" in unfit.log
+
+
 def test_sigint_and_a_second_signal_stop_it_cleanly(tmp_path, arguments):
     with servers.server_process(arguments) as server:
         before = learn(server.endpoint)

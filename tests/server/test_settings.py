@@ -3,10 +3,14 @@ import runpy
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from triquad_format.errors import SettingsError
+from triquad_format.records.field_settings import FieldSettings
 from triquad_server import cli
-from triquad_server.settings import Settings, setting_schemas
-from triquad_server.settings_loading import load_settings, settings_toml
+from triquad_server.setting_schemas import setting_schemas
+from triquad_server.settings import MeshSettings, Settings
+from triquad_server.settings_loading import PRESETS, load_settings, settings_toml
 from triquad_server.source_settings import SourceSettings
 
 ROOT = Path(__file__).parents[2]
@@ -53,6 +57,103 @@ def test_a_file_has_numbers_and_text_stands_for_them(
     assert settings.training.learning_rate == 1.0
     assert settings.field.leaf_m == 1.0
     assert (settings.scan.max_points, settings.scan.spread_m) == (4096, 0.1)
+
+
+def test_a_preset_lies_below_all_else(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[training]\nbatch = 1\n[scan]\nthin_m = 0.03\n")
+    settings = load_settings(path, ["training.seed=3"], preset="indoor")
+    indoor = load_settings(preset="indoor")
+    assert indoor.field.leaf_m < Settings().field.leaf_m
+    assert settings.field == indoor.field
+    assert (settings.training.batch, settings.training.seed) == (1, 3)
+    assert (settings.scan.thin_m, settings.scan.spread_m) == (0.03, indoor.scan.spread_m)
+
+
+def test_the_street_is_what_there_is_without_a_preset() -> None:
+    assert load_settings(preset="street") == Settings()
+
+
+def test_presets_are_all_that_lie_in_their_folder_and_each_is_valid() -> None:
+    folder = ROOT / "server" / "triquad_server" / "presets"
+    assert {path.stem for path in folder.iterdir()} == set(PRESETS)
+    leaves = {name: load_settings(preset=name).field.leaf_m for name in PRESETS}
+    assert leaves["tabletop"] < leaves["indoor"] < leaves["street"] < leaves["long-range"]
+
+
+def test_an_unknown_preset_is_named_with_those_there_are(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    assert cli.main(["--preset", "../indoor", "--print-settings"]) == cli.USAGE
+    assert "there is no preset '../indoor': use street, indoor, tabletop, long-range" in caplog.text
+
+
+def test_errors_tell_what_a_preset_gave(tmp_path: Path) -> None:
+    leaf_m = load_settings(preset="indoor").field.leaf_m
+    with pytest.raises(SettingsError, match=f"--set: mesh.cell_m = 2 .*leaf_m = {leaf_m:g}"):
+        load_settings(assignments=["mesh.cell_m=2"], preset="indoor")
+
+
+def test_lengths_follow_the_leaf_from_wherever_it_is_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[field]\nleaf_m = 0.05\n")
+    in_python = Settings(field=FieldSettings(leaf_m=0.05))
+    assert load_settings(path) == load_settings(assignments=["field.leaf_m=0.05"]) == in_python
+    monkeypatch.setenv("TRIQUAD_FIELD__LEAF_M", "0.05")
+    assert load_settings() == in_python
+    scan, mesh = in_python.scan, in_python.mesh
+    assert (scan.range_min_m, scan.range_max_m, scan.thin_m) == (0.375, 12.5, 0.0125)
+    assert (scan.spread_m, scan.truncation_m, scan.behind_m) == (0.02, 0.075, 0.2)
+    assert (mesh.cell_m, mesh.reach_m, mesh.tolerance_m) == (0.025, 0.005, 0.0025)
+
+
+def test_at_the_default_leaf_lengths_are_their_defaults() -> None:
+    scan, mesh = Settings().scan, Settings().mesh
+    assert (scan.range_min_m, scan.range_max_m, scan.thin_m) == (1.5, 50.0, 0.05)
+    assert (scan.spread_m, scan.truncation_m, scan.behind_m) == (0.08, 0.3, 0.8)
+    assert (mesh.cell_m, mesh.reach_m, mesh.tolerance_m) == (0.1, 0.02, 0.01)
+
+
+def test_a_length_that_is_given_follows_nothing() -> None:
+    settings = load_settings(assignments=["field.leaf_m=0.05", "scan.thin_m=0.02"])
+    assert (settings.scan.thin_m, settings.scan.spread_m) == (0.02, 0.02)
+    coarse = Settings(field=FieldSettings(leaf_m=0.4), mesh=MeshSettings(cell_m=0.1))
+    assert (coarse.mesh.cell_m, coarse.mesh.reach_m) == (0.1, 0.04)
+
+
+@given(st.floats(0.01, 10.0), st.integers(6, 15))
+def test_what_follows_from_any_leaf_is_allowed(leaf_m: float, depth: int) -> None:
+    settings = Settings(field=FieldSettings(leaf_m=leaf_m, depth=depth))
+    given_in_full = Settings.model_validate(settings.model_dump())
+    assert given_in_full == settings
+    assert settings.scan.thin_m == pytest.approx(leaf_m / 4)
+
+
+def test_for_another_field_lengths_follow_its_leaf_and_have_to_go_with_it() -> None:
+    settings = load_settings(assignments=["field.leaf_m=0.05", "mesh.cell_m=0.1"])
+    street = settings.with_field(FieldSettings())
+    assert street.scan == Settings().scan
+    assert street.mesh == Settings().mesh
+    assert street.with_field(settings.field) == settings
+    with pytest.raises(SettingsError, match=r"mesh\.cell_m = 0\.1 .* field\.leaf_m = 0\.02"):
+        settings.with_field(FieldSettings(leaf_m=0.02))
+
+
+def test_errors_tell_lengths_that_follow_from_those_that_are_given() -> None:
+    with pytest.raises(SettingsError) as error:
+        load_settings(assignments=["field.leaf_m=1", "scan.range_max_m=5"])
+    assert str(error.value) == (
+        "--set: scan.range_max_m = 5 is less than scan.range_min_m = 7.5 "
+        "(which follows field.leaf_m = 1): use at least that"
+    )
+
+
+def test_printed_settings_mark_the_lengths_that_follow_the_leaf() -> None:
+    printed = settings_toml(load_settings(assignments=["field.leaf_m=0.1", "scan.thin_m=0.02"]))
+    assert "\nspread_m = 0.04  # follows field.leaf_m\n" in printed
+    assert "\nthin_m = 0.02\n" in printed
 
 
 def test_sources_have_sections_of_their_own_from_all_places(
@@ -215,7 +316,10 @@ def test_errors_name_the_key_and_the_value(tmp_path: Path, text: str, words: lis
 @pytest.mark.parametrize(
     ("sections", "words"),
     [
-        ({"field": {"leaf_m": 0.01, "depth": 6}}, ["range_max_m", "leaf_m", "depth"]),
+        (
+            {"field": {"leaf_m": 0.01, "depth": 6}, "scan": {"range_max_m": 5.0}},
+            ["--set: scan.range_max_m = 5 reaches", "leaf_m = 0.01", "depth", "at most 3.84"],
+        ),
         ({"scan": {"thin_m": 0.001, "range_max_m": 2000.0}}, ["thin_m", "range_max_m"]),
         ({"field": {"leaf_m": 0.05}, "mesh": {"cell_m": 0.5}}, ["cell_m", "leaf_m"]),
         (

@@ -1,5 +1,6 @@
 """Publishing scans, and waiting until they are in the map."""
 
+import logging
 import secrets
 import threading
 import time
@@ -20,6 +21,8 @@ from triquad_client.errors import RequestTimeoutError
 from triquad_client.net.call import Ask, Call, Pause, ask_each
 from triquad_client.net.connection import Connection
 
+_log = logging.getLogger("triquad_client")
+
 _REPLY_MARGIN_S = 5.0
 """By how much the server's answer that the time is over may be late."""
 
@@ -35,6 +38,7 @@ class FlushReport:
     refused: int  # seen by the server, but of no use
     lost: int  # never arrived, or pushed out of the server's full queue
     last_refusal: str | None  # by source, why the last of the refused ones was
+    warnings: tuple[str, ...] = ()  # what goes wrong with the scans, and which setting helps
 
 
 @dataclass
@@ -54,6 +58,7 @@ class ScanPublisher:
         self._sending = threading.Lock()
         self._lock = threading.Lock()  # of the dictionary, never held for long
         self._sources: dict[str, _Source] = {}
+        self._warned: set[str] = set()  # what was logged
 
     def publish(
         self,
@@ -112,11 +117,14 @@ class ScanPublisher:
             for request, reply in zip(requests, replies, strict=True)
             if reply.last_refusal is not None
         ]
+        warnings = tuple(line for reply in replies for line in (reply.warnings or "").splitlines())
+        self._log_new(warnings)
         return FlushReport(
             taken=sum(reply.taken for reply in replies),
             refused=sum(reply.refused for reply in replies),
             lost=sum(reply.lost for reply in replies),
             last_refusal="; ".join(refusals) or None,
+            warnings=warnings,
         )
 
     def settle(self, timeout_s: float) -> Call[ServerStatus]:
@@ -129,6 +137,14 @@ class ScanPublisher:
             _check_time(deadline, timeout_s)
             yield Pause(_SETTLE_PAUSE_S)
         return now
+
+    def _log_new(self, warnings: tuple[str, ...]) -> None:
+        """Log each warning once; the server says it in other words where it says it again."""
+        with self._lock:
+            new = [text for text in warnings if text not in self._warned]
+            self._warned.update(new)
+        for text in new:
+            _log.warning("%s", text)
 
     def _dealt_with_by(self, deadline: float) -> Call[bool]:
         """Whether the scans are, after some waiting: servers bound the time that one may ask."""

@@ -21,11 +21,12 @@ from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.mesh.mesh import Mesh, joined
 
-CELL_RANGE_M = (0.01, 10.0)
+CELL_RANGE_M = (0.005, 10.0)
 MAX_FACES = 50_000_000
 
 _BLOCK_CELLS = 32  # along the side of a block: bounds the memory that is needed at once
-_REACH_M = 0.02  # how far beside a voxel with seen surface the middle of a face may lie
+_REACH_LEAVES = 0.1  # how far beside a voxel with seen surface the middle of a face may lie
+_CELL_LEAVES = 0.5
 
 Report = Callable[[int, int], None]
 """Is told how many blocks are done, and of how many."""
@@ -44,13 +45,18 @@ class _Voxels:
 
 
 def map_mesh(
-    view: MapView, seen: MapRecord, bounds: Bounds | None, cell_m: float, report: Report | None
+    view: MapView,
+    seen: MapRecord,
+    bounds: Bounds | None,
+    cell_m: float | None,
+    report: Report | None,
 ) -> Mesh:
     """The surface of a map where rays have seen one; ``OfflineMap.mesh`` documents the rest.
 
     ``view`` answers for the field of the map, and ``seen`` holds its evidence; no more is read.
     """
-    cell_m = checks.within("cell_m", cell_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
+    chosen_m = _CELL_LEAVES * view.voxel_m if cell_m is None else cell_m
+    cell_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
     box = checks.box(bounds)
     blocks = list(_blocks(_voxels(seen, *box, cell_m=cell_m)))
     tiles: list[Mesh] = []
@@ -72,7 +78,7 @@ def _voxels(seen: MapRecord, low: Doubles, high: Doubles, cell_m: float) -> _Vox
     """The voxels of which faces may lie between two corners [3]."""
     leaf_m = seen.settings.leaf_m
     middles = surface_voxels(seen)
-    reach_m = leaf_m / 2 + _REACH_M + cell_m / 2  # from a voxel's middle to that of a cell
+    reach_m = (0.5 + _REACH_LEAVES) * leaf_m + cell_m / 2  # from a voxel's middle to that of a cell
     near = (middles >= low - 2 * reach_m) & (middles <= high + 2 * reach_m)
     middles = middles[near.all(axis=1)]
     return _Voxels(
@@ -142,9 +148,8 @@ def _any_of_eight(flags: Bools) -> Bools:
 
 def _beside(voxels: Longs, points: Doubles, leaf_m: float) -> Bools:
     """Whether points [P, 3] lie within the reach of any of the voxels [N, 3], on each axis."""
-    sides = [
-        np.floor((points + shift) / leaf_m).astype(np.int64) for shift in (-_REACH_M, _REACH_M)
-    ]
+    places = points / leaf_m
+    sides = [np.floor(places + shift).astype(np.int64) for shift in (-_REACH_LEAVES, _REACH_LEAVES)]
     least = voxels.min(axis=0) - 1
     near = np.zeros(len(points), np.bool_)
     for x, y, z in np.ndindex(2, 2, 2):

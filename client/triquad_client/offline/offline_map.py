@@ -89,14 +89,17 @@ class OfflineMap(MapQueries):
             driver.close()
 
     def mesh(
-        self, bounds: Bounds | None = None, cell_m: float = 0.1, report: Report | None = None
+        self,
+        bounds: Bounds | None = None,
+        cell_m: float | None = None,
+        report: Report | None = None,
     ) -> Mesh:
         """The surface where rays have seen one, by marching cubes: the faces centred in ``bounds``.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
-            cell_m: side of the cells, 0.01 to 10 m; those of a server's mesh have 0.1 m unless it
-                is set otherwise.
+            cell_m: side of the cells, 0.005 to 10 m; ``None``: half a leaf, 0.1 m unless the map
+                was made with others, as in a server's mesh.
             report: is told after each block how many are done, and of how many.
 
         Raises:

@@ -184,6 +184,7 @@ class ServerStatus(Message):
     uptime_s: float
     last_checkpoint: CheckpointInfo | None
     store_error: str | None  # why the map is not durable, None if it is
+    warnings: str | None = None  # what goes wrong with scans, and what helps: a line each
 
 
 @dataclass(frozen=True)
@@ -204,6 +205,7 @@ class FlushReply(Message):
     refused: int
     lost: int
     last_refusal: str | None
+    warnings: str | None = None  # about this source, as in the status
 
 
 @dataclass(frozen=True)

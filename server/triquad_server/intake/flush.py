@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
@@ -34,13 +34,13 @@ class _Pending:
         """Source, session and sequence of the scan."""
         return self.asks.source, self.asks.session, self.asks.sequence
 
-    def send(self, outcome: Outcome) -> None:
+    def send(self, outcome: Outcome, warnings: Callable[[str], str | None]) -> None:
         """Answer the request; an internal error ends this one only, not the thread of all."""
         try:
             if isinstance(outcome, RefusedError):
                 self.request.refuse(outcome.code, str(outcome))
             else:
-                self.request.answer(outcome)
+                self.request.answer(replace(outcome, warnings=warnings(self.asks.source)))
         except Exception as error:
             self.request.fail(error)
 
@@ -57,15 +57,17 @@ class FlushHandler:
         publish_soon: Callable[[], None],
         timeout_max_s: float,
         limit: int,
+        warnings: Callable[[str], str | None] = lambda _: None,
     ) -> None:
         """Begin to answer; ``publish_soon`` asks the mapper for an epoch.
 
-        At most ``limit`` requests are pending.
+        At most ``limit`` requests are pending. ``warnings`` are those about a source.
         """
         self._ledger = ledger
         self._publish_soon = publish_soon
         self._timeout_max_s = timeout_max_s
         self._limit = limit
+        self._warnings = warnings
         self._pending: list[_Pending] = []
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="flush")
@@ -123,7 +125,7 @@ class FlushHandler:
                     why = RefusedError("timeout", "the server is stopping")
                     decided = [(entry, why) for entry in self._pending]
             for entry, outcome in decided:
-                entry.send(outcome)
+                entry.send(outcome, self._warnings)
 
     def _decided(self) -> list[tuple[_Pending, Outcome]]:
         """The requests that can be answered now, and how; they are no longer pending."""

@@ -10,7 +10,7 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import empty_keys, enter
 
 from triquad_server.errors import ScanRefusedError
-from triquad_server.settings import ScanSettings
+from triquad_server.scan_settings import ScanSettings
 from triquad_server.source_settings import ANY_SOURCE, SourceSettings
 
 WORLD_LIMIT_M = 100_000.0
@@ -145,6 +145,7 @@ class _Selection(NamedTuple):
     kept: Doubles  # [N, 3]
     beyond: Doubles  # [M, 3] where the rays to points that are too far leave the sensor's range
     not_finite: int
+    no_range: int
     on_robot: int
     too_near: int
     too_far: int
@@ -153,7 +154,7 @@ class _Selection(NamedTuple):
     def dropped(self) -> dict[str, int]:
         """How many points are not used, by reason."""
         counts = self._asdict()
-        reasons = ("not_finite", "on_robot", "too_near", "too_far")
+        reasons = ("not_finite", "no_range", "on_robot", "too_near", "too_far")
         return {reason: counts[reason] for reason in reasons if counts[reason]}
 
 
@@ -168,14 +169,14 @@ def _is_within(x: float, y: float, z: float, low: Doubles, high: Doubles) -> boo
 def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
     """Tell the points that are used from the others."""
     kept, beyond = np.empty((len(points), 3)), np.empty((len(points), 3))
-    count = not_finite = on_robot = too_near = too_far = 0
+    count = not_finite = no_range = on_robot = too_near = too_far = 0
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         distance = np.sqrt(x * x + y * y + z * z)
         if not np.isfinite(distance):
             not_finite += 1
         elif distance == 0:  # which is "no return" to many sensors
-            too_near += 1
+            no_range += 1
         elif _is_within(x, y, z, limits.robot_low, limits.robot_high):
             on_robot += 1
         elif distance < limits.range_min_m:
@@ -188,7 +189,9 @@ def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
         elif enter(keys, x, y, z, limits.thin_m):
             kept[count, 0], kept[count, 1], kept[count, 2] = x, y, z
             count += 1
-    return _Selection(kept[:count], beyond[:too_far], not_finite, on_robot, too_near, too_far)
+    return _Selection(
+        kept[:count], beyond[:too_far], not_finite, no_range, on_robot, too_near, too_far
+    )
 
 
 def _why_empty(

@@ -3,6 +3,7 @@
 import threading
 from collections import OrderedDict, deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from triquad_format.wire.messages import FlushReply, Scan
 
@@ -17,6 +18,13 @@ FORGOTTEN = "*"
 """Stands for all forgotten sources where losses are listed."""
 
 _MAX_COUNT = 2**63 - 1
+
+
+class Refusals(NamedTuple):
+    """Refused scans of one source."""
+
+    scans: int
+    last: str  # why the last of them was
 
 
 @dataclass
@@ -161,6 +169,16 @@ class SourceLedger:
                 if track.lost:
                     counts[source] = min(_MAX_COUNT, counts.get(source, 0) + track.lost)
             return counts
+
+    def refused(self) -> dict[str, Refusals]:
+        """Scans refused, by source."""
+        with self.changed:
+            found: dict[str, Refusals] = {}
+            for (source, _), track in self._tracks.items():
+                if track.last_refusal is not None:
+                    before = found[source].scans if source in found else 0
+                    found[source] = Refusals(before + track.refused, track.last_refusal)
+            return found
 
     def _leave_queue(self, scan: Scan) -> _Track:
         track = self._track(scan.source, scan.session)

@@ -36,9 +36,9 @@ from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sampl
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
 
-_CARVE_SHORT_M = 0.1
-_CLEAR_SHORT_M = 0.5
-"""How far before its end a ray still shows that a surface is not there."""
+_CARVE_SHORT = 0.5  # voxels before its end a ray shows free space
+_CLEAR_SHORT = 2.5
+"""So many voxels before its end a ray still shows that a surface is not there."""
 
 _SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
 _VISITS = 4  # to each of them
@@ -72,6 +72,7 @@ class LiveRegion:
                 truncation_m=setup.scan.truncation_m,
                 half_side_m=setup.field.region_side_m / 2,
             ),
+            leaf_m=setup.field.leaf_m,
             device=setup.device,
             seed=seed,
             team=setup.team,
@@ -131,8 +132,8 @@ class LiveRegion:
         # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
         self.field.grow(self._marks.new)
         self.changed = True
-        clear_m = math.inf if self._setup.change.static else _CLEAR_SHORT_M
-        reach = Reach(_CARVE_SHORT_M / leaf_m, clear_m / leaf_m, self._scans)
+        clear = math.inf if self._setup.change.static else _CLEAR_SHORT
+        reach = Reach(_CARVE_SHORT, clear, self._scans)
 
         def carve() -> None:
             thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]

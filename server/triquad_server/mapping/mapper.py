@@ -55,7 +55,7 @@ class Mapper:
         if self._device.type == "cpu":
             # Its threads spin between operations, and would take the cores from the kernels.
             torch.set_num_threads(1)
-        self._normals = SurfaceNormals(self._teams.mapping)
+        self._normals = SurfaceNormals(self._field_settings.leaf_m, self._teams.mapping)
         self._setup = RegionSetup(
             field=self._field_settings,
             scan=settings.scan,
@@ -103,7 +103,7 @@ class Mapper:
         *,
         source: str = "",
         no_return: Floats | None = None,
-    ) -> dict[str, int]:
+    ) -> ScanRays:
         """Take in a scan.
 
         Args:
@@ -114,7 +114,7 @@ class Mapper:
             no_return: directions [M, 3], sensor frame, of rays that met nothing.
 
         Returns:
-            How many points and rays without a return were not used, by reason.
+            What of it is used, and how many points and rays without a return are not.
 
         Raises:
             ScanRefusedError: the scan cannot be used; the map is unchanged.
@@ -139,7 +139,7 @@ class Mapper:
             self._share_pool()
         for region in regions:
             region.set_normals(normals)
-        return rays.points_dropped
+        return rays
 
     def train(self) -> None:
         """One optimiser step where the training budget is largest; nothing once all is settled."""

@@ -16,6 +16,7 @@ from triquad_server.counter import Counter
 from triquad_server.epochs import EpochHistory
 from triquad_server.errors import MapperStoppedError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import check_box
 from triquad_server.settings import ServiceSettings
@@ -59,13 +60,18 @@ class MapperThread:
         scans: ScanQueue,
         settings: ServiceSettings,
         failed: Callable[[], None],
+        warnings: ScanWarnings | None = None,
     ) -> None:
-        """Publish the first epoch; ``failed`` is called where an internal error ends the thread."""
+        """Publish the first epoch; ``failed`` is called where an internal error ends the thread.
+
+        ``warnings`` are told what was used of each scan.
+        """
         self._mapper = mapper
         self._scans = scans
         self.points_dropped = Counter()  # of scans that were taken, by reason
         self._period_s = settings.publish_period_s
         self._failed = failed
+        self._warnings = warnings
         self._lock = threading.Lock()
         self._commands: deque[_Command] = deque()
         self._ended: str | None = None  # why there are no more commands
@@ -208,7 +214,7 @@ class MapperThread:
         if scan is None:
             return False
         try:
-            points_dropped = self._mapper.ingest(
+            rays = self._mapper.ingest(
                 scan.points,
                 scan.world_from_sensor,
                 scan.stamp_ns // 1_000_000_000,
@@ -224,8 +230,10 @@ class MapperThread:
             self._scans.ledger.refuse(scan, f"internal error of the server: {error!r}")
             _log.exception("scan %d of %s could not be taken in", scan.sequence, scan.source)
         else:
-            for reason, count in points_dropped.items():
+            for reason, count in rays.points_dropped.items():
                 self.points_dropped.add(reason, count)
+            if self._warnings is not None:
+                self._warnings.add(scan.source, len(scan.points), rays)
             self._scans_taken += 1
             self._unpublished = True
             self._scans.ledger.take(scan)

@@ -20,7 +20,7 @@ from triquad_map.compiled.voxel_index import (
     with_room,
 )
 
-_FINE_M, _COARSE_M = 0.15, 0.5  # sides of the cells
+_FINE_LEAVES, _COARSE_LEAVES = 0.75, 2.5  # sides of the cells
 _FULL = 65_536  # points of a cell, above which older ones count for less
 _RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
 
@@ -188,9 +188,10 @@ class MomentGrid:
 class SurfaceNormals:
     """Normals of the surfaces around the sensor; those farthest from it go first."""
 
-    def __init__(self, team: Team, max_cells: int = 150_000) -> None:
+    def __init__(self, leaf_m: float, team: Team, max_cells: int = 150_000) -> None:
         """Each grid has ``max_cells`` cells, at some 100 bytes."""
-        self._grids = (MomentGrid(_FINE_M, team), MomentGrid(_COARSE_M, team))
+        sides_m = (_FINE_LEAVES * leaf_m, _COARSE_LEAVES * leaf_m)
+        self._grids = tuple(MomentGrid(side_m, team) for side_m in sides_m)
         self._max_cells = max_cells
 
     def add(self, points: Doubles, sensor: Doubles) -> Doubles:

@@ -26,16 +26,16 @@ from triquad_server.mapping.ray_intervals import (
     draw_samples,
 )
 
-_BIN_M = 0.8
+_BIN_LEAVES = 4.0
 _BINS = 1 << 18
 _AHEAD = 16  # places that are brought into the cache before their turn
 
 
 @kernel()
-def _bin(interval: Floats) -> int:
+def _bin(interval: Floats, bin_m: float) -> int:
     mixed: int = np.int64(0)
     for axis, prime in enumerate((73856093, 19349663, 83492791)):
-        mixed ^= int(np.floor(interval[END + axis] / _BIN_M)) * prime
+        mixed ^= int(np.floor(interval[END + axis] / bin_m)) * prime
     return mixed & (_BINS - 1)
 
 
@@ -58,7 +58,13 @@ def _best_to_push_out(
 
 @kernel()
 def _put(
-    new: Floats, places: Longs, used: int, intervals: Floats, bins: Ints, occupancy: Ints
+    new: Floats,
+    bin_m: float,
+    places: Longs,
+    used: int,
+    intervals: Floats,
+    bins: Ints,
+    occupancy: Ints,
 ) -> None:
     """Put new intervals into places; those below ``used`` hold one that is pushed out."""
     for i in range(len(places)):
@@ -67,7 +73,7 @@ def _put(
         if place < used:
             occupancy[bins[place]] -= 1
         intervals[place] = new[i]
-        bins[place] = _bin(new[i])
+        bins[place] = _bin(new[i], bin_m)
         occupancy[bins[place]] += 1
 
 
@@ -81,7 +87,7 @@ def _bins_of(voxels: Longs, leaf_m: float, middle: float) -> Bools:
             for axis in range(3):
                 inset = 0.99 if number >> axis & 1 else 0.01
                 corner[END + axis] = (voxel[axis] + inset - middle) * leaf_m
-            chosen[_bin(corner)] = True
+            chosen[_bin(corner, _BIN_LEAVES * leaf_m)] = True
     return chosen
 
 
@@ -117,10 +123,17 @@ class ReplayPool:
     """Ray intervals of one region; the newest can be drawn from apart from the others."""
 
     def __init__(
-        self, capacity: int, placement: Placement, device: torch.device, seed: int, team: Team
+        self,
+        capacity: int,
+        placement: Placement,
+        leaf_m: float,
+        device: torch.device,
+        seed: int,
+        team: Team,
     ) -> None:
         """Up to ``capacity`` intervals; ``team`` draws on the CPU, ``device`` does elsewhere."""
         self._capacity = capacity
+        self._bin_m = _BIN_LEAVES * leaf_m
         self._team = team
         self._placement = placement
         self._device = device
@@ -151,7 +164,15 @@ class ReplayPool:
             # Any of them: the last rays of a scan are as good as the first.
             intervals = intervals[self._rng.permutation(len(intervals))[: len(places)]]
         self._extend(used + room)
-        _put(intervals, places, used, self._intervals, self._bins, self._occupancy)
+        _put(
+            intervals,
+            self._bin_m,
+            places,
+            used,
+            self._intervals,
+            self._bins,
+            self._occupancy,
+        )
         if self._on_device is not None:
             changed = torch.from_numpy(places).to(self._device)
             self._on_device[changed] = torch.from_numpy(intervals).to(self._device)

@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import RobotBox, usable_rays
-from triquad_server.settings import ScanSettings
+from triquad_server.scan_settings import ScanSettings
 from triquad_server.source_settings import SourceSettings
 
 SETTINGS = ScanSettings()
@@ -73,7 +73,7 @@ def test_returns_at_the_sensor_itself_are_dropped() -> None:
     points = np.array([[0.0, 0, 0], [5, 0, 0], [0, 0, 0]], np.float32)
     rays = usable_rays(points, np.eye(4), ScanSettings(range_min_m=0.0))
     np.testing.assert_array_equal(rays.ends, [[5, 0, 0]])
-    assert rays.points_dropped == {"too_near": 2}
+    assert rays.points_dropped == {"no_range": 2}
 
 
 def test_rays_that_met_nothing_reach_as_far_as_the_sensor() -> None:
@@ -123,7 +123,7 @@ def test_points_on_the_robot_are_told_from_near_ones() -> None:
     scan = points((2.9, 0.9, 0.9), (0.2, 0, 0), (0, 1.2, 0), (0, 0, 0), (3.1, 0, 0), (-2, 0, 0))
     rays = usable_rays(scan, pose(), SETTINGS, source=source)
     np.testing.assert_allclose(rays.ends, [[3.1, 0, 0]], atol=1e-6)
-    assert rays.points_dropped == {"on_robot": 3, "too_near": 2}
+    assert rays.points_dropped == {"on_robot": 3, "too_near": 1, "no_range": 1}
 
 
 def test_the_voxels_of_a_turned_robot_are_those_whose_centres_it_holds() -> None:

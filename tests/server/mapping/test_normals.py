@@ -16,7 +16,7 @@ def test_the_normal_of_a_noisy_plane() -> None:
     for _ in range(5):
         normal = RNG.normal(size=3)
         normal /= np.linalg.norm(normal)
-        normals = SurfaceNormals(TEAM)
+        normals = SurfaceNormals(0.2, TEAM)
         points = plane(normal, 4000, 2.0, 0.01)
         found = normals.add(points, np.zeros(3))
         known = ~np.isnan(found[:, 0])
@@ -27,13 +27,13 @@ def test_the_normal_of_a_noisy_plane() -> None:
 
 
 def test_a_line_of_points_has_no_normal() -> None:
-    normals = SurfaceNormals(TEAM)
+    normals = SurfaceNormals(0.2, TEAM)
     line = np.linspace(0, 10, 400)[:, None] * np.array([1.0, 0.3, 0.0])
     assert np.isnan(normals.add(line, np.zeros(3))).all()
 
 
 def test_later_scans_fill_in_what_one_line_cannot_tell() -> None:
-    normals = SurfaceNormals(TEAM)
+    normals = SurfaceNormals(0.2, TEAM)
     lines = [np.stack([np.linspace(0, 8, 60), np.full(60, y), np.zeros(60)], 1) for y in (0, 0.4)]
     assert np.isnan(normals.add(lines[0], np.zeros(3))).all()
     normals.add(lines[1], np.zeros(3))
@@ -44,13 +44,13 @@ def test_later_scans_fill_in_what_one_line_cannot_tell() -> None:
 
 
 def test_scattered_points_have_no_normal() -> None:
-    normals = SurfaceNormals(TEAM)
+    normals = SurfaceNormals(0.2, TEAM)
     points = RNG.uniform(-1, 1, (3000, 3))
     assert np.isnan(normals.add(points, np.zeros(3))[:, 0]).mean() > 0.95
 
 
 def test_memory_is_bounded_and_the_surroundings_stay_known() -> None:
-    normals = SurfaceNormals(TEAM, max_cells=4000)
+    normals = SurfaceNormals(0.2, TEAM, max_cells=4000)
     ground = np.zeros((40_000, 3))
     for x in range(0, 200, 10):
         ground[:, :2] = RNG.uniform([x - 10, -10], [x + 10, 10], (40_000, 2))
@@ -63,7 +63,7 @@ def test_memory_is_bounded_and_the_surroundings_stay_known() -> None:
 
 
 def test_forgetting_a_box() -> None:
-    normals = SurfaceNormals(TEAM)
+    normals = SurfaceNormals(0.2, TEAM)
     points = plane(np.array([0.0, 0.0, 1.0]), 8000, 3.0, 0.0)
     normals.add(points, np.zeros(3))
     middle = points.mean(axis=0)

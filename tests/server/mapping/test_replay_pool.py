@@ -11,7 +11,7 @@ RNG = np.random.default_rng(0)
 
 
 def new_pool(capacity: int) -> ReplayPool:
-    return ReplayPool(capacity, PLACEMENT, CPU, 0, TEAM)
+    return ReplayPool(capacity, PLACEMENT, leaf_m=0.2, device=CPU, seed=0, team=TEAM)
 
 
 def place(x: float, count: int) -> np.ndarray:

@@ -85,7 +85,7 @@ def on_street(made: BenchStreet) -> PlacedScans:
     rng = np.random.default_rng(_SEED)
     chosen = np.linspace(0, len(made.drive) - 1, _STREET_SCANS).astype(int)
     poses = (displaced(made.drive.poses[index], Offset(0.4, 3.0), rng) for index in chosen)
-    scan, scene = made.drive.lidar.scan, made.drive.scene
+    scan, scene = made.drive.sensor.scan, made.drive.scene
     return PlacedScans(view, tuple(scan(scene, pose, rng) for pose in poses))
 
 

@@ -133,7 +133,7 @@ def _one_more(made: BenchStreet) -> SimulatedScan:
     """A scan from between two others."""
     pose = made.scans[_NEXT].world_from_sensor.copy()
     pose[:3, 3] = (pose[:3, 3] + made.scans[_NEXT + 1].world_from_sensor[:3, 3]) / 2
-    return made.drive.lidar.scan(made.drive.scene, pose, np.random.default_rng(0))
+    return made.drive.sensor.scan(made.drive.scene, pose, np.random.default_rng(0))
 
 
 def _work(made: BenchStreet) -> list[Figure]:

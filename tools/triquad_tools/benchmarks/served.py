@@ -46,8 +46,11 @@ class Served:
 
 
 @contextmanager
-def served(record: MapRecord | None = None) -> Iterator[Served]:
-    """A server with an empty map, or with that of a record, in a folder that goes in the end."""
+def served(record: MapRecord | None = None, arguments: Sequence[str] = ()) -> Iterator[Served]:
+    """A server with an empty map, or with that of a record, in a folder that goes in the end.
+
+    ``arguments`` are further ones of its command line.
+    """
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         folder = Path(name)
         if record is not None:
@@ -55,7 +58,7 @@ def served(record: MapRecord | None = None) -> Iterator[Served]:
             store.mkdir(parents=True)
             write_map(record, store / checkpoint_name(record.epoch, complete=True))
         with (
-            DemoServer(folder, MAP) as server,
+            DemoServer(folder, MAP, arguments) as server,
             connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client,
         ):
             yield Served(folder, server.endpoint, client)

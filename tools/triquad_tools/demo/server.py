@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -24,8 +25,10 @@ def _free_endpoint() -> str:
 class DemoServer:
     """A running server on a free port; leaving the ``with`` statement stops it in any case."""
 
-    def __init__(self, folder: Path, map_name: str) -> None:
+    def __init__(self, folder: Path, map_name: str, arguments: Sequence[str] = ()) -> None:
         """Start the process, with store and log in a folder, and wait until it is ready.
+
+        ``arguments`` are further ones of its command line.
 
         Raises:
             ToolError: it ended before, or took too long.
@@ -37,7 +40,7 @@ class DemoServer:
         self._last_line = "it said nothing"
         command = [sys.executable, "-m", "triquad_server.cli", "--listen", self.endpoint]
         command += ["--map", map_name, "--store", str(folder / "store")]
-        command += ["--no-multicast-scouting"]
+        command += ["--no-multicast-scouting", *arguments]
         self._process = subprocess.Popen(
             command, stderr=subprocess.PIPE, text=True, errors="replace"
         )

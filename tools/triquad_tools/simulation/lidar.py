@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -72,12 +73,21 @@ class Lidar:
         )
 
 
+class Sensor(Protocol):
+    """A simulated sensor."""
+
+    def scan(
+        self, scene: Scene, world_from_sensor: Doubles, rng: np.random.Generator
+    ) -> SimulatedScan:
+        """One scan of ``scene`` from a pose ``[4, 4]`` in its free space."""
+
+
 @dataclass(frozen=True)
 class SimulatedDrive:
     """A sequence of scans along a drive. Each scan is made when asked for, always the same."""
 
     scene: Scene
-    lidar: Lidar
+    sensor: Sensor
     poses: Doubles  # [n, 4, 4] world_from_sensor
     seed: int = 0
 
@@ -90,7 +100,7 @@ class SimulatedDrive:
     def scan(self, index: int) -> SimulatedScan:
         """Scan ``index`` of the drive."""
         rng = np.random.default_rng([self.seed, index])
-        return self.lidar.scan(self.scene, self.poses[index], rng)
+        return self.sensor.scan(self.scene, self.poses[index], rng)
 
     def true_hits(self, voxel_m: float = 0.02) -> Doubles:
         """What the sensor could have seen: exact surface points ``[N, 3]``, world frame.

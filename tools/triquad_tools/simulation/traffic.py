@@ -48,7 +48,7 @@ class Traffic:
         moving = tuple(self.movers(index * _PERIOD_S))
         scene = Scene((*standing.scene.solids, *moving), standing.scene.bounds)
         rng = np.random.default_rng([standing.seed, index])
-        made = standing.lidar.scan(scene, standing.poses[index], rng)
+        made = standing.sensor.scan(scene, standing.poses[index], rng)
         on_moving = np.zeros(len(made.points), np.bool_)
         if moving:
             on_moving = lies_on(Scene(moving, standing.scene.bounds), made.true_hits)

@@ -1,0 +1,192 @@
+"""Warnings about scans: what goes wrong with those of each source, and which setting helps."""
+
+import logging
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from triquad_server.intake.rays import ScanRays
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.settings import Settings
+from triquad_server.source_settings import ANY_SOURCE
+
+_log = logging.getLogger(__name__)
+
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 30.0, 3600.0
+"""Between two warnings of one cause and source; each time twice as long."""
+
+_STANDS_S = 60.0  # for so long after its cause was last met, clients are told a warning
+_SCANS = 10  # of a source that are judged together
+_TOO_NEAR_SHARE, _TOO_FAR_SHARE = 0.1, 0.5
+"""Of the points, above which their loss is told. What is too far still shows free space."""
+_MAX_SOURCES = 256  # that are remembered; the one heard of longest ago goes
+_MAX_WARNINGS = 1024  # that are remembered, the same way
+_MAX_TOLD = 50  # warnings for a client at once
+_RANGES = 1000  # of a scan, at most, of which the median is taken
+
+_NEAR_LEAVES, _GOOD_LEAVES = 18.0, 40.0
+"""Median ranges that are too near for the leaf, and that suit it: lidars in streets have 28 to 55
+leaves with the presets for them, sensors in rooms 15 with the leaf of streets."""
+
+_TABLETOP_LEAF_M = 0.035  # finer leaves than this are those of the preset tabletop
+
+
+@dataclass
+class _Points:
+    """The points of some scans of one source."""
+
+    scans: int = 0
+    sent: int = 0
+    dropped: dict[str, int] = field(default_factory=lambda: {"too_near": 0, "too_far": 0})
+    ranges_m: list[float] = field(default_factory=list)  # median of each scan, of what is used
+
+
+@dataclass
+class _Warning:
+    """A warning as it was last told."""
+
+    text: str
+    scans: int  # of which was told so far, where it is of scans
+    due_s: float  # monotonic: not again before
+    pause_s: float
+    met_s: float  # when its cause was last met
+
+
+class ScanWarnings:
+    """Logs and keeps warnings, each cause of each source once in a while; safe for any thread."""
+
+    def __init__(
+        self, scans: ScanQueue, settings: Settings, now: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Watch a queue; ``now`` is a monotonic clock, seconds."""
+        self._scans = scans
+        self._settings = settings
+        self._now = now
+        self._lock = threading.Lock()
+        self._points: OrderedDict[str, _Points] = OrderedDict()
+        # By source and cause, the newest last.
+        self._warnings: OrderedDict[tuple[str, str], _Warning] = OrderedDict()
+
+    def add(self, source: str, sent: int, rays: ScanRays) -> None:
+        """A scan of ``sent`` points was taken in, and ``rays`` are what of it is used."""
+        with self._lock:
+            points = self._points.setdefault(source, _Points())
+            self._points.move_to_end(source)
+            if len(self._points) > _MAX_SOURCES:
+                self._points.popitem(last=False)
+            points.scans += 1
+            points.sent += sent
+            for reason in points.dropped:
+                points.dropped[reason] += rays.points_dropped.get(reason, 0)
+            if len(rays.ends):
+                some = rays.ends[:: max(1, len(rays.ends) // _RANGES)]
+                points.ranges_m.append(float(np.median(np.linalg.norm(some - rays.origin, axis=1))))
+
+    def check(self) -> None:
+        """Log what there is to warn of and was not told lately."""
+        with self._lock:
+            self._check_scans()
+            for source, points in self._points.items():
+                if points.scans >= _SCANS:
+                    self._check_ranges(source, points)
+                    self._check_leaf(source, points)
+                    self._points[source] = _Points()
+
+    def of(self, source: str) -> str | None:
+        """The warnings that stand about a source, a line each."""
+        self.check()
+        return self._lines(lambda of_source: of_source == source)
+
+    def all(self) -> str | None:
+        """All warnings that stand, a line each."""
+        return self._lines(lambda _: True)
+
+    def _lines(self, wanted: Callable[[str], bool]) -> str | None:
+        with self._lock:
+            since_s = self._now() - _STANDS_S
+            texts = [
+                warning.text
+                for (source, _), warning in self._warnings.items()
+                if wanted(source) and warning.met_s >= since_s
+            ]
+        return "\n".join(texts[-_MAX_TOLD:]) or None
+
+    def _check_scans(self) -> None:
+        ledger = self._scans.ledger
+        thin_m, leaf_m = self._settings.scan.thin_m, self._settings.field.leaf_m
+        for source, lost in ledger.lost().items():
+            self._count(
+                source,
+                "lost",
+                lost,
+                f"of its scans were lost, since the server does not keep up: publish fewer, or "
+                f"fewer points a scan, or set a larger scan.thin_m (it is {thin_m:g}) or, for a "
+                f"new map, field.leaf_m (it is {leaf_m:g})",
+            )
+        for source, refusal in ledger.refused().items():
+            text = f"of its scans were refused, the last since {refusal.last}"
+            self._count(source, "refused", refusal.scans, text)
+
+    def _count(self, source: str, cause: str, count: int, text: str) -> None:
+        """Warn of scans of which there are ``count`` by now, if they became more."""
+        before = self._warnings.get((source, cause))
+        more = count - (before.scans if before else 0)
+        if more > 0:
+            self._warn(source, cause, f"{more} {text}", scans=count)
+
+    def _check_ranges(self, source: str, points: _Points) -> None:
+        own = self._settings.sources.get(source, ANY_SOURCE)
+        scan = self._settings.scan_of(own)
+        for reason, key, less, most in (
+            ("too_near", "range_min_m", "less", _TOO_NEAR_SHARE),
+            ("too_far", "range_max_m", "more", _TOO_FAR_SHARE),
+        ):
+            share = points.dropped[reason] / max(1, points.sent)
+            # What is given for the source is meant, and so is a background that is cut off.
+            meant = getattr(own, key) is not None or (
+                reason == "too_far" and key in self._settings.scan.model_fields_set
+            )
+            if share <= most or meant:
+                continue
+            limit_m = getattr(scan, key)
+            self._warn(
+                source,
+                reason,
+                f"{key} = {limit_m:g} drops {100 * share:.0f} % of its points: set scan.{key} or "
+                f"sources.{source}.{key} to {less}, or the latter to {limit_m:g} if this is meant",
+            )
+
+    def _check_leaf(self, source: str, points: _Points) -> None:
+        if not points.ranges_m:
+            return
+        range_m, leaf_m = float(np.median(points.ranges_m)), self._settings.field.leaf_m
+        if range_m >= _NEAR_LEAVES * leaf_m:
+            return
+        better_m = float(f"{range_m / _GOOD_LEAVES:.1g}")
+        preset = "tabletop" if better_m < _TABLETOP_LEAF_M else "indoor"
+        self._warn(
+            source,
+            "leaf",
+            f"what it sees is {range_m:.2g} m away (median), near for field.leaf_m = {leaf_m:g}: "
+            f"details are lost. For a new map use --preset {preset}, or field.leaf_m = "
+            f"{better_m:g}",
+        )
+
+    def _warn(self, source: str, cause: str, text: str, scans: int = 0) -> None:
+        """Tell a warning, unless its last telling was not long ago."""
+        now, before = self._now(), self._warnings.get((source, cause))
+        if before is not None:
+            before.met_s = now
+            if now < before.due_s:
+                return
+        pause_s = _FIRST_PAUSE_S if before is None else min(2 * before.pause_s, _LONGEST_PAUSE_S)
+        text = f"source {source!r}: {text}"
+        self._warnings[source, cause] = _Warning(text, scans, now + pause_s, pause_s, met_s=now)
+        self._warnings.move_to_end((source, cause))
+        if len(self._warnings) > _MAX_WARNINGS:
+            self._warnings.popitem(last=False)
+        _log.warning("%s", text)

@@ -1,0 +1,58 @@
+"""What goes wrong with scans reaches the server's log and who publishes them."""
+
+import dataclasses
+import logging
+
+import msgpack
+import numpy as np
+import pytest
+from support import servers
+from triquad_client import FlushReport
+from triquad_format.wire import codec
+from triquad_format.wire.messages import FlushReply, ServerStatus
+from triquad_server.source_settings import SourceSettings
+
+POSE = np.eye(4)
+
+
+def half_near() -> np.ndarray:
+    return np.concatenate([servers.sphere(500, 1.0), servers.sphere(500, 6.0)])
+
+
+def test_a_publisher_learns_what_a_setting_takes_of_its_scans_and_is_told_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with servers.service_and_client() as client, caplog.at_level(logging.WARNING):
+        reports: list[FlushReport] = []
+        for _ in range(2):
+            for _ in range(12):
+                client.publish_scan(half_near(), POSE, source="cam")
+            reports.append(client.flush(servers.WAIT_S))
+        status = client.status()
+    (text,) = reports[0].warnings
+    assert text.startswith("source 'cam': range_min_m = 1.5 drops 50 % of its points: set ")
+    assert reports[1].warnings == (text,)
+    assert status.warnings == text
+    assert status.scans_taken == 24
+    for logger in ("triquad_client", "triquad_server.intake.scan_warnings"):
+        assert [r.getMessage() for r in caplog.records if r.name == logger] == [text]
+
+
+def test_a_range_that_fits_the_source_ends_the_warning() -> None:
+    fits = servers.SMALL.model_copy(update={"sources": {"cam": SourceSettings(range_min_m=0.5)}})
+    with servers.service_and_client(fits) as client:
+        for _ in range(12):
+            client.publish_scan(half_near() * np.float32(1.5), POSE, source="cam")
+        assert client.flush(servers.WAIT_S).warnings == ()
+        assert client.status().warnings is None
+
+
+def test_replies_of_servers_that_know_no_warnings_are_read_and_theirs_by_older_clients() -> None:
+    reply = FlushReply(1, 2, 3, None, warnings="source 'cam': text")
+    body = msgpack.unpackb(codec.encode(reply))
+    assert body.pop("warnings") == "source 'cam': text"
+    older = codec.decode(FlushReply, msgpack.packb(body))
+    assert older == dataclasses.replace(reply, warnings=None)
+    # What a reader does not know it ignores; the field has to have a default for the other way.
+    default = {part.name: part.default for part in dataclasses.fields(ServerStatus)}
+    assert default["warnings"] is None

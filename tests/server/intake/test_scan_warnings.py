@@ -1,0 +1,175 @@
+import logging
+
+import numpy as np
+import pytest
+from support import servers
+from triquad_format.records.field_settings import FieldSettings
+from triquad_server.intake.rays import usable_rays
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.scan_warnings import ScanWarnings
+from triquad_server.settings import Settings
+from triquad_server.settings_loading import load_settings
+from triquad_server.source_settings import SourceSettings
+
+SETTINGS = Settings()
+
+
+class Clock:
+    """Seconds, as the test says."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def cloud(*parts: tuple[int, float]) -> np.ndarray:
+    """So many points at each range."""
+    points = [servers.sphere(count, radius_m) for count, radius_m in parts]
+    return np.concatenate(points)
+
+
+def watch(settings: Settings = SETTINGS, clock: Clock | None = None) -> ScanWarnings:
+    return ScanWarnings(ScanQueue(2), settings, clock or Clock())
+
+
+def take_in(
+    warnings: ScanWarnings, points: np.ndarray, settings: Settings = SETTINGS, scans: int = 20
+) -> None:
+    source = settings.sources.get("cam", SourceSettings())
+    scan = settings.scan_of(source)
+    for _ in range(scans):
+        warnings.add("cam", len(points), usable_rays(points, np.eye(4), scan, source=source))
+
+
+def test_points_that_range_min_m_takes_are_told_with_the_setting_to_change() -> None:
+    warnings = watch()
+    take_in(warnings, cloud((880, 8.0), (120, 1.0)))
+    text = warnings.of("cam")
+    assert text is not None
+    assert text == (
+        "source 'cam': range_min_m = 1.5 drops 12 % of its points: set scan.range_min_m or "
+        "sources.cam.range_min_m to less, or the latter to 1.5 if this is meant"
+    )
+
+
+def test_a_few_near_points_and_a_background_are_no_reason_to_warn() -> None:
+    warnings = watch()
+    take_in(warnings, cloud((500, 8.0), (80, 1.0), (420, 90.0)))
+    assert warnings.of("cam") is None
+
+
+def test_most_points_beyond_the_range_are_told() -> None:
+    warnings = watch()
+    take_in(warnings, cloud((400, 20.0), (600, 80.0)))
+    text = warnings.of("cam")
+    assert text is not None
+    assert "range_max_m = 50 drops 60 % of its points" in text
+    assert "sources.cam.range_max_m to more" in text
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Settings(sources={"cam": SourceSettings(range_min_m=1.5, range_max_m=50.0)}),
+        load_settings(assignments=["scan.range_max_m=50", "sources.cam.range_min_m=1.5"]),
+    ],
+)
+def test_what_is_given_for_the_source_and_a_background_that_is_cut_off_are_meant(
+    settings: Settings,
+) -> None:
+    warnings = watch(settings)
+    take_in(warnings, cloud((200, 1.0), (200, 20.0), (600, 80.0)), settings)
+    assert warnings.of("cam") is None
+
+
+def test_a_near_range_that_is_given_for_all_sources_may_not_suit_each() -> None:
+    settings = load_settings(assignments=["scan.range_min_m=2"])
+    warnings = watch(settings)
+    take_in(warnings, cloud((800, 8.0), (200, 1.0)), settings)
+    assert "range_min_m = 2 drops 20 % of its points" in (warnings.of("cam") or "")
+
+
+def test_pixels_without_depth_are_not_near_points() -> None:
+    warnings = watch()
+    take_in(warnings, np.concatenate([cloud((500, 8.0)), np.zeros((500, 3), np.float32)]))
+    assert warnings.of("cam") is None
+
+
+def test_what_is_near_for_the_leaf_is_told_with_a_leaf_and_a_preset_that_suit() -> None:
+    warnings = watch()
+    take_in(warnings, cloud((1000, 2.0)))
+    text = warnings.of("cam")
+    assert text is not None
+    assert "2 m away (median), near for field.leaf_m = 0.2" in text
+    assert "--preset indoor, or field.leaf_m = 0.05" in text
+
+
+def test_a_leaf_that_suits_is_not_warned_of() -> None:
+    fine = Settings(field=FieldSettings(leaf_m=0.05))
+    warnings = watch(fine)
+    take_in(warnings, cloud((1000, 2.0)), fine)
+    assert warnings.of("cam") is None
+
+
+def test_lost_scans_are_told_once_in_a_while_with_those_since() -> None:
+    scans, clock = ScanQueue(2), Clock()
+    warnings = ScanWarnings(scans, SETTINGS, clock)
+    for sequence in range(5):
+        scans.put(servers.scan(sequence))
+    first = warnings.of("lidar")
+    assert first is not None
+    assert first.startswith("source 'lidar': 3 of its scans were lost")
+    assert "scan.thin_m (it is 0.05)" in first
+    for sequence in range(5, 9):
+        scans.put(servers.scan(sequence))
+    assert warnings.of("lidar") == first
+    clock.now_s += 31.0
+    second = warnings.of("lidar")
+    assert second is not None
+    assert second.startswith("source 'lidar': 4 of its scans were lost")
+
+
+def test_refused_scans_are_told_with_the_reason() -> None:
+    scans = ScanQueue(2)
+    warnings = ScanWarnings(scans, SETTINGS, Clock())
+    scans.refuse(servers.scan(0), "too_many_points", "7 points exceed scan.max_points = 5")
+    text = warnings.of("lidar")
+    assert text == (
+        "source 'lidar': 1 of its scans were refused, the last since scan 0: "
+        "7 points exceed scan.max_points = 5"
+    )
+    assert warnings.of("other") is None
+    assert warnings.all() == text
+
+
+def test_the_log_has_one_line_for_each_telling(caplog: pytest.LogCaptureFixture) -> None:
+    clock = Clock()
+    warnings = watch(clock=clock)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(25):
+            take_in(warnings, cloud((500, 8.0), (500, 1.0)))
+            warnings.check()
+            clock.now_s += 10.0
+    told_s = (0.0, 30.0, 90.0, 210.0)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING] * len(told_s)
+
+
+def test_a_warning_whose_cause_is_gone_is_no_longer_told() -> None:
+    clock = Clock()
+    warnings = watch(clock=clock)
+    take_in(warnings, cloud((500, 8.0), (500, 1.0)))
+    assert warnings.of("cam") is not None
+    take_in(warnings, cloud((500, 8.0)))
+    clock.now_s += 61.0
+    assert warnings.of("cam") is None
+    assert warnings.all() is None
+
+
+def test_sources_that_are_invented_take_no_memory_without_end() -> None:
+    warnings = watch()
+    rays = usable_rays(cloud((10, 8.0)), np.eye(4), SETTINGS.scan)
+    for number in range(2000):
+        warnings.add(f"s{number}", 10, rays)
+    assert len(warnings._points) == 256
