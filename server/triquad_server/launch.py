@@ -3,7 +3,6 @@
 import functools
 import logging
 import sys
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -154,11 +153,6 @@ def _prepare(settings: Settings, device: str, teams: Teams, *, stops: Stops) -> 
     """
     _log.info("preparing compiled code")
     started = time.monotonic()
-    first_time = threading.Timer(
-        _QUICK_S, _log.warning, ["compiling, about a minute: this is done once for each release"]
-    )
-    first_time.daemon = True
-    first_time.start()
 
     def report(stage: str) -> None:
         if not stops.empty():
@@ -167,10 +161,7 @@ def _prepare(settings: Settings, device: str, teams: Teams, *, stops: Stops) -> 
         if seconds > _QUICK_S:
             _log.info("%.0f s so far; next: %s", seconds, stage)
 
-    try:
-        warm_up(settings, device, teams, report=report)
-    finally:
-        first_time.cancel()
+    warm_up(settings, device, teams, report=report)
 
 
 def warm_up(
