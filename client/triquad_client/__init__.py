@@ -12,6 +12,7 @@ from triquad_format import __version__
 from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_map.asked import NotAskedError
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
 from triquad_map.questions.grid import Grid
@@ -80,6 +81,7 @@ __all__ = [
     "MeshUpdate",
     "MeshWatch",
     "NoReplyError",
+    "NotAskedError",
     "OfflineMap",
     "PinnedMap",
     "Polyline",

@@ -16,7 +16,7 @@ from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
-from triquad_map.questions.distance import Unknown
+from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
 from triquad_sensors.errors import NO_NUMBER, InvalidScanError
 from triquad_sensors.pose import Pose
@@ -190,7 +190,7 @@ def grid_shape(bounds: Bounds, cell_m: float) -> GridShape:
     return GridShape(corner, side_m, (int(counts[0]), int(counts[1]), int(counts[2])))
 
 
-def unknown_policy(unknown: Unknown | str) -> Unknown:
+def unknown_policy(unknown: UnknownLike) -> Unknown:
     """How unknown space is to count."""
     try:
         return Unknown(unknown)

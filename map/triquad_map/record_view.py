@@ -1,5 +1,7 @@
 """The map in a record as something to ask, as fast as this installation can."""
 
+import functools
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -7,6 +9,8 @@ from triquad_format.records.region import MapRecord
 
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.view import MapView
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,17 @@ def open_view(record: MapRecord) -> OpenView:
     """
     try:
         from triquad_map.compiled.recorded_view import RecordedView
-    except ImportError:  # no numba, or one that does not go with this numpy
+    except ImportError as error:  # no numba, or one that does not go with this numpy
+        _tell_what_to_install(str(error))
         return OpenView(MapEvaluator(record), compiled=False, close=lambda: None)
     view = RecordedView(record)
     return OpenView(view, compiled=True, close=view.close)
+
+
+@functools.cache  # once
+def _tell_what_to_install(reason: str) -> None:
+    _log.warning(
+        "no compiled code (%s): numpy answers some forty times as slowly, the first distance after "
+        "ten seconds for 100 m of street; pip install 'triquad[fast]'",
+        reason,
+    )

@@ -5,6 +5,8 @@ from typing import Protocol
 
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 
+from triquad_map.asked import asked
+
 
 @dataclass(frozen=True)
 class FieldAnswer:
@@ -12,7 +14,12 @@ class FieldAnswer:
 
     sdf: Floats  # [N] metres, positive in free space; NaN where no region is
     status: Bytes  # [N] triquad_format.records.status.Status
-    gradient: Floats | None  # [N, 3] d(sdf)/dx, map frame; NaN as the sdf
+    _gradient: Floats | None
+
+    @property
+    def gradient(self) -> Floats:
+        """[N, 3] d(sdf)/dx, map frame; NaN as the sdf. :class:`NotAskedError`: not asked for."""
+        return asked("gradient", self._gradient, "gradient")
 
 
 @dataclass(frozen=True)

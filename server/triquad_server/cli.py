@@ -1,7 +1,6 @@
 """``triquad-server``: the command line of the map server."""
 
 import argparse
-import importlib.util
 import logging
 import queue
 import signal
@@ -14,6 +13,9 @@ from triquad_format.errors import FormatError
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 from triquad_format.wire.keys import check_name
 
+from triquad_server.errors import ListenError, ServerError, StoreError
+from triquad_server.installed import require_libraries
+
 OK, UNEXPECTED, USAGE, CANNOT_LISTEN, STORE = 0, 1, 2, 3, 4
 
 _EPILOG = """\
@@ -23,10 +25,8 @@ exit codes:
   2  wrong usage or settings, or a missing extra (install triquad[server])
   3  cannot listen on an endpoint (port in use), or cannot connect to one
   4  the store cannot be used: not readable or writable, in use, all checkpoints are damaged,
-     or the newest needs a newer release or more memory
+     or the newest needs a newer release or more memory; or the last one was not written
 """
-
-_NEEDED = ("torch", "numba", "pydantic_settings")
 
 _log = logging.getLogger("triquad_server")
 
@@ -41,17 +41,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     for name in ("numba", "torch"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        _log.error("%s is missing: install triquad[server]", ", ".join(missing))
-        return USAGE
     return _exit_code(options)
 
 
 def _exit_code(options: argparse.Namespace) -> int:
     """Do what the options say; every error becomes a line in the log and an exit code."""
-    from triquad_server.errors import ListenError, ServerError, StoreError
-
     try:
         return _run(options)
     except ListenError as error:
@@ -69,6 +63,8 @@ def _exit_code(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    require_libraries()
+    from triquad_server.launch_options import LaunchOptions
     from triquad_server.net.session import NetworkOptions
     from triquad_server.settings_loading import load_settings, settings_toml
     from triquad_server.stop import Stop, Stops
@@ -83,7 +79,7 @@ def _run(options: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stops.put(Stop.ASKED))
     # Only now, since it takes seconds to import.
-    from triquad_server.launch import LaunchOptions, run_server
+    from triquad_server.launch import run_server
 
     network = NetworkOptions(
         listen=tuple(map(full_endpoint, options.listen)),

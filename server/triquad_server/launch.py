@@ -1,14 +1,11 @@
-"""Starting and stopping a server process."""
+"""Starting and stopping a server: one that is a process, or one within a program."""
 
 import functools
 import logging
 import sys
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,10 +14,11 @@ from triquad_format.records.region import MapRecord
 from triquad_map.questions.distance import DistanceOptions, distances
 
 from triquad_server.errors import ServerError
+from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.memory import give_back_early, spare_from_collection
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.net.session import NetworkOptions, listen_endpoints, open_session
+from triquad_server.net.session import listen_endpoints, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.stop import Stop, Stops, wait_for_stop
@@ -42,63 +40,84 @@ _WARM_UP_DIRECTIONS = 400
 _WARM_UP_RADIUS_M = 3.0
 
 
-@dataclass(frozen=True)
-class LaunchOptions:
-    """What a server process is started with."""
-
-    map_name: str
-    network: NetworkOptions
-    settings: Settings
-    store: Path | None
-    device: str  # "cpu", "cuda" or "auto"
+class _StoppedEarlyError(Exception):
+    """The server was asked to stop before it had started."""
 
 
 def run_server(options: LaunchOptions, stops: Stops) -> Stop:
-    """Serve until something is put into ``stops``, and return it.
+    """Serve until something is put into ``stops``, and return it: this process does nothing else.
 
     Raises:
         ServerError: the server cannot start; subclasses tell what is in the way.
     """
-    device = choose_device(options.device)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     give_back_early()
-    with ExitStack() as stack:
-        settings = options.settings
-        store = None
-        restored = None
-        if options.store is not None:
-            store = Store(options.store, options.map_name, settings.store)
-            stack.enter_context(closing(store))
-            restored = _restored(store, options)
-        if restored is not None:
-            settings = _settings_of(restored.record, settings)
-        teams = Teams()
-        _prepare(settings, device, teams)
-        mapper = Mapper(
-            options.map_name,
-            settings,
-            device,
-            record=restored.record if restored else None,
-            teams=teams,
-        )
-        session = stack.enter_context(closing(open_session(options.network)))
-        served = ServedMap(
-            name=options.map_name,
-            mapper=mapper,
-            device=device,
-            store=store,
-            restored=restored.info if restored else None,
-            teams=teams,
-        )
-        failed = functools.partial(stops.put, Stop.INTERNAL_ERROR)
-        service = Service(session, served, settings, failed=failed)
-        stack.enter_context(closing(service))
-        spare_from_collection()
-        _log_ready(options, service.epoch, device)
-        why = wait_for_stop(stops)
-        _log.info("stopping, %s", why.value)
+    if not options.network.listen and options.network.config_file is None:
+        _log.info("no --listen: only this machine can connect")
+    if options.store is None:
+        _log.warning("no --store: the map is not kept when the server stops")
+    return serve_until_stopped(options, stops, started=spare_from_collection)
+
+
+def serve_until_stopped(options: LaunchOptions, stops: Stops, started: Callable[[], None]) -> Stop:
+    """Serve until something is put into ``stops``, write a last checkpoint, and return it.
+
+    Signals, and what else belongs to the process as a whole, are left as they are.
+
+    Args:
+        options: what the server is started with.
+        stops: where it is asked to stop; before it has started, too.
+        started: called once it serves.
+
+    Raises:
+        ServerError: the server cannot start; subclasses tell what is in the way.
+    """
+    try:
+        with ExitStack() as stack:
+            _open(options, stops, stack)
+            started()
+            why = wait_for_stop(stops)
+            _log.info("stopping, %s", why.value)
+    except _StoppedEarlyError:
+        why = stops.get()
     _log.info("stopped")
     return why
+
+
+def _open(options: LaunchOptions, stops: Stops, stack: ExitStack) -> None:
+    """Open all parts of a server, to be closed by ``stack``."""
+    device = choose_device(options.device)
+    settings = options.settings
+    store = None
+    restored = None
+    if options.store is not None:
+        store = Store(options.store, options.map_name, settings.store)
+        stack.enter_context(closing(store))
+        restored = _restored(store, options)
+    if restored is not None:
+        settings = _settings_of(restored.record, settings)
+    teams = stack.enter_context(closing(Teams()))
+    _prepare(settings, device, teams, stops=stops)
+    mapper = Mapper(
+        options.map_name,
+        settings,
+        device,
+        record=restored.record if restored else None,
+        teams=teams,
+    )
+    session = stack.enter_context(closing(open_session(options.network)))
+    served = ServedMap(
+        name=options.map_name,
+        mapper=mapper,
+        device=device,
+        store=store,
+        restored=restored.info if restored else None,
+        teams=teams,
+    )
+    failed = functools.partial(stops.put, Stop.INTERNAL_ERROR)
+    service = Service(session, served, settings, failed=failed)
+    stack.enter_context(closing(service))
+    _log_ready(options, service.epoch, device)
 
 
 def _restored(store: Store, options: LaunchOptions) -> ValidCheckpoint | None:
@@ -139,35 +158,35 @@ def choose_device(wanted: str) -> str:
     """The device to compute on: ``wanted``, or for "auto" a GPU where there is one.
 
     Raises:
-        ServerError: there is no GPU, but one is wanted.
+        ServerError: there is no GPU, but one is wanted; or it is no device.
     """
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise ServerError(f"device {wanted!r}: use auto, cpu or cuda")
     available = torch.cuda.is_available()
     if wanted == "cuda" and not available:
-        raise ServerError("--device cuda: no CUDA device is usable here; use cpu or auto")
+        raise ServerError("device cuda: no CUDA device is usable here; use cpu or auto")
     if wanted == "auto":
         return "cuda" if available else "cpu"
     return wanted
 
 
-def _prepare(settings: Settings, device: str, teams: Teams) -> None:
-    """Have all kernels compiled; whoever waits for it is told how it goes."""
+def _prepare(settings: Settings, device: str, teams: Teams, *, stops: Stops) -> None:
+    """Have all kernels compiled; whoever waits for it is told how it goes.
+
+    Raises:
+        _StoppedEarlyError: something was put into ``stops`` meanwhile.
+    """
     _log.info("preparing compiled code")
     started = time.monotonic()
-    first_time = threading.Timer(
-        _QUICK_S, _log.info, ["compiling, about a minute: this is done once for each release"]
-    )
-    first_time.daemon = True
-    first_time.start()
 
     def report(stage: str) -> None:
+        if not stops.empty():
+            raise _StoppedEarlyError
         seconds = time.monotonic() - started
         if seconds > _QUICK_S:
             _log.info("%.0f s so far; next: %s", seconds, stage)
 
-    try:
-        warm_up(settings, device, teams, report=report)
-    finally:
-        first_time.cancel()
+    warm_up(settings, device, teams, report=report)
 
 
 def warm_up(
@@ -208,10 +227,6 @@ def warm_up(
 
 def _log_ready(options: LaunchOptions, epoch: int, device: str) -> None:
     endpoints = ", ".join(listen_endpoints(options.network)) or "the configured endpoints"
-    if not options.network.listen and options.network.config_file is None:
-        _log.info("no --listen: only this machine can connect")
-    if options.store is None:
-        _log.warning("no --store: the map is not kept when the server stops")
     _log.info(
         "ready: map '%s' on %s, epoch %d, %s, store %s",
         options.map_name,

@@ -95,7 +95,11 @@ class Service:
         return self._mapper.epochs.newest.number
 
     def close(self) -> None:
-        """Stop mapping, write a last checkpoint, and answer what still waits."""
+        """Stop mapping, write a last checkpoint, and answer what still waits.
+
+        Raises:
+            StoreError: the checkpoint cannot be written; all else is closed.
+        """
         self._parts.close()
 
     def _open(self, failed: Callable[[], None]) -> None:

@@ -1,6 +1,7 @@
-"""Why a server process stops; quick to import, so that signals are heeded from the start."""
+"""Why a server stops; quick to import, so that signals are heeded from the start."""
 
 import queue
+import threading
 from contextlib import suppress
 from enum import Enum
 
@@ -19,11 +20,12 @@ _WAKE_S = 0.5
 
 
 def wait_for_stop(stops: Stops) -> Stop:
-    """Wait on the main thread until something asks the server to stop.
+    """Wait until something asks the server to stop, or until the program's main thread has ended.
 
     The system may deliver a signal to any thread, a library's too, and its Python handler runs once
     the main thread does: so that thread must not block for good.
     """
-    while True:
+    while threading.main_thread().is_alive():
         with suppress(queue.Empty):
             return stops.get(timeout=_WAKE_S)
+    return Stop.ASKED

@@ -17,3 +17,8 @@ class Teams:
     mapping: Team = field(default_factory=lambda: Team("triquad-mapping", NICENESS))
     # Tiles that nobody waits for at the moment.
     meshing: Team = field(default_factory=lambda: Team("triquad-meshing", NICENESS))
+
+    def close(self) -> None:
+        """End the threads; work that still comes is left to the callers."""
+        for team in (self.answers, self.mapping, self.meshing):
+            team.close()

@@ -173,6 +173,22 @@ def test_a_reply_of_other_bytes_is_told_apart() -> None:
         client.query_sdf(CLOUD)
 
 
+def test_a_reply_that_lacks_what_was_asked_for_is_told_apart() -> None:
+    nothing = SdfReply(1, np.zeros(0, np.float32), np.zeros(0, np.uint8), gradient=None)
+
+    def answer(query: zenoh.Query, key: str) -> None:
+        with query:
+            query.reply(key, codec.encode(nothing))
+
+    with (
+        servers.answering({keys.SDF: answer}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+    ):
+        assert len(client.query_sdf(np.zeros((0, 3))).sdf) == 0
+        with pytest.raises(BadReplyError, match="lacks gradient"):
+            client.query_sdf(np.zeros((0, 3)), gradient=True)
+
+
 def test_a_refusal_carries_its_code() -> None:
     def answer(query: zenoh.Query, _: str) -> None:
         with query:

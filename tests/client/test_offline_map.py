@@ -212,6 +212,7 @@ with triquad_client.open_map(sys.argv[1]) as offline:
     assert not offline.compiled
     above = offline.query_distance([[0.0, 0.0, 1.0]], surface_point=True)
     print(above.distance_m[0], above.surface_point[0, 2], offline.query_sdf([[0, 0, 0.1]]).sdf[0])
+triquad_client.open_map(sys.argv[1]).close()
 loaded = {"zenoh", "triquad_server"} & {n for n, m in sys.modules.items() if m is not None}
 assert loaded <= {"zenoh"}, loaded
 """
@@ -224,6 +225,7 @@ def test_without_numba_and_torch_it_answers_the_same(tmp_path: Path) -> None:
         [sys.executable, "-c", PLAIN, str(path)], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    assert done.stderr.count("pip install 'triquad[fast]'") == 1  # however many maps are opened
     plain = [float(number) for number in done.stdout.split()]
     with open_map(path) as offline:
         above = offline.query_distance([[0.0, 0.0, 1.0]], surface_point=True)

@@ -75,7 +75,7 @@ def test_a_box_of_the_map_is_downloaded_without_the_rest(client, tmp_path):
 
 
 def test_without_a_store_checkpoints_are_refused_and_the_status_says_so(client):
-    with pytest.raises(RefusedError, match="without --store") as caught:
+    with pytest.raises(RefusedError, match="without a store") as caught:
         client.checkpoint()
     assert caught.value.code == "store"
     assert "not kept" in client.status().store_error

@@ -10,6 +10,7 @@ from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES, Evidence, MapRecord, VertexTable
 from triquad_format.records.status import Status
+from triquad_map.asked import NotAskedError
 from triquad_map.reference import evaluator
 from triquad_map.reference.evaluator import MapEvaluator
 
@@ -142,7 +143,8 @@ def test_agrees_with_slow_field(encoding, indices):
     slow = SlowField(record)
     answer = MapEvaluator(record).query(points)
     assert answer.sdf.dtype == np.float32
-    assert answer.gradient is None
+    with pytest.raises(NotAskedError):
+        _ = answer.gradient
     np.testing.assert_allclose(answer.sdf, [slow.sdf(p) for p in points.tolist()], atol=2e-5)
     assert answer.status.tolist() == [slow.status(p) for p in points.tolist()]
     assert set(answer.status.tolist()) == set(Status)

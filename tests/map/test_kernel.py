@@ -39,20 +39,23 @@ def package(tmp_path):
 
 def run(package, **variables):
     """The result of the caller in a process of its own, and what it found compiled."""
+    result, found = run_process(package, **variables).stdout.split()
+    return int(result), int(found)
+
+
+def run_process(package, **variables):
     unset = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
     environment = {name: value for name, value in os.environ.items() if name not in unset}
     environment["HOME"] = str(package.parents[1] / "home")
     code = f"import sys; sys.path.append({str(package.parent)!r}); import triquad_toy.caller"
-    output = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-c", code],
         env=environment | variables,
         capture_output=True,
         text=True,
         check=True,
         timeout=120,
-    ).stdout
-    result, found = output.split()
-    return int(result), int(found)
+    )
 
 
 def edit(package, module, old, new):
@@ -64,6 +67,11 @@ def edit(package, module, old, new):
 def test_compiled_code_is_found_by_the_next_process(package):
     assert run(package) == (33, 0)
     assert run(package) == (33, 1)
+
+
+def test_who_waits_while_it_is_compiled_is_told_once(package):
+    assert run_process(package).stderr.count("compiling") == 1
+    assert run_process(package).stderr == ""
 
 
 def test_a_change_of_what_a_kernel_calls_counts(package):

@@ -38,7 +38,10 @@ def test_an_error_of_one_part_is_raised_when_all_have_ended(team):
     assert sorted(ended) == list(range(THREADS))
 
 
-def test_what_runs_beside_has_ended_when_the_context_does(team):
+@pytest.mark.parametrize("is_closed", [False, True])
+def test_what_runs_beside_has_ended_when_the_context_does(team, is_closed):
+    if is_closed:
+        team.close()
     ended = []
     with team.beside() as hand_over:
         for number in range(5):

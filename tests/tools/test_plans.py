@@ -186,6 +186,12 @@ def test_picture_of_a_slice(tmp_path, capsys):
     above = read_picture(picture)
     assert share(at_ground, SURFACE) > 20 * share(above, SURFACE)
     assert share(above, FREE) > 20 * share(at_ground, FREE)
+    assert main([*command, "1.5", "--box", "10.4", "10.4", "11", "11", "--cell", "0.05"]) == 0
+    unseen = read_picture(picture)  # though the distance to the ground seen beside it is known
+    distances, statuses = np.array_split(unseen, 2, axis=1)
+    assert share(distances, UNKNOWN) > 0.3
+    assert share(statuses, UNKNOWN) > 0.3
+    assert share(np.array_split(above, 2, axis=1)[0], UNKNOWN) < 0.01
     assert main(["tcp/127.0.0.1:7447", "--plot", str(picture), "--slice", "1"]) == 2
     assert "needs --box" in capsys.readouterr().err
     assert main([str(path), "--slice", "1"]) == 2

@@ -2,7 +2,7 @@
 
 from numpy.typing import ArrayLike
 from triquad_map.questions.align import Alignment, AlignOptions
-from triquad_map.questions.distance import DistanceOptions, Distances, Unknown
+from triquad_map.questions.distance import DistanceOptions, Distances, Unknown, UnknownLike
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayOptions, RayRanges
@@ -36,7 +36,7 @@ class AsyncMapQueries:
         points: ArrayLike,
         max_distance_m: float = 5.0,
         *,
-        unknown: Unknown | str = Unknown.FREE,
+        unknown: UnknownLike = Unknown.FREE,
         surface_point: bool = False,
         unknown_distance: bool = False,
         at_epoch: int | None = None,

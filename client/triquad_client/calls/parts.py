@@ -1,6 +1,6 @@
 """A question in parts that are asked of one epoch, and the replies joined."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,11 +43,22 @@ def in_parts(
     return (yield from retried("epoch_gone", lambda: parts(NEWEST)))
 
 
-def joined(replies: Sequence[MapReply], flags: Sequence[str] = ()) -> dict[str, Any]:
-    """The fields of replies about parts as one: arrays end to end, ``flags`` as truth values.
+def joined(
+    replies: Sequence[MapReply],
+    *,
+    flags: Sequence[str] = (),
+    asked_for: Mapping[str, bool] | None = None,
+) -> dict[str, Any]:
+    """The fields of replies about parts as one, arrays end to end, as a result takes them.
+
+    Args:
+        replies: one or more.
+        flags: fields that become truth values.
+        asked_for: fields that are there on request, and whether they were; results have them under
+            the same name with an underscore before it, and ``None`` where they were not.
 
     Raises:
-        BadReplyError: the replies do not fit together.
+        BadReplyError: the replies do not fit together, or lack what was asked for.
     """
     try:
         fields = {
@@ -58,6 +69,11 @@ def joined(replies: Sequence[MapReply], flags: Sequence[str] = ()) -> dict[str, 
         }
     except ValueError as error:
         raise BadReplyError(f"the replies about parts do not fit together: {error}") from error
+    for name, wanted in (asked_for or {}).items():
+        part = fields.pop(name)
+        if wanted and part is None:
+            raise BadReplyError(f"the reply lacks {name}, which was asked for")
+        fields[f"_{name}"] = part if wanted else None
     return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
 
 

@@ -30,8 +30,15 @@ from triquad_format.wire.query_messages import (
     SpheresReply,
     SpheresRequest,
 )
+from triquad_map.asked import asked
 from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions, thinned
-from triquad_map.questions.distance import DistanceOptions, Distances, Unknown, with_unknown
+from triquad_map.questions.distance import (
+    DistanceOptions,
+    Distances,
+    Unknown,
+    UnknownLike,
+    with_unknown,
+)
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayOptions, RayRanges
@@ -56,8 +63,17 @@ class SdfResult:
 
     sdf: NDArray[np.float32]  # [N] metres, positive in free space; NaN where the map has nothing
     status: NDArray[np.uint8]  # [N] Status values
-    gradient: NDArray[np.float32] | None  # [N, 3] d(sdf)/dx, map frame, pointing to free space
     epoch: int
+    _gradient: NDArray[np.float32] | None = None
+
+    @property
+    def gradient(self) -> NDArray[np.float32]:
+        """[N, 3] d(sdf)/dx, map frame, pointing to free space.
+
+        Raises:
+            NotAskedError: it was not asked for.
+        """
+        return asked("gradient", self._gradient, "gradient")
 
 
 def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResult]:
@@ -71,9 +87,10 @@ def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResu
         return _ask_sdf(checked[part], gradient, epoch)
 
     parts = yield from in_parts(request, len(checked), most=_PART_SDF_POINTS, at_epoch=at_epoch)
+    asked_for = {"gradient": gradient}
     if len(parts) == 1:
-        return SdfResult(**joined(parts))
-    return (yield from offload(lambda _: SdfResult(**joined(parts))))
+        return SdfResult(**joined(parts, asked_for=asked_for))
+    return (yield from offload(lambda _: SdfResult(**joined(parts, asked_for=asked_for))))
 
 
 def pin_newest() -> Call[int]:
@@ -94,11 +111,12 @@ def _ask_sdf(points: Doubles, gradient: bool, epoch: int) -> Ask[SdfReply]:
 
 
 def distance(
-    points: ArrayLike, options: DistanceOptions, unknown: Unknown | str, at_epoch: int | None
+    points: ArrayLike, options: DistanceOptions, unknown: UnknownLike, at_epoch: int | None
 ) -> Call[Distances]:
     """True distances to the nearest surface at ``points`` [N, 3]."""
     checked = checks.query_points(points)
     policy = checks.unknown_policy(unknown)
+    unknown_distance = options.unknown_distance or policy is not Unknown.FREE
     reach_m = checks.within("max_distance_m", options.max_distance_m)
 
     def request(part: slice, epoch: int) -> Ask[DistanceReply]:
@@ -108,14 +126,19 @@ def distance(
             points=offsets_from(checked[part], origin),
             max_distance_m=reach_m,
             surface_point=options.surface_point,
-            unknown_distance=options.unknown_distance or policy is not Unknown.FREE,
+            unknown_distance=unknown_distance,
             epoch=epoch,
         )
         return Ask(keys.DISTANCE, message, DistanceReply)
 
     parts = yield from in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
-    fields = joined(parts, flags=["found"])
-    for name in ("surface_point", "unknown_point"):
+    asked_for = {
+        "surface_point": options.surface_point,
+        "unknown_distance_m": unknown_distance,
+        "unknown_point": unknown_distance,
+    }
+    fields = joined(parts, flags=["found"], asked_for=asked_for)
+    for name in ("_surface_point", "_unknown_point"):
         if fields[name] is not None:
             fields[name] = fields[name] + _origins(checked, [len(part.found) for part in parts])
     return with_unknown(Distances(**fields), checked, policy)

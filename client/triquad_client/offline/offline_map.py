@@ -122,9 +122,10 @@ class OfflineMap(MapQueries):
 def open_map(path: str | Path) -> OfflineMap:
     """The map in a file, read whole and checked.
 
-    With numba installed (``pip install 'triquad[fast]'``) it answers as fast as a server. The
-    surfels, on which distances hang, are made at the first question that needs them: half a second
-    for 100 m of street.
+    With numba installed (``pip install 'triquad[fast]'``) it answers as fast as a server; without
+    it some forty times as slowly, as a warning in the log says. The surfels, on which distances
+    hang, are made at the first question that needs them: half a second for 100 m of street, or ten
+    seconds without numba.
 
     Args:
         path: a map file, beside which the other files lie that hold parts of it; or a server's

@@ -10,6 +10,7 @@ processors numba tells apart itself.
 import ast
 import functools
 import hashlib
+import logging
 import os
 import shutil
 import sys
@@ -21,9 +22,12 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
+from numba.core import event
 
 _OURS = "triquad_"
 """What the names of the packages begin with whose modules count."""
+
+_log = logging.getLogger(__name__)
 
 _numba_config: Any = numba.config
 _choosing_folder = threading.Lock()
@@ -51,6 +55,25 @@ def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
         return done
 
     return compiled
+
+
+class _CompilingIsTold(event.Listener):
+    """Tells once that it takes a while, as soon as a kernel is not found compiled."""
+
+    def __init__(self) -> None:
+        self._told = False
+
+    def on_start(self, event: Any) -> None:
+        module = event.data["dispatcher"].py_func.__module__
+        if not self._told and module.startswith(_OURS):
+            self._told = True
+            _log.warning("compiling, up to a minute in all: this is done once for each release")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _CompilingIsTold())
 
 
 @functools.cache

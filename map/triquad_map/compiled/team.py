@@ -43,8 +43,15 @@ class Team:
     def beside(self) -> Iterator[Callable[[Callable[[], None]], None]]:
         """Run work beside the caller: each that is handed over has ended when the context does."""
         handed_over: list[Future[None]] = []
+
+        def hand_over(work: Callable[[], None]) -> None:
+            try:
+                handed_over.append(self._pool.submit(work))
+            except RuntimeError:  # closed, or the program ends
+                work()
+
         try:
-            yield lambda work: handed_over.append(self._pool.submit(work))
+            yield hand_over
         finally:
             wait(handed_over)
         for work in handed_over:
@@ -55,7 +62,7 @@ class Team:
         try:
             for part in range(1, parts):
                 others.append(self._pool.submit(work, part))
-        except RuntimeError:  # closed
+        except RuntimeError:  # closed, or the program ends
             for part in range(1, parts):
                 work(part)
         try:

@@ -86,7 +86,10 @@ class Answers:
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
             return SdfReply(
-                epoch=view.epoch, sdf=answer.sdf, status=answer.status, gradient=answer.gradient
+                epoch=view.epoch,
+                sdf=answer.sdf,
+                status=answer.status,
+                gradient=answer.gradient if request.gradient else None,
             )
 
     def distance(self, request: DistanceRequest) -> DistanceReply:
@@ -96,6 +99,12 @@ class Answers:
         options = DistanceOptions(reach_m, request.surface_point, request.unknown_distance)
         with self._view(request.epoch) as view:
             answer = distances(view, points, options)
+        surface_point = unknown_distance_m = unknown_point = None
+        if request.surface_point:
+            surface_point = _relative(answer.surface_point, request.origin)
+        if request.unknown_distance:
+            unknown_distance_m = answer.unknown_distance_m
+            unknown_point = _relative(answer.unknown_point, request.origin)
         return DistanceReply(
             epoch=answer.epoch,
             distance_m=answer.distance_m,
@@ -103,9 +112,9 @@ class Answers:
             found=answer.found.astype(np.uint8),
             status=answer.status,
             confidence=answer.confidence,
-            surface_point=_relative(answer.surface_point, request.origin),
-            unknown_distance_m=answer.unknown_distance_m,
-            unknown_point=_relative(answer.unknown_point, request.origin),
+            surface_point=surface_point,
+            unknown_distance_m=unknown_distance_m,
+            unknown_point=unknown_point,
         )
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
@@ -287,5 +296,5 @@ def _same_length(first: Floats, name: str, second: Floats) -> None:
         raise RefusedError("bad_request", f"{len(second)} {name} for {len(first)} points")
 
 
-def _relative(points: Doubles | None, origin: Doubles) -> Floats | None:
-    return None if points is None else (points - origin).astype(np.float32)
+def _relative(points: Doubles, origin: Doubles) -> Floats:
+    return (points - origin).astype(np.float32)

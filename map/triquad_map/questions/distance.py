@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from enum import Enum
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
+from triquad_map.asked import asked
 from triquad_map.surface import DISC_RADIUS
 from triquad_map.view import MapView, NearestSurface
 
@@ -47,6 +49,10 @@ class Unknown(str, Enum):
     ERROR = "error"  # to meet it raises UnknownSpaceError
 
 
+UnknownLike: TypeAlias = Unknown | Literal["obstacle", "free", "error"]
+"""An :class:`Unknown`, or its word."""
+
+
 def refuse_unknown(what: str, meets: Bools) -> None:
     """Raise :class:`UnknownSpaceError` where any of N things meets unknown space."""
     if meets.any():
@@ -64,17 +70,35 @@ class DistanceOptions:
 
 @dataclass(frozen=True)
 class Distances:
-    """Distances from N points to the nearest seen surface, metres, map frame, of one epoch."""
+    """Distances from N points to the nearest seen surface, metres, map frame, of one epoch.
+
+    What was not asked for raises :class:`NotAskedError`.
+    """
 
     distance_m: Floats  # [N] negative behind a surface; at most max_distance_m
     gradient: Floats  # [N, 3] its unit gradient, pointing to free space; 0: not found
     found: Bools  # [N] False: no surface within max_distance_m, distance_m then
     status: Bytes  # [N] Status of the points themselves
     confidence: Floats  # [N] in [0, 1]; 0 where nothing was found or the point unknown
-    surface_point: Doubles | None  # [N, 3] nearest point; the point itself: not found
-    unknown_distance_m: Floats | None  # [N] at most max_distance_m, 0 in unknown space
-    unknown_point: Doubles | None  # [N, 3] nearest point of it, within max_distance_m
     epoch: int
+    _surface_point: Doubles | None = None
+    _unknown_distance_m: Floats | None = None
+    _unknown_point: Doubles | None = None
+
+    @property
+    def surface_point(self) -> Doubles:
+        """[N, 3] nearest point of the surface; the point itself: not found."""
+        return asked("surface_point", self._surface_point, "surface_point")
+
+    @property
+    def unknown_distance_m(self) -> Floats:
+        """[N] distance to unknown space, at most max_distance_m, 0 within it."""
+        return asked("unknown_distance_m", self._unknown_distance_m, "unknown_distance")
+
+    @property
+    def unknown_point(self) -> Doubles:
+        """[N, 3] nearest point of unknown space, within max_distance_m."""
+        return asked("unknown_point", self._unknown_point, "unknown_distance")
 
 
 def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
@@ -99,10 +123,10 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
         found=nearest.found,
         status=status,
         confidence=np.where(status == Status.UNKNOWN, np.float32(0), nearest.confidence),
-        surface_point=surface_point,
-        unknown_distance_m=None if unknown is None else unknown.distance.astype(np.float32),
-        unknown_point=None if unknown is None else unknown.point,
         epoch=view.epoch,
+        _surface_point=surface_point,
+        _unknown_distance_m=None if unknown is None else unknown.distance.astype(np.float32),
+        _unknown_point=None if unknown is None else unknown.point,
     )
 
 
@@ -116,13 +140,11 @@ def with_unknown(answer: Distances, points: Doubles, unknown: Unknown) -> Distan
     """
     if unknown is Unknown.FREE:
         return answer
-    assert answer.unknown_distance_m is not None
-    assert answer.unknown_point is not None
     nearer = answer.unknown_distance_m < answer.distance_m
     if unknown is Unknown.ERROR:
         refuse_unknown("point", nearer)
     gradient = _unit(points - answer.unknown_point, 0.0)
-    surface_point = answer.surface_point
+    surface_point = answer._surface_point
     if surface_point is not None:
         surface_point = np.where(nearer[:, None], answer.unknown_point, surface_point)
     return dataclasses.replace(
@@ -131,7 +153,7 @@ def with_unknown(answer: Distances, points: Doubles, unknown: Unknown) -> Distan
         gradient=np.where(nearer[:, None], gradient, answer.gradient).astype(np.float32),
         found=answer.found | nearer,
         confidence=np.where(nearer, np.float32(0), answer.confidence),
-        surface_point=surface_point,
+        _surface_point=surface_point,
     )
 
 
@@ -143,7 +165,6 @@ def _join_field(
         return
     low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
     field = view.query(points[rows], gradient=True)
-    assert field.gradient is not None
     usable = np.isfinite(field.sdf) & (np.abs(field.gradient).max(axis=1) > 0)
     rows = rows[usable]
     value = field.sdf[usable].astype(np.float64)

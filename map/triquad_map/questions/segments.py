@@ -9,6 +9,7 @@ from triquad_format.records.arrays import Bools, Doubles, Floats
 from triquad_map.questions.distance import (
     DistanceOptions,
     Unknown,
+    UnknownLike,
     UnknownSpaceError,
     distances,
     refuse_unknown,
@@ -44,7 +45,7 @@ class Segments:
     unknown_contact_m: Floats  # [N] where it first does; the length where it does not
     epoch: int
 
-    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> Bools:
+    def free(self, unknown: UnknownLike = Unknown.OBSTACLE) -> Bools:
         """Whether the ball can pass each segment [N], where unknown space counts as asked.
 
         Raises:
@@ -166,7 +167,7 @@ class Polyline:
     unknown_contact_m: float
     epoch: int
 
-    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> bool:
+    def free(self, unknown: UnknownLike = Unknown.OBSTACLE) -> bool:
         """Whether the ball can pass, where unknown space counts as asked.
 
         Raises:

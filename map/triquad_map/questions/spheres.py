@@ -6,7 +6,13 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles
 from triquad_format.records.status import Status
 
-from triquad_map.questions.distance import DistanceOptions, Unknown, distances, refuse_unknown
+from triquad_map.questions.distance import (
+    DistanceOptions,
+    Unknown,
+    UnknownLike,
+    distances,
+    refuse_unknown,
+)
 from triquad_map.view import MapView
 
 
@@ -21,7 +27,7 @@ class Spheres:
     status: Bytes  # [N] Status
     epoch: int
 
-    def free(self, unknown: Unknown | str = Unknown.OBSTACLE) -> Bools:
+    def free(self, unknown: UnknownLike = Unknown.OBSTACLE) -> Bools:
         """Whether each sphere [N] can be entered, where unknown space counts as asked.
 
         Raises:
@@ -40,7 +46,6 @@ def spheres(view: MapView, centres: Doubles, radii: Doubles) -> Spheres:
     # A little beyond the largest, so that what touches it is found.
     reach_m = float(radii.max(initial=0.0)) + view.voxel_m
     answer = distances(view, centres, DistanceOptions(reach_m, unknown_distance=True))
-    assert answer.unknown_distance_m is not None
     status = np.full(len(centres), Status.FREE, np.uint8)
     status[(answer.unknown_distance_m < radii) | (answer.status == Status.UNKNOWN)] = Status.UNKNOWN
     status[answer.found & (answer.distance_m <= radii)] = Status.SURFACE

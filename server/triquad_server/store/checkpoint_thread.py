@@ -18,7 +18,7 @@ from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
-_NO_STORE = "the server was started without --store: the map is not kept"
+_NO_STORE = "the server was started without a store: the map is not kept"
 
 
 class CheckpointThread:
@@ -51,13 +51,17 @@ class CheckpointThread:
             self._thread.start()
 
     def close(self) -> None:
-        """Write a last checkpoint, if the map changed since the one before."""
+        """Write a last checkpoint, if the map changed since the one before.
+
+        Raises:
+            StoreError: it cannot be written.
+        """
         self._stopping.set()
         self._wake.set()
         if self._thread.ident is not None:
             self._thread.join()
         if self._store is not None:
-            self._write_if_changed()
+            self._write()
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
         """A checkpoint of the map as it is now; the last one where nothing changed.

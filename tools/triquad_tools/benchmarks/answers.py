@@ -69,7 +69,6 @@ def _distances(
     slopes = scene.gradient(points)
     answer = distances(view, points, DistanceOptions(REACH_M, unknown_distance=True))
     feet_seen = view.status(points - truth[:, None] * slopes) == Status.SURFACE
-    assert answer.unknown_distance_m is not None
     # What a planner can tell from the answer itself.
     known = answer.unknown_distance_m >= answer.distance_m
     figures = [Figure("points to which a surface is nearer than unknown space",

@@ -103,7 +103,6 @@ def driven_street(drive: SimulatedDrive) -> DrivenStreet:
 def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     """Scores of a map at ``probes``."""
     answer = query(probes.near, gradient=True)
-    assert answer.gradient is not None
     known = np.isfinite(answer.sdf)
     errors = np.abs(answer.sdf.astype(np.float64) - probes.exact_sdf)[known]
     houses = query(probes.in_houses)

@@ -124,7 +124,6 @@ def surface_points(record: MapRecord) -> Doubles:
     under_way = np.arange(len(points))
     for _ in range(_STEPS):
         answer = evaluator.query(points[under_way], gradient=True)
-        assert answer.gradient is not None
         there = np.abs(answer.sdf) <= NEAR_ENOUGH_M
         arrived[under_way[there & (answer.status == Status.SURFACE)]] = True
         sdf, gradient, under_way = answer.sdf[~there], answer.gradient[~there], under_way[~there]

@@ -73,10 +73,14 @@ def _seen_box(target: str) -> list[float]:
 
 
 def _draw_distance(answer: Grid, axes: Axes) -> None:
+    """Where nothing was seen, no distance either: there it only says how far the last wall is."""
     colours = colormaps["viridis"].with_extremes(under=_BEHIND)
-    label = f"m to the nearest surface, {_MAX_DISTANCE_M:g} or more\norange: behind it"
-    values = np.asarray(answer.distance_m[:, :, 0].T, np.float64)
-    draw_values(axes, values, Scale(label, colours, low=0.0, high=_MAX_DISTANCE_M))
+    label = (
+        f"m to the nearest surface, {_MAX_DISTANCE_M:g} or more\norange: behind it; grey: not seen"
+    )
+    seen = answer.status != Status.UNKNOWN
+    distance_m = np.where(seen, answer.distance_m.astype(np.float64), np.nan)
+    draw_values(axes, distance_m[:, :, 0].T, Scale(label, colours, low=0.0, high=_MAX_DISTANCE_M))
 
 
 def _draw_status(answer: Grid, axes: Axes) -> None:

@@ -1,0 +1,18 @@
+"""What the server needs beside the base installation."""
+
+import importlib.util
+
+from triquad_server.errors import ServerError
+
+_NEEDED = ("torch", "numba", "pydantic_settings")
+
+
+def require_libraries() -> None:
+    """Tell what to install, before anything is imported that needs it.
+
+    Raises:
+        ServerError: a library is missing.
+    """
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ServerError(f"{', '.join(missing)} is missing: install triquad[server]")

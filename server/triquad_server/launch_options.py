@@ -1,0 +1,18 @@
+"""What a server is started with; quick to import."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_server.net.session import NetworkOptions
+from triquad_server.settings import Settings
+
+
+@dataclass(frozen=True)
+class LaunchOptions:
+    """What a server is started with."""
+
+    map_name: str
+    network: NetworkOptions
+    settings: Settings
+    store: Path | None
+    device: str  # "cpu", "cuda" or "auto"
