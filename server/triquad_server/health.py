@@ -65,6 +65,7 @@ class Health:
             last_checkpoint=self.checkpoints.last,
             store_error=self.checkpoints.error,
             warnings=self.warnings.all(),
+            samples_left=progress.samples_left,
         )
 
 

@@ -185,6 +185,7 @@ class ServerStatus(Message):
     last_checkpoint: CheckpointInfo | None
     store_error: str | None  # why the map is not durable, None if it is
     warnings: str | None = None  # what goes wrong with scans, and what helps: a line each
+    samples_left: int = 0  # training samples until nothing is left to learn
 
 
 @dataclass(frozen=True)

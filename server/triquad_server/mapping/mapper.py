@@ -78,7 +78,12 @@ class Mapper:
     @property
     def settled(self) -> bool:
         """Whether nothing is left to learn from the scans so far."""
-        return not any(region.budget_samples for region in self._regions.values())
+        return self.samples_left == 0
+
+    @property
+    def samples_left(self) -> int:
+        """Training samples that are still owed, of all regions."""
+        return sum(region.budget_samples for region in self._regions.values())
 
     @property
     def loss(self) -> float:

@@ -39,6 +39,7 @@ class Progress:
     settled: bool = True  # nothing is left to learn, and the newest epoch shows all
     scans_taken: int = 0
     samples_trained: int = 0
+    samples_left: int = 0
     rays_kept: int = 0
     loss: float = 0.0
 
@@ -260,6 +261,7 @@ class MapperThread:
             settled=self._mapper.settled and not self._unpublished,
             scans_taken=self._scans_taken,
             samples_trained=self._mapper.samples_trained,
+            samples_left=self._mapper.samples_left,
             rays_kept=self._mapper.rays_kept,
             loss=self._loss,
         )

@@ -90,7 +90,7 @@ class MappingRun:
             KeyboardInterrupt: the user wants to stop; all that was done is saved.
         """
         mapper = self._mapper
-        owed = _owed(mapper)
+        owed = mapper.samples_left
         trained = mapper.samples_trained
         began = time.monotonic()
         with progress("training", owed) as report:
@@ -99,7 +99,7 @@ class MappingRun:
                 mapper.train()
                 done = mapper.samples_trained - trained
                 rate = done / (time.monotonic() - began)
-                left = _owed(mapper)
+                left = mapper.samples_left
                 report(owed - left, f"{rate / 1e6:.2f} M samples/s, {left / rate:.0f} s left")
 
     def _between_steps(self) -> None:
@@ -109,8 +109,3 @@ class MappingRun:
         if time.monotonic() >= self._next_save:
             self._unfinished.save(self._mapper, self.scans_taken)
             self._next_save = time.monotonic() + _SAVE_PERIOD_S
-
-
-def _owed(mapper: Mapper) -> int:
-    """Samples that are still to be trained."""
-    return sum(region.budget_samples for region in mapper.regions)

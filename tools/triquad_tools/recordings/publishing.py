@@ -37,12 +37,17 @@ def publish_all(client: Client, scans: Sequence[PosedScan]) -> FlushReport:
 def wait_until_settled(client: Client, limit_s: float | None = None) -> ServerStatus:
     """The server's status once nothing is left to learn, or after ``limit_s`` seconds."""
     started = time.monotonic()
-    with progress("training", limit_s) as report:
+    first = client.status()
+    with progress("training", first.samples_left) as report:
         while True:
             status = client.status()
             waited_s = time.monotonic() - started
-            done_s = limit_s if status.settled and limit_s is not None else waited_s
-            report(done_s, f"{status.samples_trained / 1e6:.1f} M samples, loss {status.loss:.4f}")
+            trained = status.samples_trained - first.samples_trained
+            left_s = status.samples_left * waited_s / max(trained, 1)
+            note = f"{status.samples_trained / 1e6:.1f} M samples, loss {status.loss:.4f}"
+            if trained and not status.settled:
+                note += f", {left_s:.0f} s left"
+            report(first.samples_left - status.samples_left, note)
             if status.settled or (limit_s is not None and waited_s >= limit_s):
                 return status
             time.sleep(_POLL_S)
