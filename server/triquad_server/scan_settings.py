@@ -26,7 +26,7 @@ class ScanSettings(BaseModel):
     on rays without a return. At least `range_min_m`."""
 
     thin_m: float = length(0.05, least_m=1e-3, most_m=10)
-    """One point is kept per voxel of this side."""
+    """One point is kept per patch of this side, as the sensor sees it."""
 
     surface_share: Annotated[float, Field(ge=0.01, le=1)] = 0.5
     """Share of the training samples that lie around end points; the others lie in free space."""

@@ -16,6 +16,9 @@ from triquad_server.source_settings import ANY_SOURCE, SourceSettings
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
 
+_SHELL = 0.18
+"""The logarithm of how many times farther the outer side of a shell is than its inner one."""
+
 _NOWHERE = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
 """Corners of a box that holds nothing."""
 
@@ -165,6 +168,19 @@ def _is_within(x: float, y: float, z: float, low: Doubles, high: Doubles) -> boo
     return within
 
 
+@kernel(inline="always")
+def _is_first(keys: Longs, x: float, y: float, z: float, distance: float, thin_m: float) -> bool:
+    """Whether no point before lies in the same direction, in the same shell around the sensor.
+
+    Points are put onto the inner sphere of their shell, and thinned there: voxels around the
+    points themselves would keep each of the outliers, before and behind a surface, and but few of
+    the many points on it.
+    """
+    shell = np.floor(np.log(distance) / _SHELL)
+    onto_sphere = np.exp(shell * _SHELL) / distance
+    return bool(enter(keys, onto_sphere * x, onto_sphere * y, onto_sphere * z, thin_m))
+
+
 @kernel()
 def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
     """Tell the points that are used from the others."""
@@ -186,7 +202,7 @@ def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
             beyond[too_far, 0], beyond[too_far, 1] = share * x, share * y
             beyond[too_far, 2] = share * z
             too_far += 1
-        elif enter(keys, x, y, z, limits.thin_m):
+        elif _is_first(keys, x, y, z, distance, limits.thin_m):
             kept[count, 0], kept[count, 1], kept[count, 2] = x, y, z
             count += 1
     return _Selection(

@@ -38,7 +38,24 @@ def test_scans_are_thinned() -> None:
     rng = np.random.default_rng(0)
     dense = rng.uniform([5, -1, 0], [5.001, 1, 2], (50_000, 3)).astype(np.float32)
     rays = usable_rays(dense, pose(), SETTINGS)
-    assert 1500 <= len(rays.ends) <= 1800, "one of 40 x 40 voxels, borders apart"
+    assert 1500 <= len(rays.ends) <= 2000, "one of 40 x 40 patches, borders apart"
+
+
+def test_what_is_kept_of_a_noisy_wall_is_as_noisy_as_the_wall() -> None:
+    rng = np.random.default_rng(0)
+    y, z = np.meshgrid(np.arange(-0.5, 0.5, 0.005), np.arange(-0.5, 0.5, 0.005))
+    rays = np.stack([np.full(y.size, 4.0), y.ravel(), z.ravel()], axis=-1)
+    sent = rays * rng.normal(1.0, 0.01, (len(rays), 1))
+    kept = usable_rays(sent.astype(np.float32), pose(), SETTINGS).ends
+    assert len(kept) < len(sent) / 50
+    assert np.std(kept[:, 0]) == pytest.approx(0.04, rel=0.1)
+    assert np.mean(kept[:, 0]) == pytest.approx(4.0, abs=0.004)
+
+
+def test_what_lies_well_behind_something_else_is_kept() -> None:
+    fence, wall = points((5, 0, 0), (5, 1, 0)), points((7, 0, 0), (7, 1.4, 0))
+    rays = usable_rays(np.concatenate([fence, wall, fence]), pose(), SETTINGS)
+    np.testing.assert_array_equal(rays.ends, np.concatenate([fence, wall]))
 
 
 @pytest.mark.parametrize(
