@@ -53,7 +53,7 @@ def mapped(
             status = client.status()
         assert (status.scans_taken, status.scans_lost) == (len(taken), {}), status
         client.settle(600.0)
-        clouds = (world_points(folder, index, *RANGES_M) for index in withheld)
+        clouds = (world_points(scan, *RANGES_M) for scan in folder.read(withheld))
         return score_withheld(client.query_sdf, clouds).sdf_median_m
 
 
