@@ -277,3 +277,46 @@ def test_clouds_that_wait_are_bounded_and_all_accounted_for() -> None:
         stand(r2, 0, 1)
         status = until(client, lambda status: accounted(status) == 10)
         assert (status.scans_taken, status.scans_lost) == (3, {}), status
+
+
+def test_clouds_that_the_network_lost_are_counted() -> None:
+    with serving() as (endpoint, client), robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 0, 1)
+        r2.cloud(0.1, servers.sphere())
+        r2.wire.skip("/points", 2)
+        r2.cloud(0.4, servers.sphere())
+        status = until(client, lambda status: status.scans_taken == 2)
+        assert status.scans_dropped == {"not_received": 2}
+
+
+def test_a_better_frame_that_turns_up_late_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    with serving() as (endpoint, client), robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        for second in (0, 1):
+            r2.tf(second, ("odom", "base_link", shifted(*AT)))
+        r2.cloud(0.5, servers.sphere())
+        until(client, lambda status: status.scans_taken == 1)
+        r2.tf(0, ("map", "odom", shifted(x=99)), static=True)
+        r2.cloud(0.6, servers.sphere())
+        until(client, lambda status: status.scans_taken == 2)
+        assert finds_sphere(client, (AT[0], AT[1], AT[2] + 0.5))
+    assert 'set ros2.map_frame = "map"' in caplog.text
+
+
+def test_tokens_with_impossible_names_stop_nothing() -> None:
+    with serving() as (endpoint, client), robot(endpoint, "bridge") as r2:
+        cloud = "sensor_msgs§msg§PointCloud2"
+        dds = "sensor_msgs::msg::dds_::PointCloud2_"
+        for token in (
+            f"@/x/@ros2_lv/MP/§§/{cloud}/q",
+            f"@/x/@ros2_lv/MP/a§§b/{cloud}/q",
+            f"@ros2_lv/0/x/0/1/MP/%/%/n/%%/{dds}/RIHS01_0/q",
+            f"@ros2_lv/0/x/0/1/MP/%/%/n/%a/{dds}/%/q",
+            "@ros2_lv/0/x/0/1/MP/%/%/n/%a/no_type/RIHS01_0/q",
+        ):
+            r2.session.liveliness().declare_token(token)
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 0, 1)
+        r2.cloud(0.5, servers.sphere())
+        until(client, lambda status: status.scans_taken == 1)

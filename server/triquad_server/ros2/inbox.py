@@ -18,6 +18,7 @@ class Arrival:
     topic_name: str
     payload: zenoh.ZBytes
     arrived_ns: int  # nanoseconds since 1970, by this machine's clock
+    attachment: bytes = b""
 
 
 @dataclass(frozen=True)

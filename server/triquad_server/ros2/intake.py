@@ -20,6 +20,7 @@ from triquad_server.ros2.node import Node
 from triquad_server.ros2.placement import Placement
 from triquad_server.ros2.reading import Reader
 from triquad_server.ros2.scans import Place, ScanMaker
+from triquad_server.ros2.sequence_gaps import SequenceGaps
 from triquad_server.ros2.silence import Silence
 from triquad_server.ros2_settings import Ros2Settings
 
@@ -70,6 +71,8 @@ class Ros2Intake:
             timeout_s=settings.waiting_s,
         )
         self._inbox = Inbox(_SCANS_WAITING, _OTHERS_WAITING, self._pushed_out)
+        self._gaps = SequenceGaps()
+        self._gaps_lock = threading.Lock()
         self._silence = Silence(choice, time.monotonic())
         self._stopping = threading.Event()
         self._listening = Listening(session, choice, node, self._receive)
@@ -90,12 +93,21 @@ class Ros2Intake:
 
     def _receive(self, arrival: Arrival) -> None:
         """Keep a message for the thread that reads it."""
+        if arrival.role.brings_scans:
+            self._count_missed(arrival)
         limit = self._max_bytes if arrival.role.brings_scans else _OTHER_BYTES
         if len(arrival.payload) > limit:
             text = f"{len(arrival.payload)} bytes exceed {limit}"
             self._losses.add(arrival.topic_name, "too_large", text)
         else:
             self._inbox.put(arrival)
+
+    def _count_missed(self, arrival: Arrival) -> None:
+        with self._gaps_lock:
+            missed = self._gaps.missed(arrival.attachment)
+        if missed:
+            text = "their numbers are missing"
+            self._losses.add(arrival.topic_name, "not_received", text, missed)
 
     def _pushed_out(self, arrival: Arrival) -> None:
         self._losses.add(arrival.topic_name, "pushed_out", "too many messages wait")

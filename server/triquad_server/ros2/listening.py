@@ -101,7 +101,10 @@ class Listening:
     def _pass_on(self, feed: Feed, subscriber: Any) -> None:
         for sample in subscriber:
             name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
-            self._arrived(Arrival(feed.role, name, sample.payload, time.time_ns()))
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            self._arrived(
+                Arrival(feed.role, name, sample.payload, time.time_ns(), attachment=attachment)
+            )
 
     def _find(self, announcement: Announcement) -> None:
         """Somebody publishes on a topic."""
