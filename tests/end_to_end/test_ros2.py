@@ -13,7 +13,7 @@ from support import servers
 from support.ros_messages import CLOUD
 from support.ros_robot import T0, Robot, robot, shifted
 from triquad_client import Client, ServerStatus, Status
-from triquad_server.ros2 import silence
+from triquad_server.ros2.intake import silence
 from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.source_settings import SourceSettings
 

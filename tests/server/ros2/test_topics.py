@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from support.ros_messages import RosMessages
-from triquad_server.ros2.feeds import Choice, Role
-from triquad_server.ros2.markers import Action, Marker
-from triquad_server.ros2.sequence_gaps import ATTACHMENT, SequenceGaps
+from triquad_server.ros2.attachment import ATTACHMENT, SequenceGaps
+from triquad_server.ros2.intake.feeds import Choice, Role
+from triquad_server.ros2.output.markers import Action, Marker
 from triquad_server.ros2.topics import (
     Announcement,
     Delivery,

@@ -9,8 +9,8 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from triquad_server.ros2.feeds import Choice, Feed, Role
-from triquad_server.ros2.inbox import Arrival
+from triquad_server.ros2.intake.feeds import Choice, Feed, Role
+from triquad_server.ros2.intake.inbox import Arrival
 from triquad_server.ros2.node import Node
 from triquad_server.ros2.token_watch import TokenWatch
 from triquad_server.ros2.topics import (

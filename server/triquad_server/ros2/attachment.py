@@ -1,10 +1,10 @@
-"""Messages that never arrived, told by the numbers that publishers of rmw_zenoh give them."""
+"""What rmw_zenoh attaches to messages, and which never arrived, as their numbers tell."""
 
 import struct
 from collections import OrderedDict
 
 ATTACHMENT = struct.Struct("<qqB16s")
-"""What rmw_zenoh attaches: number, time, length of the identity, identity of the publisher."""
+"""The attachment: number, time, length of the identity, identity of the publisher."""
 
 _MAX_PUBLISHERS = 256
 

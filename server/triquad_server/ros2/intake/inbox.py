@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from triquad_server.ros2.feeds import Role
+from triquad_server.ros2.intake.feeds import Role
 
 
 @dataclass(frozen=True)

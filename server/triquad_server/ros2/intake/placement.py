@@ -11,7 +11,7 @@ from triquad_sensors.motion.frame_tree import ROOT_NAMES
 from triquad_sensors.motion.placing import place
 from triquad_sensors.sweep import PosedScan, Sweep
 
-from triquad_server.ros2.motion import Motion
+from triquad_server.ros2.intake.motion import Motion
 
 _log = logging.getLogger("triquad_server.ros2")
 

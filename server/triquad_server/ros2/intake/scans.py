@@ -14,8 +14,8 @@ from triquad_sensors.sweep import PosedScan, Sweep
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import check_count
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.ros2.losses import Losses
-from triquad_server.ros2.placement import Placed
+from triquad_server.ros2.intake.losses import Losses
+from triquad_server.ros2.intake.placement import Placed
 from triquad_server.ros2.topics import source_name
 
 _BEGAN_ANEW_NS = 10 * 10**9

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import zenoh
 
+from triquad_server.ros2.attachment import ATTACHMENT
 from triquad_server.ros2.node import Node
-from triquad_server.ros2.sequence_gaps import ATTACHMENT
 from triquad_server.ros2.token_watch import TokenWatch
 from triquad_server.ros2.topics import (
     NO_HASH,

@@ -11,17 +11,17 @@ import zenoh
 from triquad_sensors.errors import NoScanError
 
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.ros2.feeds import Choice, Role
-from triquad_server.ros2.inbox import Arrival, Inbox, LaneLimit
-from triquad_server.ros2.listening import MAX_TOPICS, Listening
-from triquad_server.ros2.losses import Losses
-from triquad_server.ros2.motion import Motion
+from triquad_server.ros2.attachment import SequenceGaps
+from triquad_server.ros2.intake.feeds import Choice, Role
+from triquad_server.ros2.intake.inbox import Arrival, Inbox, LaneLimit
+from triquad_server.ros2.intake.listening import MAX_TOPICS, Listening
+from triquad_server.ros2.intake.losses import Losses
+from triquad_server.ros2.intake.motion import Motion
+from triquad_server.ros2.intake.placement import Placement
+from triquad_server.ros2.intake.reading import Reader
+from triquad_server.ros2.intake.scans import Place, ScanMaker
+from triquad_server.ros2.intake.silence import Silence
 from triquad_server.ros2.node import Node
-from triquad_server.ros2.placement import Placement
-from triquad_server.ros2.reading import Reader
-from triquad_server.ros2.scans import Place, ScanMaker
-from triquad_server.ros2.sequence_gaps import SequenceGaps
-from triquad_server.ros2.silence import Silence
 from triquad_server.ros2_settings import Ros2Settings
 
 _log = logging.getLogger("triquad_server.ros2")
