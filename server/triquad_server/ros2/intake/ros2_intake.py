@@ -145,7 +145,7 @@ class Ros2Intake:
         sweep = self._reader.sweep(arrival)
         if self._scans.begins_anew(arrival.topic_name, sweep):
             _log.warning("ros2: %s: time went back, poses so far are forgotten", arrival.topic_name)
-            self._motion.frames.forget_moving()
+            self._motion.forget_after(sweep.stamp_ns)
         self._placement.add(arrival.topic_name, sweep, time.monotonic())
 
     def _read_motion(self, arrival: Arrival) -> None:

@@ -15,11 +15,9 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import check_count
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.ros2.intake.losses import Losses
+from triquad_server.ros2.intake.motion import BEGAN_ANEW_NS
 from triquad_server.ros2.intake.placement import Placed
 from triquad_server.ros2.topics import source_name
-
-_BEGAN_ANEW_NS = 10 * 10**9
-"""Stamps that go back by more are of a simulation or a bag that began anew."""
 
 
 def _new_session() -> int:
@@ -66,7 +64,7 @@ class ScanMaker:
         source = self._sources.get(topic_name)
         if source is None:
             source = self._sources[topic_name] = self._new_source(topic_name, sweep.stamp_ns)
-        went_back = sweep.stamp_ns < source.newest_ns - _BEGAN_ANEW_NS
+        went_back = sweep.stamp_ns < source.newest_ns - BEGAN_ANEW_NS
         if went_back:
             source.session, source.sequence = _new_session(), 0
             source.newest_ns = sweep.stamp_ns
