@@ -25,6 +25,14 @@ class Pose:
         Raises:
             InvalidScanError: it is not 3 and 4 finite numbers, or no rotation.
         """
+        return pose_matrices(*self.numbers())
+
+    def numbers(self) -> tuple[Doubles, Doubles]:
+        """The position [3] and the unit quaternion [4].
+
+        Raises:
+            InvalidScanError: as :meth:`matrix`.
+        """
         position = _numbers("position_m", self.position_m, 3)
         quaternion = _numbers("quaternion_xyzw", self.quaternion_xyzw, 4)
         with np.errstate(over="ignore"):  # what overflows has no length of 1
@@ -33,7 +41,7 @@ class Pose:
             raise InvalidScanError(
                 f"quaternion_xyzw = {quaternion.tolist()} has the length {length:.4g}, not 1"
             )
-        return pose_matrices(position, quaternion / length)
+        return position, quaternion / length
 
 
 def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -24,6 +24,9 @@ class RosMessages:
     def __init__(self, release: Stores = Stores.ROS2_JAZZY) -> None:
         self.types = get_typestore(release)
         self._is_ros_1 = release is Stores.ROS1_NOETIC
+        if self._is_ros_1:  # it has packages of its own for transforms
+            definition = "geometry_msgs/TransformStamped[] transforms"
+            self.types.register(get_types_from_msg(definition, TF))
 
     def encode(self, message: Any, type_name: str) -> bytes:
         if self._is_ros_1:

@@ -7,7 +7,7 @@ from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_sensors.errors import NoTransformError
 from triquad_sensors.motion.track import Track
-from triquad_sensors.pose import Pose
+from triquad_sensors.pose import Pose, pose_matrices
 
 STATIC = None
 """The stamp of a transform that always holds."""
@@ -59,17 +59,22 @@ class FrameTree:
         """
         if transform.child == transform.parent:
             return
-        pose = transform.pose.matrix()
+        position, quaternion = transform.pose.numbers()
         edge = self._edges.get(transform.child)
         if edge is None or edge.parent != transform.parent:
             edge = _Edge(transform.parent, None, Track(self._limit))
             self._edges[transform.child] = edge
         if transform.stamp_ns is STATIC:
-            edge.standing = pose
+            edge.standing = pose_matrices(position, quaternion)
         else:
             edge.standing = None
-            quaternion = np.asarray(transform.pose.quaternion_xyzw, np.float64)
-            edge.track.add(transform.stamp_ns, pose[:3, 3], quaternion / np.linalg.norm(quaternion))
+            edge.track.add(transform.stamp_ns, position, quaternion)
+
+    def with_track(self, parent: str, child: str, track: Track) -> "FrameTree":
+        """A tree that differs in where ``child`` is, and else shares what this one knows."""
+        tree = FrameTree(self._limit)
+        tree._edges = {**self._edges, child: _Edge(parent, None, track)}
+        return tree
 
     def knows(self, child: str) -> bool:
         """Whether a transform says where a frame is."""
@@ -107,9 +112,11 @@ class FrameTree:
         target_from_frame: Doubles = np.linalg.inv(shared_from_target) @ shared_from_frame
         return target_from_frame
 
-    def connected(self, target: str, frame: str) -> bool:
-        """Whether both hang together, at whatever times."""
-        return self.root(target) == self.root(frame)
+    def moves(self, target: str, frame: str) -> bool:
+        """Whether it was ever reported that ``frame`` moves in ``target``."""
+        up, down = self._path(frame), self._path(target)
+        between = {*up} ^ {*down}
+        return any(name in self._edges and self._edges[name].standing is None for name in between)
 
     def _path(self, frame: str) -> list[str]:
         """The frame, its parent, and so on up to the root."""

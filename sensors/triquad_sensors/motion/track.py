@@ -1,5 +1,6 @@
 """How one frame moved in another: poses at times, and between them."""
 
+from array import array
 from bisect import bisect_left
 
 import numpy as np
@@ -11,6 +12,7 @@ from triquad_sensors.pose import pose_matrices
 MAX_GAP_S = 2.0
 """Between poses that lie farther apart nothing is interpolated."""
 
+_WIDTH = 7  # numbers of a pose
 _NEARLY_PARALLEL = 0.9995  # quaternions, of which spherical interpolation would divide by nearly 0
 
 
@@ -24,8 +26,8 @@ class Track:
     def __init__(self, limit: int | None = None) -> None:
         """Only the ``limit`` newest poses are kept."""
         self._limit = limit
-        self._stamps: list[int] = []
-        self._values: list[tuple[float, ...]] = []  # position and unit quaternion
+        self._stamps = array("q")
+        self._values = array("d")  # position and unit quaternion of each
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -38,14 +40,13 @@ class Track:
     def add(self, stamp_ns: int, position_m: Doubles, quaternion: Doubles) -> None:
         """Add a pose; one with the same stamp is replaced."""
         at = bisect_left(self._stamps, stamp_ns)
-        value = (*position_m, *quaternion)
-        if at < len(self._stamps) and self._stamps[at] == stamp_ns:
-            self._values[at] = value
-        else:
+        replaced = at < len(self._stamps) and self._stamps[at] == stamp_ns
+        if not replaced:
             self._stamps.insert(at, stamp_ns)
-            self._values.insert(at, value)
+        end = at + 1 if replaced else at
+        self._values[_WIDTH * at : _WIDTH * end] = array("d", [*position_m, *quaternion])
         if self._limit is not None and len(self._stamps) > self._limit:
-            del self._stamps[0], self._values[0]
+            del self._stamps[0], self._values[:_WIDTH]
 
     def poses(self, stamps_ns: Longs) -> Doubles:
         """Poses [M, 4, 4] at times [M].
@@ -71,7 +72,8 @@ class Track:
         low = max(0, bisect_left(self._stamps, first_ns) - 1)
         high = bisect_left(self._stamps, last_ns) + 1
         stamps = np.array(self._stamps[low:high], np.int64)
-        return stamps, np.array(self._values[low:high], np.float64).reshape(-1, 7)
+        values = np.array(self._values[_WIDTH * low : _WIDTH * high], np.float64)
+        return stamps, values.reshape(-1, _WIDTH)
 
     def _check_covered(self, stamps_ns: Longs) -> None:
         first, last = self.span_ns

@@ -18,6 +18,11 @@ def is_depth(encoding: str) -> bool:
     return encoding in _ENCODINGS
 
 
+def camera_topic(image_topic: str) -> str:
+    """Where the ``CameraInfo`` of an image is published: beside it, by the habit of ROS."""
+    return image_topic.rpartition("/")[0] + "/camera_info"
+
+
 def intrinsics_of(info: Any) -> Intrinsics:
     """The camera of a ``CameraInfo``, for the rectified image.
 

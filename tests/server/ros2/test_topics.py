@@ -18,7 +18,6 @@ from triquad_server.ros2.topics import (
     rmw_node_token,
     rmw_token,
     rmw_topic_name,
-    source_name,
     type_hash,
 )
 from triquad_server.ros2_settings import Ros2Settings
@@ -40,7 +39,6 @@ def test_keys_are_those_of_the_documents() -> None:
     namespaced = rmw_key(0, Topic("/robot1/chatter", STRING), HASH)
     assert namespaced == f"0/robot1/chatter/std_msgs::msg::dds_::String_/{HASH}"
     assert rmw_topic_name(namespaced) == "/robot1/chatter"
-    assert source_name("/robot1/chatter") == "robot1.chatter"
 
 
 def test_tokens_are_those_of_the_documents() -> None:

@@ -4,11 +4,10 @@ import secrets
 from dataclasses import dataclass, field
 
 import numpy as np
-from triquad_format.errors import FormatError
 from triquad_format.records.arrays import Doubles
-from triquad_format.wire import keys
 from triquad_format.wire.messages import Scan
 from triquad_sensors.errors import NoScanError
+from triquad_sensors.ros.topic import source_of_topic
 from triquad_sensors.sweep import PosedScan, Sweep
 
 from triquad_server.errors import ScanRefusedError
@@ -17,7 +16,6 @@ from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.ros2.intake.losses import Losses
 from triquad_server.ros2.intake.motion import BEGAN_ANEW_NS
 from triquad_server.ros2.intake.placement import Placed
-from triquad_server.ros2.topics import source_name
 
 
 def _new_session() -> int:
@@ -104,7 +102,4 @@ class ScanMaker:
     def _new_source(self, topic_name: str, stamp_ns: int) -> _Source:
         if len(self._sources) >= self._max_sources:
             raise NoScanError("too_many_topics", f"there are {len(self._sources)} others already")
-        try:
-            return _Source(keys.check_name("source", source_name(topic_name)), stamp_ns)
-        except FormatError as error:
-            raise NoScanError("bad_source", f"{error}: give the topic another name") from error
+        return _Source(source_of_topic(topic_name), stamp_ns)
