@@ -329,3 +329,18 @@ def test_tokens_with_impossible_names_stop_nothing() -> None:
         stand(r2, 0, 1)
         r2.cloud(0.5, servers.sphere())
         until(client, lambda status: status.scans_taken == 1)
+
+
+def test_a_server_started_with_the_flag_says_what_it_maps() -> None:
+    with (
+        servers.server_process(["--ros2", "--settings", "/dev/null"]) as server,
+        robot(server.endpoint) as r2,
+    ):
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 0, 1)
+        r2.cloud(0.5, servers.sphere())
+        server.wait_for("ros2: mapping in the frame 'map'")
+        assert "ros2: listening in domain 0" in server.log
+        assert "ros2: found /points (sensor_msgs/msg/PointCloud2)" in server.log
+        server.process.terminate()
+        assert server.wait() == 0
