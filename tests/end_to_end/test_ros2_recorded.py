@@ -49,11 +49,12 @@ def mapped(
             publish(index)
         status = client.status()
         while status.scans_taken + sum(status.scans_dropped.values()) < len(taken):
+            assert status.scans_lost == {}, status
             time.sleep(0.1)
             status = client.status()
         assert (status.scans_taken, status.scans_lost) == (len(taken), {}), status
         client.settle(600.0)
-        clouds = (world_points(folder, index, *RANGES_M) for index in withheld)
+        clouds = (world_points(scan, *RANGES_M) for scan in folder.read(withheld))
         return score_withheld(client.query_sdf, clouds).sdf_median_m
 
 
