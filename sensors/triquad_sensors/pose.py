@@ -35,7 +35,8 @@ class Pose:
         """
         position = _numbers("position_m", self.position_m, 3)
         quaternion = _numbers("quaternion_xyzw", self.quaternion_xyzw, 4)
-        length = float(np.linalg.norm(quaternion))
+        with np.errstate(over="ignore"):  # what overflows has no length of 1
+            length = float(np.linalg.norm(quaternion))
         if abs(length - 1.0) > _UNIT_TOLERANCE:
             raise InvalidScanError(
                 f"quaternion_xyzw = {quaternion.tolist()} has the length {length:.4g}, not 1"

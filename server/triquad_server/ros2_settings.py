@@ -69,8 +69,8 @@ class Ros2Settings(BaseModel):
     mesh_topic: TopicOrNone = "/triquad/mesh"
     """The mesh as `visualization_msgs/Marker`, while somebody listens; empty: never."""
 
-    mesh_level: Annotated[int, Field(ge=0, le=2)] = 0
-    """Level of detail of that mesh: 1 and 2 have cells of twice and four times the side."""
+    mesh_level: Annotated[int, Field(ge=0, le=2)] = 1
+    """Level of detail of that mesh: 1 and 2 have cells of twice and four times the side of 0."""
 
     mesh_bytes_per_s: Annotated[int, Field(ge=1000, le=2**40)] = 5_000_000
     """No more of the mesh is published a second."""

@@ -43,7 +43,6 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.net.requests import Handler, RequestHandlers, answering, payload_limit
-from triquad_server.ros2.connection import Ros2Connection, ServedParts
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
@@ -166,6 +165,9 @@ class Service:
         self._parts.callback(intake.close)
 
     def _open_ros2(self, tiles: TileFeed) -> None:
+        # Only where it is wanted, since the types of ROS take a while to import.
+        from triquad_server.ros2.connection import Ros2Connection, ServedParts
+
         parts = ServedParts(
             scans=self._scans,
             scan_arrived=self._mapper.wake,

@@ -29,6 +29,7 @@ def serving(**changes: object) -> Iterator[tuple[str, Client]]:
             "grid_side_m": 12.0,
             "grid_height_m": HEIGHT_M,
             "mesh_bytes_per_s": 10**9,
+            "mesh_level": 0,
             **changes,
         }
     )

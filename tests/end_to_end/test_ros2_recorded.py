@@ -49,6 +49,7 @@ def mapped(
             publish(index)
         status = client.status()
         while status.scans_taken + sum(status.scans_dropped.values()) < len(taken):
+            assert status.scans_lost == {}, status
             time.sleep(0.1)
             status = client.status()
         assert (status.scans_taken, status.scans_lost) == (len(taken), {}), status

@@ -1,8 +1,9 @@
 """Robots that speak ROS 2 over Zenoh, byte by byte as nodes of rmw_zenoh and bridges do."""
 
-import itertools
+import hashlib
 import struct
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -52,7 +53,7 @@ class RmwZenoh:
         self._namespace = namespace
         self._publishers: dict[str, Any] = {}
         self._tokens: list[Any] = []
-        self._sequence = itertools.count(1)
+        self._sent: Counter[str] = Counter()
 
     def publish(self, topic: str, type_name: str, payload: bytes, latched: bool = False) -> None:
         topic = self._namespace + topic
@@ -70,9 +71,14 @@ class RmwZenoh:
                     f"{len(self._publishers)}/MP/%/%/robot/{names}"
                 )
             )
-        stamp = T0
-        attachment = struct.pack("<qqB", next(self._sequence), stamp, 16) + b"g" * 16
+        self._sent[topic] += 1
+        identity = hashlib.blake2b(key.encode(), digest_size=16).digest()
+        attachment = struct.pack("<qqB", self._sent[topic], T0, 16) + identity
         self._publishers[key].put(payload, attachment=attachment)
+
+    def skip(self, topic: str, count: int) -> None:
+        """As if so many messages were lost on the way."""
+        self._sent[self._namespace + topic] += count
 
 
 class Bridge:

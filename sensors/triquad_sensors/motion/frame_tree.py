@@ -84,11 +84,9 @@ class FrameTree:
         """How many frames there are of which a transform says where they are."""
         return len(self._edges)
 
-    def forget_moving(self) -> None:
-        """Forget all poses of frames but of those that always hold."""
-        self._edges = {
-            child: edge for child, edge in self._edges.items() if edge.standing is not None
-        }
+    def forget(self, child: str) -> None:
+        """Forget where a frame is."""
+        self._edges.pop(child, None)
 
     def root(self, frame: str) -> str:
         """The frame above all others that ``frame`` hangs on; itself where it hangs on none."""

@@ -57,13 +57,11 @@ def _points(message: Any, fields: dict[str, Any]) -> Floats:
             f"x, y and z of the cloud are {', '.join(str(c.dtype) for c in columns)}: only "
             "FLOAT32 and FLOAT64 are understood",
         )
-    starts = [fields[name].offset for name in "xyz"]
-    item = columns[0].dtype.itemsize
-    if np.all(np.diff(starts) == item) and len({c.dtype for c in columns}) == 1:
-        shape, strides = (*columns[0].shape, 3), (*columns[0].strides, item)
-        together = np.ndarray(shape, columns[0].dtype, message.data, starts[0], strides)
-        return np.array(together.reshape(-1, 3), np.float32)
-    return np.array(np.stack([column.reshape(-1) for column in columns], axis=1), np.float32)
+    # Column by column, which is three times as fast as three numbers at a time.
+    points = np.empty((*columns[0].shape, 3), np.float32)
+    for axis, column in enumerate(columns):
+        points[..., axis] = column
+    return points.reshape(-1, 3)
 
 
 def _column(message: Any, field: Any) -> NDArray[Any]:

@@ -1,5 +1,6 @@
 """The connection of a server with ROS 2: what it takes in there, and what it publishes."""
 
+import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -12,14 +13,16 @@ from triquad_sensors.ros.type_store import MARKER, OCCUPANCY_GRID
 from triquad_server.epochs import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mesh.tile_feed import TileFeed
-from triquad_server.ros2.feeds import full_name
-from triquad_server.ros2.grid_outlet import GridOutlet, SliceShape
-from triquad_server.ros2.intake import Ros2Intake
-from triquad_server.ros2.mesh_outlet import MeshOutlet
+from triquad_server.ros2.intake.feeds import full_name
+from triquad_server.ros2.intake.ros2_intake import Ros2Intake
 from triquad_server.ros2.node import Node
-from triquad_server.ros2.outlet import Outlet
+from triquad_server.ros2.output.grid_outlet import GridOutlet, SliceShape
+from triquad_server.ros2.output.mesh_outlet import MeshOutlet
+from triquad_server.ros2.output.outlet import Outlet
 from triquad_server.ros2.topics import Delivery, Topic
 from triquad_server.ros2_settings import Ros2Settings
+
+_log = logging.getLogger("triquad_server.ros2")
 
 
 class _Part(Protocol):
@@ -54,6 +57,8 @@ class Ros2Connection:
         self._session = session
         self._settings = settings
         self._open = ExitStack()
+        below = f" below {settings.namespace}" if settings.namespace else ""
+        _log.info("ros2: listening in domain %d%s", settings.domain, below)
         try:
             self._node = self._keep(Node(session, settings.domain))
             self._intake = self._keep(

@@ -1,11 +1,14 @@
 """Watching liveliness tokens: who publishes on topics, and who listens."""
 
+import logging
 import threading
 from collections.abc import Callable
 
 import zenoh
 
 from triquad_server.ros2.topics import Announcement, End, bridge_tokens, read_token, rmw_tokens
+
+_log = logging.getLogger("triquad_server.ros2")
 
 _WAITING = 256
 
@@ -47,6 +50,13 @@ class TokenWatch:
         for sample in subscriber:
             token = str(sample.key_expr)
             if sample.kind == zenoh.SampleKind.PUT and self._own_chunk not in token:
-                announcement = read_token(token)
-                if announcement is not None:
-                    self._appeared(announcement)
+                self._tell(token)
+
+    def _tell(self, token: str) -> None:
+        announcement = read_token(token)
+        if announcement is None:
+            return
+        try:
+            self._appeared(announcement)
+        except zenoh.ZError as error:  # names that cannot stand in a key
+            _log.debug("ros2: %s is of no use: %s", token, error)

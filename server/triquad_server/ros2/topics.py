@@ -66,11 +66,6 @@ def old_bridge_cache(topic_name: str) -> str:
     return f"@/*/@ros2_pub_cache/{bridge_key(topic_name)}"
 
 
-def source_name(topic_name: str) -> str:
-    """The source of scans as which a topic counts: ``lidar.points`` of ``/lidar/points``."""
-    return topic_name.strip("/").replace("/", ".")
-
-
 def rmw_tokens(domain: int, end: End) -> str:
     """Key expression of all tokens of rmw_zenoh for one end of topics."""
     return f"@ros2_lv/{domain}/*/*/*/{end.value}/**"

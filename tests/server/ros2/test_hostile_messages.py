@@ -11,7 +11,7 @@ from support.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, TF, RosMes
 from support.ros_robot import robot, shifted
 from triquad_format.wire.messages import Scan
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.ros2.intake import Ros2Intake
+from triquad_server.ros2.intake.ros2_intake import Ros2Intake
 from triquad_server.ros2.node import Node
 from triquad_server.ros2_settings import Ros2Settings
 

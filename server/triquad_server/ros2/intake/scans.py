@@ -4,22 +4,18 @@ import secrets
 from dataclasses import dataclass, field
 
 import numpy as np
-from triquad_format.errors import FormatError
 from triquad_format.records.arrays import Doubles
-from triquad_format.wire import keys
 from triquad_format.wire.messages import Scan
 from triquad_sensors.errors import NoScanError
+from triquad_sensors.ros.topic import source_of_topic
 from triquad_sensors.sweep import PosedScan, Sweep
 
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import check_count
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.ros2.losses import Losses
-from triquad_server.ros2.placement import Placed
-from triquad_server.ros2.topics import source_name
-
-_BEGAN_ANEW_NS = 10 * 10**9
-"""Stamps that go back by more are of a simulation or a bag that began anew."""
+from triquad_server.ros2.intake.losses import Losses
+from triquad_server.ros2.intake.motion import BEGAN_ANEW_NS
+from triquad_server.ros2.intake.placement import Placed
 
 
 def _new_session() -> int:
@@ -66,7 +62,7 @@ class ScanMaker:
         source = self._sources.get(topic_name)
         if source is None:
             source = self._sources[topic_name] = self._new_source(topic_name, sweep.stamp_ns)
-        went_back = sweep.stamp_ns < source.newest_ns - _BEGAN_ANEW_NS
+        went_back = sweep.stamp_ns < source.newest_ns - BEGAN_ANEW_NS
         if went_back:
             source.session, source.sequence = _new_session(), 0
             source.newest_ns = sweep.stamp_ns
@@ -106,7 +102,4 @@ class ScanMaker:
     def _new_source(self, topic_name: str, stamp_ns: int) -> _Source:
         if len(self._sources) >= self._max_sources:
             raise NoScanError("too_many_topics", f"there are {len(self._sources)} others already")
-        try:
-            return _Source(keys.check_name("source", source_name(topic_name)), stamp_ns)
-        except FormatError as error:
-            raise NoScanError("bad_source", f"{error}: give the topic another name") from error
+        return _Source(source_of_topic(topic_name), stamp_ns)

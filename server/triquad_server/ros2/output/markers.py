@@ -6,7 +6,7 @@ from enum import IntEnum
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
 
-from triquad_server.ros2.cdr import CdrWriter
+from triquad_server.ros2.output.cdr import CdrWriter
 
 _TRIANGLE_LIST = 11
 _NAMESPACE = "triquad"

@@ -9,8 +9,8 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from triquad_server.ros2.feeds import Choice, Feed, Role
-from triquad_server.ros2.inbox import Arrival
+from triquad_server.ros2.intake.feeds import Choice, Feed, Role
+from triquad_server.ros2.intake.inbox import Arrival
 from triquad_server.ros2.node import Node
 from triquad_server.ros2.token_watch import TokenWatch
 from triquad_server.ros2.topics import (
@@ -101,7 +101,10 @@ class Listening:
     def _pass_on(self, feed: Feed, subscriber: Any) -> None:
         for sample in subscriber:
             name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
-            self._arrived(Arrival(feed.role, name, sample.payload, time.time_ns()))
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            self._arrived(
+                Arrival(feed.role, name, sample.payload, time.time_ns(), attachment=attachment)
+            )
 
     def _find(self, announcement: Announcement) -> None:
         """Somebody publishes on a topic."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from triquad_server.ros2.feeds import Role
+from triquad_server.ros2.intake.feeds import Role
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,7 @@ class Arrival:
     topic_name: str
     payload: zenoh.ZBytes
     arrived_ns: int  # nanoseconds since 1970, by this machine's clock
+    attachment: bytes = b""
 
 
 @dataclass(frozen=True)

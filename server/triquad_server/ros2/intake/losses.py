@@ -19,6 +19,8 @@ REMEDIES = {
     'and poses differ, set ros2.clock = "arrival"',
     "pose_early": 'some at the start are usual; else the clocks differ: set ros2.clock = "arrival"',
     "pose_gap": "poses came too seldom or not at all for a while",
+    "not_received": "the network or the publisher drops them: publish fewer or smaller clouds, or "
+    "with RELIABLE delivery",
     "pushed_out": "clouds come faster than they are read: choose fewer topics with ros2.clouds",
     "too_large": "raise scan.max_points",
     "decode": "is it another type, or was it cut off? The topic is left out with ros2.clouds",
@@ -42,12 +44,12 @@ class Losses:
         self._clock = clock
         self._kinds: dict[tuple[str, str], _Kind] = {}
 
-    def add(self, topic_name: str, reason: str, text: object) -> None:
-        """Count a message that is lost, and why."""
-        self._counter.add(reason)
-        self.say(topic_name, reason, text)
+    def add(self, topic_name: str, reason: str, text: object, count: int = 1) -> None:
+        """Count messages that are lost, and why."""
+        self._counter.add(reason, count)
+        self.say(topic_name, reason, text, count)
 
-    def say(self, topic_name: str, reason: str, text: object) -> None:
+    def say(self, topic_name: str, reason: str, text: object, count: int = 1) -> None:
         """As :meth:`add`, for what is counted elsewhere."""
         now_s = self._clock()
         kind = self._kinds.get((topic_name, reason))
@@ -55,7 +57,7 @@ class Losses:
             if len(self._kinds) >= _MAX_REMEMBERED:
                 return
             kind = self._kinds[topic_name, reason] = _Kind(now_s - LOG_PERIOD_S)
-        kind.since += 1
+        kind.since += count
         if now_s - kind.logged_s < LOG_PERIOD_S:
             return
         remedy = f" ({REMEDIES[reason]})" if reason in REMEDIES else ""

@@ -11,7 +11,7 @@ from triquad_sensors.motion.frame_tree import ROOT_NAMES
 from triquad_sensors.motion.placing import place
 from triquad_sensors.sweep import PosedScan, Sweep
 
-from triquad_server.ros2.motion import Motion
+from triquad_server.ros2.intake.motion import Motion
 
 _log = logging.getLogger("triquad_server.ros2")
 
@@ -51,6 +51,7 @@ class Placement:
         self._limit = limit
         self._timeout_s = timeout_s
         self._waiting: dict[str, deque[_Waiting]] = {}
+        self._warned = bool(map_frame)  # that there is a better frame; not where it was chosen
         self._choose_s: float | None = None  # when the map frame is chosen at the latest
 
     def __len__(self) -> int:
@@ -106,7 +107,21 @@ class Placement:
         if not self.map_frame:
             _log.info("ros2: mapping in the frame %r", target)
             self.map_frame = target
+        self._warn_of_better_frame()
         return scan
+
+    def _warn_of_better_frame(self) -> None:
+        """Say so, once, where a frame to map in turned up too late."""
+        better = self._motion.frames.fixed_frame(self.map_frame)
+        if better != self.map_frame and not self._warned:
+            self._warned = True
+            _log.warning(
+                "ros2: %r turned up above %r, in which the map is made: to map in it, set "
+                'ros2.map_frame = "%s" and begin anew',
+                better,
+                self.map_frame,
+                better,
+            )
 
     def _best_frame(self, frame: str, now_s: float) -> str:
         """The frame to map in, as far as is known by now."""

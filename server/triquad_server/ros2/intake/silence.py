@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 from triquad_sensors.ros.type_store import IMAGE, POINT_CLOUD
 
-from triquad_server.ros2.feeds import Choice
+from triquad_server.ros2.intake.feeds import Choice
 from triquad_server.ros2.topics import Topic
 
 _log = logging.getLogger("triquad_server.ros2")

@@ -3,6 +3,7 @@
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -13,9 +14,9 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_feed import TileFeed
-from triquad_server.ros2.markers import Action, Marker
-from triquad_server.ros2.outlet import Outlet
-from triquad_server.ros2.scans import Place
+from triquad_server.ros2.intake.scans import Place
+from triquad_server.ros2.output.markers import Action, Marker
+from triquad_server.ros2.output.outlet import Outlet
 from triquad_server.threads import NICENESS
 
 _log = logging.getLogger("triquad_server.ros2")
@@ -69,6 +70,7 @@ class MeshOutlet:
         self._revision = 0
         self._numbers: dict[TileIndex, int] = {}
         self._is_first = True
+        self._free_s = 0.0  # monotonic: when what was sent last is through
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="ros2-mesh")
         self._thread.start()
@@ -98,9 +100,10 @@ class MeshOutlet:
         self._server, self._revision = updates.server, updates.revision
         for marker in self._markers(updates, place.map_frame):
             payload = marker.payload()
-            self._outlet.put(payload)
-            if self._stopping.wait(len(payload) / self._bytes_per_s):
+            if self._stopping.wait(max(0.0, self._free_s - time.monotonic())):
                 return
+            self._outlet.put(payload)
+            self._free_s = time.monotonic() + len(payload) / self._bytes_per_s
 
     def _ask(self) -> TileUpdates | None:
         """What changed; None where that cannot be told now."""

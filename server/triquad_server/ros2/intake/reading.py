@@ -23,8 +23,8 @@ from triquad_sensors.ros.type_store import (
 )
 from triquad_sensors.sweep import Sweep
 
-from triquad_server.ros2.feeds import Role, camera_info_of
-from triquad_server.ros2.inbox import Arrival
+from triquad_server.ros2.intake.feeds import Role, camera_info_of
+from triquad_server.ros2.intake.inbox import Arrival
 
 
 class Reader:

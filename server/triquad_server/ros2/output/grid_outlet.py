@@ -16,8 +16,8 @@ from triquad_map.questions.grid import Grid, GridShape, grid
 from triquad_sensors.ros.type_store import OCCUPANCY_GRID, encode_cdr, type_store
 
 from triquad_server.epochs import Epoch, EpochHistory
-from triquad_server.ros2.outlet import Outlet
-from triquad_server.ros2.scans import Place
+from triquad_server.ros2.intake.scans import Place
+from triquad_server.ros2.output.outlet import Outlet
 from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.threads import NICENESS
 

@@ -2,13 +2,13 @@
 
 import hashlib
 import itertools
-import struct
 import threading
 import time
 from dataclasses import dataclass
 
 import zenoh
 
+from triquad_server.ros2.attachment import ATTACHMENT
 from triquad_server.ros2.node import Node
 from triquad_server.ros2.token_watch import TokenWatch
 from triquad_server.ros2.topics import (
@@ -21,8 +21,6 @@ from triquad_server.ros2.topics import (
     rmw_key,
     type_hash,
 )
-
-_ATTACHMENT = struct.Struct("<qqB16s")  # number, time, length of the id, id of the publisher
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ class Outlet:
         number, now_ns = next(self._numbers), time.time_ns()
         for way in self._all_ways():
             if way.is_followed:
-                attachment = way.identity and _ATTACHMENT.pack(number, now_ns, 16, way.identity)
+                attachment = way.identity and ATTACHMENT.pack(number, now_ns, 16, way.identity)
                 way.publisher.put(payload, attachment=attachment)
 
     def _all_ways(self) -> list[_Way]:

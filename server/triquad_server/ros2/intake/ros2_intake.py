@@ -11,16 +11,17 @@ import zenoh
 from triquad_sensors.errors import NoScanError
 
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.ros2.feeds import Choice, Role
-from triquad_server.ros2.inbox import Arrival, Inbox, LaneLimit
-from triquad_server.ros2.listening import MAX_TOPICS, Listening
-from triquad_server.ros2.losses import Losses
-from triquad_server.ros2.motion import Motion
+from triquad_server.ros2.attachment import SequenceGaps
+from triquad_server.ros2.intake.feeds import Choice, Role
+from triquad_server.ros2.intake.inbox import Arrival, Inbox, LaneLimit
+from triquad_server.ros2.intake.listening import MAX_TOPICS, Listening
+from triquad_server.ros2.intake.losses import Losses
+from triquad_server.ros2.intake.motion import Motion
+from triquad_server.ros2.intake.placement import Placement
+from triquad_server.ros2.intake.reading import Reader
+from triquad_server.ros2.intake.scans import Place, ScanMaker
+from triquad_server.ros2.intake.silence import Silence
 from triquad_server.ros2.node import Node
-from triquad_server.ros2.placement import Placement
-from triquad_server.ros2.reading import Reader
-from triquad_server.ros2.scans import Place, ScanMaker
-from triquad_server.ros2.silence import Silence
 from triquad_server.ros2_settings import Ros2Settings
 
 _log = logging.getLogger("triquad_server.ros2")
@@ -70,6 +71,8 @@ class Ros2Intake:
             timeout_s=settings.waiting_s,
         )
         self._inbox = Inbox(_SCANS_WAITING, _OTHERS_WAITING, self._pushed_out)
+        self._gaps = SequenceGaps()
+        self._gaps_lock = threading.Lock()
         self._silence = Silence(choice, time.monotonic())
         self._stopping = threading.Event()
         self._listening = Listening(session, choice, node, self._receive)
@@ -90,12 +93,21 @@ class Ros2Intake:
 
     def _receive(self, arrival: Arrival) -> None:
         """Keep a message for the thread that reads it."""
+        if arrival.role.brings_scans:
+            self._count_missed(arrival)
         limit = self._max_bytes if arrival.role.brings_scans else _OTHER_BYTES
         if len(arrival.payload) > limit:
             text = f"{len(arrival.payload)} bytes exceed {limit}"
             self._losses.add(arrival.topic_name, "too_large", text)
         else:
             self._inbox.put(arrival)
+
+    def _count_missed(self, arrival: Arrival) -> None:
+        with self._gaps_lock:
+            missed = self._gaps.missed(arrival.attachment)
+        if missed:
+            text = "their numbers are missing"
+            self._losses.add(arrival.topic_name, "not_received", text, missed)
 
     def _pushed_out(self, arrival: Arrival) -> None:
         self._losses.add(arrival.topic_name, "pushed_out", "too many messages wait")
@@ -133,7 +145,7 @@ class Ros2Intake:
         sweep = self._reader.sweep(arrival)
         if self._scans.begins_anew(arrival.topic_name, sweep):
             _log.warning("ros2: %s: time went back, poses so far are forgotten", arrival.topic_name)
-            self._motion.frames.forget_moving()
+            self._motion.forget_after(sweep.stamp_ns)
         self._placement.add(arrival.topic_name, sweep, time.monotonic())
 
     def _read_motion(self, arrival: Arrival) -> None:

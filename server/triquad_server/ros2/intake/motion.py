@@ -1,7 +1,10 @@
 """What is known of how the robot moves, from transforms or from a topic of poses."""
 
 from triquad_sensors.errors import InvalidScanError, NoScanError
-from triquad_sensors.motion.frame_tree import FrameTree, Transform
+from triquad_sensors.motion.frame_tree import STATIC, FrameTree, Transform
+
+BEGAN_ANEW_NS = 10 * 10**9
+"""Stamps that go back by more are of a simulation or a bag that began anew."""
 
 _POSES_KEPT = 2000  # of each frame; 20 s at 100 Hz
 _MAX_FRAMES = 1000
@@ -17,6 +20,7 @@ class Motion:
         self.body_parent: str | None = None  # in which frame that topic has the body
         self._from_topic = from_topic
         self._body: str | None = None
+        self._newest_ns: dict[str, int] = {}  # stamp by child, of those that move
 
     def add(self, transforms: list[Transform], *, is_body: bool) -> None:
         """Take in transforms, or the pose of the body.
@@ -32,11 +36,33 @@ class Motion:
                 continue
             try:
                 self._check(transform)
+                self._begin_anew(transform)
                 self.frames.add(transform)
             except (InvalidScanError, NoScanError) as error:
                 refusal = NoScanError("bad_transform", f"{transform.child[:_MAX_NAME]}: {error}")
         if refusal is not None:
             raise refusal
+
+    def forget_after(self, stamp_ns: int) -> None:
+        """Forget poses that belong to a time which began anew after them."""
+        for child, newest_ns in list(self._newest_ns.items()):
+            if newest_ns > stamp_ns + BEGAN_ANEW_NS:
+                self._forget(child)
+
+    def _begin_anew(self, transform: Transform) -> None:
+        """Forget the poses of a frame whose time goes back."""
+        if transform.stamp_ns is STATIC:
+            self._newest_ns.pop(transform.child, None)
+            return
+        newest_ns = self._newest_ns.get(transform.child, transform.stamp_ns)
+        if transform.stamp_ns < newest_ns - BEGAN_ANEW_NS:
+            self._forget(transform.child)
+            newest_ns = transform.stamp_ns
+        self._newest_ns[transform.child] = max(newest_ns, transform.stamp_ns)
+
+    def _forget(self, child: str) -> None:
+        self.frames.forget(child)
+        self._newest_ns.pop(child, None)
 
     def _check(self, transform: Transform) -> None:
         if max(len(transform.parent), len(transform.child)) > _MAX_NAME or not transform.child:

@@ -1,0 +1,31 @@
+"""What rmw_zenoh attaches to messages, and which never arrived, as their numbers tell."""
+
+import struct
+from collections import OrderedDict
+
+ATTACHMENT = struct.Struct("<qqB16s")
+"""The attachment: number, time, length of the identity, identity of the publisher."""
+
+_MAX_PUBLISHERS = 256
+
+
+class SequenceGaps:
+    """The last number of each publisher; those heard of longest ago are forgotten."""
+
+    def __init__(self) -> None:
+        self._last: OrderedDict[bytes, int] = OrderedDict()
+
+    def missed(self, attachment: bytes) -> int:
+        """How many messages of its publisher are missing before one with this attachment.
+
+        What is attached in another form, as by old releases, tells nothing.
+        """
+        if len(attachment) != ATTACHMENT.size:
+            return 0
+        number: int
+        number, _, _, publisher = ATTACHMENT.unpack(attachment)
+        last = self._last.pop(publisher, number - 1)
+        self._last[publisher] = number
+        if len(self._last) > _MAX_PUBLISHERS:
+            self._last.popitem(last=False)
+        return max(0, number - last - 1)

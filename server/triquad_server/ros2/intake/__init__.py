@@ -1,0 +1,1 @@
+"""Clouds, depth images and poses, from messages of ROS 2 to scans."""

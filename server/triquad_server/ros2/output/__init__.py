@@ -1,0 +1,1 @@
+"""The map as messages of ROS 2: markers and occupancy grids."""
