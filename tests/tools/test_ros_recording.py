@@ -8,7 +8,8 @@ import pytest
 from support.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
 from support.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.opening import open_recording
+from triquad_tools.recordings.opening import RecordingOptions
+from triquad_tools.recordings.opening import open_recording as open_any
 from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_options import RosOptions, parse_transform
 
@@ -19,6 +20,10 @@ RNG = np.random.default_rng(5)
 SCANS = [RNG.normal(size=(30 + i, 3)).astype(np.float32) for i in range(COUNT)]
 LIDAR = np.eye(4)
 LIDAR[:3, 3] = 0.3, 0, 1.5
+
+
+def open_recording(path: Path, ros: RosOptions) -> Recording:
+    return open_any(path, RecordingOptions(ros))
 
 
 def poses(count: int = COUNT) -> np.ndarray:
@@ -161,6 +166,16 @@ def test_a_cloud_is_placed_as_each_of_its_points_was_measured(tmp_path: Path) ->
     (scan,) = opened(tmp_path, messages).read([0])
     placed = scan.points @ scan.world_from_sensor[:3, :3].T + scan.world_from_sensor[:3, 3]
     assert np.abs(placed - world).max() < 2e-3
+
+
+def test_a_cloud_of_the_whole_map_is_no_scan(tmp_path: Path) -> None:
+    messages = a_drive()
+    whole = ROS2.cloud(SCANS[0], STAMPS[0], "map")
+    messages.append(Recorded("/map_cloud", CLOUD, STAMPS[0], whole))
+    recording = opened(tmp_path, messages)
+    assert {entry.source for entry in recording.entries} == {"lidar.points"}
+    streams = {stream.name: stream for stream in recording.streams}
+    assert streams["/map_cloud"].use == "other scans: --topics /map_cloud"
 
 
 def test_missing_poses_and_transforms_are_named_with_the_remedy(tmp_path: Path) -> None:

@@ -116,8 +116,10 @@ def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
     folder = read_folder(path)
     mapped: list[PosedScan] = []
     withheld: list[PosedScan] = []
-    for index, pose in enumerate(folder.poses[:scans]):
-        scan = PosedScan(points_in_range(folder.read_points(index), _RANGE_MIN_M), pose)
+    indices = range(len(folder))[:scans]
+    for index, whole in zip(indices, folder.read(indices), strict=True):
+        near = points_in_range(whole.points, _RANGE_MIN_M)
+        scan = PosedScan(near, whole.world_from_sensor)
         (withheld if is_withheld(index, _SKIP_EVERY) else mapped).append(scan)
     return RecordedScans(tuple(mapped), tuple(withheld))
 

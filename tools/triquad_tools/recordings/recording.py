@@ -6,6 +6,9 @@ from typing import Protocol
 
 from triquad_sensors.sweep import PosedScan
 
+DEFAULT_SOURCE = "default"
+"""Of recordings that name no sensor: the source that the client takes by default, too."""
+
 
 @dataclass(frozen=True)
 class ScanEntry:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from triquad_sensors.errors import NoScanError
+from triquad_sensors.motion.frame_tree import ROOT_NAMES
 from triquad_sensors.motion.placing import place
 from triquad_sensors.ros import type_store
 from triquad_sensors.ros.point_cloud import sweep_of_cloud
@@ -209,5 +210,9 @@ def _chosen_topics(found: Survey, options: RosOptions) -> set[str]:
             what = f"is {kind}, no clouds or depth images" if kind else "does not exist"
             known = ", ".join(sorted(there)) or "none"
             raise ToolError(f"--topics {topic}: the topic {what}; to map there is {known}")
-    clouds = {topic for topic in there if found.kinds[topic] == type_store.POINT_CLOUD}
-    return set(options.topics) or clouds or there
+    if options.topics:
+        return set(options.topics)
+    # A cloud in a frame that stands still is no scan, but a map that somebody made of scans.
+    scans = {cloud.topic for cloud in found.clouds if cloud.frame not in ROOT_NAMES} or there
+    clouds = {topic for topic in scans if found.kinds[topic] == type_store.POINT_CLOUD}
+    return clouds or scans

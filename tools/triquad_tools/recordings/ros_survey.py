@@ -115,6 +115,7 @@ class _Reader:
         self._found = found
         self._recorder_clock = recorder_clock
         self._numbers: Counter[str] = Counter()
+        self._colours: set[str] = set()  # topics of images that hold no depth
         self._takers: dict[str, Callable[[Message, Any], None]] = {
             type_store.POINT_CLOUD: self._take_cloud,
             type_store.IMAGE: self._take_image,
@@ -124,6 +125,8 @@ class _Reader:
         }
 
     def take(self, opened: OpenBag, message: Message) -> None:
+        if message.connection.topic in self._colours:
+            return
         self._takers[message.connection.msgtype](message, opened.decode(message))
         self._numbers[message.connection.topic] += 1
 
@@ -131,9 +134,10 @@ class _Reader:
         self._add(message, lambda: sweep_of_cloud(decoded))
 
     def _take_image(self, message: Message, decoded: Any) -> None:
-        if not is_depth(decoded.encoding):
-            return
         topic = message.connection.topic
+        if not is_depth(decoded.encoding):
+            self._colours.add(topic)
+            return
         self._add(message, lambda: sweep_of_image(decoded, topic, self._found.cameras))
 
     def _add(self, message: Message, make: Callable[[], Sweep]) -> None:
