@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _map(options: argparse.Namespace) -> int:
     output = options.output
     _check_output(output, options.force)
-    settings = load_settings(options.settings, options.set)
+    settings = load_settings(options.settings, options.set, preset=options.preset)
     device = choose_device(options.device)
     selection = open_selected(options)
     key = mapping_key(selection.entries, settings)
@@ -97,6 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     add_recording(parser)
     add = parser.add_argument
     add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(SUFFIXES))
+    add("--preset", metavar="NAME", help="of the settings, as of triquad-server: for rooms, indoor")
     add("--settings", type=Path, metavar="FILE", help="settings of the map, as of triquad-server")
     add(
         "--set",
