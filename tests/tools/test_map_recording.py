@@ -174,3 +174,11 @@ def test_a_recording_of_which_nothing_can_be_used_is_told(
         "nothing was mapped: 8 of 8 scans could not be used (empty: 8); the last: scan 7" in error
     )
     assert not output.exists()
+
+
+def test_a_preset_lies_below_the_settings(tmp_path: Path, settings: Path) -> None:
+    output = tmp_path / "map.triquad"
+    command = [str(folder(tmp_path)), str(output), "--preset", "long-range"]
+    assert main([*command, "--settings", str(settings)]) == 0
+    field = read_map(output).settings
+    assert (field.leaf_m, field.depth) == (0.4, 7)
