@@ -79,6 +79,12 @@ SWALLOWED = {
 
         Thing()
     """,
+    "by a library that fails then": """
+        try:
+            press()
+        except KeyboardInterrupt as interrupt:
+            raise SystemError("returned a result with an exception set") from interrupt
+    """,
     "by nobody": "press()",
 }
 

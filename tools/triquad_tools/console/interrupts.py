@@ -13,6 +13,8 @@ _SWALLOW = re.compile(r"<frozen importlib|llvmlite.binding.executionengine\.py$"
 
 _AGAIN_S = 0.1
 
+_raised = threading.Event()
+
 
 @contextmanager
 def no_interrupt_lost() -> Iterator[None]:
@@ -20,7 +22,7 @@ def no_interrupt_lost() -> Iterator[None]:
 
     Importing a library may turn it into an ``ImportError``, and with that into a library that
     seems not to be there; a callback of the compiler drops it, and fails then for a reason of its
-    own; and so does a ``__del__``.
+    own; and so does a ``__del__``. Whatever fails after an interrupt was interrupted.
     """
     in_main = threading.current_thread() is threading.main_thread()
     if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
@@ -37,8 +39,13 @@ def no_interrupt_lost() -> Iterator[None]:
     sys.unraisablehook = raise_again
     signal.signal(signal.SIGALRM, _interrupt)
     signal.signal(signal.SIGINT, _interrupt)
+    _raised.clear()
     try:
         yield
+    except Exception as error:
+        if _raised.is_set():
+            raise KeyboardInterrupt from error
+        raise
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -61,6 +68,7 @@ def _interrupt(_number: int, frame: FrameType | None) -> None:
         if _SWALLOW.search(frame.f_code.co_filename):
             return _interrupt_later()
         frame = frame.f_back
+    _raised.set()
     raise KeyboardInterrupt
 
 
