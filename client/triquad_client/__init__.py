@@ -9,7 +9,7 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 """
 
 from triquad_format import __version__
-from triquad_format.errors import MapFileError, RefusedError, TriquadError
+from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
 from triquad_map.asked import NotAskedError
@@ -20,6 +20,9 @@ from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Polyline, Segments
 from triquad_map.questions.spheres import Spheres
+from triquad_sensors.depth_image import Intrinsics, depth_points
+from triquad_sensors.errors import InvalidScanError
+from triquad_sensors.pose import Pose
 
 from triquad_client.async_client import AsyncClient, connect_async
 from triquad_client.calls.async_queries import AsyncPinnedMap
@@ -29,14 +32,11 @@ from triquad_client.calls.questions import SdfResult
 from triquad_client.calls.scans import FlushReport
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.client import Client, connect
-from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
     ConnectError,
     DownloadError,
-    InvalidInputError,
-    InvalidScanError,
     NoReplyError,
     RequestTimeoutError,
     UnknownMapError,
@@ -48,7 +48,6 @@ from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.offline_map import OfflineMap, open_map
 from triquad_client.offline.synced_map import AsyncSyncedMap, SyncedMap, SyncReport
 from triquad_client.organised_cloud import empty_returns
-from triquad_client.pose import Pose
 
 __all__ = [
     "Alignment",

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_sensors.depth_image import Intrinsics, depth_points
 
 from triquad_client.calls import admin, changes, download, questions
 from triquad_client.calls.async_queries import AsyncMapQueries, AsyncPinnedMap
@@ -17,7 +18,6 @@ from triquad_client.calls.changes import ChangeReport
 from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.client import Client
-from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.documentation import documented_as
 from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles

@@ -12,14 +12,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
 from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
-
-from triquad_client.errors import NO_NUMBER, InvalidInputError, InvalidScanError
-from triquad_client.pose import Pose
+from triquad_sensors.errors import NO_NUMBER, InvalidScanError
+from triquad_sensors.pose import Pose
 
 PoseLike: TypeAlias = ArrayLike | Pose
 """A rigid pose in the map frame: a matrix [4, 4], or a position and a quaternion."""

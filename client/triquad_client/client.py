@@ -6,13 +6,13 @@ from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_sensors.depth_image import Intrinsics, depth_points
 
 from triquad_client.calls import admin, changes, download, questions
 from triquad_client.calls.changes import ChangeReport
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.checks import Bounds, PoseLike
-from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.mesh.mesh_watch import MeshWatch

@@ -2,9 +2,6 @@
 
 from triquad_format.errors import TriquadError
 
-NO_NUMBER = (TypeError, ValueError, OverflowError)
-"""What conversions to numbers raise: Python's integers may be larger than any float."""
-
 
 class ConnectError(TriquadError):
     """No server, or one that does not let us in, at the endpoint."""
@@ -38,11 +35,3 @@ class ClosedError(TriquadError):
 
 class DownloadError(TriquadError):
     """The map file could not be fetched whole."""
-
-
-class InvalidInputError(TriquadError, ValueError):
-    """An argument that cannot be used; nothing was sent."""
-
-
-class InvalidScanError(InvalidInputError):
-    """A scan that cannot be published; nothing was sent."""

@@ -31,6 +31,10 @@ class RefusedError(TriquadError):
         self.message = message
 
 
+class InvalidInputError(TriquadError, ValueError):
+    """An argument that cannot be used; nothing was sent."""
+
+
 class FormatError(TriquadError):
     """Bytes or values that are not what the triquad formats allow."""
 

@@ -8,8 +8,7 @@ import pytest
 import triquad_client
 from numpy.typing import ArrayLike
 from support import servers
-from triquad_client import Client, Status
-from triquad_client.errors import InvalidScanError
+from triquad_client import Client, InvalidScanError, Status
 from triquad_format.wire import codec
 from triquad_server.settings import Settings
 

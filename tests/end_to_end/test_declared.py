@@ -14,6 +14,7 @@ else:
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DISTRIBUTIONS = {
+    "PIL": "pillow",
     "zenoh": "eclipse-zenoh",
     "google": "protobuf",
     "skimage": "scikit-image",
@@ -65,10 +66,11 @@ def imported(folder: str) -> set[str]:
         ("format", ()),
         ("client", ("mesh",)),
         ("map", ("fast",)),
-        ("server", ("fast", "preview", "server")),
-        ("tools", ("fast", "mesh", "preview", "server", "tools")),
+        ("sensors", ("ros",)),
+        ("server", ("fast", "preview", "ros", "server")),
+        ("tools", ("fast", "mesh", "preview", "ros", "server", "tools")),
         *(
-            (f"tools/triquad_tools/{room}", ("fast", "mesh", "preview", "tools"))
+            (f"tools/triquad_tools/{room}", ("fast", "mesh", "preview", "ros", "tools"))
             for room in WITHOUT_TORCH
         ),
     ],
@@ -78,6 +80,6 @@ def test_what_is_imported_is_declared(folder: str, extras: tuple[str, ...]) -> N
 
 
 def test_what_is_declared_is_imported() -> None:
-    folders = ("format", "map", "client", "server", "tools")
+    folders = ("format", "map", "sensors", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
-    assert declared("fast", "mesh", "preview", "server", "tools") <= used | USED_BY_OTHERS
+    assert declared("fast", "mesh", "preview", "ros", "server", "tools") <= used | USED_BY_OTHERS

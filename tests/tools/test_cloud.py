@@ -1,9 +1,6 @@
-from pathlib import Path
-
 import numpy as np
-from support.kitti_folder import write_folder
+from triquad_sensors.sweep import PosedScan
 from triquad_tools.recordings.cloud import is_withheld, merged, points_in_range, world_points
-from triquad_tools.recordings.kitti import read_folder
 
 
 def test_the_last_of_every_few_scans_is_withheld() -> None:
@@ -19,15 +16,14 @@ def test_points_out_of_range_are_left_out() -> None:
     assert points_in_range(points, 2.0).dtype == np.float32
 
 
-def test_world_points_are_moved_by_the_pose_and_finite(tmp_path: Path) -> None:
+def test_world_points_are_moved_by_the_pose_and_finite() -> None:
     pose = np.eye(4)
     pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     pose[:3, 3] = [100, 0, 5]
     points = np.array([[2, 0, 0], [0.5, 0, 0], [np.inf, 0, 0]], np.float32)
-    write_folder(tmp_path, [points], pose[None], [0])
-    folder = read_folder(tmp_path)
-    np.testing.assert_allclose(world_points(folder, 0), [[100, 2, 5], [100, 0.5, 5]])
-    np.testing.assert_allclose(world_points(folder, 0, range_min_m=1.0), [[100, 2, 5]])
+    scan = PosedScan(points, pose)
+    np.testing.assert_allclose(world_points(scan), [[100, 2, 5], [100, 0.5, 5]])
+    np.testing.assert_allclose(world_points(scan, range_min_m=1.0), [[100, 2, 5]])
 
 
 def test_merged_clouds_keep_one_point_per_voxel() -> None:

@@ -13,6 +13,7 @@ NAMES = {
     "demo": "triquad-demo",
     "evaluate": "triquad-eval",
     "inspect": "triquad-inspect",
+    "map_recording": "triquad-map",
     "pack": "triquad-pack",
     "replay": "triquad-replay",
 }

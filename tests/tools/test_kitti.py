@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from support.kitti_folder import write_folder
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.kitti import KittiFolder, read_folder
+from triquad_tools.recordings.kitti import KittiFolder, is_kitti_folder, read_folder
+from triquad_tools.recordings.recording import Recording
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
@@ -109,11 +110,29 @@ def test_calibration_without_tr_is_refused(tmp_path: Path) -> None:
         read_folder(tmp_path)
 
 
-def test_scan_of_a_broken_size_is_refused(tmp_path: Path) -> None:
-    folder = read_folder(_folder(tmp_path))
-    folder.scan_paths[0].write_bytes(b"x" * 33)
-    with pytest.raises(ToolError, match=r"000000.bin: 33 bytes are not whole points of 16"):
-        folder.read_points(0)
+def test_scan_of_a_broken_size_is_refused_before_any_is_read(tmp_path: Path) -> None:
+    folder = read_folder(_folder(tmp_path, f"{IDENTITY}\n" * 3, 3))
+    folder.scan_paths[2].write_bytes(b"x" * 33)
+    words = r"000002.bin: 33 bytes are not whole points of 16"
+    with pytest.raises(ToolError, match=words):
+        read_folder(tmp_path)
+    with pytest.raises(ToolError, match=words):
+        folder.read_points(2)
+
+
+def test_a_folder_is_a_recording(tmp_path: Path) -> None:
+    poses = f"{IDENTITY}\n1 0 0 5 0 1 0 0 0 0 1 0\n{IDENTITY}\n"
+    recording: Recording = read_folder(_folder(tmp_path, poses, 3))
+    assert is_kitti_folder(tmp_path)
+    assert not is_kitti_folder(tmp_path / "scans" / "none")
+    assert [entry.stamp_ns for entry in recording.entries] == [0, 100_000_000, 200_000_000]
+    assert {entry.source for entry in recording.entries} == {"default"}
+    assert [stream.name for stream in recording.streams] == ["scans/*.bin", "poses.txt"]
+    assert not recording.remarks
+    first, second = recording.read([1, 2])
+    assert np.all(first.points == 1.0)
+    assert first.world_from_sensor[0, 3] == 5.0
+    assert np.all(second.points == 2.0)
 
 
 def test_counts_that_differ_are_refused(tmp_path: Path) -> None:

@@ -1,10 +1,17 @@
+import signal
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
+from support.bags import drive, messages_for, write_bag
 from support.kitti_folder import write_folder
 from triquad_client import FlushReport
-from triquad_tools.commands.replay import Pace, ReplayReport, due_times, main
+from triquad_tools.commands.replay import Pace, ReplayReport, main
+
+ROS2 = messages_for("mcap")
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +60,80 @@ def test_every_third_scan_is_withheld(server, replay, tmp_path, capsys):
     assert _taken(server) == before + 4
 
 
-@pytest.mark.parametrize("pace", [("--rate", 200), ("--as-recorded",)])
+@pytest.mark.parametrize("pace", [("--rate", 200), ("--rate", "2x"), ("--as-recorded",)])
 def test_scans_are_taken_at_a_pace(replay, tmp_path, capsys, pace):
     assert replay(_folder(tmp_path, 3), *pace) == 0
     assert "3 scans published, 3 taken, 0 refused, 0 lost, " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("choice", "published"),
+    [
+        (("--start", 0.15), 4),
+        (("--end", 0.25), 3),
+        (("--start", 0.15, "--end", 0.35), 2),
+        (("--every", 4), 2),
+        (("--every", 2, "--start", 0.3), 1),
+    ],
+)
+def test_a_part_of_a_recording_is_chosen(replay, tmp_path, capsys, choice, published):
+    assert replay(_folder(tmp_path), *choice, "--source", f"part{published}") == 0
+    assert f"{published} scans published, {published} taken, " in capsys.readouterr().out
+
+
+def test_a_bag_is_published_with_a_source_for_each_topic(server, replay, tmp_path, capsys):
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = 0.1 * np.arange(4)
+    stamps = [2 * 10**18 + i * 10**8 for i in range(4)]
+    messages = drive(ROS2, [servers.sphere(500)] * 4, poses, stamps, np.eye(4))
+    bag = write_bag(tmp_path / "bag", "mcap", messages)
+    before = _taken(server)
+    assert replay(bag) == 0
+    output = capsys.readouterr()
+    assert "4 scans published, 4 taken, 0 refused, 0 lost, " in output.out
+    assert "100% 4 of 4 scans, " in output.err
+    assert _taken(server) == before + 4
+
+
+def test_what_a_recording_holds_is_told_without_a_server(tmp_path, capsys):
+    stamps = [2 * 10**18 + i * 10**8 for i in range(4)]
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    messages = drive(ROS2, [servers.sphere(50)] * 4, poses, stamps, np.eye(4))
+    bag = write_bag(tmp_path / "bag", "mcap", messages)
+    assert main([str(bag), "--list"]) == 0
+    output = capsys.readouterr().out
+    assert "4 scans, source lidar.points" in output
+    assert "4 scans in 0.3 s, 10.0 a second" in output
+    assert f"triquad-map {bag} bag.triquad" in output
+    assert main([str(bag), "--list", "--transform", "a b 0 0 0 0 0 0 1", "--poses", "tf"]) == 0
+    assert "bag.triquad --poses tf --transform 'a b 0 0 0 0 0 0 1'" in capsys.readouterr().out
+    blind = write_bag(tmp_path / "blind", "mcap", [m for m in messages if m.topic != "/tf"])
+    assert main([str(blind), "--list"]) == 1
+    output = capsys.readouterr().out
+    assert "it holds no poses: record /tf" in output
+    assert "nothing of it can be mapped as it is" in output
+    assert main([str(blind)]) == 2
+    assert "it holds no poses" in capsys.readouterr().err
+
+
+def test_a_loop_goes_on_until_ctrl_c(server, tmp_path):
+    _folder(tmp_path, 3)
+    command = [
+        sys.executable,
+        "-c",
+        "from triquad_tools.commands.entry_points import replay; replay()",
+    ]
+    command += [str(tmp_path), "--loop", "--source", "looped"]
+    command += ["--connect", server.endpoint]
+    with triquad_client.connect(server.endpoint) as client:
+        before = client.status().scans_taken
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+            while client.status().scans_taken < before + 8:
+                assert process.poll() is None
+            process.send_signal(signal.SIGINT)
+            _, error = process.communicate(timeout=servers.WAIT_S)
+    assert "interrupted; scans that were sent are in the map" in error
+    assert "Traceback" not in error
 
 
 def test_near_points_are_not_sent(replay, tmp_path, capsys):
@@ -81,9 +158,10 @@ def test_a_lost_scan_makes_the_replay_incomplete():
 
 def test_scans_are_due_by_rate_by_their_times_or_at_once():
     stamps = [5_000_000_000, 5_500_000_000, 7_000_000_000]
-    assert due_times(Pace(), stamps) == [0.0, 0.0, 0.0]
-    assert due_times(Pace(rate_hz=4.0), stamps) == [0.0, 0.25, 0.5]
-    assert due_times(Pace(as_recorded=True), stamps) == [0.0, 0.5, 2.0]
+    assert Pace().due_s(stamps) == [0.0, 0.0, 0.0]
+    assert Pace(rate_hz=4.0).due_s(stamps) == [0.0, 0.25, 0.5]
+    assert Pace(speed=1.0).due_s(stamps) == [0.0, 0.5, 2.0]
+    assert Pace(speed=2.0).due_s(stamps) == [0.0, 0.25, 1.0]
     assert Pace().by_server
     assert not Pace(rate_hz=1.0).by_server
 
@@ -93,7 +171,9 @@ def test_input_that_cannot_be_used_is_refused(replay, tmp_path, capsys):
     assert "triquad-replay: " in capsys.readouterr().err
     folder = _folder(tmp_path / "scans")
     assert replay(folder, "--skip-every", 1) == 2
-    assert "--skip-every 1 leaves no scan" in capsys.readouterr().err
+    assert "no scan is left of 6 in 0.5 s: see --start" in capsys.readouterr().err
+    assert replay(folder, "--start", 7) == 2
+    assert "no scan is left of 6" in capsys.readouterr().err
     assert replay(folder, "--source", "a/b") == 2
     assert "'a/b' is not allowed" in capsys.readouterr().err
 

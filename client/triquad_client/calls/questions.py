@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_RANGE_M
@@ -47,7 +48,6 @@ from triquad_map.questions.spheres import Spheres
 from triquad_client import checks
 from triquad_client.calls.parts import in_parts, joined, offsets_from, origin_of
 from triquad_client.checks import Bounds, PoseLike
-from triquad_client.errors import InvalidInputError
 from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried
 
 # Items of one request: it takes the server some tens of milliseconds, and others wait as long.

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from triquad_format.errors import FormatError, RefusedError
+from triquad_format.errors import FormatError, InvalidInputError, RefusedError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest, Scan, ServerStatus
+from triquad_sensors.errors import InvalidScanError
 
 from triquad_client import checks
 from triquad_client.calls import admin
 from triquad_client.checks import PoseLike
-from triquad_client.errors import InvalidInputError, InvalidScanError, RequestTimeoutError
+from triquad_client.errors import RequestTimeoutError
 from triquad_client.net.call import Ask, Call, Pause, ask_each
 from triquad_client.net.connection import Connection
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.errors import WireError
+from triquad_format.errors import InvalidInputError, WireError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
@@ -16,7 +16,7 @@ from triquad_format.wire.tile_codec import decode_tile
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import BadReplyError, InvalidInputError
+from triquad_client.errors import BadReplyError
 from triquad_client.mesh.mesh import Mesh, joined
 
 _REPLY_BYTES = 1_000_000

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles, Ints
 from triquad_format.wire import keys
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import InvalidInputError
 from triquad_client.net.call import NEWEST, Ask, Call, Run, ask, ask_each, offload, retried
 
 if TYPE_CHECKING:

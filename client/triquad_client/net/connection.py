@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import zenoh
-from triquad_format.errors import FormatError, RefusedError, WireError
+from triquad_format.errors import FormatError, InvalidInputError, RefusedError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.endpoints import full_endpoint
@@ -18,7 +18,6 @@ from triquad_client.errors import (
     BadReplyError,
     ClosedError,
     ConnectError,
-    InvalidInputError,
     NoReplyError,
     RequestTimeoutError,
     UnknownMapError,

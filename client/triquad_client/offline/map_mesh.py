@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.cells import cells_of_boxes, rows_by_cell
 from triquad_format.records.region import MapRecord
@@ -18,7 +19,6 @@ from triquad_map.view import MapView
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import InvalidInputError
 from triquad_client.mesh.mesh import Mesh, joined
 
 CELL_RANGE_M = (0.01, 10.0)

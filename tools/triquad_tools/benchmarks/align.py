@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from triquad_format.records.arrays import Doubles
 from triquad_map.questions.align import Alignment, AlignOptions, align
 from triquad_map.view import MapView
+from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
-from triquad_tools.recordings.cloud import PosedScan, is_withheld, points_in_range
+from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.kitti import read_folder
 
 _SKIP_EVERY = 7
@@ -115,8 +116,10 @@ def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
     folder = read_folder(path)
     mapped: list[PosedScan] = []
     withheld: list[PosedScan] = []
-    for index, pose in enumerate(folder.poses[:scans]):
-        scan = PosedScan(points_in_range(folder.read_points(index), _RANGE_MIN_M), pose)
+    indices = range(len(folder))[:scans]
+    for index, whole in zip(indices, folder.read(indices), strict=True):
+        near = points_in_range(whole.points, _RANGE_MIN_M)
+        scan = PosedScan(near, whole.world_from_sensor)
         (withheld if is_withheld(index, _SKIP_EVERY) else mapped).append(scan)
     return RecordedScans(tuple(mapped), tuple(withheld))
 

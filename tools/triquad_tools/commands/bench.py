@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _COMMAND = "triquad-bench"
 _ON_STREET = ("core", "server", "file", "store", "mesh", "answers", "align", "offline")
-USUAL_PARTS = (*_ON_STREET, "growth", "air", "moving")
+USUAL_PARTS = (*_ON_STREET, "growth", "air", "moving", "sweeps")
 PARTS = (*USUAL_PARTS, "ablation")
 
 
@@ -88,11 +88,13 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
     from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
     from triquad_tools.benchmarks.air import measure_air
     from triquad_tools.benchmarks.moving import measure_moving
+    from triquad_tools.benchmarks.sweeps import measure_sweeps
 
     measures: dict[str, Callable[[int], list[Figure]]] = {
         "growth": _growth,
         "air": measure_air,
         "moving": partial(measure_moving, folder=options.recorded),
+        "sweeps": measure_sweeps,
         "ablation": partial(measure_ablation, scans=options.scans, step_m=options.step),
     }
     return [figure for part in parts for figure in measures[part](options.seed)]
@@ -149,8 +151,8 @@ def _parser() -> argparse.ArgumentParser:
         description="Measure triquad on this machine, on a simulated street: a server under a "
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
         "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
-        "opened offline, open air, and things that move. Takes over twenty minutes; nothing "
-        "else should run meanwhile.",
+        "opened offline, open air, things that move, and a lidar that moves while it turns. Takes "
+        "over twenty minutes; nothing else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument

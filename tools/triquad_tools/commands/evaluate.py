@@ -98,7 +98,7 @@ def _at_withheld(options: argparse.Namespace) -> Results:
         )
     limits = (options.range_min, options.range_max)
     with open_map(options.target, options.map) as opened:
-        clouds = (world_points(folder, index, *limits) for index in indices)
+        clouds = (world_points(scan, *limits) for scan in folder.read(indices))
         return {"withheld": score_withheld(opened.query_sdf, clouds)}
 
 
@@ -106,7 +106,7 @@ def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
     """The points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
     if path.is_dir():
         folder = read_folder(path)
-        clouds = (world_points(folder, index, range_min_m) for index in range(len(folder)))
+        clouds = (world_points(scan, range_min_m) for scan in folder.read(range(len(folder))))
         points = merged(clouds, voxel_m)
     else:
         points = np.asarray(read_mesh(path).vertices, np.float64)

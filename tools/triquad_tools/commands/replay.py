@@ -1,27 +1,31 @@
-"""``triquad-replay``: publish a recorded folder of scans to a map server."""
+"""``triquad-replay``: publish a recording to a map server."""
 
 import argparse
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 from triquad_client import Client, FlushReport, connect
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
+from triquad_sensors.sweep import PosedScan
 
-from triquad_tools.console.arguments import add_version, count, not_negative, positive
-from triquad_tools.console.command import FAILED, OK, ToolError, run
+from triquad_tools.console.arguments import add_version, positive
+from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.progress import progress
-from triquad_tools.recordings.cloud import is_withheld, points_in_range
-from triquad_tools.recordings.kitti import KittiFolder, read_folder
+from triquad_tools.recordings.arguments import add_recording, flags_of, open_from
+from triquad_tools.recordings.listing import print_contents
 from triquad_tools.recordings.publishing import (
     FLUSH_TIMEOUT_S,
     keep_few_pending,
     wait_until_settled,
 )
+from triquad_tools.recordings.recording import ScanEntry
+from triquad_tools.recordings.selection import Selection, open_selected
 
 _COMMAND = "triquad-replay"
+_LOOK_PERIOD_S = 1.0  # between questions how many scans were lost
 
 
 @dataclass(frozen=True)
@@ -29,12 +33,19 @@ class Pace:
     """When scans are sent; by default as soon as the server has taken in those before."""
 
     rate_hz: float | None = None
-    as_recorded: bool = False
+    speed: float | None = None  # times the pace at which they were taken
 
     @property
     def by_server(self) -> bool:
         """Whether the server sets the pace: nothing is lost then."""
-        return self.rate_hz is None and not self.as_recorded
+        return self.rate_hz is None and self.speed is None
+
+    def due_s(self, stamps_ns: Sequence[int]) -> list[float]:
+        """When each scan is to be sent, seconds after the first."""
+        if self.speed is not None:
+            return [(stamp - stamps_ns[0]) / 1e9 / self.speed for stamp in stamps_ns]
+        period_s = 0.0 if self.rate_hz is None else 1.0 / self.rate_hz
+        return [index * period_s for index in range(len(stamps_ns))]
 
 
 @dataclass(frozen=True)
@@ -60,12 +71,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    folder = read_folder(options.folder)
-    indices = [i for i in range(len(folder)) if not is_withheld(i, options.skip_every)]
-    if not indices:
-        raise ToolError(f"{options.folder}: --skip-every {options.skip_every} leaves no scan")
+    if options.list:
+        recording = open_from(options)
+        mappable = print_contents(options.recording, recording, flags_of(options))
+        return OK if mappable else FAILED
+    selection = open_selected(options)
     with connect(options.connect, options.map) as client:
-        report = _publish_all(client, folder, indices, options=options)
+        report = _publish_all(client, selection, options)
         print(_summary(report))
         if options.settle:
             status = wait_until_settled(client)
@@ -74,42 +86,80 @@ def _replay(options: argparse.Namespace) -> int:
     return OK if report.complete else FAILED
 
 
-def _publish_all(
-    client: Client, folder: KittiFolder, indices: Sequence[int], options: argparse.Namespace
-) -> ReplayReport:
-    """Publish the scans ``indices`` and wait until the server has dealt with them."""
-    pace = Pace(options.rate, options.as_recorded)
+def _publish_all(client: Client, selection: Selection, options: argparse.Namespace) -> ReplayReport:
+    """Publish the chosen scans and wait until the server has dealt with them."""
     before = client.status().scans_dropped
-    due_s = due_times(pace, [int(folder.stamps_ns[index]) for index in indices])
-    published = skipped = 0
-    started = time.monotonic()
-    with progress("publishing", len(indices)) as report:
-        for done, index in enumerate(indices):
-            time.sleep(max(0.0, started + due_s[done] - time.monotonic()))
-            points = points_in_range(folder.read_points(index), options.range_min)
-            if len(points):
-                stamp_s = int(folder.stamps_ns[index]) / 1e9
-                client.publish_scan(points, folder.poses[index], stamp_s, source=options.source)
-                published += 1
-                if pace.by_server:
-                    keep_few_pending(client, published)
-            else:
-                skipped += 1
-            report(done + 1, f"{done + 1} of {len(indices)} scans")
-        flush = client.flush(FLUSH_TIMEOUT_S)
-    seconds = time.monotonic() - started
+    publisher = _Publisher(client, options.pace, options.source)
+    rounds = itertools.count() if options.loop else range(1)
+    for number in rounds:
+        publisher.play(selection, number)
+    flush = client.flush(FLUSH_TIMEOUT_S)
+    seconds = publisher.seconds
     after = client.status().scans_dropped
     refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
     refusals = {reason: count for reason, count in refusals.items() if count > 0}
-    return ReplayReport(published, skipped, flush, refusals=refusals, seconds=seconds)
+    return ReplayReport(
+        publisher.published, publisher.skipped, flush, refusals=refusals, seconds=seconds
+    )
 
 
-def due_times(pace: Pace, stamps_ns: Sequence[int]) -> list[float]:
-    """When each scan is to be sent, seconds after the first."""
-    if pace.as_recorded:
-        return [(stamp - stamps_ns[0]) / 1e9 for stamp in stamps_ns]
-    period_s = 0.0 if pace.rate_hz is None else 1.0 / pace.rate_hz
-    return [index * period_s for index in range(len(stamps_ns))]
+class _Publisher:
+    """Sends scans at a pace, and tells how it goes."""
+
+    def __init__(self, client: Client, pace: Pace, source: str | None) -> None:
+        self._client = client
+        self._pace = pace
+        self._source = source
+        self._started = time.monotonic()
+        self._lost_before = self._lost_now = _lost(client)
+        self._next_look = self._started
+        self.published = 0
+        self.skipped = 0
+
+    @property
+    def seconds(self) -> float:
+        """Since the first scan was sent."""
+        return time.monotonic() - self._started
+
+    def play(self, selection: Selection, number: int) -> None:
+        """Send all chosen scans, which go on in time after ``number`` rounds before."""
+        entries = selection.entries
+        stamps = [entry.stamp_ns for entry in entries]
+        length_ns = max(stamps) - min(stamps)
+        round_ns = length_ns + length_ns // max(1, len(stamps) - 1)
+        due_s = self._pace.due_s(stamps)
+        began_s = self.seconds
+        with progress("publishing", len(selection)) as report:
+            for done, (entry, scan) in enumerate(zip(entries, selection.scans(), strict=True)):
+                time.sleep(max(0.0, began_s + due_s[done] - self.seconds))
+                self._send(entry, scan, entry.stamp_ns + number * round_ns)
+                report(done + 1, self._note(done + 1, len(selection), self.seconds - began_s))
+
+    def _send(self, entry: ScanEntry, scan: PosedScan, stamp_ns: int) -> None:
+        if len(scan.points) == 0:
+            self.skipped += 1
+            return
+        source = self._source or entry.source
+        self._client.publish_scan(
+            scan.points, scan.world_from_sensor, stamp_ns / 1e9, source=source
+        )
+        self.published += 1
+        if self._pace.by_server:
+            keep_few_pending(self._client, self.published)
+
+    def _note(self, done: int, total: int, seconds: float) -> str:
+        rate_hz = done / max(seconds, 1e-9)
+        if time.monotonic() >= self._next_look:
+            self._next_look = time.monotonic() + _LOOK_PERIOD_S
+            self._lost_now = _lost(self._client)
+        lost = self._lost_now - self._lost_before
+        left_s = (total - done) / rate_hz
+        return f"{done} of {total} scans, {rate_hz:.1f} /s, {lost} lost, {left_s:.0f} s left"
+
+
+def _lost(client: Client) -> int:
+    """Scans that the server has lost so far, of all sources."""
+    return sum(client.status().scans_lost.values())
 
 
 def _summary(report: ReplayReport) -> str:
@@ -133,13 +183,14 @@ def _summary(report: ReplayReport) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
-        description="Publish a KITTI-style folder of scans to a map server. By default the server "
-        "sets the pace, and no scan is lost.",
-        epilog="Exit status: 0 all scans are in the map, 1 some were lost or refused or the "
-        "server failed, 2 wrong usage or input.",
+        description="Publish a recording to a map server. By default the server sets the pace, and "
+        "no scan is lost.",
+        epilog="Exit status: 0 all scans are in the map (--list: there are some to map), 1 some "
+        "were lost or refused or the server failed, 2 wrong usage or input.",
     )
+    add_recording(parser)
     add = parser.add_argument
-    add("folder", type=Path, metavar="FOLDER", help="poses.txt, scans and perhaps times.txt")
+    add("--list", action="store_true", help="tell what the recording holds, and publish nothing")
     add(
         "--connect",
         default=DEFAULT_ENDPOINT,
@@ -147,28 +198,30 @@ def _parser() -> argparse.ArgumentParser:
         help=f"of the server (default: {DEFAULT_ENDPOINT})",
     )
     add("--map", default="default", metavar="NAME", help="default: default")
-    add("--source", default="default", metavar="NAME", help="name of the sensor (default: default)")
+    add("--source", metavar="NAME", help="publish as this sensor (default: as the recording says)")
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(
-        "--rate", type=positive, metavar="HZ", help="scans a second, whatever the server takes"
+        "--rate",
+        dest="pace",
+        type=_pace,
+        default=Pace(),
+        metavar="HZ|FACTORx",
+        help="scans a second, or 2x: twice as fast as recorded; whatever the server takes",
     )
     pace.add_argument(
-        "--as-recorded", action="store_true", help="at the times in times.txt (10 Hz without it)"
+        "--as-recorded",
+        dest="pace",
+        action="store_const",
+        const=Pace(speed=1.0),
+        help="--rate 1x; folders without times are taken as 10 Hz",
     )
-    add(
-        "--skip-every",
-        type=count,
-        default=0,
-        metavar="N",
-        help="withhold every Nth scan, for triquad-eval --withheld",
-    )
-    add(
-        "--range-min",
-        type=not_negative,
-        default=0.0,
-        metavar="M",
-        help="do not send nearer points: the vehicle's own body (default: 0)",
-    )
+    add("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
     add("--settle", action="store_true", help="wait until the server has learnt all of it")
     add_version(parser)
     return parser
+
+
+def _pace(text: str) -> Pace:
+    if text.endswith("x"):
+        return Pace(speed=positive(text[:-1]))
+    return Pace(rate_hz=positive(text))

@@ -37,18 +37,22 @@ def print_rows(title: str, rows: Sequence[Row], align: Literal["left", "right"] 
     _print(table)
 
 
-def print_columns(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table under titles: the first column to the left, the others to the right.
+def print_columns(
+    titles: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[str] = ()
+) -> None:
+    """Print a table under titles: the first column and those of ``words`` to the left, the others
+    to the right.
 
     Where the terminal is too narrow, titles are broken, but no cell is.
     """
     table = _table(show_header=True)
     columns = list(zip(titles, *rows, strict=True))
     narrow = sum(_GAP + max(map(len, column)) for column in columns) > _console().width
-    for number, (title, *cells) in enumerate(columns):
+    to_the_left = {*titles[:1], *words}
+    for title, *cells in columns:
         widest = max(map(len, cells), default=1)
         shown = textwrap.fill(title, widest, break_long_words=False) if narrow else title
-        table.add_column(shown, justify="right" if number else "left", no_wrap=True)
+        table.add_column(shown, justify="left" if title in to_the_left else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     _print(table)

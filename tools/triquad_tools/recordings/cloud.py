@@ -1,23 +1,13 @@
 """Clouds of points: those of recorded scans in the world frame, and thinner ones."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Doubles, Floats
-
-from triquad_tools.recordings.kitti import KittiFolder
+from triquad_format.records.arrays import Doubles
+from triquad_sensors.sweep import PosedScan
 
 _MERGED_POINTS = 2_000_000  # fewer are not worth a merge
-
-
-@dataclass(frozen=True)
-class PosedScan:
-    """A scan, and where it was taken."""
-
-    points: NDArray[np.floating]  # [N, 3] metres, sensor frame
-    world_from_sensor: Doubles  # [4, 4]
 
 
 def is_withheld(index: int, every: int) -> bool:
@@ -25,7 +15,9 @@ def is_withheld(index: int, every: int) -> bool:
     return every > 0 and index % every == every - 1
 
 
-def points_in_range(points: Floats, range_min_m: float, range_max_m: float = np.inf) -> Floats:
+def points_in_range(
+    points: NDArray[np.floating], range_min_m: float, range_max_m: float = np.inf
+) -> NDArray[np.floating]:
     """The points ``[N, 3]``, sensor frame, whose ranges lie within both limits.
 
     Points that are not finite are left out as soon as a limit is given.
@@ -33,17 +25,15 @@ def points_in_range(points: Floats, range_min_m: float, range_max_m: float = np.
     if range_min_m <= 0.0 and not np.isfinite(range_max_m):
         return points
     ranges = np.linalg.norm(points, axis=1)
-    kept: Floats = points[(ranges >= range_min_m) & (ranges <= range_max_m)]
+    kept: NDArray[np.floating] = points[(ranges >= range_min_m) & (ranges <= range_max_m)]
     return kept
 
 
-def world_points(
-    folder: KittiFolder, index: int, range_min_m: float = 0.0, range_max_m: float = np.inf
-) -> Doubles:
-    """The finite points ``[N, 3]`` of one scan within limits of the range, world frame."""
-    points = points_in_range(folder.read_points(index), range_min_m, range_max_m)
+def world_points(scan: PosedScan, range_min_m: float = 0.0, range_max_m: float = np.inf) -> Doubles:
+    """The finite points ``[N, 3]`` of a scan within limits of the range, world frame."""
+    points = points_in_range(scan.points, range_min_m, range_max_m)
     points = points[np.isfinite(points).all(axis=1)]
-    pose = folder.poses[index]
+    pose = scan.world_from_sensor
     world: Doubles = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     return world
 

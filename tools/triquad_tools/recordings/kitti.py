@@ -8,16 +8,17 @@ A folder holds ``poses.txt`` (12 numbers a line: a row-major 3 x 4 pose) and sca
 turned into poses of the lidar.
 """
 
-import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
-from triquad_format.records.pose import is_rotation, orthonormal, rotation_error
+from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry, Stream
+from triquad_tools.recordings.text_lines import parse_rigid, parse_stamp, read_lines
 
 SCAN_FOLDERS = (".", "scans", "velodyne", "velodyne_points/data")
 DEFAULT_PERIOD_NS = 100_000_000  # between scans of a folder without times
@@ -35,22 +36,49 @@ class KittiFolder:
     def __len__(self) -> int:
         return len(self.scan_paths)
 
+    @property
+    def entries(self) -> Sequence[ScanEntry]:
+        """All scans."""
+        return [ScanEntry(stamp, DEFAULT_SOURCE) for stamp in self.stamps_ns.tolist()]
+
+    @property
+    def streams(self) -> Sequence[Stream]:
+        """The scans and their poses."""
+        scans = self.scan_paths[0].parent.name + "/*.bin"
+        return [
+            Stream(scans, "KITTI scans", len(self), frame="", use="scans"),
+            Stream("poses.txt", "KITTI poses", len(self), frame="", use="poses, one per scan"),
+        ]
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """None: nothing is left out."""
+        return ()
+
+    def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
+        """The scans of these numbers."""
+        for index in indices:
+            yield PosedScan(self.read_points(index), self.poses[index])
+
     def read_points(self, index: int) -> Floats:
         """Points ``[N, 3]`` of one scan, metres, lidar frame, as the file has them."""
         path = self.scan_paths[index]
-        size = path.stat().st_size
-        if size % _POINT_BYTES:
-            raise ToolError(f"{path}: {size} bytes are not whole points of {_POINT_BYTES}")
+        _check_size(path)
         return np.fromfile(path, "<f4").reshape(-1, 4)[:, :3].astype(np.float32)
+
+
+def is_kitti_folder(folder: Path) -> bool:
+    """Whether a folder holds scans as KITTI has them."""
+    return any(any((folder / name).glob("*.bin")) for name in SCAN_FOLDERS)
 
 
 def read_folder(folder: Path) -> KittiFolder:
     """The scans, poses and times of a folder.
 
     Raises:
-        ToolError: the folder, its poses or its scans are missing, their counts differ, a
-            pose or the calibration is not a rigid motion, a time is not a number, or times run
-            backwards.
+        ToolError: the folder, its poses or its scans are missing, their counts differ, a scan
+            is not whole, a pose or the calibration is not a rigid motion, a time is not a
+            number, or times run backwards.
     """
     if not folder.is_dir():
         raise ToolError(f"{folder}: no such folder")
@@ -59,6 +87,8 @@ def read_folder(folder: Path) -> KittiFolder:
     scans = _scan_paths(folder)
     poses = _read_poses(folder / "poses.txt")
     _check_count(folder / "poses.txt", "poses", len(poses), scans=len(scans))
+    for path in scans:
+        _check_size(path)
     calibration = folder / "calib.txt"
     if calibration.is_file():
         camera_from_lidar = _read_calibration(calibration)
@@ -84,61 +114,27 @@ def _check_count(path: Path, what: str, count: int, scans: int) -> None:
         raise ToolError(f"{path}: {count} {what} for {scans} scans")
 
 
-def _lines(path: Path) -> list[tuple[str, str]]:
-    """The lines of a file that are not blank, each with its place for messages."""
-    lines = path.read_text(errors="replace").splitlines()
-    return [(f"{path}:{i}", line) for i, line in enumerate(lines, start=1) if line.strip()]
+def _check_size(path: Path) -> None:
+    size = path.stat().st_size
+    if size % _POINT_BYTES:
+        raise ToolError(f"{path}: {size} bytes are not whole points of {_POINT_BYTES}")
 
 
 def _read_poses(path: Path) -> Doubles:
-    poses = [_parse_pose(place, line) for place, line in _lines(path)]
+    poses = [parse_rigid(line.place, line.words) for line in read_lines(path)]
     return np.array(poses, np.float64).reshape(-1, 4, 4)
 
 
 def _read_calibration(path: Path) -> Doubles:
-    for place, line in _lines(path):
-        name, _, numbers = line.partition(":")
+    for line in read_lines(path):
+        name, _, numbers = line.text.partition(":")
         if name.strip() == "Tr":
-            return _parse_pose(place, numbers)
+            return parse_rigid(line.place, numbers.split())
     raise ToolError(f"{path}: has no line 'Tr:'")
 
 
-def _parse_pose(place: str, line: str) -> Doubles:
-    """The rigid pose ``[4, 4]`` of 12 numbers, its rotation made orthonormal."""
-    words = line.split()
-    if len(words) != 12:
-        raise ToolError(f"{place}: {len(words)} numbers where a pose has 12")
-    pose = np.eye(4)
-    pose[:3] = np.reshape([_parse_number(place, word) for word in words], (3, 4))
-    if not is_rotation(pose):
-        raise ToolError(
-            f"{place}: not a rotation: off orthonormal by {rotation_error(pose):.3g}, "
-            f"determinant {np.linalg.det(pose[:3, :3]):.3g}"
-        )
-    return orthonormal(pose)
-
-
-def _parse_number(place: str, word: str) -> float:
-    try:
-        number = float(word)
-    except ValueError:
-        raise ToolError(f"{place}: {word!r} is not a number") from None
-    if not math.isfinite(number):
-        raise ToolError(f"{place}: {word!r} is not finite")
-    return number
-
-
 def _read_stamps(path: Path) -> Longs:
-    """Times in nanoseconds; decimal, for a float of seconds since 1970 is off by 100 ns."""
     stamps: list[int] = []
-    for place, line in _lines(path):
-        try:
-            stamp = int(Decimal(line.strip()) * 10**9)
-        except (InvalidOperation, ValueError, OverflowError):
-            raise ToolError(f"{place}: {line.strip()!r} is not a number of seconds") from None
-        if not 0 <= stamp < 2**63:
-            raise ToolError(f"{place}: {line.strip()} s is out of range")
-        if stamps and stamp < stamps[-1]:
-            raise ToolError(f"{place}: {line.strip()} s is before the line above")
-        stamps.append(stamp)
+    for place, text in read_lines(path):
+        stamps.append(parse_stamp(place, text, earliest_ns=stamps[-1] if stamps else 0))
     return np.array(stamps, np.int64)

@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 from triquad_format.records.arrays import Doubles, Floats
+from triquad_sensors.sweep import PosedScan
 
-from triquad_tools.recordings.cloud import PosedScan, merged
+from triquad_tools.recordings.cloud import merged
 from triquad_tools.simulation.scene import Scene
 
 _SENSOR_HEIGHT_M = 1.8

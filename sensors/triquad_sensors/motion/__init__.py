@@ -1,0 +1,1 @@
+"""How frames moved in each other, and clouds corrected by it."""

@@ -1,0 +1,142 @@
+"""The tree of frames that robots report: which frame stands or moves how in which other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from triquad_format.records.arrays import Doubles, Longs
+
+from triquad_sensors.errors import NoTransformError
+from triquad_sensors.motion.track import Track
+from triquad_sensors.pose import Pose, pose_matrices
+
+STATIC = None
+"""The stamp of a transform that always holds."""
+
+ROOT_NAMES = ("map", "odom", "world")
+"""Frames that stand still, by the habits of ROS (REP 105), the first that there is goes first."""
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Where a frame is in its parent."""
+
+    parent: str
+    child: str
+    stamp_ns: int | None  # nanoseconds since 1970, or STATIC
+    pose: Pose
+
+
+@dataclass
+class _Edge:
+    """From a frame to its parent."""
+
+    parent: str
+    standing: Doubles | None  # [4, 4] where it always holds
+    track: Track
+
+
+class FrameTree:
+    """Transforms over time, and where a frame was in another.
+
+    As in tf2 a frame has one parent: a transform to another one replaces what was known of it.
+    """
+
+    def __init__(self, limit: int | None = None) -> None:
+        """Of each frame, only the ``limit`` newest poses are kept."""
+        self._limit = limit
+        self._edges: dict[str, _Edge] = {}
+
+    @property
+    def frames(self) -> list[str]:
+        """The names of all frames."""
+        return sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
+
+    def add(self, transform: Transform) -> None:
+        """Take in a transform.
+
+        Raises:
+            InvalidScanError: its pose is none.
+        """
+        if transform.child == transform.parent:
+            return
+        position, quaternion = transform.pose.numbers()
+        edge = self._edges.get(transform.child)
+        if edge is None or edge.parent != transform.parent:
+            edge = _Edge(transform.parent, None, Track(self._limit))
+            self._edges[transform.child] = edge
+        if transform.stamp_ns is STATIC:
+            edge.standing = pose_matrices(position, quaternion)
+        else:
+            edge.standing = None
+            edge.track.add(transform.stamp_ns, position, quaternion)
+
+    def with_track(self, parent: str, child: str, track: Track) -> "FrameTree":
+        """A tree that differs in where ``child`` is, and else shares what this one knows."""
+        tree = FrameTree(self._limit)
+        tree._edges = {**self._edges, child: _Edge(parent, None, track)}
+        return tree
+
+    def root(self, frame: str) -> str:
+        """The frame above all others that ``frame`` hangs on; itself where it hangs on none."""
+        return self._path(frame)[-1]
+
+    def fixed_frame(self, frame: str) -> str:
+        """The frame to map in: of those above ``frame`` a usual one, or else the root."""
+        path = self._path(frame)
+        return next((name for name in ROOT_NAMES if name in path), path[-1])
+
+    def poses(self, target: str, frame: str, stamps_ns: Longs) -> Doubles:
+        """Poses [M, 4, 4] ``target_from_frame`` at times [M].
+
+        Raises:
+            NoTransformError: the frames do not hang together, or not at those times.
+        """
+        up, down = self._path(frame), self._path(target)
+        shared = next((name for name in up if name in down), None)
+        if shared is None:
+            raise self._unconnected(target, frame)
+        shared_from_frame = self._climb(up[: up.index(shared)], stamps_ns)
+        shared_from_target = self._climb(down[: down.index(shared)], stamps_ns)
+        target_from_frame: Doubles = np.linalg.inv(shared_from_target) @ shared_from_frame
+        return target_from_frame
+
+    def moves(self, target: str, frame: str) -> bool:
+        """Whether it was ever reported that ``frame`` moves in ``target``."""
+        up, down = self._path(frame), self._path(target)
+        between = {*up} ^ {*down}
+        return any(name in self._edges and self._edges[name].standing is None for name in between)
+
+    def _path(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on up to the root."""
+        path = [frame]
+        while (edge := self._edges.get(path[-1])) is not None and edge.parent not in path:
+            path.append(edge.parent)
+        return path
+
+    def _climb(self, path: list[str], stamps_ns: Longs) -> Doubles:
+        """Poses of the first frame of a path in the parent of the last."""
+        poses = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
+        for child in path:
+            edge = self._edges[child]
+            if edge.standing is not None:
+                poses = edge.standing @ poses
+                continue
+            try:
+                poses = edge.track.poses(stamps_ns) @ poses
+            except NoTransformError as error:
+                text = f"{edge.parent} from {child}: {error}"
+                raise NoTransformError(error.reason, text, late=error.late) from None
+        return np.array(poses)
+
+    def _unconnected(self, target: str, frame: str) -> NoTransformError:
+        if frame not in self.frames:
+            known = ", ".join(self.frames[:10]) or "none"
+            text = f"no transform names the frame {frame!r} (known: {known})"
+        elif target not in self.frames:
+            text = f"no transform names the map frame {target!r}: {frame} is in {self.root(frame)}"
+        else:
+            text = (
+                f"{frame} is in {self.root(frame)} and {target} in {self.root(target)}, and no "
+                "transform connects the two"
+            )
+        return NoTransformError("no_transform", text, late=True)

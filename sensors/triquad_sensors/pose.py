@@ -1,0 +1,76 @@
+"""A pose as a position and a quaternion, the way ROS and trajectory files have it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from triquad_format.records.arrays import Doubles
+
+from triquad_sensors.errors import NO_NUMBER, InvalidScanError
+
+_UNIT_TOLERANCE = 1e-2
+"""By how much a quaternion's length may be off: files of three digits are."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a sensor is and how it is turned, in the map frame: stands for a matrix [4, 4]."""
+
+    position_m: ArrayLike  # [3] x, y, z
+    quaternion_xyzw: ArrayLike  # [4] x, y, z, w: the order of ROS; made a unit quaternion
+
+    def matrix(self) -> Doubles:
+        """The pose as a matrix [4, 4], ``world_from_sensor``.
+
+        Raises:
+            InvalidScanError: it is not 3 and 4 finite numbers, or no rotation.
+        """
+        return pose_matrices(*self.numbers())
+
+    def numbers(self) -> tuple[Doubles, Doubles]:
+        """The position [3] and the unit quaternion [4].
+
+        Raises:
+            InvalidScanError: as :meth:`matrix`.
+        """
+        position = _numbers("position_m", self.position_m, 3)
+        quaternion = _numbers("quaternion_xyzw", self.quaternion_xyzw, 4)
+        length = float(np.linalg.norm(quaternion))
+        if abs(length - 1.0) > _UNIT_TOLERANCE:
+            raise InvalidScanError(
+                f"quaternion_xyzw = {quaternion.tolist()} has the length {length:.4g}, not 1"
+            )
+        return position, quaternion / length
+
+
+def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
+    """Poses [..., 4, 4] of positions [..., 3] and unit quaternions [..., 4] x, y, z, w.
+
+    Diebel 2006, "Representing attitude", section 5.6.
+    """
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    poses = np.zeros((*x.shape, 4, 4))
+    poses[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    poses[..., 0, 1] = 2 * (x * y - z * w)
+    poses[..., 0, 2] = 2 * (x * z + y * w)
+    poses[..., 1, 0] = 2 * (x * y + z * w)
+    poses[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    poses[..., 1, 2] = 2 * (y * z - x * w)
+    poses[..., 2, 0] = 2 * (x * z - y * w)
+    poses[..., 2, 1] = 2 * (y * z + x * w)
+    poses[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    poses[..., :3, 3] = positions
+    poses[..., 3, 3] = 1.0
+    return poses
+
+
+def _numbers(name: str, values: ArrayLike, count: int) -> Doubles:
+    try:
+        array = np.asarray(values, np.float64)
+    except NO_NUMBER as error:
+        raise InvalidScanError(f"{name} = {values!r} are not {count} numbers: {error}") from error
+    if array.shape != (count,):
+        raise InvalidScanError(f"{name} is {list(array.shape)}, not [{count}]")
+    if not np.isfinite(array).all():
+        raise InvalidScanError(f"{name} = {array.tolist()} has values that are not finite")
+    return array

@@ -1,0 +1,106 @@
+"""``sensor_msgs/PointCloud2``: clouds as nearly all lidars publish them."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Floats
+
+from triquad_sensors.errors import NoScanError
+from triquad_sensors.ros.header import frame_name, stamp_ns
+from triquad_sensors.ros.point_times import TIME_FIELDS, offsets_s
+from triquad_sensors.sweep import Sweep
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Of the message's constants INT8 to FLOAT64."""
+
+
+def sweep_of_cloud(message: Any) -> Sweep:
+    """The finite points of a ``PointCloud2``, with their times where it has some.
+
+    Raises:
+        NoScanError: it has no x, y and z, or not as floating numbers, or is not whole.
+    """
+    fields = {field.name: field for field in message.fields}
+    _check_layout(message)
+    points = _points(message, fields)
+    stamp = stamp_ns(message.header)
+    times = _times(message, fields)
+    if not np.isfinite(points).all():
+        finite = np.isfinite(points).all(axis=1)
+        points = points[finite]
+        times = None if times is None else times[finite]
+    offsets = None if times is None else offsets_s(times, stamp)
+    return Sweep(points, frame_name(message.header.frame_id), stamp, offsets)
+
+
+def _times(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
+    """The time of each point [N] as the driver wrote it, if it did."""
+    name = next((name for name in TIME_FIELDS if name in fields), None)
+    return None if name is None else _column(message, fields[name]).reshape(-1)
+
+
+def _points(message: Any, fields: dict[str, Any]) -> Floats:
+    """The points [N, 3], the one copy that is made of them."""
+    missing = [name for name in "xyz" if name not in fields]
+    if missing:
+        raise NoScanError(
+            "no_xyz",
+            f"the cloud has no field {', '.join(missing)}, only {', '.join(fields) or 'none'}: "
+            "choose a topic of points",
+        )
+    columns = [_column(message, fields[name]) for name in "xyz"]
+    kinds = [column.dtype.kind for column in columns]
+    if kinds != ["f", "f", "f"]:
+        raise NoScanError(
+            "field_type",
+            f"x, y and z of the cloud are {', '.join(str(c.dtype) for c in columns)}: only "
+            "FLOAT32 and FLOAT64 are understood",
+        )
+    starts = [fields[name].offset for name in "xyz"]
+    item = columns[0].dtype.itemsize
+    if np.all(np.diff(starts) == item) and len({c.dtype for c in columns}) == 1:
+        shape, strides = (*columns[0].shape, 3), (*columns[0].strides, item)
+        together = np.ndarray(shape, columns[0].dtype, message.data, starts[0], strides)
+        return np.array(together.reshape(-1, 3), np.float32)
+    return np.array(np.stack([column.reshape(-1) for column in columns], axis=1), np.float32)
+
+
+def _column(message: Any, field: Any) -> NDArray[Any]:
+    """A view [height, width] of one field."""
+    if field.datatype not in _TYPES or field.count > 1:
+        raise NoScanError(
+            "field_type",
+            f"the cloud's field {field.name} has the type {field.datatype} and {field.count} "
+            "values a point: a type from 1 to 8 and one value are understood",
+        )
+    order = ">" if message.is_bigendian else "<"
+    dtype = np.dtype(order + _TYPES[field.datatype])
+    if field.offset + dtype.itemsize > message.point_step:
+        raise NoScanError(
+            "truncated",
+            f"the cloud's field {field.name} ends at byte {field.offset + dtype.itemsize} of a "
+            f"point of {message.point_step}",
+        )
+    strides = (_row_step(message), message.point_step)
+    shape = (message.height, message.width)
+    if 0 in shape:
+        return np.empty(shape, dtype)
+    view: NDArray[Any] = np.ndarray(shape, dtype, message.data, field.offset, strides)
+    return view
+
+
+def _row_step(message: Any) -> int:
+    """Bytes from row to row; drivers leave it 0 where there is one row."""
+    return int(message.row_step or message.width * message.point_step)
+
+
+def _check_layout(message: Any) -> None:
+    row = message.width * message.point_step
+    needed = (message.height - 1) * _row_step(message) + row if message.height else 0
+    if row > _row_step(message) or needed > len(message.data):
+        raise NoScanError(
+            "truncated",
+            f"the cloud says {message.height} x {message.width} points of {message.point_step} "
+            f"bytes, which are {needed} bytes, but has {len(message.data)}",
+        )

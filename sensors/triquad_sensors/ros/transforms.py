@@ -1,0 +1,46 @@
+"""Poses as robots report them: ``TFMessage``, ``Odometry`` and ``PoseStamped``."""
+
+from typing import Any
+
+from triquad_sensors.motion.frame_tree import STATIC, Transform
+from triquad_sensors.pose import Pose
+from triquad_sensors.ros.header import frame_name, stamp_ns
+
+
+def transforms_of_tf(message: Any, *, static: bool) -> list[Transform]:
+    """The transforms of a ``TFMessage``, which always hold where they are ``static``."""
+    return [
+        Transform(
+            parent=frame_name(each.header.frame_id),
+            child=frame_name(each.child_frame_id),
+            stamp_ns=STATIC if static else stamp_ns(each.header),
+            pose=_pose(each.transform.translation, each.transform.rotation),
+        )
+        for each in message.transforms
+    ]
+
+
+def transform_of_odometry(message: Any) -> Transform:
+    """Where the robot's body was, as an ``Odometry`` has it."""
+    return Transform(
+        parent=frame_name(message.header.frame_id),
+        child=frame_name(message.child_frame_id),
+        stamp_ns=stamp_ns(message.header),
+        pose=_pose(message.pose.pose.position, message.pose.pose.orientation),
+    )
+
+
+def transform_of_pose(message: Any, body_frame: str) -> Transform:
+    """Where ``body_frame`` was, as a ``PoseStamped`` has it, which does not name it."""
+    return Transform(
+        parent=frame_name(message.header.frame_id),
+        child=body_frame,
+        stamp_ns=stamp_ns(message.header),
+        pose=_pose(message.pose.position, message.pose.orientation),
+    )
+
+
+def _pose(position: Any, rotation: Any) -> Pose:
+    return Pose(
+        (position.x, position.y, position.z), (rotation.x, rotation.y, rotation.z, rotation.w)
+    )

@@ -1,0 +1,25 @@
+"""What a sensor measured in one go, before and after it is known where the sensor was."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A cloud of points, or what a depth image shows, that has no pose yet."""
+
+    points: NDArray[np.floating]  # [N, 3] metres, sensor frame; some may not be finite
+    frame: str  # of the sensor, as frames are named in ROS: no leading slash
+    stamp_ns: int  # nanoseconds since 1970
+    offsets_s: Doubles | None = None  # [N] seconds after the stamp at which each was measured
+
+
+@dataclass(frozen=True)
+class PosedScan:
+    """A scan, and where it was taken."""
+
+    points: NDArray[np.floating]  # [N, 3] metres, sensor frame
+    world_from_sensor: Doubles  # [4, 4]

@@ -1,0 +1,112 @@
+"""``triquad-map``: a recording in, a map out."""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+from triquad_server.errors import StoreError
+from triquad_server.launch import choose_device, warm_up
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings_loading import load_settings
+
+from triquad_tools.console.arguments import add_version
+from triquad_tools.console.command import OK, ToolError, run
+from triquad_tools.console.progress import progress
+from triquad_tools.mapping.mapping_run import MappingRun, stop_requests
+from triquad_tools.mapping.output import SUFFIXES, write_output
+from triquad_tools.mapping.unfinished import MAP_NAME, UnfinishedMap, mapping_key
+from triquad_tools.recordings.arguments import add_recording
+from triquad_tools.recordings.selection import Selection, open_selected
+
+_COMMAND = "triquad-map"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool: 0 done, 1 nothing could be written, 2 bad input, 130 interrupted."""
+    work = partial(_map, _parser().parse_args(argv))
+    interrupted = "interrupted; the same command goes on where it was"
+    return run(_COMMAND, work, failures=(StoreError,), interrupted=interrupted)
+
+
+def _map(options: argparse.Namespace) -> int:
+    output = options.output
+    _check_output(output, options.force)
+    settings = load_settings(options.settings, options.set)
+    device = choose_device(options.device)
+    selection = open_selected(options)
+    key = mapping_key(selection.entries, settings)
+    with stop_requests() as stop, closing(UnfinishedMap(output, key)) as unfinished:
+        with progress("preparing") as report:
+            warm_up(settings, device, report=lambda stage: report(0.0, stage))
+        at = unfinished.position()
+        if at.scans_taken:
+            print(f"going on after scan {at.scans_taken}, from {unfinished.folder}")
+        mapper = Mapper(MAP_NAME, settings, device, at.record)
+        mapping = MappingRun(mapper, unfinished, stop.is_set)
+        mapping.take(selection, at.scans_taken)
+        _check_result(mapper, mapping, selection)
+        mapping.settle()
+        record = mapper.changes_since(None).record
+        written = write_output(
+            record, output, cell_m=settings.mesh.cell_m, training=options.training
+        )
+    unfinished.remove()
+    print(f"{output}: {written}")
+    return OK
+
+
+def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> None:
+    """Tell of refused scans.
+
+    Raises:
+        ToolError: all were.
+    """
+    refused = sum(mapping.refusals.values())
+    if refused:
+        reasons = ", ".join(f"{reason}: {n}" for reason, n in mapping.refusals.items())
+        told = f"{refused} of {len(selection)} scans could not be used ({reasons})"
+        told += f"; the last: {mapping.last_refusal}"
+        if not mapper.regions:
+            raise ToolError(f"nothing was mapped: {told}")
+        print(f"{_COMMAND}: {told}", file=sys.stderr)
+
+
+def _check_output(path: Path, force: bool) -> None:
+    """Refuse a target that cannot be written, before the work is done."""
+    if path.suffix not in SUFFIXES:
+        raise ToolError(f"{path}: use a name that ends in {', '.join(SUFFIXES)}")
+    if path.is_dir():
+        raise ToolError(f"{path} is a folder; give the name of a file")
+    if os.path.lexists(path) and not force:
+        raise ToolError(f"{path} exists; give --force to replace it")
+    if not path.parent.is_dir():
+        raise ToolError(f"{path.parent} is not a folder: make it first")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=_COMMAND,
+        description="Make a map of a recording, without a server or a network.",
+        epilog="Exit status: 0 done; 1 the map could not be written; 2 wrong usage, or input of "
+        "which nothing can be used; 130 interrupted: the same command then goes on where it was.",
+    )
+    add_recording(parser)
+    add = parser.add_argument
+    add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(SUFFIXES))
+    add("--settings", type=Path, metavar="FILE", help="settings of the map, as of triquad-server")
+    add(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="one setting, such as field.leaf_m=0.05, repeatable",
+    )
+    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
+    add("--training", action="store_true", help="keep what further training needs in the map file")
+    add("--force", action="store_true", help="replace OUT where it exists")
+    add_version(parser)
+    return parser

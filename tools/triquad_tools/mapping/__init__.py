@@ -1,0 +1,1 @@
+"""Maps made of recordings within this process, without a network."""

@@ -1,0 +1,116 @@
+"""Making a map of a recording, scan by scan."""
+
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from triquad_server.errors import ScanRefusedError
+from triquad_server.mapping.mapper import Mapper
+
+from triquad_tools.console.progress import progress
+from triquad_tools.mapping.unfinished import UnfinishedMap
+from triquad_tools.recordings.selection import Selection
+
+_SAVE_PERIOD_S = 60.0
+
+
+@contextmanager
+def stop_requests() -> Iterator[threading.Event]:
+    """Ctrl-C and SIGTERM only set an event, so that no step is cut off in the middle.
+
+    A second Ctrl-C raises KeyboardInterrupt.
+    """
+    asked = threading.Event()
+
+    def ask(*_: object) -> None:
+        asked.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class MappingRun:
+    """Takes in the scans of a recording and trains until nothing is left to learn."""
+
+    def __init__(self, mapper: Mapper, unfinished: UnfinishedMap, stop: Callable[[], bool]) -> None:
+        """``stop()`` is asked between steps."""
+        self._mapper = mapper
+        self._unfinished = unfinished
+        self._stop = stop
+        self._next_save = time.monotonic() + _SAVE_PERIOD_S
+        self.scans_taken = 0  # or refused: those that need not be taken again
+        self.refusals: Counter[str] = Counter()
+        self.last_refusal = ""
+
+    def take(self, selection: Selection, start: int) -> None:
+        """Take in the scans from number ``start`` on, and train between them.
+
+        Raises:
+            KeyboardInterrupt: the user wants to stop; all that was done is saved.
+        """
+        self.scans_taken = start
+        total = len(selection)
+        entries = selection.entries
+        began = time.monotonic()
+        with progress("mapping", total) as report:
+            for scan in selection.scans(start):
+                self._between_steps()
+                entry = entries[self.scans_taken]
+                try:
+                    self._mapper.ingest(
+                        scan.points,
+                        scan.world_from_sensor,
+                        entry.stamp_ns // 1_000_000_000,
+                        source=entry.source,
+                    )
+                except ScanRefusedError as error:
+                    self.refusals[error.reason] += 1
+                    self.last_refusal = f"scan {self.scans_taken}: {error}"
+                self.scans_taken += 1
+                self._mapper.train()
+                rate_hz = (self.scans_taken - start) / (time.monotonic() - began)
+                left_s = (total - self.scans_taken) / rate_hz
+                report(
+                    self.scans_taken,
+                    f"{self.scans_taken} of {total} scans, {rate_hz:.1f} /s, {left_s:.0f} s left",
+                )
+
+    def settle(self) -> None:
+        """Train until nothing is left to learn.
+
+        Raises:
+            KeyboardInterrupt: the user wants to stop; all that was done is saved.
+        """
+        mapper = self._mapper
+        owed = _owed(mapper)
+        trained = mapper.samples_trained
+        began = time.monotonic()
+        with progress("training", owed) as report:
+            while not mapper.settled:
+                self._between_steps()
+                mapper.train()
+                done = mapper.samples_trained - trained
+                rate = done / (time.monotonic() - began)
+                left = _owed(mapper)
+                report(owed - left, f"{rate / 1e6:.2f} M samples/s, {left / rate:.0f} s left")
+
+    def _between_steps(self) -> None:
+        if self._stop():
+            self._unfinished.save(self._mapper, self.scans_taken)
+            raise KeyboardInterrupt
+        if time.monotonic() >= self._next_save:
+            self._unfinished.save(self._mapper, self.scans_taken)
+            self._next_save = time.monotonic() + _SAVE_PERIOD_S
+
+
+def _owed(mapper: Mapper) -> int:
+    """Samples that are still to be trained."""
+    return sum(region.budget_samples for region in mapper.regions)

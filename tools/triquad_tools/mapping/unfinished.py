@@ -1,0 +1,113 @@
+"""A map that is not finished: its checkpoints, and how far in the recording each of them is."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_format.mapfile.writer import replacing
+from triquad_format.records.region import MapRecord
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings, StoreSettings
+from triquad_server.settings_loading import settings_toml
+from triquad_server.store.store import Store
+
+from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.recording import ScanEntry
+
+MAP_NAME = "recording"
+_POSITIONS = "positions.json"
+_KEEP = StoreSettings(period_s=0.0, keep=2)
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where to go on."""
+
+    record: MapRecord | None  # None: with an empty map
+    scans_taken: int
+
+
+def mapping_key(entries: Sequence[ScanEntry], settings: Settings) -> str:
+    """What tells whether an unfinished map is of the same scans and settings."""
+    digest = hashlib.sha256(settings_toml(settings).encode())
+    for entry in entries:
+        digest.update(f"{entry.stamp_ns} {entry.source}\n".encode())
+    return digest.hexdigest()
+
+
+class UnfinishedMap:
+    """The folder beside the output in which a map lies while it is made. Close it."""
+
+    def __init__(self, output: Path, key: str) -> None:
+        """Take possession of the folder, which is made if need be.
+
+        Raises:
+            ToolError: it holds a map of other scans or settings.
+            StoreError: it cannot be written to, or another process makes a map in it.
+        """
+        self.folder = output.with_name(f"{output.name}.part")
+        self._key = key
+        self._store = Store(self.folder, MAP_NAME, _KEEP)
+        self._scans_taken: dict[str, int] = {}  # by epoch
+        try:
+            self._read_positions()
+        except BaseException:
+            self._store.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the folder; what is in it stays."""
+        self._store.close()
+
+    def remove(self) -> None:
+        """Delete the folder, once it is closed: the map is finished."""
+        shutil.rmtree(self.folder)
+
+    def position(self) -> Position:
+        """Where to go on.
+
+        Raises:
+            StoreError: there are checkpoints, but none can be read.
+        """
+        newest = self._store.newest()
+        if newest is None:
+            return Position(None, 0)
+        epoch = newest.record.epoch
+        if str(epoch) not in self._scans_taken:
+            raise ToolError(
+                f"{self.folder}: {_POSITIONS} says nothing of epoch {epoch}; delete the folder to "
+                "begin anew"
+            )
+        return Position(newest.record, self._scans_taken[str(epoch)])
+
+    def save(self, mapper: Mapper, scans_taken: int) -> None:
+        """Write a checkpoint from which the map can go on.
+
+        Raises:
+            StoreError: it cannot be written; the one before is untouched.
+        """
+        changes = mapper.changes_since(self._store.base_epoch)
+        # First: a checkpoint without its position would be of no use.
+        self._scans_taken[str(changes.record.epoch)] = scans_taken
+        text = json.dumps({"key": self._key, "scans_taken": self._scans_taken})
+        with replacing(self.folder / _POSITIONS) as stream:
+            stream.write(text.encode())
+        self._store.write(changes)
+
+    def _read_positions(self) -> None:
+        path = self.folder / _POSITIONS
+        if not path.exists():
+            return
+        try:
+            read = json.loads(path.read_text())
+            key, self._scans_taken = read["key"], dict(read["scans_taken"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ToolError(f"{path} is damaged; delete {self.folder} to begin anew") from error
+        if key != self._key:
+            raise ToolError(
+                f"{self.folder} holds an unfinished map of other scans or with other settings: "
+                "give those to go on with it, or delete the folder to begin anew"
+            )

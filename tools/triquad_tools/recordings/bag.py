@@ -1,0 +1,127 @@
+"""Bags of ROS 1 and ROS 2 and MCAP files, message by message."""
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores, get_typestore
+
+from triquad_tools.console.command import ToolError
+
+_SUFFIXES = (".bag", ".mcap", ".db3")
+_REPAIR = {
+    ".bag": "rosbag reindex",
+    ".mcap": "mcap recover",
+    ".db3": "ros2 bag reindex",
+}
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message as it was recorded."""
+
+    connection: Connection
+    recorded_ns: int  # nanoseconds since 1970, by the recorder's clock
+    payload: bytes
+
+
+class OpenBag:
+    """A bag that can be read."""
+
+    def __init__(self, bag: "Bag", reader: AnyReader) -> None:
+        """Use :meth:`Bag.open`."""
+        self._bag = bag
+        self._reader = reader
+
+    @property
+    def connections(self) -> list[Connection]:
+        """What was recorded: several may be of one topic."""
+        return self._reader.connections
+
+    def messages(
+        self, connections: Collection[Connection], start_ns: int | None = None
+    ) -> Iterator[Message]:
+        """The messages of some connections in the order in which they were recorded.
+
+        Raises:
+            ToolError: the bag is damaged.
+        """
+        if not connections:
+            return
+        messages = self._reader.messages(connections, start=start_ns)
+        while True:
+            try:
+                message = next(messages, None)
+            except Exception as error:  # a damaged file leads the readers anywhere
+                raise self._bag.damaged(error) from error
+            if message is None:
+                return
+            yield Message(*message)
+
+    def decode(self, message: Message) -> Any:
+        """The message as an object with the fields that its type has.
+
+        Raises:
+            ToolError: its bytes are no such message.
+        """
+        kind = message.connection.msgtype
+        try:
+            return self._reader.deserialize(message.payload, kind)
+        except Exception as error:  # as above
+            topic = message.connection.topic
+            raise ToolError(f"{self._bag.path}: a message on {topic} is no {kind}: {error}") from (
+                error
+            )
+
+
+@dataclass(frozen=True)
+class Bag:
+    """Where a bag is, which may be cut into several files."""
+
+    path: Path
+    files: tuple[Path, ...]
+
+    @contextmanager
+    def open(self) -> Iterator[OpenBag]:
+        """The bag, open for reading.
+
+        Raises:
+            ToolError: it cannot be read, or is not whole.
+        """
+        try:
+            reader = AnyReader(self.files, default_typestore=get_typestore(Stores.LATEST))
+            reader.open()
+        except Exception as error:  # a damaged file leads the readers anywhere
+            raise self.damaged(error) from error
+        try:
+            yield OpenBag(self, reader)
+        finally:
+            reader.close()
+
+    def damaged(self, error: Exception) -> ToolError:
+        """What to say where reading the bag fails."""
+        suffixes = {file.suffix for file in _bag_files(self.path)} or {self.path.suffix}
+        repair = " or ".join(f"'{_REPAIR[suffix]}'" for suffix in sorted(suffixes & {*_REPAIR}))
+        words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        remedy = f"; where it was cut off or damaged, {repair} saves what is left" if repair else ""
+        return ToolError(f"{self.path}: the bag cannot be read ({words}){remedy}")
+
+
+def find_bag(path: Path) -> Bag | None:
+    """The bag at a path: a file, a folder that ROS 2 wrote, or one of parts of a bag."""
+    if path.is_file():
+        return Bag(path, (path,)) if path.suffix in _SUFFIXES else None
+    if (path / "metadata.yaml").is_file():
+        return Bag(path, (path,))
+    files = _bag_files(path)
+    return Bag(path, files) if files else None
+
+
+def _bag_files(path: Path) -> tuple[Path, ...]:
+    if path.is_file():
+        return (path,)
+    return tuple(sorted(file for file in path.glob("*") if file.suffix in _SUFFIXES))

@@ -1,0 +1,90 @@
+"""The camera of a folder of depth images."""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+from triquad_sensors.depth_image import Intrinsics
+from triquad_sensors.errors import NO_NUMBER, InvalidScanError
+
+from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.folders.depth_png import ImageSize
+
+INTRINSICS_NAMES = ("camera_intrinsic.json", "intrinsic.json", "camera_primesense.json")
+"""Names that Open3D and its data give them."""
+
+
+class Camera(NamedTuple):
+    """A camera, and the size of its images where that is known."""
+
+    intrinsics: Intrinsics
+    size: ImageSize | None
+    origin: str  # where this is said, for messages
+
+
+_TUM = Camera(
+    Intrinsics(525.0, 525.0, 319.5, 239.5), ImageSize(640, 480), "the documentation of TUM RGB-D"
+)
+"""Of all three cameras, whose depth was registered by OpenNI:
+https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
+
+
+def choose_camera(folder: Path, given: Intrinsics | None) -> Camera:
+    """The camera that was given, that a folder has in a file, or that its name tells.
+
+    Raises:
+        ToolError: it is not known, or the file is not understood.
+    """
+    if given is not None:
+        return Camera(given, None, "--intrinsics")
+    for name in INTRINSICS_NAMES:
+        if (folder / name).is_file():
+            return read_camera(folder / name)
+    if "freiburg" in folder.resolve().name:
+        return _TUM
+    raise ToolError(
+        f"{folder}: the camera is not known: put {INTRINSICS_NAMES[0]} of Open3D there, or give "
+        "--intrinsics FX,FY,CX,CY in pixels"
+    )
+
+
+def read_camera(path: Path) -> Camera:
+    """The camera of a file as Open3D writes it.
+
+    JSON with ``width``, ``height`` and ``intrinsic_matrix``, nine numbers, column by column.
+
+    Raises:
+        ToolError: it is no such file.
+    """
+    try:
+        said = json.loads(path.read_text())
+        size = ImageSize(int(said["width"]), int(said["height"]))
+        columns = [said["intrinsic_matrix"][start : start + 3] for start in (0, 3, 6)]
+        matrix = [list(row) for row in zip(*columns, strict=True)]
+        return Camera(Intrinsics.from_matrix(matrix), size, path.name)
+    except InvalidScanError as error:
+        raise ToolError(f"{path}: {error}; numbers stand column by column") from error
+    except (*NO_NUMBER, KeyError) as error:
+        raise ToolError(
+            f"{path}: has no width, height and intrinsic_matrix of nine numbers, as Open3D writes "
+            f"them: {error}"
+        ) from error
+
+
+def check_fits(camera: Camera, size: ImageSize, path: Path) -> None:
+    """Whether an image is one of a camera.
+
+    Raises:
+        ToolError: it has another size, or the centre of the camera lies outside of it.
+    """
+    if camera.size is not None and camera.size != size:
+        raise ToolError(
+            f"{path}: has {size} pixels, and the camera of {camera.origin} {camera.size}: give the "
+            "intrinsics for these images, with --intrinsics FX,FY,CX,CY"
+        )
+    centre = camera.intrinsics
+    if not (0 < centre.cx < size.width and 0 < centre.cy < size.height):
+        raise ToolError(
+            f"{path}: has {size} pixels, and the centre of the camera of {camera.origin} lies "
+            f"outside, at {centre.cx:g}, {centre.cy:g}: give the intrinsics for these images"
+        )

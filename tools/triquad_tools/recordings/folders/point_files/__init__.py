@@ -1,0 +1,1 @@
+"""Files of one cloud each: PLY, PCD, LAS and LAZ."""

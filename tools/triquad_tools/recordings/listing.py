@@ -1,0 +1,34 @@
+"""What a recording holds, told to a person."""
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from triquad_tools.console.report import print_columns
+from triquad_tools.recordings.recording import Recording
+
+
+def print_contents(path: Path, recording: Recording, flags: Sequence[str]) -> bool:
+    """Print all streams, what is wrong, and how to map it; whether it can be mapped.
+
+    ``flags`` are those with which it was opened.
+    """
+    rows = [
+        (each.name, each.kind, f"{each.count:,}", each.frame, each.use)
+        for each in recording.streams
+    ]
+    titles = ("stream", "type", "count", "frame", "use")
+    print_columns(titles, rows, words=("type", "frame", "use"))
+    for remark in recording.remarks:
+        print(remark)
+    entries = recording.entries
+    if not entries:
+        print(f"{path}: nothing of it can be mapped as it is")
+        return False
+    stamps = [entry.stamp_ns for entry in entries]
+    seconds = (max(stamps) - min(stamps)) / 1e9
+    rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
+    print(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
+    command = ["triquad-map", str(path), f"{path.stem}.triquad", *flags]
+    print(f"to map it: {shlex.join(command)}")
+    return True

@@ -1,0 +1,52 @@
+"""Recordings: scans with poses, whatever kind of file or folder holds them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from triquad_sensors.sweep import PosedScan
+
+DEFAULT_SOURCE = "default"
+"""Of recordings that name no sensor: the source that the client takes by default, too."""
+
+
+@dataclass(frozen=True)
+class ScanEntry:
+    """A scan that can be mapped; its points are read when they are asked for."""
+
+    stamp_ns: int  # nanoseconds since 1970, or since the recording began
+    source: str  # name of the sensor, under which its scans are published
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What of one kind a recording holds, as ``triquad-replay --list`` shows it."""
+
+    name: str  # of the topic, or of the files
+    kind: str  # type of the messages, or of the files
+    count: int
+    frame: str  # of the sensor, or parent and child of poses; empty where there is none
+    use: str  # in plain words: what is made of it, or why nothing
+
+
+class Recording(Protocol):
+    """A recording that was looked through as a whole, so that what is wrong with it is known."""
+
+    @property
+    def entries(self) -> Sequence[ScanEntry]:
+        """The scans that can be mapped, in the order of their stamps."""
+
+    @property
+    def streams(self) -> Sequence[Stream]:
+        """All that it holds."""
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """What is left out and why, and what to do about it: a line each."""
+
+    def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
+        """The scans of these numbers, which increase, one after the other.
+
+        Raises:
+            ToolError: a scan cannot be read.
+        """

@@ -1,0 +1,40 @@
+"""How a recording of ROS is to be read, where what it holds leaves a choice."""
+
+from dataclasses import dataclass
+
+from triquad_sensors.motion.frame_tree import STATIC, Transform
+from triquad_sensors.pose import Pose
+
+from triquad_tools.console.command import ToolError
+
+
+@dataclass(frozen=True)
+class RosOptions:
+    """What a person said about a recording; what is left out is found out."""
+
+    topics: tuple[str, ...] = ()  # of clouds or depth images
+    poses: str | None = None  # topic of odometry or poses, or "tf"
+    map_frame: str | None = None
+    body_frame: str | None = None  # whose poses those of the topic are
+    recorder_clock: bool = False  # stamps are when a message was recorded
+    transforms: tuple[Transform, ...] = ()  # that the recording lacks
+
+
+def parse_transform(text: str) -> Transform:
+    """A transform such as ``base_link lidar 0 0 1.5 0 0 0 1``: position and quaternion.
+
+    Raises:
+        ToolError: it is none.
+    """
+    words = text.split()
+    try:
+        parent, child, *numbers = words
+        x, y, z, *quaternion = map(float, numbers)
+        pose = Pose((x, y, z), quaternion)
+        pose.matrix()
+    except ValueError as error:
+        raise ToolError(
+            f"--transform {text!r}: use 'PARENT CHILD X Y Z QX QY QZ QW', such as "
+            f"'base_link lidar 0 0 1.5 0 0 0 1' ({error})"
+        ) from error
+    return Transform(parent, child, STATIC, pose)

@@ -1,0 +1,81 @@
+"""What of a recording is to be mapped."""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from triquad_sensors.sweep import PosedScan
+
+from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.arguments import open_from
+from triquad_tools.recordings.cloud import is_withheld, points_in_range
+from triquad_tools.recordings.recording import Recording, ScanEntry
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Some scans of a recording, without points that are too near."""
+
+    recording: Recording
+    indices: Sequence[int]
+    range_min_m: float
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def entries(self) -> list[ScanEntry]:
+        """When each was taken, and by which sensor."""
+        entries = self.recording.entries
+        return [entries[index] for index in self.indices]
+
+    def scans(self, start: int = 0) -> Iterator[PosedScan]:
+        """The scans from number ``start`` on, one after the other."""
+        for scan in self.recording.read(self.indices[start:]):
+            points = points_in_range(np.asarray(scan.points, np.float32), self.range_min_m)
+            yield PosedScan(points, scan.world_from_sensor)
+
+
+def open_selected(options: argparse.Namespace) -> Selection:
+    """The recording of the arguments and the scans they choose; its remarks are told.
+
+    Raises:
+        ToolError: it cannot be read, or no scan is left to map.
+    """
+    recording = open_from(options)
+    for remark in recording.remarks:
+        print(f"{options.recording}: {remark}", file=sys.stderr)
+    if not recording.entries:
+        raise ToolError(f"{options.recording}: nothing of it can be mapped")
+    indices = _chosen(recording.entries, options)
+    if not indices:
+        raise ToolError(
+            f"{options.recording}: no scan is left of {len(recording.entries)} in "
+            f"{_length_s(recording.entries):.1f} s: see --start, --end, --every and --skip-every"
+        )
+    return Selection(recording, indices, options.range_min)
+
+
+def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:
+    """The numbers of the scans within the times, every Nth of each sensor, and not withheld."""
+    first_ns = min(entry.stamp_ns for entry in entries)
+    end_s = float("inf") if options.end is None else options.end
+    numbers: dict[str, int] = {}
+    chosen: list[int] = []
+    for index, entry in enumerate(entries):
+        number = numbers[entry.source] = numbers.get(entry.source, -1) + 1
+        after_s = (entry.stamp_ns - first_ns) / 1e9
+        if (
+            options.start <= after_s <= end_s
+            and number % options.every == 0
+            and not is_withheld(index, options.skip_every)
+        ):
+            chosen.append(index)
+    return chosen
+
+
+def _length_s(entries: Sequence[ScanEntry]) -> float:
+    stamps = [entry.stamp_ns for entry in entries]
+    return (max(stamps) - min(stamps)) / 1e9
