@@ -2,16 +2,16 @@
 
 import argparse
 import logging
+import os
 import queue
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import triquad_format
 from triquad_format.errors import FormatError
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
-from triquad_format.wire.keys import check_name
 
 from triquad_server.errors import ListenError, ServerError, StoreError
 from triquad_server.installed import require_libraries
@@ -33,6 +33,7 @@ _log = logging.getLogger("triquad_server")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the server until SIGINT or SIGTERM; returns the exit code."""
+    _on_signals(_leave)
     options = _parser().parse_args(argv)
     logging.basicConfig(
         stream=sys.stderr,
@@ -42,6 +43,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in ("numba", "torch"):
         logging.getLogger(name).setLevel(logging.WARNING)
     return _exit_code(options)
+
+
+def _on_signals(handler: Callable[..., None]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+
+
+def _leave(*_: object) -> None:
+    """Stop before anything is open: an exception could get lost in what is being imported."""
+    os.write(2, b"stopped\n")
+    os._exit(OK)
 
 
 def _exit_code(options: argparse.Namespace) -> int:
@@ -64,6 +76,8 @@ def _exit_code(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     require_libraries()
+    from triquad_format.wire.keys import check_name
+
     from triquad_server.launch_options import LaunchOptions
     from triquad_server.net.session import NetworkOptions
     from triquad_server.settings_loading import load_settings, settings_toml
@@ -75,12 +89,11 @@ def _run(options: argparse.Namespace) -> int:
     if options.print_settings:
         sys.stdout.write(settings_toml(settings))
         return OK
-    stops: Stops = queue.SimpleQueue()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stops.put(Stop.ASKED))
     # Only now, since it takes seconds to import.
     from triquad_server.launch import run_server
 
+    stops: Stops = queue.SimpleQueue()
+    _on_signals(lambda *_: stops.put(Stop.ASKED))
     network = NetworkOptions(
         listen=tuple(map(full_endpoint, options.listen)),
         connect=tuple(map(full_endpoint, options.connect)),

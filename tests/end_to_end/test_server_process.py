@@ -99,6 +99,17 @@ def test_sigint_and_a_second_signal_stop_it_cleanly(tmp_path, arguments):
     assert read_map(checkpoints(tmp_path)[-1]).epoch == before.epoch
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_it_has_started_stops_it(arguments, number):
+    with servers.server_process(arguments, ready=False) as server:
+        server.wait_for("preparing compiled code")
+        server.process.send_signal(number)
+        assert server.wait() == 0
+    assert "stopped" in server.log
+    assert "ready" not in server.log
+    assert "Traceback" not in server.log
+
+
 def test_sigterm_amid_a_stream_of_scans(tmp_path, arguments):
     with (
         servers.server_process(arguments) as server,

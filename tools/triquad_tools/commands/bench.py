@@ -21,8 +21,8 @@ from triquad_tools.console.command import (
     ToolError,
     complain,
     run,
-    sigterm_interrupts,
 )
+from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.report import Row, json_text, print_rows
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from triquad_tools.console.arguments import add_version, count, seed
-from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, sigterm_interrupts
+from triquad_tools.console.command import FAILED, OK, ToolError, complain, run
+from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo import steps
 from triquad_tools.demo.results import DemoResults, broken_promises, table_rows

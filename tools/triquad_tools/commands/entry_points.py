@@ -2,6 +2,10 @@
 
 import importlib
 import importlib.util
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 
 from triquad_tools.console.command import BAD_INPUT, INTERRUPTED, complain
@@ -10,17 +14,37 @@ from triquad_tools.console.command import BAD_INPUT, INTERRUPTED, complain
 def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, ...] = ()) -> int:
     """Run the ``main`` of a command; ``needs`` are libraries that its processes import later."""
     try:
-        for name in needs:
-            if importlib.util.find_spec(name) is None:
-                raise ModuleNotFoundError(name=name)
-        return int(importlib.import_module(f"triquad_tools.commands.{module}").main())
-    except KeyboardInterrupt:  # while libraries are imported
+        with _leaving_on_interrupt(command):
+            for name in needs:
+                if importlib.util.find_spec(name) is None:
+                    raise ModuleNotFoundError(name=name)
+            imported = importlib.import_module(f"triquad_tools.commands.{module}")
+        status = int(imported.main())
+    except KeyboardInterrupt:  # between the imports and the work
         return complain(command, "interrupted", INTERRUPTED)
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("triquad"):
             raise
         library = error.name.partition(".")[0]
         return complain(command, f"{library} is missing: install triquad[{extra}]", BAD_INPUT)
+    if status == INTERRUPTED:
+        os._exit(status)  # the interpreter's own end would clean up what a compiler has half done
+    return status
+
+
+@contextmanager
+def _leaving_on_interrupt(command: str) -> Iterator[None]:
+    """Ctrl-C ends the process at once: an exception could get lost in what is being imported."""
+
+    def leave(*_: object) -> None:
+        os.write(2, f"{command}: interrupted\n".encode())
+        os._exit(INTERRUPTED)
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:  # as for what a shell runs in the background
+        signal.signal(signal.SIGINT, leave)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 _run_with_server = partial(_run, extra="demo", needs=("torch", "foxglove_schemas_protobuf"))

@@ -1,16 +1,20 @@
 """How every command ends: with an exit status, and one line for what went wrong."""
 
 import os
-import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 
 from triquad_format.errors import FormatError, TriquadError
+
+from triquad_tools.console.interrupts import no_interrupt_lost
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED, NOBODY_READS = 130, 141
 """As shells have it: 128 and the number of SIGINT, or of SIGPIPE."""
+
+
+_kept: list[KeyboardInterrupt] = []
+"""With what was being done when they came: what a compiler has half done may not be cleaned up."""
 
 
 class ToolError(TriquadError):
@@ -33,7 +37,8 @@ def run(
         interrupted: what the line says after Ctrl-C.
     """
     try:
-        status = work()
+        with no_interrupt_lost():
+            status = work()
         sys.stdout.flush()
         return status
     except BrokenPipeError:
@@ -49,7 +54,8 @@ def run(
     except TriquadError as error:
         # What the client refuses to send is a ValueError, too; all else is the server's failure.
         return complain(command, error, BAD_INPUT if isinstance(error, ValueError) else FAILED)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
+        _kept.append(interrupt)
         return complain(command, interrupted, INTERRUPTED)
 
 
@@ -71,17 +77,3 @@ def refuse(problems: Mapping[str, object]) -> None:
     for problem, there in problems.items():
         if there:
             raise ToolError(problem)
-
-
-@contextmanager
-def sigterm_interrupts() -> Iterator[None]:
-    """SIGTERM raises KeyboardInterrupt, as SIGINT does: then servers are stopped, too."""
-    before = signal.signal(signal.SIGTERM, _interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
