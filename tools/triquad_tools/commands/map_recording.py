@@ -3,7 +3,7 @@
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from pathlib import Path
 from triquad_server.errors import StoreError
 from triquad_server.launch import choose_device, warm_up
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
 from triquad_server.settings_loading import PRESETS, load_settings
 
 from triquad_tools.console.arguments import add_version
@@ -40,8 +41,7 @@ def _map(options: argparse.Namespace) -> int:
     selection = open_selected(options)
     key = mapping_key(selection.entries, settings)
     with stop_requests() as stop, closing(UnfinishedMap(output, key)) as unfinished:
-        with progress("preparing") as report:
-            warm_up(settings, device, report=lambda stage: report(0.0, stage))
+        _prepare(settings, device, stop.is_set)
         at = unfinished.position()
         if at.scans_taken:
             print(f"going on after scan {at.scans_taken}, from {unfinished.folder}")
@@ -57,6 +57,22 @@ def _map(options: argparse.Namespace) -> int:
     unfinished.remove()
     print(f"{output}: {written}")
     return OK
+
+
+def _prepare(settings: Settings, device: str, stop: Callable[[], bool]) -> None:
+    """Have all kernels compiled, which takes a minute the first time.
+
+    Raises:
+        KeyboardInterrupt: the user wants to stop.
+    """
+    with progress("preparing") as report:
+
+        def begin(stage: str) -> None:
+            if stop():
+                raise KeyboardInterrupt
+            report(0.0, stage)
+
+        warm_up(settings, device, report=begin)
 
 
 def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> None:
