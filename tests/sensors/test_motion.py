@@ -55,6 +55,8 @@ def test_a_track_goes_straight_and_turns_evenly(seed: int, count: int) -> None:
 
 def test_a_track_says_nothing_of_before_after_and_gaps() -> None:
     track = Track()
+    with pytest.raises(NoTransformError, match="there are no poses"):
+        track.poses(at(T0))
     here, upright = np.zeros(3), np.array([0, 0, 0, 1.0])
     for second in (0, 1, 5):
         track.add(T0 + second * SECOND, here, upright)

@@ -19,6 +19,7 @@ from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands.map_recording import main
 from triquad_tools.mapfiles.meshfile import read_mesh
 
+ROS2 = messages_for("mcap")
 COUNT = 8
 POSES = np.tile(np.eye(4), (COUNT, 1, 1))
 POSES[:, 0, 3] = 0.05 * np.arange(COUNT)
@@ -126,11 +127,25 @@ def test_after_ctrl_c_the_same_command_goes_on(tmp_path: Path, settings: Path, c
     assert process.lines[-1] == "triquad-map: interrupted; the same command goes on where it was\n"
     assert not output.exists()
     assert main([*map(str, arguments[:2]), "--settings", str(settings)]) == 2
-    assert "of other scans or with other settings" in capsys.readouterr().err
+    assert "of another recording, or with other flags or settings" in capsys.readouterr().err
     assert main(list(map(str, arguments))) == 0
     assert f"going on after scan {COUNT}" in capsys.readouterr().out
     assert error_of(output) < 0.1
     assert not output.with_name("map.triquad.part").exists()
+
+
+def test_other_poses_do_not_go_on_with_the_same_map(tmp_path: Path, settings: Path, capsys) -> None:
+    messages = [
+        m for m in drive(ROS2, scans(), POSES, STAMPS, np.eye(4)) if "static" not in m.topic
+    ]
+    bag, output = write_bag(tmp_path / "bag", "mcap", messages), tmp_path / "map.triquad"
+    arguments = (bag, output, "--settings", settings, *LONG, "--transform")
+    with mapping(*arguments, "base_link lidar 0 0 1 0 0 0 1") as (process, training):
+        assert training.wait(servers.WAIT_S)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(servers.WAIT_S) == 130
+    assert main([*map(str, arguments), "base_link lidar 0 0 0 0 0 0 1"]) == 2
+    assert "with other flags or settings" in capsys.readouterr().err
 
 
 def test_after_a_kill_the_same_command_makes_the_map(tmp_path: Path, settings: Path) -> None:
@@ -157,6 +172,8 @@ def test_input_that_cannot_be_used_is_refused(tmp_path: Path, settings: Path, ca
         ((recording, tmp_path / "none" / "a.triquad"), "is not a folder: make it first"),
         ((recording, tmp_path / "a.triquad", "--set", "scan.range=5"), "unknown setting"),
         ((recording, tmp_path / "a.triquad", "--start", "99"), "no scan is left"),
+        ((recording, tmp_path / "a.triquad", "--stride", "2"), "for which --stride means nothing"),
+        ((recording, tmp_path / "a.triquad", "--transform", "a b"), "use 'PARENT CHILD X Y Z"),
     ):
         assert main(list(map(str, arguments))) == 2
         assert words in capsys.readouterr().err

@@ -264,6 +264,17 @@ def test_poses_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None:
     assert "/tf: 1 poses are left out: quaternion_xyzw" in only_remark(recording)
 
 
+def test_a_topic_of_poses_that_are_none_does_no_harm(tmp_path: Path) -> None:
+    messages = a_drive()
+    for stamp in STAMPS:
+        odometry = ROS2.odometry(stamp, np.eye(4), "odom", "base_link")
+        odometry.pose.pose.orientation.w = 0.0
+        messages.append(Recorded("/odom", ODOMETRY, stamp, odometry))
+    recording = opened(tmp_path, messages)
+    assert len(recording.entries) == COUNT
+    assert f"/odom: {COUNT} poses are left out: quaternion_xyzw" in only_remark(recording)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_bag_is_refused_with_the_remedy(tmp_path: Path, kind: BagKind) -> None:
     messages = drive(messages_for(kind), SCANS, poses(), STAMPS, LIDAR)

@@ -34,11 +34,11 @@ class Track:
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """The first stamp and the last."""
+        """The first stamp and the last, of a track that has poses."""
         return self._stamps[0], self._stamps[-1]
 
     def add(self, stamp_ns: int, position_m: Doubles, quaternion: Doubles) -> None:
-        """Add a pose; one with the same stamp is replaced."""
+        """Add a pose, position [3] and unit quaternion [4]; one with the same stamp is replaced."""
         at = bisect_left(self._stamps, stamp_ns)
         replaced = at < len(self._stamps) and self._stamps[at] == stamp_ns
         if not replaced:
@@ -75,6 +75,8 @@ class Track:
         return np.array(self._stamps[low:high], np.int64), values.reshape(-1, _WIDTH)
 
     def _check_covered(self, stamps_ns: Longs) -> None:
+        if not self._stamps:
+            raise NoTransformError("no_poses", "there are no poses", late=True)
         first, last = self.span_ns
         if stamps_ns.max() > last:
             late_s = (int(stamps_ns.max()) - last) / 1e9

@@ -50,7 +50,8 @@ class _Warning:
     """A warning as it was last told."""
 
     text: str
-    scans: int  # of which was told so far, where it is of scans
+    told: int  # scans of which was told so far, where it is of scans
+    seen: int  # of which was known so far
     due_s: float  # monotonic: not again before
     pause_s: float
     met_s: float  # when its cause was last met
@@ -134,9 +135,10 @@ class ScanWarnings:
     def _count(self, source: str, cause: str, count: int, text: str) -> None:
         """Warn of scans of which there are ``count`` by now, if they became more."""
         before = self._warnings.get((source, cause))
-        more = count - (before.scans if before else 0)
-        if more > 0:
-            self._warn(source, cause, f"{more} {text}", scans=count)
+        told, seen = (before.told, before.seen) if before else (0, 0)
+        if count > told:
+            met_s = self._now() if before is None or count > seen else before.met_s
+            self._warn(source, cause, f"{count - told} {text}", scans=count, met_s=met_s)
 
     def _check_ranges(self, source: str, points: _Points) -> None:
         own = self._settings.sources.get(source, ANY_SOURCE)
@@ -176,16 +178,24 @@ class ScanWarnings:
             f"{better_m:g}",
         )
 
-    def _warn(self, source: str, cause: str, text: str, scans: int = 0) -> None:
-        """Tell a warning, unless its last telling was not long ago."""
+    def _warn(
+        self, source: str, cause: str, text: str, *, scans: int = 0, met_s: float | None = None
+    ) -> None:
+        """Tell a warning, unless its last telling was not long ago.
+
+        Its cause was met at ``met_s``, or just now.
+        """
         now, before = self._now(), self._warnings.get((source, cause))
+        met_s = now if met_s is None else met_s
         if before is not None:
-            before.met_s = now
+            before.met_s, before.seen = met_s, scans
             if now < before.due_s:
                 return
         pause_s = _FIRST_PAUSE_S if before is None else min(2 * before.pause_s, _LONGEST_PAUSE_S)
         text = f"source {source!r}: {text}"
-        self._warnings[source, cause] = _Warning(text, scans, now + pause_s, pause_s, met_s=now)
+        self._warnings[source, cause] = _Warning(
+            text, told=scans, seen=scans, due_s=now + pause_s, pause_s=pause_s, met_s=met_s
+        )
         self._warnings.move_to_end((source, cause))
         if len(self._warnings) > _MAX_WARNINGS:
             self._warnings.popitem(last=False)

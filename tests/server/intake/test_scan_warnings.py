@@ -129,6 +129,8 @@ def test_lost_scans_are_told_once_in_a_while_with_those_since() -> None:
     second = warnings.of("lidar")
     assert second is not None
     assert second.startswith("source 'lidar': 4 of its scans were lost")
+    clock.now_s += 31.0  # a minute after the last was lost
+    assert warnings.of("lidar") is None
 
 
 def test_refused_scans_are_told_with_the_reason() -> None:

@@ -39,7 +39,7 @@ def _map(options: argparse.Namespace) -> int:
     settings = load_settings(options.settings, options.set, preset=options.preset)
     device = choose_device(options.device)
     selection = open_selected(options)
-    key = mapping_key(selection.entries, settings)
+    key = mapping_key(selection, settings)
     with stop_requests() as stop, closing(UnfinishedMap(output, key)) as unfinished:
         _prepare(settings, device, stop.is_set)
         at = unfinished.position()

@@ -14,8 +14,9 @@ from triquad_sensors.sweep import PosedScan
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.progress import progress
-from triquad_tools.recordings.arguments import add_recording, flags_of, open_from
+from triquad_tools.recordings.arguments import add_recording, flags_of, options_of
 from triquad_tools.recordings.listing import print_contents
+from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.publishing import (
     FLUSH_TIMEOUT_S,
     keep_few_pending,
@@ -72,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _replay(options: argparse.Namespace) -> int:
     if options.list:
-        recording = open_from(options)
+        recording = open_recording(options.recording, options_of(options))
         mappable = print_contents(options.recording, recording, flags_of(options))
         return OK if mappable else FAILED
     selection = open_selected(options)

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,14 +10,14 @@ from triquad_format.mapfile.writer import replacing
 from triquad_format.records.region import MapRecord
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings, StoreSettings
-from triquad_server.settings_loading import settings_toml
 from triquad_server.store.store import Store
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.recording import ScanEntry
+from triquad_tools.recordings.selection import Selection
 
 MAP_NAME = "recording"
 _POSITIONS = "positions.json"
+_SECTIONS = {"field", "scan", "change", "training", "sources"}  # that a map depends on
 _KEEP = StoreSettings(period_s=0.0, keep=2)
 
 
@@ -30,10 +29,11 @@ class Position:
     scans_taken: int
 
 
-def mapping_key(entries: Sequence[ScanEntry], settings: Settings) -> str:
-    """What tells whether an unfinished map is of the same scans and settings."""
-    digest = hashlib.sha256(settings_toml(settings).encode())
-    for entry in entries:
+def mapping_key(selection: Selection, settings: Settings) -> str:
+    """What tells whether an unfinished map is of the same scans, poses and settings."""
+    digest = hashlib.sha256(settings.model_dump_json(include=_SECTIONS).encode())
+    digest.update(selection.way.encode())
+    for entry in selection.entries:
         digest.update(f"{entry.stamp_ns} {entry.source}\n".encode())
     return digest.hexdigest()
 
@@ -108,6 +108,6 @@ class UnfinishedMap:
             raise ToolError(f"{path} is damaged; delete {self.folder} to begin anew") from error
         if key != self._key:
             raise ToolError(
-                f"{self.folder} holds an unfinished map of other scans or with other settings: "
-                "give those to go on with it, or delete the folder to begin anew"
+                f"{self.folder} holds an unfinished map of another recording, or with other "
+                "flags or settings: give the same to go on with it, or delete it to begin anew"
             )

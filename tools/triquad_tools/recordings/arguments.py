@@ -10,8 +10,7 @@ from triquad_tools.console.arguments import count, not_negative, positive
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.cloud_folder import CloudOptions
 from triquad_tools.recordings.folders.depth_folder import DepthOptions
-from triquad_tools.recordings.opening import RecordingOptions, open_recording
-from triquad_tools.recordings.recording import Recording
+from triquad_tools.recordings.opening import RecordingOptions
 from triquad_tools.recordings.ros_options import RosOptions, parse_transform
 
 _Add = Callable[..., argparse.Action]
@@ -125,17 +124,18 @@ def _intrinsics(text: str) -> Intrinsics:
         ) from error
 
 
-def open_from(options: argparse.Namespace) -> Recording:
-    """The recording of the arguments.
+def options_of(options: argparse.Namespace) -> RecordingOptions:
+    """How the arguments want a recording to be read.
 
     Raises:
-        ToolError: it cannot be read, or has not what they name.
+        ToolError: one of them cannot be used.
     """
     ros = RosOptions(
         topics=tuple(options.topics),
         poses=options.poses,
         map_frame=options.map_frame,
         body_frame=options.body_frame,
+        depth_stride=options.stride or 1,
         recorder_clock=options.recorder_clock,
         transforms=tuple(map(parse_transform, options.transform)),
     )
@@ -146,7 +146,7 @@ def open_from(options: argparse.Namespace) -> Recording:
         units_per_metre=options.units_per_metre,
         stride=options.stride or 1,
     )
-    return open_recording(options.recording, RecordingOptions(ros, clouds, depth))
+    return RecordingOptions(ros, clouds, depth)
 
 
 def flags_of(options: argparse.Namespace) -> list[str]:

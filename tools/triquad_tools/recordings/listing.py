@@ -29,6 +29,6 @@ def print_contents(path: Path, recording: Recording, flags: Sequence[str]) -> bo
     seconds = (max(stamps) - min(stamps)) / 1e9
     rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
     print(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
-    command = ["triquad-map", str(path), f"{path.stem}.triquad", *flags]
+    command = ["triquad-map", str(path), f"{path.resolve().stem}.triquad", *flags]
     print(f"to map it: {shlex.join(command)}")
     return True

@@ -1,6 +1,6 @@
 """Telling what kind of recording a path is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from triquad_tools.console.command import ToolError
@@ -20,6 +20,9 @@ from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_options import RosOptions
 from triquad_tools.recordings.ros_recording import RosRecording
 
+_FLAGS = {"transforms": "transform", "deskew": "no-deskew", "depth_stride": "stride"}
+"""Names of flags that are not those of the options they set."""
+
 
 @dataclass(frozen=True)
 class RecordingOptions:
@@ -38,16 +41,34 @@ def open_recording(path: Path, options: RecordingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
+    ros, clouds, depth = options.ros, options.clouds, options.depth
     bag = find_bag(path)
     if bag is not None:
-        return RosRecording(bag, options.ros)
+        _refuse(path, "a bag", clouds, replace(depth, stride=1))
+        return RosRecording(bag, ros)
     if is_kitti_folder(path):
+        _refuse(path, "a folder in the style of KITTI", ros, clouds, depth)
         return read_folder(path)
     if is_depth_folder(path):
-        return read_depth_folder(path, options.depth)
+        kind = "a folder of depth images"
+        _refuse(path, kind, replace(ros, depth_stride=1), replace(clouds, trajectory=None))
+        return read_depth_folder(path, depth)
     if is_cloud_folder(path):
-        return read_cloud_folder(path, options.clouds)
+        _refuse(path, "a folder of clouds", ros, replace(depth, trajectory=None))
+        return read_cloud_folder(path, clouds)
     raise ToolError(
         f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
         "docs/tools.md describes them"
     )
+
+
+def _refuse(path: Path, kind: str, *others: RosOptions | CloudOptions | DepthOptions) -> None:
+    """Refuse options that are given, but are not for the kind of recording that was found."""
+    given = [
+        f"--{_FLAGS.get(field.name, field.name.replace('_', '-'))}"
+        for options in others
+        for field in fields(options)
+        if getattr(options, field.name) != field.default
+    ]
+    if given:
+        raise ToolError(f"{path} is {kind}, for which {given[0]} means nothing: leave it out")

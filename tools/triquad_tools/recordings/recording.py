@@ -34,7 +34,7 @@ class Recording(Protocol):
 
     @property
     def entries(self) -> Sequence[ScanEntry]:
-        """The scans that can be mapped, in the order of their stamps."""
+        """The scans that can be mapped, those of each source in the order of their stamps."""
 
     @property
     def streams(self) -> Sequence[Stream]:

@@ -16,6 +16,7 @@ class RosOptions:
     poses: str | None = None  # topic of odometry or poses, or "tf"
     map_frame: str | None = None
     body_frame: str | None = None  # whose poses those of the topic are
+    depth_stride: int = 1  # take every so many-th row and column of depth images
     recorder_clock: bool = False  # stamps are when a message was recorded
     transforms: tuple[Transform, ...] = ()  # that the recording lacks
 

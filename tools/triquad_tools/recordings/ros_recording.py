@@ -120,7 +120,8 @@ class RosRecording:
         if kind == type_store.POINT_CLOUD:
             sweep = sweep_of_cloud(decoded)
         else:
-            sweep = sweep_of_image(decoded, topic, self._survey.cameras)
+            stride = self._options.depth_stride
+            sweep = sweep_of_image(decoded, topic, self._survey.cameras, stride=stride)
         if self._options.recorder_clock:
             sweep = replace(sweep, stamp_ns=message.recorded_ns)
         return sweep

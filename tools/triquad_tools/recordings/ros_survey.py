@@ -60,7 +60,7 @@ class Survey:
     frames: FrameTree = field(default_factory=FrameTree)
     poses: dict[str, PoseTopic] = field(default_factory=dict)
     broken: dict[str, list[str]] = field(default_factory=dict)  # what is wrong with poses, by topic
-    cameras: dict[str, Any] = field(default_factory=dict)  # newest CameraInfo by topic
+    cameras: dict[str, Any] = field(default_factory=dict)  # first CameraInfo by topic
 
 
 def survey(bag: Bag, *, recorder_clock: bool) -> Survey:
@@ -92,7 +92,7 @@ def _of_kind(connections: list[Any], kind: str) -> list[Any]:
     return [connection for connection in connections if connection.msgtype == kind]
 
 
-def sweep_of_image(image: Any, topic: str, cameras: Mapping[str, Any]) -> Sweep:
+def sweep_of_image(image: Any, topic: str, cameras: Mapping[str, Any], stride: int = 1) -> Sweep:
     """What a depth image shows that was recorded on ``topic``.
 
     Raises:
@@ -105,7 +105,7 @@ def sweep_of_image(image: Any, topic: str, cameras: Mapping[str, Any]) -> Sweep:
             "no_camera_info",
             f"{wanted} was not recorded (of that kind there is {there}): record it",
         )
-    return sweep_of_depth(image, cameras[wanted])
+    return sweep_of_depth(image, cameras[wanted], stride)
 
 
 class _Reader:
@@ -178,14 +178,14 @@ class _Reader:
         else:
             transform = transform_of_pose(decoded, "")
         transform = self._timed(transform, message)
-        known = self._found.poses.setdefault(topic, PoseTopic(kind))
-        known.parent, known.child = transform.parent, transform.child
         try:
             position, quaternion = transform.pose.numbers()
         except InvalidInputError as error:
             self._found.broken.setdefault(topic, []).append(str(error))
             return
         assert transform.stamp_ns is not STATIC
+        known = self._found.poses.setdefault(topic, PoseTopic(kind))
+        known.parent, known.child = transform.parent, transform.child
         known.track.add(transform.stamp_ns, position, quaternion)
 
     def _timed(self, transform: Transform, message: Message) -> Transform:

@@ -9,8 +9,9 @@ import numpy as np
 from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.arguments import open_from
+from triquad_tools.recordings.arguments import options_of
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
+from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.recording import Recording, ScanEntry
 
 
@@ -21,6 +22,7 @@ class Selection:
     recording: Recording
     indices: Sequence[int]
     range_min_m: float
+    way: str  # in which it is read: another one may give other scans
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -44,7 +46,8 @@ def open_selected(options: argparse.Namespace) -> Selection:
     Raises:
         ToolError: it cannot be read, or no scan is left to map.
     """
-    recording = open_from(options)
+    reading = options_of(options)
+    recording = open_recording(options.recording, reading)
     for remark in recording.remarks:
         print(f"{options.recording}: {remark}", file=sys.stderr)
     if not recording.entries:
@@ -55,7 +58,8 @@ def open_selected(options: argparse.Namespace) -> Selection:
             f"{options.recording}: no scan is left of {len(recording.entries)} in "
             f"{_length_s(recording.entries):.1f} s: see --start, --end, --every and --skip-every"
         )
-    return Selection(recording, indices, options.range_min)
+    way = repr((options.recording.resolve(), reading, options.range_min))
+    return Selection(recording, indices, options.range_min, way)
 
 
 def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,7 +63,7 @@ def parse_stamp(place: str, word: str, earliest_ns: int) -> int:
     """
     try:
         stamp_ns = int(Decimal(word) * 10**9)
-    except (InvalidOperation, ValueError, OverflowError):
+    except (ArithmeticError, ValueError):  # those of decimal numbers among them
         raise ToolError(f"{place}: {word!r} is not a number of seconds") from None
     if not 0 <= stamp_ns < 2**63:
         raise ToolError(f"{place}: {word} s is out of range: times are seconds, from 0 on")
