@@ -6,7 +6,6 @@ import socket
 import threading
 import weakref
 from collections.abc import Iterator
-from concurrent.futures import Future, wait
 from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -26,6 +25,70 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("triquad_server")
 
+_WAKE_S = 0.2  # for when two threads wait for the end
+
+
+class _Run:
+    """A server on a thread of its own, where no Ctrl-C cuts short an import or a checkpoint.
+
+    Other threads wait for it by what C code alone locks: the locks of Python's own conditions and
+    futures may be in disorder after a ``KeyboardInterrupt``.
+    """
+
+    def __init__(self) -> None:
+        self.stops: Stops = queue.SimpleQueue()
+        self.has_ended = False
+        self._is_started = False
+        self._started: queue.SimpleQueue[BaseException | None] = queue.SimpleQueue()
+        self._why = Stop.ASKED
+        self._error: BaseException | None = None
+        self._running = threading.Lock()
+        self._running.acquire()
+
+    def serve(self, options: "LaunchOptions") -> None:
+        """Serve until asked to stop; for the thread."""
+        try:
+            from triquad_server.launch import serve_until_stopped  # takes seconds
+
+            self._why = serve_until_stopped(options, self.stops, started=self._has_started)
+        except BaseException as error:
+            self._error = error
+            if self._is_started:
+                _log.error("the server ended with an error: %s", error)  # maybe nobody closes it
+            self._started.put(error)
+        finally:
+            self.has_ended = True
+            self._running.release()
+
+    def _has_started(self) -> None:
+        self._is_started = True
+        self._started.put(None)
+
+    def wait_for_start(self) -> None:
+        """Wait until it serves; raises what keeps it from that."""
+        error = self._started.get()
+        if error is not None:
+            raise error
+
+    def wait_for_end(self) -> Stop:
+        """Why it has stopped, once it has, however often Ctrl-C is pressed meanwhile.
+
+        Raises:
+            KeyboardInterrupt: it was pressed; the server has ended.
+            ServerError: the server could not do what is due at its end.
+        """
+        interrupt: KeyboardInterrupt | None = None
+        while not self.has_ended:
+            try:
+                self._running.acquire(timeout=_WAKE_S)  # nobody releases it after the thread
+            except KeyboardInterrupt as pressed:
+                interrupt = pressed
+        if interrupt is not None:
+            raise interrupt
+        if self._error is not None:
+            raise self._error
+        return self._why
+
 
 class Server:
     """A map server within this program. Close it, or use it in a ``with`` statement.
@@ -40,15 +103,11 @@ class Server:
         (self.endpoint,) = options.network.listen
         self.map_name = options.map_name
         self._clients: weakref.WeakSet[Client] = weakref.WeakSet()
-        self._ended: Future[Stop] = Future()
-        stops: Stops = queue.SimpleQueue()
-        self._ask_to_stop = weakref.finalize(self, stops.put, Stop.ASKED)
-        started: Future[None] = Future()
-        threading.Thread(
-            target=_serve, args=(options, stops, started, self._ended), name="triquad-server"
-        ).start()
+        self._run = _Run()
+        self._ask_to_stop = weakref.finalize(self, self._run.stops.put, Stop.ASKED)
+        threading.Thread(target=self._run.serve, args=(options,), name="triquad-server").start()
         try:
-            started.result()
+            self._run.wait_for_start()
         except BaseException:  # Ctrl-C too, which the thread hears of from us alone
             self._ask_to_stop()
             raise
@@ -71,7 +130,7 @@ class Server:
         # The one door from the server to the client, of which the server itself needs nothing.
         from triquad_client import connect
 
-        if self._ended.done():
+        if self._run.has_ended:
             raise ServerError("the server has stopped: triquad_server.serve() starts another one")
         client = connect(self.endpoint, self.map_name, timeout_s=timeout_s)
         self._clients.add(client)
@@ -88,7 +147,7 @@ class Server:
         """
         self._ask_to_stop()
         try:
-            why = _awaited(self._ended)
+            why = self._run.wait_for_end()
         finally:
             for client in list(self._clients):
                 client.close()
@@ -158,35 +217,3 @@ def _free_endpoint() -> Iterator[str]:
         reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         reserved.bind(("127.0.0.1", 0))
         yield f"tcp/127.0.0.1:{reserved.getsockname()[1]}"
-
-
-def _serve(
-    options: "LaunchOptions", stops: Stops, started: "Future[None]", ended: "Future[Stop]"
-) -> None:
-    """Run a server, on a thread where no Ctrl-C cuts short an import or a checkpoint."""
-    try:
-        from triquad_server.launch import serve_until_stopped  # takes seconds
-
-        ended.set_result(
-            serve_until_stopped(options, stops, started=lambda: started.set_result(None))
-        )
-    except BaseException as error:
-        if started.done():
-            _log.error("the server stopped with an error: %s", error)
-        else:
-            started.set_exception(error)
-        ended.set_exception(error)
-
-
-def _awaited(ended: "Future[Stop]") -> Stop:
-    """Why a server has stopped, once it has, however often Ctrl-C is pressed meanwhile."""
-    interrupt: KeyboardInterrupt | None = None
-    while not ended.done():
-        try:
-            wait([ended])
-        except KeyboardInterrupt as pressed:
-            interrupt = pressed
-            _log.warning("the last checkpoint is still being written")
-    if interrupt is not None:
-        raise interrupt
-    return ended.result()
