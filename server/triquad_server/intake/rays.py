@@ -16,8 +16,9 @@ from triquad_server.source_settings import ANY_SOURCE, SourceSettings
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
 
-_SHELL = 0.18
-"""The logarithm of how many times farther the outer side of a shell is than its inner one."""
+_SHELL = 0.05
+"""The logarithm of how many times farther the outer side of a shell is than its inner one: more
+than the noise of most sensors, and less than from row to row of a lidar on a flat top."""
 
 _NOWHERE = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
 """Corners of a box that holds nothing."""

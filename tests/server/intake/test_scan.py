@@ -47,9 +47,10 @@ def test_what_is_kept_of_a_noisy_wall_is_as_noisy_as_the_wall() -> None:
     rays = np.stack([np.full(y.size, 4.0), y.ravel(), z.ravel()], axis=-1)
     sent = rays * rng.normal(1.0, 0.01, (len(rays), 1))
     kept = usable_rays(sent.astype(np.float32), pose(), SETTINGS).ends
-    assert len(kept) < len(sent) / 50
-    assert np.std(kept[:, 0]) == pytest.approx(0.04, rel=0.1)
-    assert np.mean(kept[:, 0]) == pytest.approx(4.0, abs=0.004)
+    assert len(kept) < len(sent) / 40
+    # A border between shells lies just behind the wall.
+    assert np.std(kept[:, 0]) < 1.2 * 0.04  # voxels would make it 1.7 times 0.04
+    assert np.mean(kept[:, 0]) == pytest.approx(4.0, abs=0.025)
 
 
 def test_what_lies_well_behind_something_else_is_kept() -> None:
