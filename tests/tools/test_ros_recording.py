@@ -107,6 +107,7 @@ def test_poses_without_a_name_are_those_of_what_the_sensor_is_fixed_to(tmp_path:
         body = pose @ np.linalg.inv(LIDAR)
         messages.append(Recorded("/pose", POSE, stamp, ROS2.pose(stamp, body, "map")))
     recording = opened(tmp_path, messages)
+    assert "/pose: taken as poses of base_link, since its messages" in only_remark(recording)
     for scan, pose in zip(recording.read(range(COUNT)), poses(), strict=True):
         assert np.allclose(scan.world_from_sensor, pose)
     of_lidar = open_recording(tmp_path / "bag", RosOptions(body_frame="lidar"))
@@ -182,6 +183,11 @@ def test_missing_poses_and_transforms_are_named_with_the_remedy(tmp_path: Path) 
     nothing = opened(tmp_path / "a", without(a_drive(), "/tf"))
     assert not nothing.entries
     assert "it holds no poses: record /tf" in only_remark(nothing)
+    unmounted = opened(tmp_path / "c", without(a_drive(), "/tf_static"))
+    assert not unmounted.entries
+    assert "no transform names the frame 'lidar' (known: base_link, odom)" in (
+        only_remark(unmounted)
+    )
     loose = opened(tmp_path / "b", without(a_drive(pose_kind="odometry"), "/tf_static"))
     assert not loose.entries
     assert "no transform names the frame 'lidar' (known: base_link, odom)" in only_remark(loose)

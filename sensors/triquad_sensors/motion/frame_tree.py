@@ -51,6 +51,11 @@ class FrameTree:
         """The names of all frames."""
         return sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
 
+    @property
+    def moving(self) -> list[str]:
+        """The names of the frames of which it was reported that they move in their parent."""
+        return sorted(name for name, edge in self._edges.items() if edge.standing is None)
+
     def add(self, transform: Transform) -> None:
         """Take in a transform.
 

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 
 from triquad_server.errors import StoreError
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.launch import choose_device, warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
@@ -46,7 +48,8 @@ def _map(options: argparse.Namespace) -> int:
         if at.scans_taken:
             print(f"going on after scan {at.scans_taken}, from {unfinished.folder}")
         mapper = Mapper(MAP_NAME, settings, device, at.record)
-        mapping = MappingRun(mapper, unfinished, stop.is_set)
+        warnings = ScanWarnings(ScanQueue(1), settings)
+        mapping = MappingRun(mapper, unfinished, warnings, stop=stop.is_set)
         mapping.take(selection, at.scans_taken)
         _check_result(mapper, mapping, selection)
         mapping.settle()

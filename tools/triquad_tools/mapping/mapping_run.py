@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 
 from triquad_tools.console.progress import progress
@@ -40,10 +41,17 @@ def stop_requests() -> Iterator[threading.Event]:
 class MappingRun:
     """Takes in the scans of a recording and trains until nothing is left to learn."""
 
-    def __init__(self, mapper: Mapper, unfinished: UnfinishedMap, stop: Callable[[], bool]) -> None:
-        """``stop()`` is asked between steps."""
+    def __init__(
+        self,
+        mapper: Mapper,
+        unfinished: UnfinishedMap,
+        warnings: ScanWarnings,
+        stop: Callable[[], bool],
+    ) -> None:
+        """``warnings`` are told what is used of each scan; ``stop()`` is asked between steps."""
         self._mapper = mapper
         self._unfinished = unfinished
+        self._warnings = warnings
         self._stop = stop
         self._next_save = time.monotonic() + _SAVE_PERIOD_S
         self.scans_taken = 0  # or refused: those that need not be taken again
@@ -65,12 +73,14 @@ class MappingRun:
                 self._between_steps()
                 entry = entries[self.scans_taken]
                 try:
-                    self._mapper.ingest(
+                    rays = self._mapper.ingest(
                         scan.points,
                         scan.world_from_sensor,
                         entry.stamp_ns // 1_000_000_000,
                         source=entry.source,
                     )
+                    self._warnings.add(entry.source, len(scan.points), rays)
+                    self._warnings.check()
                 except ScanRefusedError as error:
                     self.refusals[error.reason] += 1
                     self.last_refusal = f"scan {self.scans_taken}: {error}"

@@ -4,8 +4,12 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from triquad_sensors.ros.type_store import IMAGE
+
 from triquad_tools.console.report import print_columns
 from triquad_tools.recordings.recording import Recording
+
+_OF_DEPTH = ("depth images", IMAGE)
 
 
 def print_contents(path: Path, recording: Recording, flags: Sequence[str]) -> bool:
@@ -29,6 +33,8 @@ def print_contents(path: Path, recording: Recording, flags: Sequence[str]) -> bo
     seconds = (max(stamps) - min(stamps)) / 1e9
     rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
     print(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
+    if any(stream.kind in _OF_DEPTH and "scans" in stream.use for stream in recording.streams):
+        flags = ["--preset", "indoor", *flags]
     command = ["triquad-map", str(path), f"{path.resolve().stem}.triquad", *flags]
     print(f"to map it: {shlex.join(command)}")
     return True

@@ -23,6 +23,7 @@ class PoseSource:
     frames: FrameTree
     target: str
     body: str  # the frame whose poses they are, or one that hangs on it
+    assumed: bool = False  # nothing says that they are its poses
 
     def find(self, cloud: SeenCloud) -> NoTransformError | None:
         """Why it is not known where a cloud was; None where it is."""
@@ -67,8 +68,11 @@ def _merit(source: PoseSource, clouds: Sequence[SeenCloud]) -> tuple[int, bool]:
 
 
 def _of_tf(found: Survey, frame: str, options: RosOptions) -> PoseSource:
-    target = options.map_frame or found.frames.fixed_frame(frame)
-    return PoseSource(TF, found.frames, target, frame)
+    """All transforms. Where they do not reach the sensor, finding a cloud says so."""
+    frames, body = found.frames, frame
+    if not frames.moves(frames.root(frame), frame):
+        body = next(iter(frames.moving), frame)
+    return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
 
 
 def _of_topic(found: Survey, topic: str, frame: str, options: RosOptions) -> PoseSource:
@@ -77,4 +81,6 @@ def _of_topic(found: Survey, topic: str, frame: str, options: RosOptions) -> Pos
     # Where a topic does not name the body, it is what the sensor is fixed to.
     body = options.body_frame or poses.child or found.frames.root(frame)
     frames = found.frames.with_track(poses.parent, body, poses.track)
-    return PoseSource(topic, frames, options.map_frame or frames.fixed_frame(body), body)
+    target = options.map_frame or frames.fixed_frame(body)
+    assumed = not (options.body_frame or poses.child)
+    return PoseSource(topic, frames, target, body, assumed=assumed)

@@ -28,6 +28,10 @@ _NO_TRANSFORM = (
     "record /tf and /tf_static, or say where the sensor sits with --transform, or that the poses "
     "are its own with --body-frame {frame}"
 )
+_ASSUMED = (
+    "{topic}: taken as poses of {body}, since its messages do not say whose they are; if they are "
+    "of another frame, name it with --body-frame, and say where the sensor sits with --transform"
+)
 _NO_POSES = (
     "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
     "the clouds"
@@ -80,6 +84,8 @@ class RosRecording:
             f"{topic}: {len(texts)} poses are left out: {texts[0]}"
             for topic, texts in self._survey.broken.items()
         ]
+        if self._poses is not None and self._poses.assumed:
+            lines.append(_ASSUMED.format(topic=self._poses.name, body=self._poses.body))
         for topic, by_reason in self._left_out.items():
             lines += [
                 self._left_out_line(topic, reason, texts) for reason, texts in by_reason.items()
