@@ -1,4 +1,4 @@
-"""``triquad-pack``: rewrite a map file: smaller, from history, saved from damage, or as a mesh."""
+"""``triquad-pack``: rewrite a map file: smaller, from history, repaired, as a mesh or a picture."""
 
 import argparse
 import os
@@ -28,8 +28,8 @@ from triquad_tools.mapfiles.source import (
 
 _COMMAND = "triquad-pack"
 _DAMAGE = (DamagedMapFileError, NothingLeftError)
-_MAP, _MESHES, _GRID = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".npz"
-_SUFFIXES = (_MAP, *_MESHES, _GRID)
+_MAP, _MESHES, _GRID, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".npz", ".png"
+_SUFFIXES = (_MAP, *_MESHES, _GRID, _PICTURE)
 _PLANES = ("XY", "XZ", "YZ")
 _MESH_CELL_M, _GRID_CELL_M = 0.1, 0.2
 _CELL_RANGE_M = (0.01, 10.0)
@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
-        "of it, in the newest version, or as a mesh or an array of distances.",
+        "of it, in the newest version, or as a mesh, a picture or an array of distances.",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
         "nothing lies in the box; 2 wrong usage, or input that cannot be used.",
     )
@@ -179,6 +179,10 @@ def _export(options: argparse.Namespace, path: Path) -> int:
     source, complete = _source(options, path, needed, training=False)
     if grid:
         written = export_grid(source.record, box, cell_m, sparse=options.sparse, path=output)
+    elif output.suffix == _PICTURE:
+        from triquad_tools.plots.picture import export_picture  # slow to import
+
+        written = export_picture(source.record, box, cell_m, path=output)
     else:
         from triquad_tools.mapfiles.meshfile import export_mesh  # slow to import
 

@@ -3,15 +3,13 @@
 import time
 from pathlib import Path
 
-from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import without_training
 from triquad_format.records.region import MapRecord
 from triquad_server.mesh.preview import previews_of
 
-from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES, export_mesh
-from triquad_tools.plots.picture import draw_mesh
+from triquad_tools.plots.picture import export_picture
 
 MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
 SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
@@ -29,9 +27,5 @@ def write_output(record: MapRecord, path: Path, *, cell_m: float, training: bool
         kept = record if training else without_training(record)
         info = write_map(kept, path, stamp_ns=time.time_ns(), previews=previews_of(kept))
         return f"{info.bytes:,} bytes, {len(record.regions)} regions, epoch {record.epoch}"
-    if path.suffix != PICTURE_SUFFIX:
-        return export_mesh(record, None, cell_m, path)
-    with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
-        mesh = opened.mesh(None, cell_m, lambda done, of: report(done / of, f"{done} blocks"))
-    draw_mesh(mesh, path)
-    return f"a picture of {len(mesh.faces):,} faces"
+    export = export_picture if path.suffix == PICTURE_SUFFIX else export_mesh
+    return export(record, None, cell_m, path)

@@ -6,17 +6,34 @@ from pathlib import Path
 import numpy as np
 from matplotlib.image import imsave
 from numpy.typing import NDArray
-from triquad_client import Mesh
+from triquad_client import Mesh, OfflineMap
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.region import MapRecord
 
+from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.source import Box
 from triquad_tools.plots.render import Camera, height_colours, render_mesh, view_axes
 
 _VIEW_DEG = 35.0
 _TOWARDS_EYE = np.array([-0.45, -0.65, 0.62])
-_FRAMED = (2.0, 98.0)  # percentiles: what lies far away from all else does not make it small
+_FRAMED = (1.0, 99.0)  # percentiles: what lies far away from all else does not make it small
 _MARGIN = 1.05
 _ENOUGH = 200_000  # vertices, to find the place of the camera
 _ASPECT = 16 / 9
+
+
+def export_picture(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
+    """Save a picture of a map, or of what of it lies in a box; returns what it shows.
+
+    Raises:
+        InvalidInputError: the mesh is too large, or a library is missing.
+        OSError: it cannot be written.
+    """
+    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
+    with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
+        mesh = opened.mesh(bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"))
+    draw_mesh(mesh, path)
+    return f"a picture of {len(mesh.faces):,} faces"
 
 
 def draw_mesh(mesh: Mesh, path: Path) -> None:
