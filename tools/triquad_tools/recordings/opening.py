@@ -15,7 +15,7 @@ from triquad_tools.recordings.folders.depth_folder import (
     is_depth_folder,
     read_depth_folder,
 )
-from triquad_tools.recordings.kitti import is_kitti_folder, read_folder
+from triquad_tools.recordings.folders.kitti import is_kitti_folder, read_kitti_folder
 from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_options import RosOptions
 from triquad_tools.recordings.ros_recording import RosRecording
@@ -42,7 +42,7 @@ def open_recording(path: Path, options: RecordingOptions) -> Recording:
     if bag is not None:
         return RosRecording(bag, options.ros)
     if is_kitti_folder(path):
-        return read_folder(path)
+        return read_kitti_folder(path)
     if is_depth_folder(path):
         return read_depth_folder(path, options.depth)
     if is_cloud_folder(path):
