@@ -14,7 +14,7 @@ from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.settings import ScanSettings, ServiceSettings, Settings, TrainingSettings
 from triquad_tools.evaluation.map_scores import score_withheld
 from triquad_tools.recordings.cloud import is_withheld, world_points
-from triquad_tools.recordings.kitti import KittiFolder, read_folder
+from triquad_tools.recordings.folders.kitti import KittiFolder, read_kitti_folder
 
 SEOSAN = Path(__file__).resolve().parents[3] / "shared" / "data" / "seosan01"
 PERIOD_S = 0.1
@@ -61,7 +61,7 @@ def mapped(
 def test_the_map_is_as_good_as_that_of_the_client() -> None:
     if not SEOSAN.is_dir():
         pytest.skip("real scans seosan01 are not in ../shared/data")
-    folder = read_folder(SEOSAN)
+    folder = read_kitti_folder(SEOSAN)
 
     @contextmanager
     def by_client(client: Client, _: str) -> Iterator[Publish]:

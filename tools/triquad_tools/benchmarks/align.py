@@ -15,7 +15,7 @@ from triquad_sensors.sweep import PosedScan
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
-from triquad_tools.recordings.kitti import read_folder
+from triquad_tools.recordings.folders.kitti import read_kitti_folder
 
 _SKIP_EVERY = 7
 _RANGE_MIN_M = 2.0  # nearer is the vehicle's own body
@@ -104,7 +104,7 @@ def check_recorded(part: str, folder: Path | None) -> None:
     if folder is None:
         print(f"{part}: recorded scans are left out: give --recorded FOLDER", file=sys.stderr)
     else:
-        read_folder(folder)
+        read_kitti_folder(folder)
 
 
 def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
@@ -113,7 +113,7 @@ def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
     Raises:
         ToolError: the folder cannot be read.
     """
-    folder = read_folder(path)
+    folder = read_kitti_folder(path)
     mapped: list[PosedScan] = []
     withheld: list[PosedScan] = []
     indices = range(len(folder))[:scans]

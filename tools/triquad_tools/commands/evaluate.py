@@ -29,7 +29,7 @@ from triquad_tools.evaluation.metrics import (
 from triquad_tools.evaluation.open_map import open_map
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.recordings.cloud import is_withheld, merged, world_points
-from triquad_tools.recordings.kitti import read_folder
+from triquad_tools.recordings.folders.kitti import read_kitti_folder
 from triquad_tools.simulation.street import street_drive
 
 _COMMAND = "triquad-eval"
@@ -88,7 +88,7 @@ def _on_street(options: argparse.Namespace) -> Results:
 
 
 def _at_withheld(options: argparse.Namespace) -> Results:
-    folder = read_folder(options.withheld)
+    folder = read_kitti_folder(options.withheld)
     every = options.skip_every
     indices = [i for i in range(len(folder)) if every == 0 or is_withheld(i, every)]
     if not indices:
@@ -105,7 +105,7 @@ def _at_withheld(options: argparse.Namespace) -> Results:
 def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
     """The points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
     if path.is_dir():
-        folder = read_folder(path)
+        folder = read_kitti_folder(path)
         clouds = (world_points(scan, range_min_m) for scan in folder.read(range(len(folder))))
         points = merged(clouds, voxel_m)
     else:

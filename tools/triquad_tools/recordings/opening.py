@@ -15,7 +15,7 @@ from triquad_tools.recordings.folders.depth_folder import (
     is_depth_folder,
     read_depth_folder,
 )
-from triquad_tools.recordings.kitti import is_kitti_folder, read_folder
+from triquad_tools.recordings.folders.kitti import is_kitti_folder, read_kitti_folder
 from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_options import RosOptions
 from triquad_tools.recordings.ros_recording import RosRecording
@@ -48,7 +48,7 @@ def open_recording(path: Path, options: RecordingOptions) -> Recording:
         return RosRecording(bag, ros)
     if is_kitti_folder(path):
         _refuse(path, "a folder in the style of KITTI", ros, clouds, depth)
-        return read_folder(path)
+        return read_kitti_folder(path)
     if is_depth_folder(path):
         kind = "a folder of depth images"
         _refuse(path, kind, replace(ros, depth_stride=1), replace(clouds, trajectory=None))

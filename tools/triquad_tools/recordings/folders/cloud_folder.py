@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_sensors.errors import NoTransformError
 from triquad_sensors.motion.placing import place
-from triquad_sensors.ros.point_times import offsets_s
+from triquad_sensors.point_times import offsets_s
 from triquad_sensors.sweep import PosedScan, Sweep
 
 from triquad_tools.console.command import ToolError

@@ -16,7 +16,7 @@ from triquad_sensors.motion.frame_tree import FrameTree, Transform
 from triquad_sensors.pose import Pose
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.kitti import DEFAULT_PERIOD_NS
+from triquad_tools.recordings.folders.kitti import DEFAULT_PERIOD_NS
 from triquad_tools.recordings.text_lines import (
     Line,
     parse_numbers,

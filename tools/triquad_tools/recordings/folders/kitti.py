@@ -72,7 +72,7 @@ def is_kitti_folder(folder: Path) -> bool:
     return any(any((folder / name).glob("*.bin")) for name in SCAN_FOLDERS)
 
 
-def read_folder(folder: Path) -> KittiFolder:
+def read_kitti_folder(folder: Path) -> KittiFolder:
     """The scans, poses and times of a folder.
 
     Raises:
