@@ -135,7 +135,7 @@ def _read_preset(name: str) -> dict[str, Any]:
 
 def _read_file(file: Path) -> dict[str, Any]:
     try:
-        file.stat()  # a file that is missing would count as empty
+        file.open("rb").close()  # what is missing, or a folder, would count as empty
         # As it is written: a call would take [Scan] for [scan], and of both drop one.
         return TomlConfigSettingsSource(_NamedSettings, file).toml_data
     except (OSError, ValueError, RecursionError) as error:

@@ -87,8 +87,10 @@ def test_training_state_is_kept_on_request(tmp_path: Path, settings: Path) -> No
 
 
 @contextmanager
-def mapping(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], threading.Event]]:
-    """The command as a process, and whether it has begun to train."""
+def mapping(
+    *arguments: object, until: str = "training"
+) -> Iterator[tuple[subprocess.Popen[str], threading.Event]]:
+    """The command as a process, and whether it has begun with a stage."""
     code = "from triquad_tools.commands.entry_points import map_recording as run; exit(run())"
     process = subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)], stderr=subprocess.PIPE, text=True
@@ -99,7 +101,7 @@ def mapping(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], threadi
     def read() -> None:
         for line in process.stderr:
             process.lines.append(line)
-            if line.startswith("training"):
+            if line.startswith(until):
                 training.set()
         training.set()
 
@@ -132,6 +134,44 @@ def test_after_ctrl_c_the_same_command_goes_on(tmp_path: Path, settings: Path, c
     assert f"going on after scan {COUNT}" in capsys.readouterr().out
     assert error_of(output) < 0.1
     assert not output.with_name("map.triquad.part").exists()
+
+
+def test_however_often_it_is_interrupted_no_scan_is_lost(tmp_path: Path, settings: Path) -> None:
+    recording, whole = folder(tmp_path), tmp_path / "whole.triquad"
+    assert main([str(recording), str(whole), "--settings", str(settings)]) == 0
+    output = tmp_path / "map.triquad"
+    arguments = (recording, output, "--settings", settings)
+    for moment in ("preparing", "mapping", "mapping", "training", "training"):
+        with mapping(*arguments, until=moment) as (process, reached):
+            assert reached.wait(servers.WAIT_S)
+            process.send_signal(signal.SIGINT)
+            process.wait(servers.WAIT_S)
+    if not output.exists():
+        assert main(list(map(str, arguments))) == 0
+    ours, theirs = (read_map(path).regions[0].evidence for path in (output, whole))
+    assert np.array_equal(ours.codes, theirs.codes)
+    assert np.array_equal(ours.surface, theirs.surface)
+
+
+def test_what_somebody_else_put_beside_the_output_stays(
+    tmp_path: Path, settings: Path, capsys
+) -> None:
+    output = tmp_path / "map.triquad"
+    part = tmp_path / "map.triquad.part"
+    (part / "recording").mkdir(parents=True)
+    (part / "recording" / "mine.txt").write_text("precious")
+    arguments = [str(folder(tmp_path)), str(output), "--settings", str(settings)]
+    assert main(arguments) == 2
+    assert "holds something else; move it away" in capsys.readouterr().err
+    assert (part / "recording" / "mine.txt").read_text() == "precious"
+
+
+def test_nothing_stays_of_input_that_is_refused(tmp_path: Path, settings: Path) -> None:
+    near = ("--set", "scan.range_min_m=30", "--settings", str(settings))
+    recording = folder(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    assert main([str(recording), str(tmp_path / "map.triquad"), *near]) == 2
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_other_poses_do_not_go_on_with_the_same_map(tmp_path: Path, settings: Path, capsys) -> None:

@@ -19,9 +19,9 @@ from triquad_server.settings_loading import PRESETS, load_settings
 from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.mapping_run import MappingRun, stop_requests
+from triquad_tools.mapping.mapping_run import MappingRun, resumed_mapper, stop_requests
 from triquad_tools.mapping.output import SUFFIXES, write_output
-from triquad_tools.mapping.unfinished import MAP_NAME, UnfinishedMap, mapping_key
+from triquad_tools.mapping.unfinished import UnfinishedMap, mapping_key
 from triquad_tools.recordings.arguments import add_recording
 from triquad_tools.recordings.selection import Selection, open_selected
 
@@ -47,16 +47,23 @@ def _map(options: argparse.Namespace) -> int:
         at = unfinished.position()
         if at.scans_taken:
             print(f"going on after scan {at.scans_taken}, from {unfinished.folder}")
-        mapper = Mapper(MAP_NAME, settings, device, at.record)
+        mapper = resumed_mapper(at.record, settings, device)
         warnings = ScanWarnings(ScanQueue(1), settings)
         mapping = MappingRun(mapper, unfinished, warnings, stop=stop.is_set)
         mapping.take(selection, at.scans_taken)
         _check_result(mapper, mapping, selection)
         mapping.settle()
+        unfinished.save(mapper, len(selection))  # should the output not be written
         record = mapper.changes_since(None).record
-        written = write_output(
-            record, output, cell_m=settings.mesh.cell_m, training=options.training
-        )
+        try:
+            written = write_output(
+                record, output, cell_m=settings.mesh.cell_m, training=options.training
+            )
+        except OSError as error:
+            raise StoreError(
+                f"{output} cannot be written: {error}; the map is in {unfinished.folder}: the same "
+                "command writes it once there is room"
+            ) from error
     unfinished.remove()
     print(f"{output}: {written}")
     return OK

@@ -7,12 +7,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from triquad_format.records.region import MapRecord
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
 
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.unfinished import UnfinishedMap
+from triquad_tools.mapping.unfinished import MAP_NAME, UnfinishedMap
 from triquad_tools.recordings.selection import Selection
 
 _SAVE_PERIOD_S = 60.0
@@ -36,6 +38,14 @@ def stop_requests() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def resumed_mapper(record: MapRecord | None, settings: Settings, device: str) -> Mapper:
+    """A mapper that goes on with a map; ``None``: with an empty one."""
+    mapper = Mapper(MAP_NAME, settings, device, record)
+    # What comes from now on is of a later epoch than the checkpoint.
+    mapper.publish()
+    return mapper
 
 
 class MappingRun:

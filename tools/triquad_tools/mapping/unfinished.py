@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,26 +46,36 @@ class UnfinishedMap:
         """Take possession of the folder, which is made if need be.
 
         Raises:
-            ToolError: it holds a map of other scans or settings.
+            ToolError: it holds a map of another recording or other settings, or is not ours.
             StoreError: it cannot be written to, or another process makes a map in it.
         """
         self.folder = output.with_name(f"{output.name}.part")
         self._key = key
+        self._positions = self.folder / _POSITIONS
+        self._check_ours()
         self._store = Store(self.folder, MAP_NAME, _KEEP)
         self._scans_taken: dict[str, int] = {}  # by epoch
         try:
-            self._read_positions()
+            if self._positions.exists():
+                self._read_positions()
+            else:
+                self._write_positions()
         except BaseException:
             self._store.close()
             raise
 
     def close(self) -> None:
-        """Let go of the folder; what is in it stays."""
+        """Let go of the folder; what is in it stays, unless nothing was saved yet."""
         self._store.close()
+        if not self._scans_taken:
+            self.remove()
 
     def remove(self) -> None:
         """Delete the folder, once it is closed: the map is finished."""
-        shutil.rmtree(self.folder)
+        shutil.rmtree(self.folder / MAP_NAME)
+        self._positions.unlink()
+        with suppress(OSError):  # whoever put something else there keeps it
+            self.folder.rmdir()
 
     def position(self) -> Position:
         """Where to go on.
@@ -89,22 +100,34 @@ class UnfinishedMap:
         Raises:
             StoreError: it cannot be written; the one before is untouched.
         """
-        changes = mapper.changes_since(self._store.base_epoch)
+        known = self._store.base_epoch
+        changes = mapper.changes_since(known)
         # First: a checkpoint without its position would be of no use.
         self._scans_taken[str(changes.record.epoch)] = scans_taken
+        self._write_positions()
+        if changes.record.epoch != known:
+            self._store.write(changes)
+
+    def _check_ours(self) -> None:
+        """Refuse to write to, and later to delete, what somebody else put there."""
+        if self.folder.is_symlink():
+            raise ToolError(f"{self.folder} is a link; remove it, or give OUT another name")
+        if self.folder.is_dir() and any(self.folder.iterdir()) and not self._positions.is_file():
+            raise ToolError(
+                f"{self.folder} holds something else; move it away, or give OUT another name"
+            )
+
+    def _write_positions(self) -> None:
         text = json.dumps({"key": self._key, "scans_taken": self._scans_taken})
-        with replacing(self.folder / _POSITIONS) as stream:
+        with replacing(self._positions) as stream:
             stream.write(text.encode())
-        self._store.write(changes)
 
     def _read_positions(self) -> None:
-        path = self.folder / _POSITIONS
-        if not path.exists():
-            return
+        path = self._positions
         try:
             read = json.loads(path.read_text())
             key, self._scans_taken = read["key"], dict(read["scans_taken"])
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ToolError(f"{path} is damaged; delete {self.folder} to begin anew") from error
         if key != self._key:
             raise ToolError(

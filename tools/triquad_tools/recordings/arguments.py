@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from triquad_sensors.depth_image import Intrinsics
+from triquad_sensors.ros.header import frame_name
 
 from triquad_tools.console.arguments import count, not_negative, positive
 from triquad_tools.console.command import ToolError
@@ -133,8 +134,8 @@ def options_of(options: argparse.Namespace) -> RecordingOptions:
     ros = RosOptions(
         topics=tuple(options.topics),
         poses=options.poses,
-        map_frame=options.map_frame,
-        body_frame=options.body_frame,
+        map_frame=options.map_frame and frame_name(options.map_frame),
+        body_frame=options.body_frame and frame_name(options.body_frame),
         depth_stride=options.stride or 1,
         recorder_clock=options.recorder_clock,
         transforms=tuple(map(parse_transform, options.transform)),

@@ -124,4 +124,6 @@ def find_bag(path: Path) -> Bag | None:
 def _bag_files(path: Path) -> tuple[Path, ...]:
     if path.is_file():
         return (path,)
-    return tuple(sorted(file for file in path.glob("*") if file.suffix in _SUFFIXES))
+    return tuple(
+        sorted(file for file in path.glob("*") if file.suffix in _SUFFIXES and file.is_file())
+    )

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from triquad_sensors.motion.frame_tree import STATIC, Transform
 from triquad_sensors.pose import Pose
+from triquad_sensors.ros.header import frame_name
 
 from triquad_tools.console.command import ToolError
 
@@ -38,4 +39,4 @@ def parse_transform(text: str) -> Transform:
             f"--transform {text!r}: use 'PARENT CHILD X Y Z QX QY QZ QW', such as "
             f"'base_link lidar 0 0 1.5 0 0 0 1' ({error})"
         ) from error
-    return Transform(parent, child, STATIC, pose)
+    return Transform(frame_name(parent), frame_name(child), STATIC, pose)

@@ -32,6 +32,11 @@ _ASSUMED = (
     "{topic}: taken as poses of {body}, since its messages do not say whose they are; if they are "
     "of another frame, name it with --body-frame, and say where the sensor sits with --transform"
 )
+_MISSING = (
+    "{count:,} messages that its index names could not be read: it is damaged; 'mcap recover', "
+    "'rosbag reindex' or 'ros2 bag reindex' saves what is left"
+)
+_NO_CLOUDS = "it holds no clouds (PointCloud2) and no depth images (Image): nothing to map"
 _NO_POSES = (
     "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
     "the clouds"
@@ -78,9 +83,15 @@ class RosRecording:
     @property
     def remarks(self) -> Sequence[str]:
         """What is left out and why, and what to do about it: a line each."""
+        lines: list[str] = []
+        if self._survey.missing > 0:
+            lines.append(_MISSING.format(count=self._survey.missing))
         if not self._survey.clouds:
-            return ["it holds no clouds (PointCloud2) and no depth images (Image): nothing to map"]
-        lines = [
+            return [
+                *lines,
+                "it holds no clouds (PointCloud2) and no depth images (Image): nothing to map",
+            ]
+        lines += [
             f"{topic}: {len(texts)} poses are left out: {texts[0]}"
             for topic, texts in self._survey.broken.items()
         ]
@@ -110,7 +121,13 @@ class RosRecording:
                 key = topic, numbers[topic]
                 numbers[topic] += 1
                 if key in wanted:
+                    wanted.discard(key)
                     yield self._read(message, opened.decode(message))
+        if wanted:
+            raise ToolError(
+                f"{self._bag.path}: {len(wanted)} scans are no longer there; has it changed since "
+                "it was looked through?"
+            )
 
     def _read(self, message: Message, decoded: Any) -> PosedScan:
         assert self._poses is not None

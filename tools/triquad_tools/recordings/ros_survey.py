@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 from triquad_format.errors import InvalidInputError
@@ -19,6 +20,7 @@ from triquad_sensors.ros.transforms import (
 )
 from triquad_sensors.sweep import Sweep
 
+from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.bag import Bag, Message, OpenBag
 
@@ -60,6 +62,7 @@ class Survey:
     frames: FrameTree = field(default_factory=FrameTree)
     poses: dict[str, PoseTopic] = field(default_factory=dict)
     broken: dict[str, list[str]] = field(default_factory=dict)  # what is wrong with poses, by topic
+    missing: int = 0  # messages that its index names, but that could not be read
     cameras: dict[str, Any] = field(default_factory=dict)  # first CameraInfo by topic
 
 
@@ -79,17 +82,15 @@ def survey(bag: Bag, *, recorder_clock: bool) -> Survey:
         reader = _Reader(found, recorder_clock)
         with progress("looking through the recording", total) as report:
             # Cameras first: an image may come before what is known of its camera.
-            for message in opened.messages(_of_kind(wanted, type_store.CAMERA_INFO)):
-                found.cameras.setdefault(message.connection.topic, opened.decode(message))
-            rest = [c for c in wanted if c.msgtype != type_store.CAMERA_INFO]
-            for done, message in enumerate(opened.messages(rest), start=1):
+            cameras = [c for c in wanted if c.msgtype == type_store.CAMERA_INFO]
+            others = [c for c in wanted if c.msgtype != type_store.CAMERA_INFO]
+            messages = chain(opened.messages(cameras), opened.messages(others))
+            done = 0
+            for done, message in enumerate(messages, start=1):
                 reader.take(opened, message)
                 report(done, f"{done} of {total} messages")
+        found.missing = total - done
     return found
-
-
-def _of_kind(connections: list[Any], kind: str) -> list[Any]:
-    return [connection for connection in connections if connection.msgtype == kind]
 
 
 def sweep_of_image(image: Any, topic: str, cameras: Mapping[str, Any], stride: int = 1) -> Sweep:
@@ -119,15 +120,20 @@ class _Reader:
         self._takers: dict[str, Callable[[Message, Any], None]] = {
             type_store.POINT_CLOUD: self._take_cloud,
             type_store.IMAGE: self._take_image,
+            type_store.CAMERA_INFO: self._take_camera,
             type_store.ODOMETRY: self._take_pose,
             type_store.POSE: self._take_pose,
             **dict.fromkeys(_TF_KINDS, self._take_tf),
         }
 
     def take(self, opened: OpenBag, message: Message) -> None:
-        if message.connection.topic in self._colours:
+        topic, kind = message.connection.topic, message.connection.msgtype
+        if topic in self._colours:
             return
-        self._takers[message.connection.msgtype](message, opened.decode(message))
+        try:
+            self._takers[kind](message, opened.decode(message))
+        except AttributeError as error:  # a bag brings its own definitions of types
+            raise ToolError(f"{topic}: messages are not as {kind} is defined: {error}") from error
         self._numbers[message.connection.topic] += 1
 
     def _take_cloud(self, message: Message, decoded: Any) -> None:
@@ -139,6 +145,9 @@ class _Reader:
             self._colours.add(topic)
             return
         self._add(message, lambda: sweep_of_image(decoded, topic, self._found.cameras))
+
+    def _take_camera(self, message: Message, decoded: Any) -> None:
+        self._found.cameras.setdefault(message.connection.topic, decoded)
 
     def _add(self, message: Message, make: Callable[[], Sweep]) -> None:
         topic = message.connection.topic

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _MAX_HEADER_LINES = 100
 _MAX_LINE_BYTES = 65536
+_MAX_NUMBERS = 10_000  # of a point; descriptors have some hundred
 _SIZES = struct.Struct("<II")  # compressed and not, before what is compressed
 _MAX_GROWTH = 100  # LZF makes at most 264 bytes of 3
 
@@ -73,6 +74,8 @@ def _read_header(path: Path, file: BinaryIO) -> "MetaData":
         lines.append(line.decode("ascii", "replace").strip())
     try:
         header = MetaData.parse_header(lines)
+        if sum(header.count) > _MAX_NUMBERS:
+            raise ValueError(f"{sum(header.count):,} numbers a point")
         header.build_dtype()
     except (ValueError, KeyError, IndexError) as error:
         raise ToolError(
