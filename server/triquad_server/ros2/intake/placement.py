@@ -35,6 +35,7 @@ class _Waiting:
     sweep: Sweep
     needs_ns: tuple[int, int]  # first and last time at which the sensor's pose is needed
     give_up_s: float  # monotonic
+    is_over: bool = False  # its time ended, so that its transforms come no more
 
 
 class Placement:
@@ -68,6 +69,11 @@ class Placement:
             heads = [entries[0] for entries in self._waiting.values()]
             min(heads, key=lambda head: head.give_up_s).give_up_s = now_s
 
+    def give_up_after(self, topic_name: str, stamp_ns: int) -> None:
+        """Have sweeps of a topic wait no longer whose time ended, since it began anew before."""
+        for entry in self._waiting.get(topic_name, ()):
+            entry.is_over = entry.is_over or entry.sweep.stamp_ns > stamp_ns
+
     def settle(self, now_s: float) -> Iterator[Placed]:
         """Those that wait no longer, with what became of them."""
         for topic_name, entries in list(self._waiting.items()):
@@ -82,9 +88,13 @@ class Placement:
         try:
             outcome: PosedScan | NoScanError = self._scan(entry, now_s)
         except NoTransformError as error:
-            if error.late and now_s < entry.give_up_s:
+            if error.late and entry.is_over:
+                text = "time went back before its transforms came, or its stamp was wrong"
+                outcome = NoScanError("began_anew", text)
+            elif error.late and now_s < entry.give_up_s:
                 return None
-            outcome = error
+            else:
+                outcome = error
         except NoScanError as error:
             outcome = error
         except Exception as error:  # whatever numbers came must not stop the others

@@ -144,7 +144,8 @@ class Ros2Intake:
         self._silence.end(arrival.topic_name)
         sweep = self._reader.sweep(arrival)
         if self._scans.begins_anew(arrival.topic_name, sweep):
-            _log.warning("ros2: %s: time went back, poses so far are forgotten", arrival.topic_name)
+            self._losses.remark(arrival.topic_name, "time went back, it begins anew")
+            self._placement.give_up_after(arrival.topic_name, sweep.stamp_ns)
             self._motion.forget_after(sweep.stamp_ns)
         self._placement.add(arrival.topic_name, sweep, time.monotonic())
 
