@@ -37,7 +37,8 @@ class Ros2Settings(BaseModel):
     of the robot, or that of its bridge."""
 
     clouds: list[Topic] = []
-    """Topics of `PointCloud2` that are mapped; by default all that there are."""
+    """Topics of `PointCloud2` that are mapped; by default all that there are, or none where `depth`
+    names topics."""
 
     depth: list[Topic] = []
     """Topics of depth images that are mapped; the `camera_info` beside each gives the camera."""

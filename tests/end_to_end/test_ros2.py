@@ -168,6 +168,8 @@ def test_depth_images_are_mapped_with_the_camera_beside_them() -> None:
             r2.tf(second, ("map", "optical", forward))
         r2.depth(0.1, wall)
         until(client, lambda status: status.scans_dropped == {"no_camera_info": 1})
+        # The camera publishes what it sees as a cloud too, which nobody chose.
+        r2.cloud(0.1, np.zeros((10, 3)), topic="/camera/points", frame="map")
         r2.camera(0.2, wall.shape, matrix)
         times = (0.2 + number / 1000 for number in range(800))
 
@@ -179,6 +181,7 @@ def test_depth_images_are_mapped_with_the_camera_beside_them() -> None:
         until(client, is_mapped)
         at_wall = np.array([[AT[0] + 3, AT[1] + y, AT[2] + z] for y in (-1, 0, 1) for z in (-1, 1)])
         assert (client.query_sdf(at_wall).status == Status.SURFACE).all()
+        assert client.status().scans_dropped.keys() == {"no_camera_info"}
 
 
 def test_other_domains_and_namespaces_are_not_heard() -> None:
