@@ -11,6 +11,7 @@ from triquad_sensors.motion.frame_tree import ROOT_NAMES
 from triquad_sensors.motion.placing import place
 from triquad_sensors.sweep import PosedScan, Sweep
 
+from triquad_server.ros2.intake.inbox import LaneLimit
 from triquad_server.ros2.intake.motion import Motion
 
 _log = logging.getLogger("triquad_server.ros2")
@@ -41,11 +42,13 @@ class _Waiting:
 class Placement:
     """Places sweeps in the map frame, those of each topic in the order in which they came."""
 
-    def __init__(self, motion: Motion, *, map_frame: str, limit: int, timeout_s: float) -> None:
+    def __init__(
+        self, motion: Motion, *, map_frame: str, limit: LaneLimit, timeout_s: float
+    ) -> None:
         """``motion`` is added to by others in the meantime, on the same thread.
 
-        Without a ``map_frame`` it is chosen, once, as the transforms come. At most ``limit``
-        sweeps wait, for ``timeout_s`` each.
+        Without a ``map_frame`` it is chosen, once, as the transforms come. Sweeps wait within the
+        ``limit``, for ``timeout_s`` each.
         """
         self.map_frame = map_frame
         self._motion = motion
@@ -59,15 +62,13 @@ class Placement:
         return sum(map(len, self._waiting.values()))
 
     def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
-        """Have a sweep placed; where too many wait, the one that waits for longest gives up."""
+        """Have a sweep placed; where too many wait, those that wait for longest give up."""
         offsets = np.zeros(1) if sweep.offsets_s is None else sweep.offsets_s
         first, last = offsets.min(initial=0), offsets.max(initial=0)
         needs = (sweep.stamp_ns + round(first * 1e9), sweep.stamp_ns + round(last * 1e9))
         entry = _Waiting(topic_name, sweep, needs, now_s + self._timeout_s)
         self._waiting.setdefault(topic_name, deque()).append(entry)
-        if len(self) > self._limit:
-            heads = [entries[0] for entries in self._waiting.values()]
-            min(heads, key=lambda head: head.give_up_s).give_up_s = now_s
+        self._keep_within_limit(now_s)
 
     def give_up_after(self, topic_name: str, stamp_ns: int) -> None:
         """Have sweeps of a topic wait no longer whose time ended, since it began anew before."""
@@ -82,6 +83,18 @@ class Placement:
                 yield placed
             if not entries:
                 del self._waiting[topic_name]
+
+    def _keep_within_limit(self, now_s: float) -> None:
+        """Give up the oldest sweeps, so that no more are left than may wait."""
+        entries = [entry for entries in self._waiting.values() for entry in entries]
+        messages = len(entries)
+        taken_bytes = sum(entry.sweep.memory_bytes for entry in entries)
+        for entry in sorted(entries, key=lambda entry: entry.give_up_s):
+            if messages <= self._limit.messages and taken_bytes <= self._limit.bytes:
+                return
+            entry.give_up_s = min(entry.give_up_s, now_s)
+            messages -= 1
+            taken_bytes -= entry.sweep.memory_bytes
 
     def _try(self, entry: _Waiting, now_s: float) -> Placed | None:
         """What becomes of a sweep; None where it waits on."""
