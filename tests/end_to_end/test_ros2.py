@@ -128,7 +128,8 @@ def test_sensors_are_sources_of_their_own(way: str) -> None:
 @pytest.mark.parametrize("kind", ["odometry", "pose"])
 def test_poses_come_from_a_topic(kind: str, way: str) -> None:
     topic = {"odometry": "/odom", "pose": "/pose"}[kind]
-    with serving(poses=topic, body_frame="body") as (endpoint, client), robot(endpoint, way) as r2:
+    frames = {"map_frame": {"odometry": "/odom", "pose": "/map"}[kind], "body_frame": "/body"}
+    with serving(poses=topic, **frames) as (endpoint, client), robot(endpoint, way) as r2:
         r2.tf(0, ("body", "lidar", MAST), static=True)
         for second in (0, 1):
             # What transforms say of the body does not count then.
