@@ -58,9 +58,6 @@ class Placement:
         self._warned = bool(map_frame)  # that there is a better frame; not where it was chosen
         self._choose_s: float | None = None  # when the map frame is chosen at the latest
 
-    def __len__(self) -> int:
-        return sum(map(len, self._waiting.values()))
-
     def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
         """Have a sweep placed; where too many wait, those that wait for longest give up."""
         offsets = np.zeros(1) if sweep.offsets_s is None else sweep.offsets_s
