@@ -16,6 +16,11 @@ class Sweep:
     stamp_ns: int  # nanoseconds since 1970
     offsets_s: Doubles | None = None  # [N] seconds after the stamp at which each was measured
 
+    @property
+    def memory_bytes(self) -> int:
+        """What its arrays take."""
+        return self.points.nbytes + (0 if self.offsets_s is None else self.offsets_s.nbytes)
+
 
 @dataclass(frozen=True)
 class PosedScan:

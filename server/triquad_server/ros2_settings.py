@@ -2,13 +2,15 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from triquad_sensors.ros.header import frame_name
 
 _NAME = r"[A-Za-z_][A-Za-z0-9_]*"
 _TOPIC = rf"(/?{_NAME})+"
 
 Topic = Annotated[str, Field(pattern=rf"^{_TOPIC}$", max_length=255)]
 TopicOrNone = Annotated[str, Field(pattern=rf"^({_TOPIC})?$", max_length=255)]
+Frame = Annotated[str, AfterValidator(frame_name)]  # written as those of messages are read
 
 MAX_GRID_CELLS = 250_000
 TF_POSES = "tf"
@@ -37,7 +39,8 @@ class Ros2Settings(BaseModel):
     of the robot, or that of its bridge."""
 
     clouds: list[Topic] = []
-    """Topics of `PointCloud2` that are mapped; by default all that there are."""
+    """Topics of `PointCloud2` that are mapped; by default all that there are, or none where `depth`
+    names topics."""
 
     depth: list[Topic] = []
     """Topics of depth images that are mapped; the `camera_info` beside each gives the camera."""
@@ -49,10 +52,10 @@ class Ros2Settings(BaseModel):
     """Where poses come from: `"tf"`, or a topic of `Odometry` or `PoseStamped`, with which of the
     transforms only the static ones count."""
 
-    body_frame: str = "base_link"
+    body_frame: Frame = "base_link"
     """The frame whose pose a topic of `PoseStamped` gives."""
 
-    map_frame: str = ""
+    map_frame: Frame = ""
     """The frame in which the map is made; by default `map`, `odom` or `world`, the first that the
     transforms have, or that of the topic of poses."""
 
@@ -61,7 +64,8 @@ class Ros2Settings(BaseModel):
     clock is not that of the poses."""
 
     waiting_clouds: Annotated[int, Field(ge=1, le=1000)] = 32
-    """Clouds that wait for their transforms; of more, the oldest is given up, and counted."""
+    """Clouds that wait for their transforms; of more, or of more than 512 MB, the oldest is given
+    up, and counted."""
 
     waiting_s: Annotated[float, Field(ge=0, le=60)] = 2.0
     """How long a cloud waits for its transforms."""

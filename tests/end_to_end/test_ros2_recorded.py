@@ -9,6 +9,7 @@ import pytest
 import triquad_client
 from support import servers
 from support.ros_robot import SECOND, T0, robot
+from support.ros_server import accounted, until
 from triquad_client import Client
 from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.settings import ScanSettings, ServiceSettings, Settings, TrainingSettings
@@ -47,11 +48,9 @@ def mapped(
         for number, index in enumerate(taken):
             time.sleep(max(0.0, started + number * PERIOD_S - time.monotonic()))
             publish(index)
-        status = client.status()
-        while status.scans_taken + sum(status.scans_dropped.values()) < len(taken):
-            assert status.scans_lost == {}, status
-            time.sleep(0.1)
-            status = client.status()
+        status = until(
+            client, lambda status: accounted(status) + sum(status.scans_lost.values()) >= len(taken)
+        )
         assert (status.scans_taken, status.scans_lost) == (len(taken), {}), status
         client.settle(600.0)
         clouds = (world_points(scan, *RANGES_M) for scan in folder.read(withheld))

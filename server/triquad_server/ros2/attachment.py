@@ -7,6 +7,7 @@ ATTACHMENT = struct.Struct("<qqB16s")
 """The attachment: number, time, length of the identity, identity of the publisher."""
 
 _MAX_PUBLISHERS = 256
+_MAX_MISSED = 2**20  # a larger leap is of a publisher that began anew, or of wrong bytes
 
 
 class SequenceGaps:
@@ -18,7 +19,8 @@ class SequenceGaps:
     def missed(self, attachment: bytes) -> int:
         """How many messages of its publisher are missing before one with this attachment.
 
-        What is attached in another form, as by old releases, tells nothing.
+        What is attached in another form, as by old releases, tells nothing, and neither does a
+        number below 0 or one that leaps too far.
         """
         if len(attachment) != ATTACHMENT.size:
             return 0
@@ -28,4 +30,5 @@ class SequenceGaps:
         self._last[publisher] = number
         if len(self._last) > _MAX_PUBLISHERS:
             self._last.popitem(last=False)
-        return max(0, number - last - 1)
+        missed = number - last - 1
+        return missed if 0 <= missed <= _MAX_MISSED and last >= 0 else 0

@@ -13,7 +13,7 @@ from triquad_sensors.ros.type_store import MARKER, OCCUPANCY_GRID
 from triquad_server.epochs import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mesh.tile_feed import TileFeed
-from triquad_server.ros2.intake.feeds import full_name
+from triquad_server.ros2.intake.feeds import full_name, prefix_of
 from triquad_server.ros2.intake.ros2_intake import Ros2Intake
 from triquad_server.ros2.node import Node
 from triquad_server.ros2.output.grid_outlet import GridOutlet, SliceShape
@@ -112,8 +112,7 @@ class Ros2Connection:
         """A topic to publish on; None where it has no name."""
         if not name:
             return None
-        prefix = full_name("", self._settings.namespace).rstrip("/")
-        topic = Topic(full_name(prefix, name), type_name)
+        topic = Topic(full_name(prefix_of(self._settings), name), type_name)
         outlet = Outlet(
             self._session, self._node, topic, domain=self._settings.domain, delivery=delivery
         )

@@ -58,7 +58,12 @@ def test_damaged_messages_stop_nothing(poses: str) -> None:
     endpoint = servers.free_endpoint()
     queue = ScanQueue(1000)
     settings = Ros2Settings(
-        enabled=True, depth=["/camera/depth"], poses=poses, waiting_s=0.1, waiting_clouds=1000
+        enabled=True,
+        clouds=["/points", "/good"],
+        depth=["/camera/depth"],
+        poses=poses,
+        waiting_s=0.1,
+        waiting_clouds=1000,
     )
     rng = np.random.default_rng(5)
     with (

@@ -116,5 +116,8 @@ def test_numbers_that_are_missing_are_told_by_publisher() -> None:
     assert missed(1, b"b" * 16) == 0
     assert missed(9) == 0
     assert gaps.missed(b"another form") == 0
+    for number in (-(2**63), 2**63 - 1, -(2**63), -5, 5, 2**40, 3):
+        assert missed(number) == 0, "a publisher that began anew, or wrong bytes"
+    assert missed(5) == 1
     for number in range(1000):
         assert missed(number, number.to_bytes(16, "little")) == 0

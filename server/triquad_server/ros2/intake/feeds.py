@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
+from triquad_sensors.ros.depth_camera import camera_topic
 from triquad_sensors.ros.type_store import (
     CAMERA_INFO,
     IMAGE,
@@ -59,14 +60,14 @@ class Choice:
 
     domain: int
     prefix: str  # of all names, "" or with a leading slash
-    clouds: tuple[str, ...]  # (): all that there are
+    clouds: tuple[str, ...]  # (): all that there are, or none beside depth images
     depth: tuple[str, ...]
     poses: str | None  # None: from transforms
 
     @classmethod
     def of_settings(cls, settings: Ros2Settings) -> "Choice":
         """The choice that the settings make."""
-        prefix = full_name("", settings.namespace).rstrip("/")
+        prefix = prefix_of(settings)
         poses = settings.poses
         return cls(
             settings.domain,
@@ -75,6 +76,11 @@ class Choice:
             depth=tuple(full_name(prefix, name) for name in settings.depth),
             poses=None if poses.strip("/") == TF_POSES else full_name(prefix, poses),
         )
+
+    @property
+    def takes_any_cloud(self) -> bool:
+        """Whether all clouds are wanted: a depth camera publishes what it sees as clouds too."""
+        return not self.clouds and not self.depth
 
     def feeds(self) -> Iterator[Feed]:
         """What to listen to from the start.
@@ -87,7 +93,7 @@ class Choice:
                 for type_name in TYPES[role]:
                     yield Feed(role, rmw_key(self.domain, Topic(name, type_name)), name)
                 yield Feed(role, bridge_key(name), name)
-        if not self.clouds:
+        if self.takes_any_cloud:
             anywhere = Topic(f"{self.prefix}/**", POINT_CLOUD)
             yield Feed(Role.CLOUD, rmw_key(self.domain, anywhere), None)
 
@@ -97,11 +103,11 @@ class Choice:
             if topic.name in names and topic.type_name in TYPES[role]:
                 return role
         is_cloud = topic.type_name == POINT_CLOUD and topic.name.startswith(f"{self.prefix}/")
-        return Role.CLOUD if is_cloud and not self.clouds else None
+        return Role.CLOUD if is_cloud and self.takes_any_cloud else None
 
     def _names(self) -> dict[Role, tuple[str, ...]]:
         """The topics whose names are known."""
-        infos = tuple(camera_info_of(name) for name in self.depth)
+        infos = tuple(camera_topic(name) for name in self.depth)
         names = {
             Role.CLOUD: self.clouds,
             Role.DEPTH: self.depth,
@@ -113,11 +119,11 @@ class Choice:
         return {**names, Role.POSE: (self.poses,)}
 
 
+def prefix_of(settings: Ros2Settings) -> str:
+    """What goes before all names: "", or the namespace with a leading slash."""
+    return full_name("", settings.namespace).rstrip("/")
+
+
 def full_name(prefix: str, name: str) -> str:
     """A topic's name with a leading slash, behind ``prefix``."""
     return f"{prefix}/{name.strip('/')}"
-
-
-def camera_info_of(image_topic: str) -> str:
-    """The topic of the camera that takes an image, as drivers name it."""
-    return image_topic.rpartition("/")[0] + "/camera_info"

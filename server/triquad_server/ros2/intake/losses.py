@@ -51,15 +51,26 @@ class Losses:
 
     def say(self, topic_name: str, reason: str, text: object, count: int = 1) -> None:
         """As :meth:`add`, for what is counted elsewhere."""
+        since = self._due(topic_name, reason, count)
+        if since is not None:
+            remedy = f" ({REMEDIES[reason]})" if reason in REMEDIES else ""
+            _log.warning("ros2: %s: %d lost, %s: %s%s", topic_name, since, reason, text, remedy)
+
+    def remark(self, topic_name: str, text: str) -> None:
+        """As :meth:`say`, for what loses nothing by itself; the same text is one reason."""
+        if self._due(topic_name, text, 1) is not None:
+            _log.warning("ros2: %s: %s", topic_name, text)
+
+    def _due(self, topic_name: str, reason: str, count: int) -> int | None:
+        """How many to tell of in the log, where it is time for that."""
         now_s = self._clock()
         kind = self._kinds.get((topic_name, reason))
         if kind is None:
             if len(self._kinds) >= _MAX_REMEMBERED:
-                return
+                return None
             kind = self._kinds[topic_name, reason] = _Kind(now_s - LOG_PERIOD_S)
         kind.since += count
         if now_s - kind.logged_s < LOG_PERIOD_S:
-            return
-        remedy = f" ({REMEDIES[reason]})" if reason in REMEDIES else ""
-        _log.warning("ros2: %s: %d lost, %s: %s%s", topic_name, kind.since, reason, text, remedy)
-        kind.logged_s, kind.since = now_s, 0
+            return None
+        since, kind.logged_s, kind.since = kind.since, now_s, 0
+        return since

@@ -4,7 +4,7 @@ from triquad_sensors.errors import InvalidScanError, NoScanError
 from triquad_sensors.motion.frame_tree import STATIC, FrameTree, Transform
 
 BEGAN_ANEW_NS = 10 * 10**9
-"""Stamps that go back by more are of a simulation or a bag that began anew."""
+"""Transforms that go back by more are of a simulation or a bag that began anew."""
 
 _POSES_KEPT = 2000  # of each frame; 20 s at 100 Hz
 _MAX_FRAMES = 1000

@@ -11,6 +11,7 @@ from triquad_sensors.motion.frame_tree import ROOT_NAMES
 from triquad_sensors.motion.placing import place
 from triquad_sensors.sweep import PosedScan, Sweep
 
+from triquad_server.ros2.intake.inbox import LaneLimit
 from triquad_server.ros2.intake.motion import Motion
 
 _log = logging.getLogger("triquad_server.ros2")
@@ -35,16 +36,19 @@ class _Waiting:
     sweep: Sweep
     needs_ns: tuple[int, int]  # first and last time at which the sensor's pose is needed
     give_up_s: float  # monotonic
+    is_over: bool = False  # its time ended, so that its transforms come no more
 
 
 class Placement:
     """Places sweeps in the map frame, those of each topic in the order in which they came."""
 
-    def __init__(self, motion: Motion, *, map_frame: str, limit: int, timeout_s: float) -> None:
+    def __init__(
+        self, motion: Motion, *, map_frame: str, limit: LaneLimit, timeout_s: float
+    ) -> None:
         """``motion`` is added to by others in the meantime, on the same thread.
 
-        Without a ``map_frame`` it is chosen, once, as the transforms come. At most ``limit``
-        sweeps wait, for ``timeout_s`` each.
+        Without a ``map_frame`` it is chosen, once, as the transforms come. Sweeps wait within the
+        ``limit``, for ``timeout_s`` each.
         """
         self.map_frame = map_frame
         self._motion = motion
@@ -54,19 +58,19 @@ class Placement:
         self._warned = bool(map_frame)  # that there is a better frame; not where it was chosen
         self._choose_s: float | None = None  # when the map frame is chosen at the latest
 
-    def __len__(self) -> int:
-        return sum(map(len, self._waiting.values()))
-
     def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
-        """Have a sweep placed; where too many wait, the one that waits for longest gives up."""
+        """Have a sweep placed; where too many wait, those that wait for longest give up."""
         offsets = np.zeros(1) if sweep.offsets_s is None else sweep.offsets_s
         first, last = offsets.min(initial=0), offsets.max(initial=0)
         needs = (sweep.stamp_ns + round(first * 1e9), sweep.stamp_ns + round(last * 1e9))
         entry = _Waiting(topic_name, sweep, needs, now_s + self._timeout_s)
         self._waiting.setdefault(topic_name, deque()).append(entry)
-        if len(self) > self._limit:
-            heads = [entries[0] for entries in self._waiting.values()]
-            min(heads, key=lambda head: head.give_up_s).give_up_s = now_s
+        self._keep_within_limit(now_s)
+
+    def give_up_after(self, topic_name: str, stamp_ns: int) -> None:
+        """Have sweeps of a topic wait no longer whose time ended, since it began anew before."""
+        for entry in self._waiting.get(topic_name, ()):
+            entry.is_over = entry.is_over or entry.sweep.stamp_ns > stamp_ns
 
     def settle(self, now_s: float) -> Iterator[Placed]:
         """Those that wait no longer, with what became of them."""
@@ -77,14 +81,30 @@ class Placement:
             if not entries:
                 del self._waiting[topic_name]
 
+    def _keep_within_limit(self, now_s: float) -> None:
+        """Give up the oldest sweeps, so that no more are left than may wait."""
+        entries = [entry for entries in self._waiting.values() for entry in entries]
+        messages = len(entries)
+        taken_bytes = sum(entry.sweep.memory_bytes for entry in entries)
+        for entry in sorted(entries, key=lambda entry: entry.give_up_s):
+            if messages <= self._limit.messages and taken_bytes <= self._limit.bytes:
+                return
+            entry.give_up_s = min(entry.give_up_s, now_s)
+            messages -= 1
+            taken_bytes -= entry.sweep.memory_bytes
+
     def _try(self, entry: _Waiting, now_s: float) -> Placed | None:
         """What becomes of a sweep; None where it waits on."""
         try:
             outcome: PosedScan | NoScanError = self._scan(entry, now_s)
         except NoTransformError as error:
-            if error.late and now_s < entry.give_up_s:
+            if error.late and entry.is_over:
+                text = "time went back before its transforms came, or its stamp was wrong"
+                outcome = NoScanError("began_anew", text)
+            elif error.late and now_s < entry.give_up_s:
                 return None
-            outcome = error
+            else:
+                outcome = error
         except NoScanError as error:
             outcome = error
         except Exception as error:  # whatever numbers came must not stop the others

@@ -5,7 +5,7 @@ from typing import Any
 
 from triquad_sensors.errors import NoScanError
 from triquad_sensors.motion.frame_tree import STATIC, Transform
-from triquad_sensors.ros.depth_camera import sweep_of_depth
+from triquad_sensors.ros.depth_camera import camera_topic, sweep_of_depth
 from triquad_sensors.ros.point_cloud import sweep_of_cloud
 from triquad_sensors.ros.transforms import (
     transform_of_odometry,
@@ -23,7 +23,7 @@ from triquad_sensors.ros.type_store import (
 )
 from triquad_sensors.sweep import Sweep
 
-from triquad_server.ros2.intake.feeds import Role, camera_info_of
+from triquad_server.ros2.intake.feeds import Role
 from triquad_server.ros2.intake.inbox import Arrival
 
 
@@ -85,11 +85,11 @@ class Reader:
         message = decode_cdr(payload, IMAGE)
         stride = self._depth_stride
         self._check_count(-(-message.width // stride) * -(-message.height // stride))
-        camera = self._cameras.get(camera_info_of(topic_name))
+        camera = self._cameras.get(camera_topic(topic_name))
         if camera is None:
             raise NoScanError(
                 "no_camera_info",
-                f"nothing came on {camera_info_of(topic_name)} yet, which tells how the camera "
+                f"nothing came on {camera_topic(topic_name)} yet, which tells how the camera "
                 "sees: it has to publish there",
             )
         return sweep_of_depth(message, camera, stride)

@@ -30,6 +30,7 @@ _POINT_BYTES = 64  # that drivers write for each point, at most
 _OTHER_BYTES = 1_000_000  # of a message of transforms, and of a cloud without its points
 _SCANS_WAITING = LaneLimit(messages=16, bytes=256_000_000)
 _OTHERS_WAITING = LaneLimit(messages=4096, bytes=16_000_000)
+_PLACEMENT_BYTES = 512_000_000  # of points that wait for transforms
 _TICK_S = 0.2
 
 
@@ -67,7 +68,7 @@ class Ros2Intake:
         self._placement = Placement(
             self._motion,
             map_frame=settings.map_frame,
-            limit=settings.waiting_clouds,
+            limit=LaneLimit(settings.waiting_clouds, _PLACEMENT_BYTES),
             timeout_s=settings.waiting_s,
         )
         self._inbox = Inbox(_SCANS_WAITING, _OTHERS_WAITING, self._pushed_out)
@@ -144,7 +145,8 @@ class Ros2Intake:
         self._silence.end(arrival.topic_name)
         sweep = self._reader.sweep(arrival)
         if self._scans.begins_anew(arrival.topic_name, sweep):
-            _log.warning("ros2: %s: time went back, poses so far are forgotten", arrival.topic_name)
+            self._losses.remark(arrival.topic_name, "time went back, it begins anew")
+            self._placement.give_up_after(arrival.topic_name, sweep.stamp_ns)
             self._motion.forget_after(sweep.stamp_ns)
         self._placement.add(arrival.topic_name, sweep, time.monotonic())
 

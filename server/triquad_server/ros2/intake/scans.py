@@ -14,8 +14,10 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import check_count
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.ros2.intake.losses import Losses
-from triquad_server.ros2.intake.motion import BEGAN_ANEW_NS
 from triquad_server.ros2.intake.placement import Placed
+
+WENT_BACK_NS = 10**9
+"""Sweeps that go back by more begin anew; a stamp that was wrong silences no sensor for longer."""
 
 
 def _new_session() -> int:
@@ -36,9 +38,16 @@ class _Source:
     """A topic of which scans are made."""
 
     name: str
-    newest_ns: int
+    read_ns: int  # newest stamp of a sweep that was read, since time went back
+    entered_ns: int  # and of one that was entered, in this session: sweeps wait in between
     session: int = field(default_factory=_new_session)
     sequence: int = 0  # of the next scan
+
+    def advance(self, stamp_ns: int) -> None:
+        """Go on to a sweep that is entered, in a new session where time went back."""
+        if stamp_ns < self.entered_ns - WENT_BACK_NS:
+            self.session, self.sequence, self.entered_ns = _new_session(), 0, stamp_ns
+        self.entered_ns = max(self.entered_ns, stamp_ns)
 
 
 class ScanMaker:
@@ -54,7 +63,7 @@ class ScanMaker:
         self._sources: dict[str, _Source] = {}
 
     def begins_anew(self, topic_name: str, sweep: Sweep) -> bool:
-        """Whether time went back since the sweep of this topic before.
+        """Whether time went back since the sweep of this topic that was read before.
 
         Raises:
             NoScanError: the topic cannot be a source of scans.
@@ -62,16 +71,17 @@ class ScanMaker:
         source = self._sources.get(topic_name)
         if source is None:
             source = self._sources[topic_name] = self._new_source(topic_name, sweep.stamp_ns)
-        went_back = sweep.stamp_ns < source.newest_ns - BEGAN_ANEW_NS
-        if went_back:
-            source.session, source.sequence = _new_session(), 0
-            source.newest_ns = sweep.stamp_ns
-        source.newest_ns = max(source.newest_ns, sweep.stamp_ns)
+        went_back = sweep.stamp_ns < source.read_ns - WENT_BACK_NS
+        source.read_ns = sweep.stamp_ns if went_back else max(source.read_ns, sweep.stamp_ns)
         return went_back
 
     def enter(self, placed: Placed) -> None:
-        """Put a scan into the queue; where there is none, the topic's losses have it."""
+        """Put a scan into the queue; where there is none, the topic's losses have it.
+
+        The sweeps of a topic are entered in the order in which they were read.
+        """
         source = self._sources[placed.topic_name]
+        source.advance(placed.sweep.stamp_ns)
         scan = self._scan(source, placed)
         source.sequence += 1
         try:
@@ -102,4 +112,4 @@ class ScanMaker:
     def _new_source(self, topic_name: str, stamp_ns: int) -> _Source:
         if len(self._sources) >= self._max_sources:
             raise NoScanError("too_many_topics", f"there are {len(self._sources)} others already")
-        return _Source(source_of_topic(topic_name), stamp_ns)
+        return _Source(source_of_topic(topic_name), read_ns=stamp_ns, entered_ns=stamp_ns)
