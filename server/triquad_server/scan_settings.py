@@ -1,6 +1,6 @@
 """Settings of the section ``[scan]``."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -26,7 +26,12 @@ class ScanSettings(BaseModel):
     on rays without a return. At least `range_min_m`."""
 
     thin_m: float = length(0.05, least_m=1e-3, most_m=10)
-    """One point is kept per patch of this side, as the sensor sees it."""
+    """One point is kept per voxel of this side, or per patch, as the sensor sees it."""
+
+    thin_by: Literal["voxel", "direction"] = "voxel"
+    """Of which points one is kept: of those in a voxel, or of those in the same direction and,
+    within a fifth, the same distance. Voxels keep the rows of a lidar on flat tops; of a dense
+    sensor with noise they keep too many outliers."""
 
     surface_share: Annotated[float, Field(ge=0.01, le=1)] = 0.5
     """Share of the training samples that lie around end points; the others lie in free space."""

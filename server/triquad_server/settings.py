@@ -245,9 +245,8 @@ class Settings(BaseModel):
                     for key in _RANGES
                 )
             )
-            if source.robot_box_m is not None:
-                section = f"sources.{name}.robot_box_m"
-                check_robot_box(section, source.robot_box_m, self.field.leaf_m)
+            if (box := source.robot_box_m) is not None:
+                check_robot_box(f"sources.{name}.robot_box_m", box, self.field.leaf_m)
         return self
 
     def scan_of(self, source: SourceSettings) -> ScanSettings:
@@ -294,11 +293,9 @@ class Settings(BaseModel):
 
     def _said(self, key: Key) -> str:
         """A setting with its value, and where that comes from if nobody gave it."""
-        said = f"{'.'.join(key)} = {self._value(key):g}"
-        leaf_m = self.field.leaf_m
-        if leaf_m == DEFAULT_LEAF_M or not follows_leaf(self._table(key), key[-1]):
-            return said
-        return f"{said} (which follows field.leaf_m = {leaf_m:g})"
+        follows = follows_leaf(self._table(key), key[-1]) and self.field.leaf_m != DEFAULT_LEAF_M
+        why = f" (which follows field.leaf_m = {self.field.leaf_m:g})" if follows else ""
+        return f"{'.'.join(key)} = {self._value(key):g}{why}"
 
     def _table(self, key: Key) -> BaseModel:
         table: BaseModel = getattr(self, key[0]) if len(key) == 2 else self.sources[key[1]]

@@ -16,9 +16,8 @@ from triquad_server.source_settings import ANY_SOURCE, SourceSettings
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
 
-_SHELL = 0.05
-"""The logarithm of how many times farther the outer side of a shell is than its inner one: more
-than the noise of most sensors, and less than from row to row of a lidar on a flat top."""
+_SHELL = 0.18
+"""The logarithm of how many times farther the outer side of a shell is than its inner one."""
 
 _NOWHERE = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
 """Corners of a box that holds nothing."""
@@ -139,6 +138,7 @@ class _Limits(NamedTuple):
     range_min_m: float
     range_max_m: float
     thin_m: float
+    by_direction: bool
     robot_low: Doubles  # [3] corners of the robot, sensor frame
     robot_high: Doubles
 
@@ -170,16 +170,15 @@ def _is_within(x: float, y: float, z: float, low: Doubles, high: Doubles) -> boo
 
 
 @kernel(inline="always")
-def _is_first(keys: Longs, x: float, y: float, z: float, distance: float, thin_m: float) -> bool:
-    """Whether no point before lies in the same direction, in the same shell around the sensor.
+def _is_first(keys: Longs, x: float, y: float, z: float, distance: float, limits: _Limits) -> bool:
+    """Whether no point before lies in the same voxel or, so chosen, in the same direction.
 
-    Points are put onto the inner sphere of their shell, and thinned there: voxels around the
-    points themselves would keep each of the outliers, before and behind a surface, and but few of
-    the many points on it.
+    There, points are put onto the inner sphere of a shell around the sensor, and thinned on it.
     """
-    shell = np.floor(np.log(distance) / _SHELL)
-    onto_sphere = np.exp(shell * _SHELL) / distance
-    return bool(enter(keys, onto_sphere * x, onto_sphere * y, onto_sphere * z, thin_m))
+    scale = 1.0
+    if limits.by_direction:
+        scale = np.exp(np.floor(np.log(distance) / _SHELL) * _SHELL) / distance
+    return bool(enter(keys, scale * x, scale * y, scale * z, limits.thin_m))
 
 
 @kernel()
@@ -203,7 +202,7 @@ def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
             beyond[too_far, 0], beyond[too_far, 1] = share * x, share * y
             beyond[too_far, 2] = share * z
             too_far += 1
-        elif _is_first(keys, x, y, z, distance, limits.thin_m):
+        elif _is_first(keys, x, y, z, distance, limits):
             kept[count, 0], kept[count, 1], kept[count, 2] = x, y, z
             count += 1
     return _Selection(
@@ -255,7 +254,14 @@ def usable_rays(
     directions = _unit_vectors(empty) if source.no_return else np.empty((0, 3))
     disbelieved = 0 if source.no_return else len(empty)
     low, high = (np.array(corner, np.float64) for corner in source.robot_box_m or _NOWHERE)
-    limits = _Limits(settings.range_min_m, settings.range_max_m, settings.thin_m, low, high)
+    limits = _Limits(
+        settings.range_min_m,
+        settings.range_max_m,
+        settings.thin_m,
+        by_direction=settings.thin_by == "direction",
+        robot_low=low,
+        robot_high=high,
+    )
     found = _select(np.ascontiguousarray(points), limits, empty_keys(len(points)))
     if len(found.kept) + len(found.beyond) + len(directions) == 0:
         raise ScanRefusedError(
