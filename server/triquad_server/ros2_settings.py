@@ -2,8 +2,10 @@
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 from triquad_sensors.ros.header import frame_name
+
+from triquad_server.settings_section import SECTION
 
 _NAME = r"[A-Za-z_][A-Za-z0-9_]*"
 _TOPIC = rf"(/?{_NAME})+"
@@ -19,13 +21,7 @@ TF_POSES = "tf"
 class Ros2Settings(BaseModel):
     """What is taken from topics of ROS 2, and what is published on some."""
 
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
-        strict=True,
-    )
+    model_config = SECTION
 
     enabled: bool = False
     """Take in clouds and poses of ROS 2 and publish the map there; the flag `--ros2` says the

@@ -2,21 +2,16 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from triquad_server.leaf_lengths import length
+from triquad_server.settings_section import SECTION
 
 
 class ScanSettings(BaseModel):
     """Which points of a scan are used, and where its rays are sampled."""
 
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
-        strict=True,
-    )
+    model_config = SECTION
 
     range_min_m: float = length(1.5, least_m=0, most_m=1000)
     """Nearer points are dropped."""

@@ -5,7 +5,7 @@
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from triquad_format.errors import FormatError, SettingsError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
@@ -13,13 +13,8 @@ from triquad_format.wire.keys import check_name
 from triquad_server.leaf_lengths import DEFAULT_LEAF_M, at_leaf, follows_leaf, length
 from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.scan_settings import ScanSettings
+from triquad_server.settings_section import RECORD, SECTION
 from triquad_server.source_settings import SourceSettings, check_robot_box
-
-_RECORD = ConfigDict(
-    frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
-)
-# Neither text nor a truth value is a number.
-_SECTION = _RECORD | ConfigDict(strict=True)
 
 Key = tuple[str, ...]
 """A setting: its section, for a source its name, and its key."""
@@ -30,7 +25,7 @@ _RANGES = ("range_min_m", "range_max_m")
 class TrainingSettings(BaseModel):
     """How the field is trained."""
 
-    model_config = _SECTION
+    model_config = SECTION
 
     batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
     """Samples per step."""
@@ -79,7 +74,7 @@ class TrainingSettings(BaseModel):
 class ChangeSettings(BaseModel):
     """How quickly a surface is taken back that rays pass through, in a world that changes."""
 
-    model_config = _SECTION
+    model_config = SECTION
 
     static: bool = False
     """The world stands still: no surface is ever taken back."""
@@ -95,7 +90,7 @@ class ChangeSettings(BaseModel):
 class MeshSettings(BaseModel):
     """The lattice of mesh tiles, and how clients follow them."""
 
-    model_config = _SECTION
+    model_config = SECTION
 
     cell_m: float = length(0.1, least_m=0.005, most_m=10)
     """Side of the cells of marching cubes."""
@@ -129,7 +124,7 @@ class MeshSettings(BaseModel):
 class StoreSettings(BaseModel):
     """When checkpoints are written and how far back they are kept."""
 
-    model_config = _SECTION
+    model_config = SECTION
 
     period_s: Annotated[float, Field(ge=0, le=1e7)] = 60.0
     """Time between checkpoints while the map changes; 0: only on request."""
@@ -147,7 +142,7 @@ class StoreSettings(BaseModel):
 class ServiceSettings(BaseModel):
     """Limits of the network service."""
 
-    model_config = _SECTION
+    model_config = SECTION
 
     scan_queue: Annotated[int, Field(ge=1, le=10_000)] = 32
     """Scans that wait; the oldest is pushed out, and counted."""
@@ -200,7 +195,7 @@ class Settings(BaseModel):
     Lengths that are not given are in proportion to ``field.leaf_m``.
     """
 
-    model_config = _RECORD
+    model_config = RECORD
 
     field: FieldSettings = FieldSettings()
     scan: ScanSettings = ScanSettings()

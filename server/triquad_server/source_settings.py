@@ -3,7 +3,9 @@
 import math
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
+
+from triquad_server.settings_section import SECTION
 
 _Coordinate = Annotated[float, Field(ge=-20, le=20)]
 # A file has lists, not tuples.
@@ -16,13 +18,7 @@ _MAX_BOX_VOXELS = 100_000  # that are marked with each scan
 class SourceSettings(BaseModel):
     """What is particular to the scans of one source."""
 
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
-        strict=True,
-    )
+    model_config = SECTION
 
     range_min_m: Annotated[float, Field(ge=0, le=1000)] | None = None
     """Nearer points are dropped; by default as in `[scan]`."""

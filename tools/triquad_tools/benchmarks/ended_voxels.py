@@ -6,6 +6,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.status import Status
 from triquad_map.view import MapView
+from triquad_sensors.pose import moved
 from triquad_sensors.sweep import PosedScan
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
@@ -37,7 +38,7 @@ def end_keys(scan: PosedScan, settings: Settings) -> Longs:
     A point has none where its voxel holds no end of a ray that a map with such settings uses.
     """
     pose, leaf_m = scan.world_from_sensor, settings.field.leaf_m
-    points = scan.points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    points = moved(scan.points, pose)
     ends = usable_rays(scan.points.astype(np.float32), pose, settings.scan).ends
     keys = voxel_keys(points, leaf_m)
     return np.where(np.isin(keys, voxel_keys(ends, leaf_m)), keys, _NONE)

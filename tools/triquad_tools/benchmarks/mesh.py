@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from triquad_client import Client, Mesh, MeshWatch
 from triquad_format.records.arrays import Bools
 from triquad_format.wire.tile_codec import decode_tile
+from triquad_sensors.pose import moved
 from triquad_server.epochs import Epoch
 from triquad_server.mesh.mesher import TileIndex, tile_lattice
 from triquad_server.mesh.tile_cache import TileCache
@@ -162,7 +163,7 @@ def _work(made: BenchStreet) -> list[Figure]:
     meshed = cache.tiles_made - whole
     changed = _changed(before, epoch, settings.mesh)
     lattice = tile_lattice(settings.mesh, 0)
-    ends = scan.points @ scan.world_from_sensor[:3, :3].T + scan.world_from_sensor[:3, 3]
+    ends = moved(scan.points, scan.world_from_sensor)
     hit = len(lattice.tiles_meeting(ends, ends, lattice.margin_m))
     return [
         Figure("tiles that may hold a surface", whole, ""),

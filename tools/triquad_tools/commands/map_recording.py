@@ -15,6 +15,7 @@ from triquad_server.launch import choose_device, warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_server.settings_loading import PRESETS, load_settings
+from triquad_server.threads import Teams
 
 from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, ToolError, run
@@ -42,12 +43,16 @@ def _map(options: argparse.Namespace) -> int:
     device = choose_device(options.device)
     selection = open_selected(options)
     key = mapping_key(selection, settings)
-    with stop_requests() as stop, closing(UnfinishedMap(output, key)) as unfinished:
-        _prepare(settings, device, stop.is_set)
+    with (
+        stop_requests() as stop,
+        closing(UnfinishedMap(output, key)) as unfinished,
+        closing(Teams()) as teams,
+    ):
+        _prepare(settings, device, teams, stop=stop.is_set)
         at = unfinished.position()
         if at.scans_taken:
             print(f"going on after scan {at.scans_taken}, from {unfinished.folder}")
-        mapper = resumed_mapper(at.record, settings, device)
+        mapper = resumed_mapper(at.record, settings, device, teams=teams)
         warnings = ScanWarnings(ScanQueue(1), settings)
         mapping = MappingRun(mapper, unfinished, warnings, stop=stop.is_set)
         mapping.take(selection, at.scans_taken)
@@ -69,7 +74,7 @@ def _map(options: argparse.Namespace) -> int:
     return OK
 
 
-def _prepare(settings: Settings, device: str, stop: Callable[[], bool]) -> None:
+def _prepare(settings: Settings, device: str, teams: Teams, *, stop: Callable[[], bool]) -> None:
     """Have all kernels compiled, which takes a minute the first time.
 
     Raises:
@@ -82,7 +87,7 @@ def _prepare(settings: Settings, device: str, stop: Callable[[], bool]) -> None:
                 raise KeyboardInterrupt
             report(0.0, stage)
 
-        warm_up(settings, device, report=begin)
+        warm_up(settings, device, teams, report=begin)
 
 
 def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> None:

@@ -13,7 +13,7 @@ from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
-from triquad_tools.console.progress import progress
+from triquad_tools.console.progress import Speed, progress
 from triquad_tools.recordings.arguments import add_recording, flags_of, options_of
 from triquad_tools.recordings.listing import print_contents
 from triquad_tools.recordings.opening import open_recording
@@ -149,13 +149,13 @@ class _Publisher:
             keep_few_pending(self._client, self.published)
 
     def _note(self, done: int, total: int, seconds: float) -> str:
-        rate_hz = done / max(seconds, 1e-9)
+        speed = Speed.of(done, total - done, seconds)
         if time.monotonic() >= self._next_look:
             self._next_look = time.monotonic() + _LOOK_PERIOD_S
             self._lost_now = _lost(self._client)
         lost = self._lost_now - self._lost_before
-        left_s = (total - done) / rate_hz
-        return f"{done} of {total} scans, {rate_hz:.1f} /s, {lost} lost, {left_s:.0f} s left"
+        rate = f"{speed.per_s:.1f} /s, {lost} lost, {speed.left_s:.0f} s left"
+        return f"{done} of {total} scans, {rate}"
 
 
 def _lost(client: Client) -> int:

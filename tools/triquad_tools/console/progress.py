@@ -4,11 +4,27 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 
 Report = Callable[[float, str], None]
 """Takes how much is done, in the units of the total, and a note."""
 
+
 _LINE_PERIOD_S = 10.0
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How quickly work goes, and for how long it will."""
+
+    per_s: float
+    left_s: float
+
+    @classmethod
+    def of(cls, done: float, left: float, seconds: float) -> "Speed":
+        """That of work of which so much was done in ``seconds``."""
+        per_s = done / max(seconds, 1e-9)
+        return cls(per_s, left / max(per_s, 1e-9))
 
 
 def progress(title: str, total: float | None = None) -> AbstractContextManager[Report]:

@@ -12,8 +12,9 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
+from triquad_server.threads import Teams
 
-from triquad_tools.console.progress import progress
+from triquad_tools.console.progress import Speed, progress
 from triquad_tools.mapping.unfinished import MAP_NAME, UnfinishedMap
 from triquad_tools.recordings.selection import Selection
 
@@ -40,9 +41,11 @@ def stop_requests() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def resumed_mapper(record: MapRecord | None, settings: Settings, device: str) -> Mapper:
+def resumed_mapper(
+    record: MapRecord | None, settings: Settings, device: str, *, teams: Teams
+) -> Mapper:
     """A mapper that goes on with a map; ``None``: with an empty one."""
-    mapper = Mapper(MAP_NAME, settings, device, record)
+    mapper = Mapper(MAP_NAME, settings, device, record=record, teams=teams)
     # What comes from now on is of a later epoch than the checkpoint.
     mapper.publish()
     return mapper
@@ -96,12 +99,10 @@ class MappingRun:
                     self.last_refusal = f"scan {self.scans_taken}: {error}"
                 self.scans_taken += 1
                 self._mapper.train()
-                rate_hz = (self.scans_taken - start) / (time.monotonic() - began)
-                left_s = (total - self.scans_taken) / rate_hz
-                report(
-                    self.scans_taken,
-                    f"{self.scans_taken} of {total} scans, {rate_hz:.1f} /s, {left_s:.0f} s left",
-                )
+                taken = self.scans_taken
+                speed = Speed.of(taken - start, total - taken, time.monotonic() - began)
+                rate = f"{speed.per_s:.1f} /s, {speed.left_s:.0f} s left"
+                report(taken, f"{taken} of {total} scans, {rate}")
 
     def settle(self) -> None:
         """Train until nothing is left to learn.
@@ -110,17 +111,16 @@ class MappingRun:
             KeyboardInterrupt: the user wants to stop; all that was done is saved.
         """
         mapper = self._mapper
-        owed = mapper.samples_left
-        trained = mapper.samples_trained
+        total, trained = mapper.samples_left, mapper.samples_trained
         began = time.monotonic()
-        with progress("training", owed) as report:
+        with progress("training", total) as report:
             while not mapper.settled:
                 self._between_steps()
                 mapper.train()
-                done = mapper.samples_trained - trained
-                rate = done / (time.monotonic() - began)
-                left = mapper.samples_left
-                report(owed - left, f"{rate / 1e6:.2f} M samples/s, {left / rate:.0f} s left")
+                done, left = mapper.samples_trained - trained, mapper.samples_left
+                speed = Speed.of(done, left, time.monotonic() - began)
+                rate = f"{speed.per_s / 1e6:.2f} M samples/s, {speed.left_s:.0f} s left"
+                report(total - left, rate)
 
     def _between_steps(self) -> None:
         if self._stop():

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
+from triquad_sensors.pose import moved
 from triquad_sensors.sweep import PosedScan
 
 _MERGED_POINTS = 2_000_000  # fewer are not worth a merge
@@ -33,9 +34,7 @@ def world_points(scan: PosedScan, range_min_m: float = 0.0, range_max_m: float =
     """The finite points ``[N, 3]`` of a scan within limits of the range, world frame."""
     points = points_in_range(scan.points, range_min_m, range_max_m)
     points = points[np.isfinite(points).all(axis=1)]
-    pose = scan.world_from_sensor
-    world: Doubles = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-    return world
+    return moved(points, scan.world_from_sensor)
 
 
 def thin(points: Doubles, voxel_m: float) -> Doubles:

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.arrays import Floats
 from triquad_sensors.errors import NoTransformError
 from triquad_sensors.motion.placing import place
 from triquad_sensors.point_times import offsets_s
+from triquad_sensors.pose import moved
 from triquad_sensors.sweep import PosedScan, Sweep
 
 from triquad_tools.console.command import ToolError
@@ -61,7 +61,6 @@ class CloudFolder:
     placed: PlacedFiles
     trajectory: Trajectory
     options: CloudOptions
-    choice: tuple[str, ...]  # remarks on the trajectory
 
     @property
     def entries(self) -> Sequence[ScanEntry]:
@@ -84,7 +83,7 @@ class CloudFolder:
     @property
     def remarks(self) -> Sequence[str]:
         """On clouds without a pose, and on files that were not used."""
-        return [*self.choice, *self.placed.remarks]
+        return self.placed.remarks
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
         """The finite points of the scans of these numbers."""
@@ -96,8 +95,8 @@ class CloudFolder:
         finite = np.isfinite(points).all(axis=1)
         points = points[finite]
         if self.options.points_in == "world":
-            sensor_from_world = np.linalg.inv(file.world_from_sensor)
-            return PosedScan(_moved(points, sensor_from_world), file.world_from_sensor)
+            inner = moved(points, np.linalg.inv(file.world_from_sensor))
+            return PosedScan(inner.astype(np.float32), file.world_from_sensor)
         single: Floats = points.astype(np.float32)
         frames = self.trajectory.frames
         if times is not None and frames is not None and self.options.deskew:
@@ -127,7 +126,8 @@ def read_cloud_folder(folder: Path, options: CloudOptions | None = None) -> Clou
     trajectory = read_trajectory(chosen.path)
     if sum(look_through(paths, _FORMATS[paths[0].suffix.lower()].check)) == 0:
         raise ToolError(f"{paths[0].parent}: none of the {len(paths)} files holds any points")
-    recording = CloudFolder(place_files(paths, trajectory), trajectory, options, chosen.remarks)
+    placed = place_files(paths, trajectory).with_remarks(chosen.remarks)
+    recording = CloudFolder(placed, trajectory, options)
     if options.points_in is None:
         _check_frame(recording)
     return recording
@@ -189,9 +189,3 @@ def _lies_around_its_place(file: PlacedFile) -> bool:
     from_origin = np.median(np.linalg.norm(points, axis=1))
     from_place = np.median(np.linalg.norm(points - file.world_from_sensor[:3, 3], axis=1))
     return bool(from_place * _CLEARLY < from_origin)
-
-
-def _moved(points: Doubles, pose: NDArray[np.floating]) -> Floats:
-    """Points [N, 3] by a pose: in double precision, for they may lie far from the origin."""
-    moved: Floats = (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-    return moved

@@ -56,7 +56,6 @@ class DepthFolder:
     camera: Camera
     units_per_metre: float
     stride: int
-    choice: tuple[str, ...]  # remarks on the trajectory
 
     @property
     def entries(self) -> Sequence[ScanEntry]:
@@ -77,7 +76,7 @@ class DepthFolder:
     @property
     def remarks(self) -> Sequence[str]:
         """On images without a pose, and on files that were not used."""
-        return [*self.choice, *self.placed.remarks]
+        return self.placed.remarks
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
         """The scans of these numbers; one without points where an image shows nothing."""
@@ -117,12 +116,11 @@ def read_depth_folder(folder: Path, options: DepthOptions | None = None) -> Dept
     else:
         placed = place_by_time(images.paths, images.stamps_ns, trajectory)
     return DepthFolder(
-        placed,
+        placed.with_remarks(chosen.remarks),
         trajectory,
         camera=camera,
         units_per_metre=options.units_per_metre or images.units_per_metre,
         stride=options.stride,
-        choice=chosen.remarks,
     )
 
 

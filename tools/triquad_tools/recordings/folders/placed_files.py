@@ -39,7 +39,11 @@ class PlacedFiles(NamedTuple):
     """The files that can be mapped, in the order of their stamps."""
 
     files: tuple[PlacedFile, ...]
-    remarks: tuple[str, ...]  # on those that cannot
+    remarks: tuple[str, ...]  # on those that cannot, and on what else was not used
+
+    def with_remarks(self, remarks: tuple[str, ...]) -> "PlacedFiles":
+        """The same files, with other remarks before their own."""
+        return self._replace(remarks=(*remarks, *self.remarks))
 
     @property
     def entries(self) -> list[ScanEntry]:
