@@ -1,0 +1,49 @@
+"""Work that is done again and again in the background."""
+
+import logging
+import threading
+from collections.abc import Callable
+
+from triquad_format.errors import TriquadError
+
+_log = logging.getLogger(__name__)
+
+
+class Refresher:
+    """Calls ``refresh`` on a thread of its own: whenever it is woken, and after each period.
+
+    Where that raises, ``failed`` is told in words, and it is tried again after the period.
+    """
+
+    def __init__(
+        self, name: str, refresh: Callable[[], None], period_s: float, failed: Callable[[str], None]
+    ) -> None:
+        self._refresh = refresh
+        self._period_s = period_s
+        self._failed = failed
+        self._woken = threading.Event()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Let it be done soon."""
+        self._woken.set()
+
+    def close(self) -> None:
+        """Do it no more; one that is under way ends first."""
+        self._stopping = True
+        self._woken.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping:
+            self._woken.clear()
+            try:
+                self._refresh()
+            except TriquadError as error:
+                self._failed(str(error))
+            except Exception as error:
+                _log.exception("%s failed", self._thread.name)
+                self._failed(f"{type(error).__name__}: {error}")
+            self._woken.wait(self._period_s)

@@ -1,0 +1,44 @@
+"""The web server that shows a map."""
+
+import threading
+
+import viser
+
+from triquad_tools.viewer.map_source import MapSource
+from triquad_tools.viewer.visit import Visit
+
+
+class Viewer:
+    """Serves a page that shows a map, to several browsers, until it is closed."""
+
+    def __init__(self, source: MapSource, host: str, port: int) -> None:
+        self._source = source
+        self._visits: dict[int, Visit] = {}
+        self._changing = threading.Lock()
+        self._server = viser.ViserServer(host, port, label="triquad", verbose=False)
+        self._server.on_client_connect(self._enter)
+        self._server.on_client_disconnect(self._leave)
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    def close(self) -> None:
+        """Serve no longer."""
+        with self._changing:
+            visits = list(self._visits.values())
+        for visit in visits:
+            visit.close()
+        self._server.stop()
+
+    def _enter(self, client: viser.ClientHandle) -> None:
+        visit = Visit(client, self._source)
+        with self._changing:
+            self._visits[client.client_id] = visit
+
+    def _leave(self, client: viser.ClientHandle) -> None:
+        with self._changing:
+            visit = self._visits.pop(client.client_id, None)
+        if visit is not None:
+            visit.close()
