@@ -115,7 +115,8 @@ class MeshLayer:
         self._cells_m = np.append(
             self._cells_m, sizes.cell_of(COARSEST) * 2.0 ** np.arange(1, _THINNED_LEVELS + 1)
         )
-        with stage.gui.add_folder("Mesh"):
+        self._folder = stage.gui.add_folder("Mesh")
+        with self._folder:
             self._pixels = stage.gui.add_slider("Pixels per cell", 1, 20, 1, 4)
         self._refresher = Refresher("mesh", self._refresh, _PERIOD_S, stage.failed)
         self._pixels.on_update(lambda _: self._refresher.wake())
@@ -127,8 +128,9 @@ class MeshLayer:
         self._whole.close()
         for near in self._near:
             near.close()
-        for drawn in self._drawn.values():
-            drawn.handle.remove()
+        for handle in (*self._retired, *(drawn.handle for drawn in self._drawn.values())):
+            handle.remove()
+        self._folder.remove()
 
     def _refresh(self) -> None:
         for handle in self._retired:  # what came in their place is drawn by now
