@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Protocol
 
-import numpy as np
 import viser
 
 from triquad_tools.viewer.map_source import MapSource
@@ -39,7 +38,7 @@ class Visit:
         """Show another map."""
         self._clear()
         self._title.content = f"**{source.title}**"
-        stage = Stage(self._client, source, np.zeros(3), self._failed)
+        stage = Stage(self._client, source, self._failed)
         self._layers = [layer(stage) for layer in _LAYERS]
 
     def close(self) -> None:
