@@ -8,6 +8,8 @@ from triquad_format.errors import TriquadError
 
 _log = logging.getLogger(__name__)
 
+_LEAST_S = 0.05  # between one time and the next, however often it is woken
+
 
 class Refresher:
     """Calls ``refresh`` on a thread of its own: whenever it is woken, and after each period.
@@ -22,7 +24,7 @@ class Refresher:
         self._period_s = period_s
         self._failed = failed
         self._woken = threading.Event()
-        self._stopping = False
+        self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -32,12 +34,12 @@ class Refresher:
 
     def close(self) -> None:
         """Do it no more; one that is under way ends first."""
-        self._stopping = True
+        self._stopped.set()
         self._woken.set()
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._stopping:
+        while not self._stopped.is_set():
             self._woken.clear()
             try:
                 self._refresh()
@@ -46,4 +48,5 @@ class Refresher:
             except Exception as error:
                 _log.exception("%s failed", self._thread.name)
                 self._failed(f"{type(error).__name__}: {error}")
+            self._stopped.wait(_LEAST_S)
             self._woken.wait(self._period_s)
