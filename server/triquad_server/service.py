@@ -28,6 +28,7 @@ from triquad_format.wire.query_messages import (
     SegmentsRequest,
     SpheresRequest,
 )
+from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.change_queries import ChangeQueries
@@ -44,6 +45,7 @@ from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.net.requests import Handler, RequestHandlers, answering, payload_limit
 from triquad_server.settings import Settings
+from triquad_server.source_queries import SourceQueries
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.store import Store
@@ -122,6 +124,7 @@ class Service:
         )
         self._serve_queries()
         self._serve_changes(health.server)
+        self._serve_sources(health.server)
         tiles = self._serve_mesh(health.server)
         self._serve_status(health)
         self._serve_downloads()
@@ -207,6 +210,10 @@ class Service:
     def _serve_changes(self, server: str) -> None:
         queries = ChangeQueries(self._mapper.epochs, self._mapper.surface, server)
         self._serve({keys.CHANGES: answering(ChangesRequest, queries.changes)})
+
+    def _serve_sources(self, server: str) -> None:
+        queries = SourceQueries(self._mapper.trails, server)
+        self._serve({keys.SOURCES: answering(SourcesRequest, queries.sources)})
 
     def _serve_mesh(self, server: str) -> TileFeed:
         """Queries of mesh tiles, and following them; the feed of what changes."""

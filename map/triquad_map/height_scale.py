@@ -1,0 +1,53 @@
+"""Colours of heights, the same in all that shows a map: pictures, viewers, previews in map files.
+
+They are the upper four fifths of viridis, from blue below to yellow above: steps of the same height
+look the same, also to those who see no red or no green, and the darkest is bright enough to be
+shaded.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
+
+HEIGHT_STOPS: Doubles = np.array(
+    [
+        [0.254, 0.265, 0.530],
+        [0.207, 0.372, 0.553],
+        [0.164, 0.471, 0.558],
+        [0.128, 0.567, 0.551],
+        [0.135, 0.659, 0.518],
+        [0.267, 0.749, 0.441],
+        [0.478, 0.821, 0.318],
+        [0.741, 0.873, 0.150],
+        [0.993, 0.906, 0.144],
+    ]
+)
+"""``[9, 3]`` sRGB in [0, 1], evenly spaced from the bottom of a scale to its top."""
+
+_MOST = (0.01, 0.99)  # a treetop or a hole does not take the colours from all else
+_LEAST_RANGE_M = 0.1  # noise on a floor is no relief
+
+
+@dataclass(frozen=True)
+class HeightScale:
+    """Colours for heights from ``low_m`` to ``high_m``; what lies beyond has those of its ends."""
+
+    low_m: float
+    high_m: float
+
+    @classmethod
+    def around(cls, heights_m: NDArray[np.floating]) -> "HeightScale":
+        """The scale for 98 % of heights ``[N]``, at least 0.1 m of them."""
+        if not len(heights_m):
+            return cls(0.0, _LEAST_RANGE_M)
+        low, high = (float(end) for end in np.quantile(heights_m, _MOST))
+        short = max(_LEAST_RANGE_M - (high - low), 0.0)
+        return cls(low - short / 2, high + short / 2)
+
+    def colours(self, heights_m: NDArray[np.floating]) -> Doubles:
+        """Colours ``[N, 3]``, sRGB in [0, 1], of heights ``[N]``."""
+        place = (np.asarray(heights_m, np.float64) - self.low_m) / (self.high_m - self.low_m)
+        stops = np.linspace(0.0, 1.0, len(HEIGHT_STOPS))
+        return np.stack([np.interp(place, stops, channel) for channel in HEIGHT_STOPS.T], axis=1)
