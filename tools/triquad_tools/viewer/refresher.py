@@ -14,7 +14,8 @@ _LEAST_S = 0.05  # between one time and the next, however often it is woken
 class Refresher:
     """Calls ``refresh`` on a thread of its own: whenever it is woken, and after each period.
 
-    Where that raises, ``failed`` is told in words, and it is tried again after the period.
+    Where that raises, ``failed`` is told in words, and it is tried again after the period; once
+    that succeeds, ``failed`` is told the empty text.
     """
 
     def __init__(
@@ -39,14 +40,23 @@ class Refresher:
         self._thread.join()
 
     def _run(self) -> None:
+        told = ""
         while not self._stopped.is_set():
             self._woken.clear()
-            try:
-                self._refresh()
-            except TriquadError as error:
-                self._failed(str(error))
-            except Exception as error:
-                _log.exception("%s failed", self._thread.name)
-                self._failed(f"{type(error).__name__}: {error}")
+            problem = self._problem()
+            if problem or told:
+                self._failed(problem)
+            told = problem
             self._stopped.wait(_LEAST_S)
             self._woken.wait(self._period_s)
+
+    def _problem(self) -> str:
+        """Do it once; returns what went wrong, the empty text for nothing."""
+        try:
+            self._refresh()
+        except TriquadError as error:
+            return str(error)
+        except Exception as error:
+            _log.exception("%s failed", self._thread.name)
+            return f"{type(error).__name__}: {error}"
+        return ""

@@ -5,6 +5,9 @@ from typing import Protocol
 
 import viser
 
+from triquad_tools.viewer.asking.click_layer import ClickLayer
+from triquad_tools.viewer.asking.slice_layer import SliceLayer
+from triquad_tools.viewer.asking.unknown_layer import UnknownLayer
 from triquad_tools.viewer.map_source import MapSource
 from triquad_tools.viewer.mesh_layer import MeshLayer
 from triquad_tools.viewer.stage import Stage
@@ -17,7 +20,7 @@ class Layer(Protocol):
         """Draw no more; what was drawn and the folder go."""
 
 
-_LAYERS: tuple[Callable[[Stage], Layer], ...] = (MeshLayer,)
+_LAYERS: tuple[Callable[[Stage], Layer], ...] = (MeshLayer, SliceLayer, UnknownLayer, ClickLayer)
 
 
 class Visit:
