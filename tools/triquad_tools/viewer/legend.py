@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
+from triquad_map.height_scale import HEIGHT_STOPS
 
-_COLOURS = colormaps["viridis"]
-_STOPS = 11
 _TICKS = 5
 
 
@@ -37,14 +35,15 @@ class Scale:
 
 def scale_colours(scale: Scale, values: NDArray[np.floating]) -> Doubles:
     """Linear colours [N, 3] of values [N]."""
-    places = np.clip((values - scale.low) / (scale.high - scale.low), 0.0, 1.0)
-    encoded = np.asarray(_COLOURS(places))[:, :3]
-    return np.asarray(encoded**2.2, np.float64)
+    places = (np.asarray(values, np.float64) - scale.low) / (scale.high - scale.low)
+    stops = np.linspace(0.0, 1.0, len(HEIGHT_STOPS))
+    encoded = [np.interp(places, stops, channel) for channel in HEIGHT_STOPS.T]
+    return np.stack(encoded, axis=1) ** 2.2
 
 
 def legend_html(scale: Scale) -> str:
     """The scale for the panel."""
-    stops = ", ".join(to_hex(_COLOURS(place)) for place in np.linspace(0.0, 1.0, _STOPS))
+    stops = ", ".join(to_hex(stop) for stop in HEIGHT_STOPS)
     ticks = "".join(f"<span>{text}</span>" for text in scale.tick_texts)
     return (
         '<div style="padding: 0.2em 1em; font-size: 0.8em">'

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -45,8 +45,8 @@ class Stage:
 
     client: viser.ClientHandle
     source: MapSource
-    failed: Callable[[str], None]  # tells the person what went wrong
-    origin: SceneOrigin = field(default_factory=SceneOrigin)
+    failed: Callable[[str], None]  # shows what went wrong; an empty text: nothing does any more
+    origin: SceneOrigin
 
     @property
     def scene(self) -> viser.SceneApi:

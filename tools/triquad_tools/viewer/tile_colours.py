@@ -61,7 +61,7 @@ class HeightColours:
 
     def values(self, tile: Tile, triangles: Triangles) -> Doubles:
         """Heights of the vertices."""
-        return tile.origin[2] + triangles.vertices[:, 2].astype(np.float64)
+        return np.asarray(tile.origin[2] + triangles.vertices[:, 2], np.float64)
 
 
 @dataclass(frozen=True)

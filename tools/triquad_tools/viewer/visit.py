@@ -1,13 +1,18 @@
 """One browser that looks at the map."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 import viser
 
+from triquad_tools.viewer.live_source import LiveSource
 from triquad_tools.viewer.map_source import MapSource
 from triquad_tools.viewer.mesh_layer import MeshLayer
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.panel import problem_html, text_html
+from triquad_tools.viewer.stage import SceneOrigin, Stage
+from triquad_tools.viewer.status_layer import StatusLayer
+from triquad_tools.viewer.trail_layer import TrailLayer
 
 
 class Layer(Protocol):
@@ -18,28 +23,38 @@ class Layer(Protocol):
 
 
 _LAYERS: tuple[Callable[[Stage], Layer], ...] = (MeshLayer,)
+_LIVE_LAYERS: tuple[Callable[[LiveSource, Stage], Layer], ...] = (StatusLayer, TrailLayer)
 
 
 class Visit:
     """The scene and the panel of one browser, from when it opens the page until it leaves."""
 
     def __init__(self, client: viser.ClientHandle, source: MapSource) -> None:
+        client.gui.configure_theme(
+            control_layout="collapsible", show_logo=False, show_share_button=False
+        )
         client.gui.set_panel_label("triquad")
         client.scene.set_up_direction("+z")
         client.scene.configure_default_lights(cast_shadow=False)
         client.scene.configure_environment_map(None)
-        self._title = client.gui.add_markdown("")
-        self._problem = client.gui.add_markdown("")
+        self._title = client.gui.add_html("")
+        self._problem = client.gui.add_html("")
         self._client = client
         self._layers: list[Layer] = []
+        self._problems: dict[int, str] = {}  # by layer
         self.show(source)
 
     def show(self, source: MapSource) -> None:
         """Show another map."""
         self._clear()
-        self._title.content = f"**{source.title}**"
-        stage = Stage(self._client, source, self._failed)
-        self._layers = [layer(stage) for layer in _LAYERS]
+        self._title.content = text_html(source.title)
+        layers = [*_LAYERS]
+        if isinstance(source, LiveSource):
+            layers += [partial(layer, source) for layer in _LIVE_LAYERS]
+        origin = SceneOrigin()
+        for number, layer in enumerate(layers):
+            failed = partial(self._failed, number)
+            self._layers.append(layer(Stage(self._client, source, failed, origin)))
 
     def close(self) -> None:
         """The browser has left."""
@@ -48,7 +63,12 @@ class Visit:
     def _clear(self) -> None:
         for layer in self._layers:
             layer.close()
-        self._layers = []
+        self._layers.clear()
+        self._problems.clear()
+        self._problem.content = ""
 
-    def _failed(self, problem: str) -> None:
-        self._problem.content = problem
+    def _failed(self, layer: int, problem: str) -> None:
+        """Show what a layer has met; nothing is left of it where the text is empty."""
+        self._problems[layer] = problem
+        different = dict.fromkeys(filter(None, self._problems.values()))
+        self._problem.content = problem_html("\n".join(different))
