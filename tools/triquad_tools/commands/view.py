@@ -11,10 +11,9 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, run
 from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.viewer import Viewer
+from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-view"
-_PORT = 8080
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,6 +41,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--map", default="default", metavar="NAME", help="default: default")
     add("--config", metavar="FILE", help="Zenoh configuration (JSON5), for TLS or credentials")
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="to serve the page at")
-    add("--port", type=int, default=_PORT, metavar="PORT", help=f"default: {_PORT}")
+    add("--port", type=int, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
     add_version(parser)
     return parser

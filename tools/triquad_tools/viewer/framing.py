@@ -11,6 +11,7 @@ from triquad_tools.viewer.stage import Stage
 
 _NEAR_M, _FAR_M = 0.1, 20_000.0
 _VIEW_RAD = math.radians(50.0)
+_PICTURE_ASPECT = 16 / 9  # for which that camera was placed
 _GROWN = 0.02  # share of the camera's distance; a smaller step is not worth a jump
 _SAME = 1e-3
 
@@ -35,6 +36,7 @@ class Framing:
             return
         around = camera_around(points)
         closer = math.tan(0.5 * math.radians(around.view_deg)) / math.tan(0.5 * _VIEW_RAD)
+        closer *= max(1.0, _PICTURE_ASPECT / max(self._stage.client.camera.aspect, 0.1))
         target = self._stage.in_scene(around.target)
         eye = target + closer * (self._stage.in_scene(around.eye) - target)
         away_m = float(np.linalg.norm(eye - target))

@@ -1,11 +1,16 @@
 """The web server that shows a map."""
 
+import io
 import threading
+import warnings
+from contextlib import redirect_stdout
 
 import viser
 
 from triquad_tools.viewer.map_source import MapSource
 from triquad_tools.viewer.visit import Visit
+
+DEFAULT_PORT = 8080
 
 
 class Viewer:
@@ -15,7 +20,10 @@ class Viewer:
         self._source = source
         self._visits: dict[int, Visit] = {}
         self._changing = threading.Lock()
-        self._server = viser.ViserServer(host, port, label="triquad", verbose=False)
+        self._visited = threading.Event()
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
+        with redirect_stdout(io.StringIO()):  # it announces itself in a box
+            self._server = viser.ViserServer(host, port, label="triquad", verbose=False)
         self._server.on_client_connect(self._enter)
         self._server.on_client_disconnect(self._leave)
 
@@ -23,6 +31,10 @@ class Viewer:
     def url(self) -> str:
         """Where the page is."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    def wait_for_visit(self) -> None:
+        """Wait until a browser has opened the page."""
+        self._visited.wait()
 
     def close(self) -> None:
         """Serve no longer."""
@@ -36,6 +48,7 @@ class Viewer:
         visit = Visit(client, self._source)
         with self._changing:
             self._visits[client.client_id] = visit
+        self._visited.set()
 
     def _leave(self, client: viser.ClientHandle) -> None:
         with self._changing:
