@@ -3,7 +3,7 @@
 import io
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -25,9 +25,8 @@ _SOFTWARE_RENDERING = (
 )
 
 
-@contextmanager
-def running_browser() -> Iterator[Browser]:
-    """Chromium, which draws in software.
+def installed() -> str:
+    """Where Chromium is.
 
     Raises:
         ToolError: it is not installed.
@@ -35,6 +34,17 @@ def running_browser() -> Iterator[Browser]:
     path = shutil.which("chromium") or shutil.which("chromium-browser")
     if path is None:
         raise ToolError("Chromium is not installed: apt-get install chromium")
+    return path
+
+
+@contextmanager
+def running_browser() -> Iterator[Browser]:
+    """Chromium, which draws in software.
+
+    Raises:
+        ToolError: it is not installed.
+    """
+    path = installed()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=_SOFTWARE_RENDERING)
         try:
@@ -67,13 +77,23 @@ def drawn_share(page: Page) -> float:
     return float((scene.min(axis=-1) < _BRIGHT).mean())
 
 
-def wait_until_drawn(page: Page, timeout_s: float = 60.0) -> None:
+def wait_until_drawn(page: Page) -> None:
     """Wait until something is drawn.
 
     Raises:
         ToolError: nothing is.
     """
+    wait_until(page, lambda: drawn_share(page) > _NOTHING, "something is drawn")
+
+
+def wait_until(page: Page, holds: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
+    """Wait until something holds of what a page shows; ``what`` says it in words.
+
+    Raises:
+        ToolError: it does not.
+    """
     ends = time.monotonic() + timeout_s
-    while drawn_share(page) < _NOTHING:
+    while not holds():
         if time.monotonic() > ends:
-            raise ToolError(f"the page shows nothing after {timeout_s:g} s")
+            raise ToolError(f"after {timeout_s:g} s it is not so that {what}")
+        page.wait_for_timeout(100)

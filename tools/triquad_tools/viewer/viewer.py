@@ -12,6 +12,9 @@ from triquad_tools.viewer.visit import Visit
 
 DEFAULT_PORT = 8080
 
+_OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
+"""Warnings of viser: a browser that leaves takes with it what is being drawn or removed there."""
+
 
 class Viewer:
     """Serves a page that shows a map, to several browsers, until it is closed."""
@@ -21,8 +24,9 @@ class Viewer:
         self._visits: dict[int, Visit] = {}
         self._changing = threading.Lock()
         self._visited = threading.Event()
-        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
-        with redirect_stdout(io.StringIO()):  # it announces itself in a box
+        for message in _OF_ONE_WHO_LEFT:
+            warnings.filterwarnings("ignore", message, UserWarning)
+        with redirect_stdout(io.StringIO()):  # it has announcements of its own
             self._server = viser.ViserServer(host, port, label="triquad", verbose=False)
         self._server.on_client_connect(self._enter)
         self._server.on_client_disconnect(self._leave)
@@ -42,7 +46,8 @@ class Viewer:
             visits = list(self._visits.values())
         for visit in visits:
             visit.close()
-        self._server.stop()
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
 
     def _enter(self, client: viser.ClientHandle) -> None:
         visit = Visit(client, self._source)

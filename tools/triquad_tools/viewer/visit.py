@@ -30,9 +30,8 @@ class Visit:
     """The scene and the panel of one browser, from when it opens the page until it leaves."""
 
     def __init__(self, client: viser.ClientHandle, source: MapSource) -> None:
-        client.gui.configure_theme(
-            control_layout="collapsible", show_logo=False, show_share_button=False
-        )
+        client.gui.configure_theme(show_logo=False, show_share_button=False)
+        client.gui.main_panel.dock_right()
         client.gui.set_panel_label("triquad")
         client.scene.set_up_direction("+z")
         client.scene.configure_default_lights(cast_shadow=False)
