@@ -38,6 +38,10 @@ class SceneOrigin:
                 self._place = np.round(first / _GRID_M) * _GRID_M
             return self.place
 
+    def in_scene(self, points: NDArray[np.floating]) -> Floats:
+        """Points [..., 3] of the map frame as the scene has them."""
+        return np.asarray(points - self.near(points), np.float32)
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -47,6 +51,7 @@ class Stage:
     source: MapSource
     failed: Callable[[str], None]  # shows what went wrong; an empty text: nothing does any more
     origin: SceneOrigin
+    keeps_camera: bool = False  # it shows the same place as what was shown before
 
     @property
     def scene(self) -> viser.SceneApi:
@@ -60,7 +65,7 @@ class Stage:
 
     def in_scene(self, points: NDArray[np.floating]) -> Floats:
         """Points [..., 3] of the map frame as the scene has them."""
-        return np.asarray(points - self.origin.near(points), np.float32)
+        return self.origin.in_scene(points)
 
     def in_map(self, points: NDArray[np.floating]) -> Doubles:
         """Points [..., 3] of the scene in the map frame."""
