@@ -25,7 +25,7 @@ _PERIOD_S = 1.0
 _BEFORE = "the checkpoint before"
 _DRAWN, _LISTED = 50, 5  # at most, of each kind
 _BESIDE_M = 0.1  # outlines lie so far outside of what they surround
-_DASH_M = 0.4  # and a gap, together
+_DASH_M = 0.8  # and a gap, together
 _DASH_SHARE = 0.6
 _LINE_PX = 3.0
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
@@ -229,7 +229,7 @@ def _list(found: ObjectChanges) -> str:
         "(not drawn: one of the two has never been there)"
     )
     small = found.small.appeared + found.small.vanished
-    lines.append(f"{small} of less than {LEAST_POINTS} voxels are left out")
+    lines.append(f"{small} things of fewer than {LEAST_POINTS} voxels are left out")
     return "\n".join(lines)
 
 

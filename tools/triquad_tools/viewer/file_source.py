@@ -10,8 +10,9 @@ from triquad_client import OfflineMap
 from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import TileIndex
 from triquad_client.offline.map_mesh import BLOCK_CELLS, MeshBlocks
+from triquad_format.mapfile.metadata import utc_time
 
-from triquad_tools.viewer.map_source import COARSEST, TileSizes
+from triquad_tools.viewer.map_source import COARSEST, MapState, TileSizes
 from triquad_tools.viewer.tile_maker import MadeTile, TileMaker
 
 _CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
@@ -34,6 +35,12 @@ class FileSource:
             LevelTiles(opened, (*name, level), level=level, sizes=self.sizes)
             for level in range(COARSEST + 1)
         ]
+
+    def state(self) -> MapState:
+        """What the file holds."""
+        stamp_ns = self.opened.stamp_ns
+        time = utc_time(stamp_ns) if stamp_ns else ""
+        return MapState(self.opened.name, self.opened.epoch, time)
 
     def follow(self, level: int, bounds: Bounds | None = None) -> "FileFollower":
         """The mesh tiles of a level that meet ``bounds``, as they are made here."""

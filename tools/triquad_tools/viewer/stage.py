@@ -9,6 +9,7 @@ import viser
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
+from triquad_tools.viewer.legend import Scale
 from triquad_tools.viewer.map_source import MapSource
 
 _GRID_M = 100.0
@@ -51,6 +52,7 @@ class Stage:
     source: MapSource
     failed: Callable[[str], None]  # shows what went wrong; an empty text: nothing does any more
     origin: SceneOrigin
+    scales: dict[str, Scale]  # of colours that are shown now, by what has them
     keeps_camera: bool = False  # it shows the same place as what was shown before
 
     @property

@@ -118,5 +118,4 @@ class TimePanel:
         if shown is None:
             return
         place = sum(moment.epoch <= shown.epoch for moment in self._moments)
-        count = f"{place} of {len(self._moments)}"
-        self._text.content = text_html(f"{shown}\n{count}, the newest last")
+        self._text.content = text_html(f"{shown}\n{place} of {len(self._moments)}")

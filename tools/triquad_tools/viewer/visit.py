@@ -7,10 +7,12 @@ from typing import Protocol
 import viser
 
 from triquad_tools.viewer.history import History
+from triquad_tools.viewer.legend import Scale
 from triquad_tools.viewer.live_source import LiveSource
 from triquad_tools.viewer.map_source import MapSource
 from triquad_tools.viewer.mesh_layer import MeshLayer
 from triquad_tools.viewer.panel import problem_html, text_html
+from triquad_tools.viewer.screenshot_layer import ScreenshotLayer
 from triquad_tools.viewer.stage import SceneOrigin, Stage
 from triquad_tools.viewer.status_layer import StatusLayer
 from triquad_tools.viewer.time_panel import TimePanel
@@ -24,7 +26,7 @@ class Layer(Protocol):
         """Draw no more; what was drawn and the folder go."""
 
 
-_LAYERS: tuple[Callable[[Stage], Layer], ...] = (MeshLayer,)
+_LAYERS: tuple[Callable[[Stage], Layer], ...] = (MeshLayer, ScreenshotLayer)
 _LIVE_LAYERS: tuple[Callable[[LiveSource, Stage], Layer], ...] = (StatusLayer, TrailLayer)
 
 
@@ -60,9 +62,17 @@ class Visit:
         layers = [*_LAYERS]
         if isinstance(source, LiveSource):
             layers += [partial(layer, source) for layer in _LIVE_LAYERS]
+        scales: dict[str, Scale] = {}
         for number, layer in enumerate(layers):
             failed = partial(self._failed, number)
-            stage = Stage(self._client, source, failed, self._origin, keeps_camera=keeps_camera)
+            stage = Stage(
+                self._client,
+                source,
+                failed,
+                origin=self._origin,
+                scales=scales,
+                keeps_camera=keeps_camera,
+            )
             self._layers.append(layer(stage))
 
     def close(self) -> None:
