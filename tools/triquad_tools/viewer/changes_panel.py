@@ -15,12 +15,13 @@ from triquad_tools.mapfiles.object_changes import (
     ObjectChanges,
     object_changes,
 )
-from triquad_tools.plots.diff_plan import APPEARED, MOVED, VANISHED
 from triquad_tools.viewer.history import History, Moment
 from triquad_tools.viewer.panel import text_html
 from triquad_tools.viewer.refresher import Refresher
 from triquad_tools.viewer.stage import SceneOrigin
 
+# Of Okabe and Ito's colours, which all can tell apart, those that stand out on mesh and background.
+APPEARED, VANISHED, MOVED = "#56b4e9", "#d55e00", "#cc79a7"
 _PERIOD_S = 1.0
 _BEFORE = "the checkpoint before"
 _DRAWN, _LISTED = 50, 5  # at most, of each kind
@@ -146,7 +147,7 @@ class ChangesPanel:
         self._add_lines(name, _dashes(lines) if change.dashed else lines, change.colour)
         top = change.cluster.middle_m + [0, 0, change.cluster.size_m[2] / 2 + 2 * _BESIDE_M]
         place = self._origin.in_scene(top)
-        self._handles.append(self._scene.add_label(f"{name}/name", change.name, position=place))
+        self._handles.append(self._scene.add_label(f"{name}_name", change.name, position=place))
 
     def _add_lines(self, name: str, lines: Doubles, colour: str) -> None:
         """Draw lines [L, 2, 3], metres, map frame."""
