@@ -19,7 +19,7 @@ from triquad_tools.benchmarks.served import MAP, Served, served, stream_beside_p
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.map_source import COARSEST, TileSizes
+from triquad_tools.viewer.map_source import COARSEST, MapState, TileSizes
 from triquad_tools.viewer.viewer import Viewer
 
 _ROUNDS = 3
@@ -136,6 +136,10 @@ class RepeatedSource:
                     _repeated(watch.tiles, level, watch.tile_side_m)
                 )
         return cls(client, live.sizes, followers)
+
+    def state(self) -> MapState:
+        """Of no map that there is."""
+        return MapState(self.title, 0, "")
 
     def follow(self, level: int, bounds: Bounds | None = None) -> RepeatedFollower:  # noqa: ARG002
         """All tiles of a level."""

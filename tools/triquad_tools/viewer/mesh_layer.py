@@ -116,6 +116,7 @@ class MeshLayer:
             colours = ConfidenceColours(self._stage.source.queries)
         else:
             colours = HeightColours.of_heights(points[:, 2])
+        self._stage.scales["mesh"] = colours.scale
         legend = legend_html(colours.scale)
         if self._legend.content != legend:
             self._legend.content = legend

@@ -7,6 +7,7 @@ from contextlib import redirect_stdout
 
 import viser
 
+from triquad_tools.viewer.history import History
 from triquad_tools.viewer.map_source import MapSource
 from triquad_tools.viewer.visit import Visit
 
@@ -19,8 +20,8 @@ _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove a
 class Viewer:
     """Serves a page that shows a map, to several browsers, until it is closed."""
 
-    def __init__(self, source: MapSource, host: str, port: int) -> None:
-        self._source = source
+    def __init__(self, shown: MapSource | History, host: str, port: int) -> None:
+        self._shown = shown
         self._visits: dict[int, Visit] = {}
         self._changing = threading.Lock()
         self._visited = threading.Event()
@@ -50,7 +51,7 @@ class Viewer:
             self._server.stop()
 
     def _enter(self, client: viser.ClientHandle) -> None:
-        visit = Visit(client, self._source)
+        visit = Visit(client, self._shown)
         with self._changing:
             self._visits[client.client_id] = visit
         self._visited.set()
