@@ -1,20 +1,27 @@
-"""``triquad-view``: a map in the browser, as it grows."""
+"""``triquad-view``: a map in the browser, as it grows, or as a file or a store has it."""
 
 import argparse
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from functools import partial
+from pathlib import Path
 
 import triquad_client
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 from triquad_tools.console.arguments import add_version
-from triquad_tools.console.command import OK, run
+from triquad_tools.console.command import OK, ToolError, complain, refuse, run
+from triquad_tools.console.progress import progress
+from triquad_tools.viewer.file_source import FileSource
+from triquad_tools.viewer.history import DamagedError, History
 from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.viewer import Viewer
+from triquad_tools.viewer.map_source import MapSource
+from triquad_tools.viewer.open_maps import OpenMaps
+from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-view"
-_PORT = 8080
+_PREPARED_S = 10.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -23,25 +30,83 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
-    with triquad_client.connect(options.connect, options.map, config=options.config) as client:
-        viewer = Viewer(LiveSource(client, options.connect), options.host, options.port)
+    _check_usage(options)
+    with _shown(options) as shown, closing(Viewer(shown, options.host, options.port)) as viewer:
         print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
-        try:
-            threading.Event().wait()
-        finally:
-            viewer.close()
+        threading.Event().wait()
     return OK
+
+
+def _check_usage(options: argparse.Namespace) -> None:
+    """Refuse what does not go together."""
+    server = options.connect or options.map or options.config
+    refuse(
+        {"--connect, --map and --config are for a server, not for a file": options.file and server}
+    )
+
+
+@contextmanager
+def _shown(options: argparse.Namespace) -> Iterator[MapSource | History]:
+    if options.file is None:
+        endpoint, name = options.connect or DEFAULT_ENDPOINT, options.map or "default"
+        with triquad_client.connect(endpoint, name, config=options.config) as client:
+            yield LiveSource(client, endpoint)
+        return
+    with closing(OpenMaps()) as maps:
+        yield _store(options.file, maps) if options.file.is_dir() else _file(options.file, maps)
+
+
+def _file(path: Path, maps: OpenMaps) -> FileSource:
+    """The map in a file, ready to be shown."""
+    with progress(f"opening {path}") as report:
+        source = maps.use(path)
+        source.prepare(_PREPARED_S)
+        report(1, _told(source))
+    return source
+
+
+def _store(path: Path, maps: OpenMaps) -> History:
+    """The checkpoints of a store; the newest that can be shown is ready."""
+    history = History(path, maps)
+    while moments := history.moments:
+        with progress(f"opening {moments[-1].path}") as report, suppress(DamagedError):
+            source = history.use(moments[-1])
+            source.prepare(_PREPARED_S)
+            report(1, _told(source))
+            history.release(moments[-1])  # it stays open for whoever comes first
+            break
+    for problem in history.damaged:
+        complain(_COMMAND, problem, OK)
+    if not moments:
+        raise ToolError(f"{path}: nothing is left; triquad-pack --recover saves what is intact")
+    print(f"{len(moments)} checkpoints: epochs {moments[0].epoch} to {moments[-1].epoch}")
+    return history
+
+
+def _told(source: FileSource) -> str:
+    """What is worth knowing of a map that was opened."""
+    opened = source.opened
+    slow = "" if opened.compiled else "; slowly: pip install 'triquad[fast]'"
+    return f"map {opened.name!r}, epoch {opened.epoch}{slow}"
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog=_COMMAND, description="Show a map in the browser, as it grows."
+        prog=_COMMAND,
+        description="Show a map in the browser: of a server, as it grows, or of a file.",
     )
     add = parser.add_argument
-    add("--connect", default=DEFAULT_ENDPOINT, metavar="ENDPOINT", help="of the server")
-    add("--map", default="default", metavar="NAME", help="default: default")
+    add(
+        "file",
+        type=Path,
+        nargs="?",
+        metavar="FILE_OR_STORE",
+        help="a map file, or a store with its history, to be shown without a server",
+    )
+    add("--connect", metavar="ENDPOINT", help=f"of the server (default: {DEFAULT_ENDPOINT})")
+    add("--map", metavar="NAME", help="of the server's map (default: default)")
     add("--config", metavar="FILE", help="Zenoh configuration (JSON5), for TLS or credentials")
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="to serve the page at")
-    add("--port", type=int, default=_PORT, metavar="PORT", help=f"default: {_PORT}")
+    add("--port", type=int, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
     add_version(parser)
     return parser

@@ -15,7 +15,7 @@ _READY_TIMEOUT_S = 300.0  # kernels are compiled on the first start
 _STOP_TIMEOUT_S = 60.0
 
 
-def _free_endpoint() -> str:
+def free_endpoint() -> str:
     """An endpoint on a port of the loopback that nothing uses."""
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
@@ -23,17 +23,20 @@ def _free_endpoint() -> str:
 
 
 class DemoServer:
-    """A running server on a free port; leaving the ``with`` statement stops it in any case."""
+    """A running server; leaving the ``with`` statement stops it in any case."""
 
-    def __init__(self, folder: Path, map_name: str, arguments: Sequence[str] = ()) -> None:
+    def __init__(
+        self, folder: Path, map_name: str, arguments: Sequence[str] = (), endpoint: str = ""
+    ) -> None:
         """Start the process, with store and log in a folder, and wait until it is ready.
 
-        ``arguments`` are further ones of its command line.
+        ``arguments`` are further ones of its command line; without an ``endpoint`` a free one of
+        the loopback is taken.
 
         Raises:
             ToolError: it ended before, or took too long.
         """
-        self.endpoint = _free_endpoint()
+        self.endpoint = endpoint or free_endpoint()
         self._log = folder / "server.log"
         self._started = threading.Event()  # ready, or ended
         self._ready = False

@@ -4,14 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
+from triquad_map.height_scale import HEIGHT_STOPS
 
-_COLOURS = colormaps["viridis"]
-_STOPS = 11
 _TICKS = 5
+
+Stops = tuple[tuple[float, float, float], ...]
+"""Colours, sRGB in [0, 1], evenly spaced from the lower to the upper end of a scale."""
+
+_HEIGHTS: Stops = tuple((red, green, blue) for red, green, blue in HEIGHT_STOPS.tolist())
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,7 @@ class Scale:
     open_below: bool = False  # there may be values below
     open_above: bool = False
     ticks: Sequence[str] = ()  # at equal steps; empty: the values
+    stops: Stops = _HEIGHTS
 
     @property
     def tick_texts(self) -> list[str]:
@@ -37,14 +41,15 @@ class Scale:
 
 def scale_colours(scale: Scale, values: NDArray[np.floating]) -> Doubles:
     """Linear colours [N, 3] of values [N]."""
-    places = np.clip((values - scale.low) / (scale.high - scale.low), 0.0, 1.0)
-    encoded = np.asarray(_COLOURS(places))[:, :3]
-    return np.asarray(encoded**2.2, np.float64)
+    places = (np.asarray(values, np.float64) - scale.low) / (scale.high - scale.low)
+    stops = np.linspace(0.0, 1.0, len(scale.stops))
+    encoded = [np.interp(places, stops, channel) for channel in np.transpose(scale.stops)]
+    return np.stack(encoded, axis=1) ** 2.2
 
 
 def legend_html(scale: Scale) -> str:
     """The scale for the panel."""
-    stops = ", ".join(to_hex(_COLOURS(place)) for place in np.linspace(0.0, 1.0, _STOPS))
+    stops = ", ".join(to_hex(stop) for stop in scale.stops)
     ticks = "".join(f"<span>{text}</span>" for text in scale.tick_texts)
     return (
         '<div style="padding: 0.2em 1em; font-size: 0.8em">'

@@ -1,13 +1,15 @@
 """The map of a server, followed by an ordinary client."""
 
+import time
 from collections.abc import Mapping
 
 from triquad_client import Client
 from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import KnownTiles, MeshTile, TileIndex
 from triquad_client.mesh.mesh_watch import MeshWatch
+from triquad_format.mapfile.metadata import utc_time
 
-from triquad_tools.viewer.map_source import TileSizes
+from triquad_tools.viewer.map_source import MapState, TileSizes
 
 _POINT = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -27,6 +29,11 @@ class LiveSource:
         with client.watch_mesh(_POINT) as watch:
             watch.catch_up()
             self.sizes = TileSizes(watch.cell_m, watch.tile_side_m)
+
+    def state(self) -> MapState:
+        """What the server has published last; it is asked."""
+        now = utc_time(time.time_ns())
+        return MapState(self.client.map_name, self.client.status().epoch, now)
 
     def follow(self, level: int, bounds: Bounds | None = None) -> "LiveFollower":
         """The mesh tiles of a level that meet ``bounds``, as the server makes them."""

@@ -76,6 +76,15 @@ class TileSizes:
         return self.tile_side_m * (1 << level)
 
 
+@dataclass(frozen=True)
+class MapState:
+    """Of which map a page shows what state."""
+
+    map_name: str
+    epoch: int  # number of a published state of the map
+    time: str  # when that was, UTC as in RFC 3339; empty: nobody knows
+
+
 class MapSource(Protocol):
     """A map to look at."""
 
@@ -90,6 +99,13 @@ class MapSource(Protocol):
     @property
     def sizes(self) -> TileSizes:
         """Of its mesh."""
+
+    def state(self) -> MapState:
+        """What is shown now.
+
+        Raises:
+            TriquadError: nobody can tell.
+        """
 
     def follow(self, level: int, bounds: Bounds | None = None) -> TileFollower:
         """The mesh tiles of a level that meet ``bounds``, metres, map frame; ``None``: all."""

@@ -89,8 +89,8 @@ class MeshLayer:
     def _refresh(self) -> None:
         """One round: what came since the last one is drawn, and what it replaces goes."""
         self._remove_retired()
-        asking = time.monotonic() - self._asked_s >= _PERIOD_S or not self._whole.complete
-        if asking:
+        asking = time.monotonic() - self._asked_s >= _PERIOD_S
+        if asking or not self._whole.complete:
             self._asked_s = time.monotonic()
             self._whole.refresh()
         roots = self._whole.tiles
@@ -102,9 +102,11 @@ class MeshLayer:
         for near in self._near:
             within = [index for index, level in levels.items() if level <= near.level]
             near.move(within)
-            if asking:
+            if asking or not near.complete:
                 near.refresh()
         self._show(dict(self._wanted(roots, levels)), self._colours(roots, points))
+        if not (self._whole.complete and all(near.complete for near in self._near)):
+            self._refresher.wake()
 
     def _colours(self, roots: Mapping[TileIndex, Tile], points: Doubles) -> TileColours:
         colours: TileColours
@@ -114,6 +116,7 @@ class MeshLayer:
             colours = ConfidenceColours(self._stage.source.queries)
         else:
             colours = HeightColours.of_heights(points[:, 2])
+        self._stage.scales["mesh"] = colours.scale
         legend = legend_html(colours.scale)
         if self._legend.content != legend:
             self._legend.content = legend

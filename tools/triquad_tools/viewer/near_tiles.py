@@ -21,6 +21,11 @@ class NearTiles:
         self.ready: frozenset[TileIndex] = frozenset()
         """Tiles of the coarsest level within which all of this one are there."""
 
+    @property
+    def complete(self) -> bool:
+        """Whether the last refresh left nothing waiting."""
+        return self._follower is None or self._follower.complete
+
     def move(self, roots: list[TileIndex]) -> None:
         """Follow the tiles within ``roots``, tiles of the coarsest level; none: as before."""
         if roots:

@@ -14,8 +14,8 @@ _LEAST_S = 0.05  # between one time and the next, however often it is woken
 class Refresher:
     """Calls ``refresh`` on a thread of its own: whenever it is woken, and after each period.
 
-    Where that raises, ``failed`` is told in words, and it is tried again after the period; once
-    that succeeds, ``failed`` is told the empty text.
+    Where that raises, ``failed`` is told in words, and it is tried again after the period; once it
+    does not any more, ``failed`` is told nothing (an empty text).
     """
 
     def __init__(
@@ -40,23 +40,20 @@ class Refresher:
         self._thread.join()
 
     def _run(self) -> None:
-        told = ""
+        failing = False
         while not self._stopped.is_set():
             self._woken.clear()
-            problem = self._problem()
-            if problem or told:
-                self._failed(problem)
-            told = problem
+            try:
+                self._refresh()
+                if failing:
+                    self._failed("")
+                failing = False
+            except TriquadError as error:
+                failing = True
+                self._failed(str(error))
+            except Exception as error:
+                _log.exception("%s failed", self._thread.name)
+                failing = True
+                self._failed(f"{type(error).__name__}: {error}")
             self._stopped.wait(_LEAST_S)
             self._woken.wait(self._period_s)
-
-    def _problem(self) -> str:
-        """Do it once; returns what went wrong, the empty text for nothing."""
-        try:
-            self._refresh()
-        except TriquadError as error:
-            return str(error)
-        except Exception as error:
-            _log.exception("%s failed", self._thread.name)
-            return f"{type(error).__name__}: {error}"
-        return ""

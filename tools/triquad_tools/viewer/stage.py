@@ -2,13 +2,14 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
+from triquad_tools.viewer.legend import Scale
 from triquad_tools.viewer.map_source import MapSource
 
 _GRID_M = 100.0
@@ -38,6 +39,10 @@ class SceneOrigin:
                 self._place = np.round(first / _GRID_M) * _GRID_M
             return self.place
 
+    def in_scene(self, points: NDArray[np.floating]) -> Floats:
+        """Points [..., 3] of the map frame as the scene has them."""
+        return np.asarray(points - self.near(points), np.float32)
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -45,8 +50,10 @@ class Stage:
 
     client: viser.ClientHandle
     source: MapSource
-    failed: Callable[[str], None]  # tells the person what went wrong
-    origin: SceneOrigin = field(default_factory=SceneOrigin)
+    failed: Callable[[str], None]  # shows what went wrong; an empty text: nothing does any more
+    origin: SceneOrigin
+    scales: dict[str, Scale]  # of colours that are shown now, by what has them
+    keeps_camera: bool = False  # it shows the same place as what was shown before
 
     @property
     def scene(self) -> viser.SceneApi:
@@ -60,7 +67,7 @@ class Stage:
 
     def in_scene(self, points: NDArray[np.floating]) -> Floats:
         """Points [..., 3] of the map frame as the scene has them."""
-        return np.asarray(points - self.origin.near(points), np.float32)
+        return self.origin.in_scene(points)
 
     def in_map(self, points: NDArray[np.floating]) -> Doubles:
         """Points [..., 3] of the scene in the map frame."""

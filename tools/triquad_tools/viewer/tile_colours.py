@@ -19,7 +19,7 @@ _SUN, _SKY = 0.55, 0.5
 _STEP_M = 0.5
 _FRAMED = (1.0, 99.0)  # percentiles of heights
 _OLDEST_LOG2 = 10  # of ages, in epochs
-_NEAR_LEAVES_M = 0.5  # around a vertex, where its surface is looked for
+_NEAR_M = 1.0  # around a vertex, where its surface is looked for
 
 
 class TileColours(Protocol):
@@ -61,7 +61,7 @@ class HeightColours:
 
     def values(self, tile: Tile, triangles: Triangles) -> Doubles:
         """Heights of the vertices."""
-        return tile.origin[2] + triangles.vertices[:, 2].astype(np.float64)
+        return np.asarray(tile.origin[2] + triangles.vertices[:, 2], np.float64)
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class ConfidenceColours:
     def values(self, tile: Tile, triangles: Triangles) -> Doubles:
         """Asked for at the vertices."""
         points = tile.origin + triangles.vertices
-        answer = self.queries.query_distance(points, max_distance_m=_NEAR_LEAVES_M)
+        answer = self.queries.query_distance(points, max_distance_m=_NEAR_M)
         return answer.confidence.astype(np.float64)
 
 

@@ -1,6 +1,7 @@
 """One browser that looks at the map."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from functools import partial
 from typing import Protocol
 
 import viser
@@ -8,9 +9,17 @@ import viser
 from triquad_tools.viewer.asking.click_layer import ClickLayer
 from triquad_tools.viewer.asking.slice_layer import SliceLayer
 from triquad_tools.viewer.asking.unknown_layer import UnknownLayer
+from triquad_tools.viewer.history import History
+from triquad_tools.viewer.legend import Scale
+from triquad_tools.viewer.live_source import LiveSource
 from triquad_tools.viewer.map_source import MapSource
 from triquad_tools.viewer.mesh_layer import MeshLayer
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.panel import problem_html, text_html
+from triquad_tools.viewer.screenshot_layer import ScreenshotLayer
+from triquad_tools.viewer.stage import SceneOrigin, Stage
+from triquad_tools.viewer.status_layer import StatusLayer
+from triquad_tools.viewer.time_panel import TimePanel
+from triquad_tools.viewer.trail_layer import TrailLayer
 
 
 class Layer(Protocol):
@@ -20,38 +29,75 @@ class Layer(Protocol):
         """Draw no more; what was drawn and the folder go."""
 
 
-_LAYERS: tuple[Callable[[Stage], Layer], ...] = (MeshLayer, SliceLayer, UnknownLayer, ClickLayer)
+_LAYERS: tuple[Callable[[Stage], Layer], ...] = (
+    MeshLayer,
+    SliceLayer,
+    UnknownLayer,
+    ClickLayer,
+    ScreenshotLayer,
+)
+_LIVE_LAYERS: tuple[Callable[[LiveSource, Stage], Layer], ...] = (StatusLayer, TrailLayer)
 
 
 class Visit:
     """The scene and the panel of one browser, from when it opens the page until it leaves."""
 
-    def __init__(self, client: viser.ClientHandle, source: MapSource) -> None:
+    def __init__(self, client: viser.ClientHandle, shown: MapSource | History) -> None:
+        client.gui.configure_theme(show_logo=False, show_share_button=False)
+        client.gui.main_panel.dock_right()
         client.gui.set_panel_label("triquad")
         client.scene.set_up_direction("+z")
         client.scene.configure_default_lights(cast_shadow=False)
         client.scene.configure_environment_map(None)
-        self._title = client.gui.add_markdown("")
-        self._problem = client.gui.add_markdown("")
+        self._title = client.gui.add_html("")
+        self._problem = client.gui.add_html("")
         self._client = client
         self._layers: list[Layer] = []
-        self.show(source)
+        self._problems: dict[Hashable, str] = {}  # by layer
+        self._origin = SceneOrigin()
+        self._time: TimePanel | None = None
+        if isinstance(shown, History):
+            failed = partial(self._failed, "time")
+            self._time = TimePanel(client, shown, self._origin, show=self.show, failed=failed)
+        else:
+            self.show(shown)
 
     def show(self, source: MapSource) -> None:
-        """Show another map."""
+        """Show another map of the same place."""
+        keeps_camera = bool(self._layers)
         self._clear()
-        self._title.content = f"**{source.title}**"
-        stage = Stage(self._client, source, self._failed)
-        self._layers = [layer(stage) for layer in _LAYERS]
+        self._title.content = text_html(source.title)
+        layers = [*_LAYERS]
+        if isinstance(source, LiveSource):
+            layers += [partial(layer, source) for layer in _LIVE_LAYERS]
+        scales: dict[str, Scale] = {}
+        for number, layer in enumerate(layers):
+            failed = partial(self._failed, number)
+            stage = Stage(
+                self._client,
+                source,
+                failed,
+                origin=self._origin,
+                scales=scales,
+                keeps_camera=keeps_camera,
+            )
+            self._layers.append(layer(stage))
 
     def close(self) -> None:
         """The browser has left."""
+        if self._time is not None:
+            self._time.close()
         self._clear()
 
     def _clear(self) -> None:
         for layer in self._layers:
             layer.close()
-        self._layers = []
+        self._layers.clear()
+        self._problems.clear()
+        self._problem.content = ""
 
-    def _failed(self, problem: str) -> None:
-        self._problem.content = problem
+    def _failed(self, layer: Hashable, problem: str) -> None:
+        """Show what a layer has met; nothing is left of it where the text is empty."""
+        self._problems[layer] = problem
+        different = dict.fromkeys(filter(None, self._problems.values()))
+        self._problem.content = problem_html("\n".join(different))

@@ -9,18 +9,17 @@ from triquad_format.records.arrays import Bytes, Doubles
 
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import BEHIND
-from triquad_tools.viewer.asking.distance_scale import (
-    distance_colours,
-    scale_html,
-    swatch_html,
-    text_html,
-)
+from triquad_tools.viewer.asking.distance_scale import distance_colours, distance_scale
 from triquad_tools.viewer.asking.path_check import PathAnswer, ask_path
 from triquad_tools.viewer.asking.questions import newest_epoch
 from triquad_tools.viewer.asking.tube import Tube, add_tube
+from triquad_tools.viewer.legend import Scale, legend_html
+from triquad_tools.viewer.panel import swatch_html, table_html, text_html
 from triquad_tools.viewer.stage import Stage
 
 _RADIUS_M = 0.3
+_SCALE = "path"
+_LEAST_LEG_M = 0.01  # a second click at the same place adds nothing
 _LEAST_WIDTH = 0.002  # radius of what is drawn, as a share of the distance of the eye
 _SKY = "No surface there: the path stays as it was."
 
@@ -65,7 +64,9 @@ class PathProbe:
         if surface is None:
             self._text.content = text_html(_SKY) + path_html(self._points, self._answer)
             return
-        self._points.append(surface + [0.0, 0.0, raised_m])
+        point = surface + [0.0, 0.0, raised_m]
+        if not self._points or np.linalg.norm(point - self._points[-1]) > _LEAST_LEG_M:
+            self._points.append(point)
         self._check()
 
     def refresh(self) -> None:
@@ -91,11 +92,14 @@ class PathProbe:
     def _check(self) -> None:
         """Ask about the path as it is now, and draw it."""
         self._answer = None
+        self._stage.scales.pop(_SCALE, None)
         if self.unanswered:
             queries = self._stage.source.queries
             points = np.array(self._points)
             self._answer = ask_path(queries, points, float(self._radius.value))
-            self._legend.content = legend_html(self._answer.reach_m)
+            scale = distance_scale("clearance of the robot's middle, m", self._answer.reach_m)
+            self._legend.content = path_legend_html(scale)
+            self._stage.scales[_SCALE] = scale
         self._text.content = path_html(self._points, self._answer)
         with self._stage.client.atomic():
             self._erase()
@@ -147,26 +151,25 @@ def path_html(points: list[Doubles], answer: PathAnswer | None) -> str:
     if answer is None:
         return text_html("One point: click at the next." if points else "Click at the first point.")
     whole = answer.whole
-    lines = [f"{len(points)} points, {whole.length_m:.2f} m, radius {answer.radius_m:g} m"]
+    rows = [("path", f"{len(points)} points, {whole.length_m:.2f} m")]
     if whole.blocked:
-        lines.append(f"<b>blocked at {whole.contact_m:.2f} m</b>")
+        rows.append(("blocked", f"⚠ at {whole.contact_m:.2f} m"))
     if whole.meets_unknown:
-        lines.append(f"<b>enters unknown space at {whole.unknown_contact_m:.2f} m</b>")
+        rows.append(("unknown", f"⚠ from {whole.unknown_contact_m:.2f} m"))
     if whole.free():
-        lines.append("<b>free all along</b>")
+        rows.append(("free", f"all along, with radius {answer.radius_m:g} m"))
     least = f"{whole.clearance_m:.2f} m, at {whole.clearance_at_m:.2f} m"
     if whole.clearance_m >= answer.reach_m:
         least = f"{answer.reach_m:g} m or more"
-    lines.append(f"least clearance {least}")
-    lines.append(f"epoch {whole.epoch}")
-    return text_html("<br>".join(lines))
+    rows += [("least clearance", least), ("epoch", f"{whole.epoch}")]
+    return table_html(rows)
 
 
-def legend_html(reach_m: float) -> str:
+def path_legend_html(scale: Scale) -> str:
     """What the colours of a path mean."""
     return "".join(
         [
-            scale_html("clearance of the robot's middle, m", reach_m),
+            legend_html(scale),
             swatch_html(BEHIND, "blocked: the robot touches a surface"),
             swatch_html(UNKNOWN, "the robot is in unknown space"),
         ]

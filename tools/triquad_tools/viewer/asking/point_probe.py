@@ -7,13 +7,14 @@ import viser
 from triquad_client import Distances, Status
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.viewer.asking.distance_scale import text_html
 from triquad_tools.viewer.asking.questions import newest_epoch
 from triquad_tools.viewer.asking.tube import add_tube, arrow
+from triquad_tools.viewer.panel import table_html, text_html
 from triquad_tools.viewer.stage import Stage
 
 _MAX_DISTANCE_M = 10.0
-_SKY = text_html("No surface there: that is sky, or nothing was seen in that direction.")
+_SKY = text_html("No surface there: sky, or nothing was seen in that direction.")
+_HOW = text_html("Click at a surface.")
 _BALL, _ARROW = 0.006, 0.08  # radius and length, as shares of the distance of the eye
 _COLOUR = (230, 159, 0)
 
@@ -37,7 +38,7 @@ class PointProbe:
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
-        self._text = stage.gui.add_html("")
+        self._text = stage.gui.add_html(_HOW)
         self._point: AskedPoint | None = None
         self._epoch = 0
         self._marks: list[viser.SceneNodeHandle] = []
@@ -75,7 +76,7 @@ class PointProbe:
         self._erase()
         self._point = None
         self._epoch = 0
-        self._text.content = ""
+        self._text.content = _HOW
 
     def _ask(self, point: AskedPoint) -> None:
         answer = self._stage.source.queries.query_distance(point.place[None], _MAX_DISTANCE_M)
@@ -119,17 +120,13 @@ def point_html(point: AskedPoint, answer: Distances) -> str:
         ", ".join(f"{part:.2f}" for part in answer.gradient[0]) if answer.found[0] else "none"
     )
     unseen = ": not seen, so the distance is to what was" if status is Status.UNKNOWN else ""
-    rows = {
-        "position": f"{x:.3f}, {y:.3f}, {z:.3f} m",
-        "": f"{point.raised_m:.2f} m above what was clicked at",
-        "distance": distance,
-        "gradient": gradient,
-        "status": f"{status.name}{unseen}",
-        "confidence": f"{float(answer.confidence[0]):.2f}",
-        "epoch": f"{answer.epoch}",
-    }
-    cells = "".join(
-        f'<tr><td style="padding-right: 1em; opacity: 0.7">{name}</td><td>{value}</td></tr>'
-        for name, value in rows.items()
-    )
-    return text_html(f"<table>{cells}</table>")
+    rows = [
+        ("position", f"{x:.3f}, {y:.3f}, {z:.3f} m"),
+        ("", f"{point.raised_m:.2f} m above what was clicked at"),
+        ("distance", distance),
+        ("gradient", gradient),
+        ("status", f"{status.name}{unseen}"),
+        ("confidence", f"{float(answer.confidence[0]):.2f}"),
+        ("epoch", f"{answer.epoch}"),
+    ]
+    return table_html(rows)

@@ -3,12 +3,14 @@
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import BEHIND
 from triquad_tools.viewer.asking.contours import contour_step
-from triquad_tools.viewer.asking.distance_scale import scale_html, swatch_html, text_html
+from triquad_tools.viewer.asking.distance_scale import distance_scale
 from triquad_tools.viewer.asking.focus import focus_of
 from triquad_tools.viewer.asking.questions import Pace, newest_epoch
 from triquad_tools.viewer.asking.sight import ground_in_view
 from triquad_tools.viewer.asking.slice_drawing import SliceDrawing
 from triquad_tools.viewer.asking.slice_plane import HEIGHT_AXIS, SlicePlane, ask_slice
+from triquad_tools.viewer.legend import legend_html
+from triquad_tools.viewer.panel import swatch_html, text_html
 from triquad_tools.viewer.refresher import Refresher
 from triquad_tools.viewer.stage import Stage
 
@@ -18,6 +20,7 @@ _REACH_M = 20.0  # of the slider, to both sides of where the slice was put
 _STEP_M = 0.05
 _ABOVE_M = 0.75  # the ground in the middle of the view: where a level slice is put
 _MAX_DISTANCE_M = 3.0
+_SCALE = "slice"
 
 
 class SliceLayer:
@@ -50,7 +53,7 @@ class SliceLayer:
     def close(self) -> None:
         """Draw no more; what was drawn and the folder go."""
         self._refresher.close()
-        self._drawing.erase()
+        self._erase()
         self._folder.remove()
 
     def _place_anew(self, _: object) -> None:
@@ -62,8 +65,7 @@ class SliceLayer:
         for control in (self._kind, self._at, self._here, self._most, self._legend):
             control.visible = shown
         if not shown:
-            self._drawing.erase()
-            self._drawn = None
+            self._erase()
             return
         if self._unplaced:
             self._place()
@@ -77,6 +79,11 @@ class SliceLayer:
             self._explain(wanted[1], answer.epoch)
             self._drawn, self._epoch = wanted, answer.epoch
 
+    def _erase(self) -> None:
+        self._drawing.erase()
+        self._drawn = None
+        self._stage.scales.pop(_SCALE, None)
+
     def _place(self) -> None:
         """Put the slice through the middle of the view, with room to move it."""
         axis = _AXES[self._kind.value]
@@ -88,9 +95,11 @@ class SliceLayer:
 
     def _explain(self, max_distance_m: float, epoch: int) -> None:
         step_m = contour_step(max_distance_m)
+        scale = distance_scale("distance to the nearest surface, m", max_distance_m)
+        self._stage.scales[_SCALE] = scale
         self._legend.content = "".join(
             [
-                scale_html("to the nearest surface, m", max_distance_m),
+                legend_html(scale),
                 swatch_html(BEHIND, "behind a surface"),
                 swatch_html(UNKNOWN, "unknown: not seen"),
                 swatch_html("#fff", f"lines every {step_m:g} m; black: the surface itself"),

@@ -4,7 +4,6 @@ import numpy as np
 import viser
 from matplotlib.colors import to_rgb
 
-from triquad_tools.viewer.asking.distance_scale import swatch_html, text_html
 from triquad_tools.viewer.asking.focus import focus_of
 from triquad_tools.viewer.asking.questions import Pace, newest_epoch
 from triquad_tools.viewer.asking.unknown_boundary import (
@@ -13,6 +12,7 @@ from triquad_tools.viewer.asking.unknown_boundary import (
     ask_boundary,
     face_triangles,
 )
+from triquad_tools.viewer.panel import swatch_html, text_html
 from triquad_tools.viewer.refresher import Refresher
 from triquad_tools.viewer.stage import Stage
 from triquad_tools.viewer.unlit_glb import unlit_glb

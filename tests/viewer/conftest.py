@@ -1,0 +1,31 @@
+"""A browser for all tests of a module, and a page that shows a server's map."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import pytest
+import triquad_client
+from playwright.sync_api import Browser, Page
+from support.browser import opened_page, running_browser
+from triquad_tools.viewer.live_source import LiveSource
+from triquad_tools.viewer.viewer import Viewer
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with running_browser() as browser:
+        yield browser
+
+
+@pytest.fixture
+def page_of(browser: Browser) -> Iterator[Callable[[str], Page]]:
+    """Opens the page of a viewer of the server at an endpoint."""
+    with ExitStack() as opened:
+
+        def open_viewer(endpoint: str) -> Page:
+            client = opened.enter_context(triquad_client.connect(endpoint))
+            viewer = Viewer(LiveSource(client, endpoint), "127.0.0.1", 0)
+            opened.callback(viewer.close)
+            return opened.enter_context(opened_page(browser, viewer.url))
+
+        yield open_viewer
