@@ -11,7 +11,8 @@ from triquad_tools.viewer.asking.slice_plane import Slice
 
 _LINES = 6  # about as many levels
 _ROUND = np.array([1.0, 2.0, 5.0, 10.0])
-_LEAST_LABELLED = 0.1  # of the slice's width: length of a line that has its number beside it
+_LEAST_NUMBERED = 0.1  # of the slice's width: length of a line that has its number on it
+_ALONG = (0.5, 0.3, 0.7, 0.1, 0.9)  # where on it, whichever is free
 _APART = 0.12  # of the slice's width: from one number to the next
 _MOST_NUMBERS = 12
 
@@ -56,18 +57,21 @@ def contours(answer: Slice, max_distance_m: float) -> list[Contour]:
 
 
 class Number(NamedTuple):
-    """The distance of a line, beside it."""
+    """The distance of a line, on it."""
 
     level_m: float
     place: Doubles  # [3] metres, map frame
 
 
 def numbers(lines: list[Contour], width_m: float) -> list[Number]:
-    """Numbers in the middles of lines, apart from each other; longer lines come first."""
+    """Numbers on lines, apart from each other; longer lines come first."""
     found: list[Number] = []
     for line in sorted(lines, key=lambda line: -line.length_m):
-        place = line.points[len(line.points) // 2]
-        far = all(np.linalg.norm(place - other.place) > _APART * width_m for other in found)
-        if far and line.length_m > _LEAST_LABELLED * width_m and len(found) < _MOST_NUMBERS:
-            found.append(Number(line.level_m, place))
+        if len(found) == _MOST_NUMBERS or line.length_m < _LEAST_NUMBERED * width_m:
+            break
+        for share in _ALONG:
+            place = line.points[int(share * (len(line.points) - 1))]
+            if all(np.linalg.norm(place - other.place) > _APART * width_m for other in found):
+                found.append(Number(line.level_m, place))
+                break
     return found
