@@ -95,7 +95,7 @@ class Health:
         mapping = self.mapping_problem()
         if mapping is not None or not self.checkpoints.has_store or self.checkpoints.error is None:
             return mapping
-        return f"the store cannot be written: {self.checkpoints.error}"
+        return f"what is mapped is not kept: {self.checkpoints.error}"
 
     def report(self) -> dict[str, object]:
         """What a program that watches the server is told; ``problem`` is as :meth:`problem`."""
