@@ -31,6 +31,7 @@ WITHOUT_TORCH = (
     "plots",
     "recordings",
     "simulation",
+    "top",
 )
 
 
