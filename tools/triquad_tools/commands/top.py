@@ -34,8 +34,9 @@ def _top(options: argparse.Namespace) -> int:
         if options.once or not (options.json or is_screen()):
             _look_once(target, watch, options)
         elif options.json:
-            for seen in watch.looks():
-                print(json_line(target, seen), flush=True)
+            while True:
+                time.sleep(watch.due_in_s)
+                print(json_line(target, watch.look_again()), flush=True)
         else:
             show(target, watch)
     return OK
@@ -44,7 +45,7 @@ def _top(options: argparse.Namespace) -> int:
 def _look_once(target: Target, watch: Watch, options: argparse.Namespace) -> None:
     """Look for one interval, and print what was seen."""
     watch.look()
-    time.sleep(options.interval)
+    time.sleep(watch.due_in_s)
     seen = watch.look()
     if options.json:
         print(json_line(target, seen))

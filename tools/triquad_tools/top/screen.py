@@ -1,5 +1,6 @@
 """The page on a terminal, drawn anew until somebody ends it; or once, as plain text."""
 
+import io
 import os
 import sys
 from dataclasses import replace
@@ -7,6 +8,7 @@ from dataclasses import replace
 from rich.console import Console
 from rich.live import Live
 
+from triquad_tools.top.keyboard import Keyboard
 from triquad_tools.top.page import Page
 from triquad_tools.top.watch import Silence, Target, Watch
 
@@ -20,26 +22,36 @@ def is_screen() -> bool:
 
 
 def show(target: Target, watch: Watch) -> None:
-    """Draw the page until an interrupt; the terminal is then as it was."""
-    console = Console(markup=False, highlight=False, emoji=False)
+    """Draw the page until somebody types q or Ctrl-C; the terminal is then as it was."""
+    console = _console()
     page = Page(target, None)
 
     def fitted() -> Page:
         return replace(page, height=console.height)
 
-    with Live(
-        get_renderable=fitted, console=console, screen=True, refresh_per_second=_DRAWN_PER_S
-    ) as live:
-        for seen in watch.looks():
+    with (
+        Keyboard() as keyboard,
+        Live(
+            get_renderable=fitted, console=console, screen=True, refresh_per_second=_DRAWN_PER_S
+        ) as live,
+    ):
+        while not keyboard.ends_within(watch.due_in_s):
+            seen = watch.look_again()
             page = replace(page, silence=seen) if isinstance(seen, Silence) else Page(target, seen)
             live.refresh()
 
 
 def print_page(page: Page) -> None:
     """Print the whole page as text without colours."""
-    width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else _PLAIN_WIDTH
-    console = Console(width=width, color_system=None, markup=False, highlight=False, emoji=False)
-    with console.capture() as captured:
-        console.print(page)
-    for line in captured.get().splitlines():
-        print(line.rstrip())
+    console = _console()
+    if not (sys.stdout.isatty() or "COLUMNS" in os.environ):
+        console.width = _PLAIN_WIDTH
+    for line in console.render_lines(page):
+        print("".join(segment.text for segment in line).rstrip())
+
+
+def _console() -> Console:
+    """Of standard output, where a character that its encoding lacks is a question mark."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+    return Console(markup=False, highlight=False, emoji=False)

@@ -1,7 +1,6 @@
 """Looking at a server again and again, also while it is gone."""
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from triquad_client import BadReplyError, Client, NoReplyError
@@ -30,42 +29,44 @@ class Silence:
 
 
 class Watch:
-    """Looks at a server, and remembers what it saw last."""
+    """Looks at a server once in a while, and remembers what it saw last."""
 
     def __init__(self, client: Client, period_s: float) -> None:
-        """Look every ``period_s``."""
+        """Look every ``period_s``, the first time at once."""
         self._client = client
         self._period_s = period_s
+        self._due_s = time.monotonic()
         self._last: Sample | None = None
+        self._silent_since_s: float | None = None
+
+    @property
+    def due_in_s(self) -> float:
+        """Time until the next look; 0 where one took longer than a period."""
+        return max(0.0, self._due_s - time.monotonic())
 
     def look(self) -> Interval:
-        """What happened since the last look.
+        """What happened since the last look that was answered.
 
         Raises:
             TriquadError: the server does not answer.
         """
-        sample = self._sample()
+        began_s = time.monotonic()
+        self._due_s = max(self._due_s, began_s) + self._period_s
+        try:
+            sample = self._sample()
+        except TriquadError:
+            self._silent_since_s = self._silent_since_s or began_s
+            raise
         seen = interval(self._last, sample)
-        self._last = sample
+        self._last, self._silent_since_s = sample, None
         return seen
 
-    def looks(self) -> Iterator[Interval | Silence]:
-        """A look in each period, for ever.
-
-        A look that takes longer than a period is followed by the next at once.
-        """
-        due_s = time.monotonic()
-        silence: Silence | None = None
-        while True:
-            began_s = time.monotonic()
-            try:
-                seen, silence = self.look(), None
-            except TriquadError as error:
-                silence = Silence(silence.since_s if silence else began_s, str(error))
-            yield silence or seen
-            now_s = time.monotonic()
-            due_s = max(due_s + self._period_s, now_s)
-            time.sleep(due_s - now_s)
+    def look_again(self) -> Interval | Silence:
+        """As :meth:`look`, but a server that does not answer is waited for."""
+        try:
+            return self.look()
+        except TriquadError as error:
+            return Silence(self._silent_since_s or 0.0, str(error))
 
     def _sample(self) -> Sample:
         status = self._client.status()
