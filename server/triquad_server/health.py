@@ -83,9 +83,7 @@ class Health:
             return self.mapper.ended
         activity, for_s = self.mapper.time.current()
         if activity is not Activity.IDLE and for_s > STUCK_S:
-            return (
-                f"mapping makes no progress: its thread is at {activity.value} since {for_s:.0f} s"
-            )
+            return f"mapping makes no progress: it is at {activity.value} since {for_s:.0f} s"
         return None
 
     def problem(self) -> str | None:
@@ -98,6 +96,19 @@ class Health:
         if mapping is not None or not self.checkpoints.has_store or self.checkpoints.error is None:
             return mapping
         return f"the store cannot be written: {self.checkpoints.error}"
+
+    def report(self) -> dict[str, object]:
+        """What a program that watches the server is told; ``problem`` is as :meth:`problem`."""
+        epoch, progress = self.mapper.epochs.newest, self.mapper.progress
+        return {
+            "problem": self.problem(),
+            "map": self.map_name,
+            "server": self.server,
+            "epoch": epoch.number,
+            "settled": progress.settled and len(self.scans) == 0,
+            "scans_taken": progress.scans_taken,
+            "uptime_s": round(time.monotonic() - self.started_s, 3),
+        }
 
     def _requests_refused(self) -> dict[str, int]:
         """Refused requests of all operations, by error code."""
