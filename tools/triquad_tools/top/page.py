@@ -134,7 +134,9 @@ def _section(section: Section, spaced: bool) -> Iterator[RenderableType]:
     """A table, perhaps with an empty line below; nothing where it has no lines."""
     if not section.rows:
         return
-    table = Table(box=None, expand=True, padding=(0, 0, 0, 1), pad_edge=False, header_style=_TITLE)
+    table = Table(
+        box=None, expand=True, padding=(0, 0, 0, _GAP), pad_edge=False, header_style=_TITLE
+    )
     name = f"{_SIGNS[Grade.GOOD]}{section.title}"
     table.add_column(name, ratio=1, min_width=_LEAST_NAME, no_wrap=True, overflow="ellipsis")
     for title in section.columns:
