@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.server_records import BOUNDS_S, METRICS, STATUS, later, operation, sample
 from triquad_format.wire.metrics_messages import SourceMetrics
@@ -17,6 +17,7 @@ SECONDS = st.floats(1e-3, 1e4)
 TIMES_S = st.lists(st.floats(1e-4, 9.9), min_size=1, max_size=200)
 
 
+@settings(deadline=None)
 @given(before=COUNTS, more=COUNTS, seconds=SECONDS)
 def test_a_rate_times_its_interval_is_what_was_counted(before, more, seconds):
     first = later(0.0, {"scans_taken": before, "points_dropped": {"too_near": before}})
@@ -32,6 +33,7 @@ def test_a_rate_times_its_interval_is_what_was_counted(before, more, seconds):
     assert seen.rates.points_dropped["new"] * seen.seconds == pytest.approx(more)
 
 
+@settings(deadline=None)
 @given(before=TIMES_S, during=TIMES_S)
 def test_quantiles_are_those_of_the_interval_alone(before, during):
     first = later(0.0, metrics={"operations": {"query/sdf": operation(before)}})
@@ -49,6 +51,7 @@ def test_quantiles_are_those_of_the_interval_alone(before, during):
     assert sdf.p50_s <= sdf.p99_s
 
 
+@settings(deadline=None)
 @given(counts=st.dictionaries(st.sampled_from(["a", "b", "*"]), COUNTS))
 def test_no_rate_is_negative(counts):
     lost = {"scans_lost": {"a": 5, "b": 7, "c": 9}}

@@ -1,18 +1,25 @@
 """The page as people read it."""
 
 import io
+import json
+import math
 import re
 import time
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
+from random import Random
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rich.console import Console
 from support.server_records import CHECKPOINT, METRICS, STATUS, later, operation, sample
 from triquad_format.wire.metrics_messages import CheckpointMetrics, QueueMetrics, SourceMetrics
 from triquad_tools.top.amounts import count, duration, milliseconds, rate, size
 from triquad_tools.top.interval import Interval, Sample, interval
 from triquad_tools.top.page import Page
+from triquad_tools.top.report import json_line
 from triquad_tools.top.watch import Silence, Target
 
 TARGET = Target("tcp/robot:7447", "default")
@@ -183,6 +190,39 @@ def test_text_of_the_network_does_not_reach_the_terminal_raw():
     assert text.replace("\n", "").isprintable()
     assert text.count(r"\x1b]0;owned\x07\x9b2J\u202e[red]") >= 10
     assert drawn(Page(TARGET, None, Silence(0.0, evil)), 200)[1].isprintable()
+
+
+EXTREMES: dict[type, tuple[Any, ...]] = {
+    bool: (True, False),
+    int: (-(2**63), -1, 0, 1, 2**63 - 1),
+    float: (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e-300, 1e308),
+    str: ("", "\x1b[2J", "x" * 500, "\n\n", "\ud800"),
+}
+
+
+def scrambled(value: Any, random: Random) -> Any:
+    """A record like this one with extreme values, some of them as they were."""
+    if isinstance(value, np.ndarray):
+        return random.choice((value, -value, np.full_like(value, 0)))
+    if is_dataclass(value):
+        changed = {field.name: getattr(value, field.name) for field in fields(value)}
+        return replace(value, **{k: scrambled(v, random) for k, v in changed.items()})
+    if isinstance(value, dict):
+        return {scrambled(k, random): scrambled(v, random) for k, v in value.items()}
+    return random.choice((value, *EXTREMES.get(type(value), ())))
+
+
+@settings(deadline=None)
+@given(st.randoms(use_true_random=False), st.sampled_from([20, 80, 140]))
+def test_whatever_a_server_says_can_be_drawn(random, width):
+    records = [
+        sample(replace(scrambled(STATUS, random), server="x"), scrambled(METRICS, random))
+        for _ in range(2)
+    ]
+    found = interval(*records)
+    assert all(line.isprintable() for line in drawn(found, width))
+    assert all(line.isprintable() for line in drawn(found, width, 24))
+    json.loads(json_line(TARGET, found))
 
 
 def test_colours_are_left_out_where_that_is_asked_for(monkeypatch):

@@ -83,7 +83,7 @@ def _queues(metrics: ServerMetrics | None) -> tuple[Section, ...]:
 
 def _queue(name: str, queue: QueueMetrics) -> Row:
     grade = Grade.GOOD
-    if queue.waiting >= queue.limit:
+    if queue.waiting >= queue.limit > 0:
         grade = Grade.ERROR
     elif queue.waiting >= _NEARLY_FULL * queue.limit:
         grade = Grade.WARNING

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 from triquad_format.wire.messages import ServerStatus
 from triquad_format.wire.metrics_messages import ServerMetrics, SourceMetrics
 
@@ -124,7 +125,7 @@ def _traffic_between(before: ServerMetrics | None, after: ServerMetrics | None) 
     if before is None or after is None or before.server != after.server:
         return None
     seconds = _seconds(before.uptime_s, after.uptime_s)
-    if seconds is None:
+    if seconds is None or len(before.bounds_s) != len(after.bounds_s):
         return None
     return Traffic(
         _per_s(before.scan_bytes_received, after.scan_bytes_received, seconds),
@@ -150,13 +151,14 @@ def _source_rates(
 def _operation_rates(name: str, before: ServerMetrics, after: ServerMetrics) -> OperationRates:
     was, now = before.operations.get(name), after.operations[name]
     seconds = after.uptime_s - before.uptime_s
+    grown = was is None or bool(np.all(now.answers.counts >= was.answers.counts))
     return OperationRates(
         answered=_per_s(was.answered if was else 0, now.answered, seconds),
         refused=_each_per_s(was.refused if was else {}, now.refused, seconds),
         received_bytes=_per_s(was.received_bytes if was else 0, now.received_bytes, seconds),
         sent_bytes=_per_s(was.sent_bytes if was else 0, now.sent_bytes, seconds),
-        p50_s=after.answer_time_s(name, 0.5, since=before),
-        p99_s=after.answer_time_s(name, 0.99, since=before),
+        p50_s=after.answer_time_s(name, 0.5, since=before) if grown else None,
+        p99_s=after.answer_time_s(name, 0.99, since=before) if grown else None,
     )
 
 

@@ -159,4 +159,5 @@ def _cut(lines: Lines, height: int, console: Console, options: ConsoleOptions) -
         return lines
     hidden = len(lines) - height + 1
     note = _text(f"   {hidden} more lines: make the window larger, or use --once", "reverse")
+    note.no_wrap, note.overflow = True, "ellipsis"
     return lines[: height - 1] + console.render_lines(note, options)

@@ -43,7 +43,7 @@ def _errors(seen: Interval) -> Iterator[str]:
     if metrics.problem is not None:
         yield metrics.problem
     for name, queue in sorted(metrics.queues.items()):
-        if queue.waiting >= queue.limit:
+        if queue.waiting >= queue.limit > 0:
             yield f"the queue of {name} is full: {count(queue.waiting)} wait"
     if metrics.epoch_age_s > _OVERDUE_EPOCH_S and not status.settled:
         left = f"{count(status.samples_left)} samples are left to learn"

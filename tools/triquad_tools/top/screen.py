@@ -13,7 +13,7 @@ from triquad_tools.top.page import Page
 from triquad_tools.top.watch import Silence, Target, Watch
 
 _PLAIN_WIDTH = 100  # characters, where no terminal says otherwise
-_DRAWN_PER_S = 1.0  # at least: the time goes on while the server is silent
+_DRAWN_PER_S = 0.5  # at least: the time goes on while the server is waited for
 
 
 def is_screen() -> bool:
