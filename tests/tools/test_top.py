@@ -219,12 +219,12 @@ def test_an_older_server_is_shown_as_far_as_it_tells(capsys):
     with by_hand(None) as endpoint:
         assert main(["--connect", endpoint, "--once", "--interval", "0.1"]) == 0
         text = capsys.readouterr().out
-        assert "it is older" in text
+        assert "the server is older" in text
         assert re.search(r"taken +0 +12\.3 k", text)
         assert main(["--connect", endpoint, "--once", "--json", "--interval", "0.1"]) == 0
         report = json.loads(capsys.readouterr().out)
         assert report["metrics"] is report["traffic"] is None
-        assert "it is older" in report["metrics_missing"]
+        assert "the server is older" in report["metrics_missing"]
 
 
 @pytest.mark.parametrize("bounds_s", [np.zeros(0), np.array([1.0])])

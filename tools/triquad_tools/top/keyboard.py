@@ -7,7 +7,6 @@ import sys
 import termios
 import time
 import tty
-from types import TracebackType
 
 _LEAVE, _ENTER = b"\x1b[?25h\x1b[?1049l", b"\x1b[?1049h\x1b[?25l"
 """From the page's screen, without a cursor, back to that of the shell; and the reverse."""
@@ -26,12 +25,12 @@ class Keyboard:
         if self._input is not None:
             self._before = termios.tcgetattr(self._input)
             tty.setcbreak(self._input)
-            signal.signal(signal.SIGTSTP, self._suspend)
+            self._suspend_before = signal.signal(signal.SIGTSTP, self._suspend)
         return self
 
-    def __exit__(self, *_: TracebackType | object) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._input is not None:
-            signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+            signal.signal(signal.SIGTSTP, self._suspend_before)
             termios.tcsetattr(self._input, termios.TCSADRAIN, self._before)
 
     def ends_within(self, seconds: float) -> bool:
@@ -52,7 +51,7 @@ class Keyboard:
         output = sys.stdout.fileno()
         os.write(output, _LEAVE)
         termios.tcsetattr(self._input, termios.TCSADRAIN, self._before)
-        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        signal.signal(signal.SIGTSTP, self._suspend_before)
         signal.raise_signal(signal.SIGTSTP)
         signal.signal(signal.SIGTSTP, self._suspend)
         tty.setcbreak(self._input)

@@ -9,7 +9,10 @@ from triquad_format.wire.metrics_messages import ServerMetrics
 
 from triquad_tools.top.interval import Interval, Sample, interval
 
-_NO_METRICS = "this server tells no latencies, queues, memory by part and clients: it is older"
+_NO_METRICS = (
+    "no latencies, queues, memory by part and clients are told: the server is older than this "
+    "question, or access control forbids it"
+)
 
 
 @dataclass(frozen=True)
