@@ -252,6 +252,6 @@ def test_what_cannot_be_watched_is_said_in_one_line(endpoint, capsys, arguments,
 def test_where_no_server_is_nothing_is_watched(capsys):
     assert main(["--connect", servers.free_endpoint()]) == 1
     assert "Start triquad-server there" in capsys.readouterr().err
-    for wrong in (["--interval", "0"], ["--interval", "x"], ["--connect"]):
+    for wrong in (["--interval", "0"], ["--interval", "x"], ["--interval", "1e9"], ["--connect"]):
         with pytest.raises(SystemExit, match="2"):
             main(wrong)

@@ -19,6 +19,7 @@ from triquad_tools.top.watch import Target, Watch
 
 _COMMAND = "triquad-top"
 _TIMEOUT_S = 5.0  # for connecting, and for each reply
+_SHORTEST_S, _LONGEST_S = 0.1, 3600.0  # intervals
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -70,8 +71,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--map", default="default", metavar="NAME", help="default: default")
     add("--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5): TLS, credentials")
-    add("--interval", type=positive, default=1.0, metavar="S", help="seconds (default: 1)")
+    add("--interval", type=_interval, default=1.0, metavar="S", help="seconds (default: 1)")
     add("--once", action="store_true", help="print one page as plain text, after one interval")
     add("--json", action="store_true", help="print an object of JSON a line, one each interval")
     add_version(parser)
     return parser
+
+
+def _interval(text: str) -> float:
+    seconds = positive(text)
+    if not _SHORTEST_S <= seconds <= _LONGEST_S:
+        raise argparse.ArgumentTypeError(
+            f"{text} s is out of range: use {_SHORTEST_S:g} to {_LONGEST_S:g}"
+        )
+    return seconds

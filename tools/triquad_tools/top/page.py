@@ -41,6 +41,7 @@ class Page:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """As wide as the terminal."""
+        options = options.reset_height()  # else lines are filled up to it
         head = console.render_lines(self._head(), options)
         left = None
         if self.height is not None:
