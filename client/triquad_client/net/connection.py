@@ -115,8 +115,9 @@ class Connection:
         if self.map_name not in available:
             return UnknownMapError(self.map_name, available)
         return NoReplyError(
-            f"no reply on {self._key(ask)} although the map is there: the server is stopping, "
-            "access control forbids the request, or a message exceeds a size limit"
+            f"no reply on {self._key(ask)} although the map is there: the server is stopping "
+            "or older than this question, access control forbids the request, or a message "
+            "exceeds a size limit"
         )
 
     def put(self, key: str, message: Message) -> None:
