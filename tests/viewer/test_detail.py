@@ -39,16 +39,17 @@ def test_cells_are_as_coarse_as_their_pixels_allow(
 
 def test_a_thinned_mesh_is_smaller_and_stays_where_it_was() -> None:
     ball = trimesh.creation.icosphere(5, 3.0)
-    mesh = Triangles(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
+    middle = np.array([12.0, 12.0, 12.0])
+    mesh = Triangles((middle + ball.vertices).astype(np.float32), ball.faces.astype(np.int32))
     fewer = thinned(mesh, 0.5, SIDE_M)
     assert 100 < len(fewer.faces) < 0.2 * len(ball.faces)
-    radii = np.linalg.norm(fewer.vertices, axis=1)
+    radii = np.linalg.norm(fewer.vertices - middle, axis=1)
     assert (np.abs(radii - 3.0) < 0.1).all()
     a, b, c = fewer.faces.T
     assert not ((a == b) | (b == c) | (a == c)).any()
     corners = fewer.vertices[fewer.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outwards = (across * corners.mean(axis=1)).sum(axis=1) > 0
+    outwards = (across * (corners.mean(axis=1) - middle)).sum(axis=1) > 0
     assert outwards.mean() > 0.99, "faces go on to look outwards"
 
 
