@@ -87,10 +87,8 @@ class Health:
         current = self.mapper.time.current()
         if current.waited_s <= stuck_s and current.for_s <= ENDLESS_S:
             return None
-        return (
-            f"mapping makes no progress: its thread is at {current.activity.value} since "
-            f"{current.for_s:.0f} s, of which it did nothing for {current.waited_s:.0f} s"
-        )
+        at, for_s = current.activity.value, current.for_s
+        return f"mapping makes no progress: it is at {at} since {for_s:.0f} s"
 
     def problem(self) -> str | None:
         """Why the server does not do all that it should, ``None`` where it does.
@@ -111,6 +109,19 @@ class Health:
         )
         problem = self.problem()
         return doing if problem is None else f"{doing}; {problem}"
+
+    def report(self) -> dict[str, object]:
+        """What a program that watches the server is told; ``problem`` is as :meth:`problem`."""
+        epoch, progress = self.mapper.epochs.newest, self.mapper.progress
+        return {
+            "problem": self.problem(),
+            "map": self.map_name,
+            "server": self.server,
+            "epoch": epoch.number,
+            "settled": progress.settled and len(self.scans) == 0,
+            "scans_taken": progress.scans_taken,
+            "uptime_s": round(time.monotonic() - self.started_s, 3),
+        }
 
     def _requests_refused(self) -> dict[str, int]:
         """Refused requests of all operations, by error code."""

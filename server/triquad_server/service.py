@@ -42,7 +42,7 @@ from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.metrics import Metrics, ReadQueue
+from triquad_server.monitoring.metrics import Metrics, ReadQueue
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.requests import (
     Handler,
@@ -133,9 +133,10 @@ class Service:
         self._serve_changes(health.server)
         feed, tiles = self._serve_mesh(health.server)
         downloads = self._serve_downloads()
-        self._serve_status(
-            Metrics(health, self._session, tiles=tiles, downloads=downloads, queues=self._queues)
+        self.metrics = Metrics(
+            health, self._session, tiles=tiles, downloads=downloads, queues=self._queues
         )
+        self._serve_status()
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         # Closed before the last checkpoint is written: it shows every reset that was answered.
@@ -246,7 +247,7 @@ class Service:
         self._queues["mesh_followers"] = lambda: feed.queue
         return feed, cache
 
-    def _serve_status(self, metrics: Metrics) -> None:
+    def _serve_status(self) -> None:
         """How the server is doing, and whether scans are in the map."""
         flush = FlushHandler(
             self._scans.ledger,
@@ -260,8 +261,8 @@ class Service:
         self._serve(
             "status",
             {
-                keys.STATUS: answering(StatusRequest, lambda _: metrics.health.status()),
-                keys.METRICS: answering(MetricsRequest, lambda _: metrics.now()),
+                keys.STATUS: answering(StatusRequest, lambda _: self.metrics.health.status()),
+                keys.METRICS: answering(MetricsRequest, lambda _: self.metrics.now()),
                 keys.FLUSH: flush.add,
             },
         )
