@@ -32,14 +32,16 @@ from triquad_sensors.depth_image import Intrinsics, depth_points
 from triquad_sensors.errors import InvalidScanError
 from triquad_sensors.pose import Pose
 
-from triquad_client.async_client import AsyncClient, connect_async
+from triquad_client.async_client import AsyncClient
 from triquad_client.calls.async_queries import AsyncPinnedMap
 from triquad_client.calls.changes import ChangedBox, ChangeKind, ChangeReport
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.questions import SdfResult
 from triquad_client.calls.scans import FlushReport
+from triquad_client.calls.sources import NewestScan, ScanSource, SourceReport
 from triquad_client.checks import Bounds, PoseLike
-from triquad_client.client import Client, connect
+from triquad_client.client import Client
+from triquad_client.connecting import connect, connect_async
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
@@ -89,6 +91,7 @@ __all__ = [
     "MeshTile",
     "MeshUpdate",
     "MeshWatch",
+    "NewestScan",
     "NoReplyError",
     "NotAskedError",
     "OfflineMap",
@@ -101,11 +104,13 @@ __all__ = [
     "RayRanges",
     "RefusedError",
     "RequestTimeoutError",
+    "ScanSource",
     "SdfResult",
     "Segments",
     "ServerMetrics",
     "ServerStatus",
     "SourceMetrics",
+    "SourceReport",
     "Spheres",
     "Status",
     "SyncReport",

@@ -79,8 +79,8 @@ class Health:
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
         """Why nothing is mapped any more, ``None`` where all is well.
 
-        Nothing but a restart helps. A thread that computes is alive, however long that takes; one
-        that waits is alive if it hears the :class:`Heartbeat`, which wakes it.
+        Nothing but a restart helps. A thread that computes is alive, for :data:`ENDLESS_S` at most;
+        one that waits is alive if it hears the :class:`Heartbeat`, which wakes it.
         """
         if self.mapper.ended is not None:
             return self.mapper.ended
@@ -99,7 +99,7 @@ class Health:
         mapping = self.mapping_problem()
         if mapping is not None or not self.checkpoints.has_store or self.checkpoints.error is None:
             return mapping
-        return f"the store cannot be written: {self.checkpoints.error}"
+        return f"what is mapped is not kept: {self.checkpoints.error}"
 
     def summary(self) -> str:
         """What the server does, and what keeps it from that, in a line."""

@@ -29,6 +29,7 @@ from triquad_format.wire.query_messages import (
     SegmentsRequest,
     SpheresRequest,
 )
+from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.change_queries import ChangeQueries
@@ -42,16 +43,11 @@ from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.monitoring.metrics import Metrics, ReadQueue
-from triquad_server.net.operation_counts import OperationCounts
-from triquad_server.net.requests import (
-    Handler,
-    Operation,
-    RequestHandlers,
-    answering,
-    payload_limit,
-)
+from triquad_server.monitoring.metrics import Metrics
+from triquad_server.net.requests import Handler, answering
+from triquad_server.served_operations import ServedOperations
 from triquad_server.settings import Settings
+from triquad_server.source_queries import SourceQueries
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.store import Store
@@ -86,8 +82,7 @@ class Service:
         self._session = session
         self._served = served
         self._settings = settings
-        self._operations: dict[str, OperationCounts] = {}  # by name
-        self._queues: dict[str, ReadQueue] = {}  # of requests, by name
+        self._operations = ServedOperations(session, served.name, settings.service)
         self._scans = ScanQueue(settings.service.scan_queue)
         self._warnings = ScanWarnings(self._scans, settings)
         self._parts = ExitStack()  # closed in reverse order of opening
@@ -123,7 +118,7 @@ class Service:
             map_name=self._served.name,
             server=secrets.token_hex(8),
             device=self._served.device,
-            operations=self._operations,
+            operations=self._operations.counts,
             scans=self._scans,
             warnings=self._warnings,
             mapper=self._mapper,
@@ -131,10 +126,11 @@ class Service:
         )
         self._serve_queries()
         self._serve_changes(health.server)
+        self._serve_sources(health.server)
         feed, tiles = self._serve_mesh(health.server)
         downloads = self._serve_downloads()
         self.metrics = Metrics(
-            health, self._session, tiles=tiles, downloads=downloads, queues=self._queues
+            health, self._session, tiles=tiles, downloads=downloads, queues=self._operations.queues
         )
         self._serve_status()
         checkpoints.start()
@@ -223,6 +219,10 @@ class Service:
         queries = ChangeQueries(self._mapper.epochs, self._mapper.surface, server)
         self._serve("changes", {keys.CHANGES: answering(ChangesRequest, queries.changes)})
 
+    def _serve_sources(self, server: str) -> None:
+        queries = SourceQueries(self._mapper.trails, server)
+        self._serve("sources", {keys.SOURCES: answering(SourcesRequest, queries.sources)})
+
     def _serve_mesh(self, server: str) -> tuple[TileFeed, TileCache]:
         """Queries of mesh tiles, and following them; the feed of what changes, and all tiles."""
         cache = TileCache(self._settings.mesh, self._served.teams.meshing)
@@ -244,7 +244,7 @@ class Service:
             _TILE_WORKERS,
         )
         self._serve("tile_updates", {keys.TILE_UPDATES: feed.add})
-        self._queues["mesh_followers"] = lambda: feed.queue
+        self._operations.queues["mesh_followers"] = lambda: feed.queue
         return feed, cache
 
     def _serve_status(self) -> None:
@@ -257,7 +257,7 @@ class Service:
             warnings=self._warnings.of,
         )
         self._parts.callback(flush.close)
-        self._queues["flushes"] = lambda: flush.queue
+        self._operations.queues["flushes"] = lambda: flush.queue
         self._serve(
             "status",
             {
@@ -279,22 +279,5 @@ class Service:
         return downloads
 
     def _serve(self, queue: str, handlers: Mapping[str, Handler], workers: int = 1) -> None:
-        """Answer a group of operations from now on; no other group waits for it.
-
-        ``queue`` is the name of what waits for them.
-        """
-        limits = self._settings.service
-        operations = {}
-        for name, handler in handlers.items():
-            counts = self._operations[name] = OperationCounts()
-            key = keys.operation_key(self._served.name, name)
-            operations[key] = Operation(handler, counts)
-        group = RequestHandlers(
-            self._session,
-            operations,
-            workers=workers,
-            waiting=limits.request_queue,
-            max_bytes=payload_limit(limits.max_query_points),
-        )
-        self._queues[queue] = lambda: group.queue
-        self._parts.callback(group.close)
+        """Answer a group of operations from now on, as :meth:`ServedOperations.serve`."""
+        self._parts.callback(self._operations.serve(queue, handlers, workers).close)

@@ -32,6 +32,7 @@ WITHOUT_TORCH = (
     "plots",
     "recordings",
     "simulation",
+    "top",
 )
 
 

@@ -270,7 +270,7 @@ def test_a_port_that_is_taken_ends_the_server_at_once(arguments):
     assert "preparing" not in server.log
 
 
-@pytest.mark.parametrize("address", ["nowhere.invalid", "203.0.113.7", "a" * 200])
+@pytest.mark.parametrize("address", ["nowhere.invalid", "203.0.113.7", "a" * 200, "\0"])
 def test_an_address_that_is_not_ours_is_named(address):
     settings = servers.SMALL.model_copy(
         update={"metrics": MetricsSettings(port=free_port(), address=address)}

@@ -17,6 +17,7 @@ from triquad_server.epochs import EpochHistory
 from triquad_server.errors import MapperStoppedError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
+from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
 from triquad_server.mesh.mesher import check_box
@@ -90,6 +91,7 @@ class MapperThread:
         first = mapper.publish()
         self.epochs = EpochHistory(first, settings)
         self.surface = SurfaceHistory(first, settings.changes_kept)
+        self.trails = SourceTrails(first.field_settings.leaf_m)
         self.progress = Progress()
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
@@ -145,6 +147,7 @@ class MapperThread:
 
         def reset(mapper: Mapper) -> int:
             mapper.reset(request.minimum, request.maximum)
+            self.trails.forget(request.minimum, request.maximum)
             return mapper.publish().number
 
         return ResetReply(self.call(reset))
@@ -243,6 +246,7 @@ class MapperThread:
                 self.points_dropped.add(reason, count)
             if self._warnings is not None:
                 self._warnings.add(scan.source, len(scan.points), rays)
+            self.trails.add(scan, rays)
             self._scans_taken += 1
             self._unpublished = True
             self._scans.ledger.take(scan)

@@ -185,7 +185,7 @@ def _listener(settings: MetricsSettings, monitoring: MonitoringServer) -> _Liste
             settings.address, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
         return _Listener(family, (settings.address, settings.port), monitoring)
-    except (OSError, UnicodeError) as error:
+    except (OSError, ValueError) as error:
         raise ListenError(
             f"cannot listen on {_where(settings)} for metrics: {error}; choose another port with "
             "--metrics-port or metrics.port, or another metrics.address"

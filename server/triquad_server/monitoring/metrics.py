@@ -1,7 +1,6 @@
 """The server in figures: put together from its parts when somebody asks."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +13,10 @@ from triquad_server.health import Health
 from triquad_server.memory import resident_bytes
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.net.operation_counts import BOUNDS_S
+from triquad_server.served_operations import ReadQueue
 from triquad_server.store.download import MapDownloads
 
 _MAX_SESSIONS = 1024  # that are listed
-
-ReadQueue = Callable[[], QueueMetrics]
-"""What waits in a queue now."""
 
 
 @dataclass(frozen=True)
