@@ -23,7 +23,7 @@ exit codes:
   0  stopped by SIGINT or SIGTERM; the map is in the store, if there is one
   1  an unexpected error; the log has the details
   2  wrong usage or settings, or a missing extra (install triquad[server])
-  3  cannot listen on an endpoint (port in use), or cannot connect to one
+  3  cannot listen on an endpoint or on the port for metrics (in use), or cannot connect to one
   4  the store cannot be used: not readable or writable, in use, all checkpoints are damaged,
      or the newest needs a newer release or more memory; or the last one was not written
 """
@@ -116,7 +116,10 @@ def _run(options: argparse.Namespace) -> int:
 
 def _implied(options: argparse.Namespace) -> list[str]:
     """The settings that flags stand for."""
-    return ["ros2.enabled=true"] if options.ros2 else []
+    implied = ["ros2.enabled=true"] if options.ros2 else []
+    if options.metrics_port is not None:
+        implied.append(f"metrics.port={options.metrics_port}")
+    return implied
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -195,6 +198,12 @@ def _add_network(group: argparse._ArgumentGroup) -> None:
     )
     add("-m", "--mode", choices=("router", "peer", "client"), help="default: router")
     add("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration, JSON5")
+    add(
+        "--metrics-port",
+        metavar="PORT",
+        help="answer /metrics (Prometheus) and /healthz there, on this machine alone unless "
+        "metrics.address says otherwise: docs/metrics.md",
+    )
     add("--no-multicast-scouting", action="store_true", help="do not look for others by multicast")
 
 

@@ -1,5 +1,6 @@
 """The server's status: put together from its parts, published once a second, and logged."""
 
+import collections
 import logging
 import threading
 import time
@@ -10,16 +11,21 @@ import zenoh
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus
 
-from triquad_server.counter import Counter
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.mapping.thread_time import Activity
 from triquad_server.memory import resident_bytes
+from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.store.checkpoint_thread import CheckpointThread
 
 _log = logging.getLogger(__name__)
 
 STATUS_PERIOD_S = 1.0
+
+STUCK_S = 120.0
+"""No step of mapping takes as long, not even where code is compiled first."""
+
 _BEATS_PER_LOG_LINE = 5
 
 
@@ -30,7 +36,7 @@ class Health:
     map_name: str
     server: str  # a name of this process
     device: str
-    requests_refused: Counter
+    operations: dict[str, OperationCounts]
     scans: ScanQueue
     warnings: ScanWarnings
     mapper: MapperThread
@@ -53,7 +59,7 @@ class Health:
             scans_lost=self.scans.ledger.lost(),
             scans_waiting=len(self.scans),
             points_dropped=self.mapper.points_dropped.counts(),
-            requests_refused=self.requests_refused.counts(),
+            requests_refused=self._requests_refused(),
             samples_trained=progress.samples_trained,
             rays_kept=progress.rays_kept,
             loss=float(progress.loss),
@@ -67,6 +73,49 @@ class Health:
             warnings=self.warnings.all(),
             samples_left=progress.samples_left,
         )
+
+    def mapping_problem(self) -> str | None:
+        """Why nothing is mapped any more, ``None`` where all is well.
+
+        Nothing but a restart helps.
+        """
+        if self.mapper.ended is not None:
+            return self.mapper.ended
+        activity, for_s = self.mapper.time.current()
+        if activity is not Activity.IDLE and for_s > STUCK_S:
+            return f"mapping makes no progress: it is at {activity.value} since {for_s:.0f} s"
+        return None
+
+    def problem(self) -> str | None:
+        """Why the server does not do all that it should, ``None`` where it does.
+
+        Beside :meth:`mapping_problem`: a store that cannot be written. A server that was started
+        without one keeps no map, as it should.
+        """
+        mapping = self.mapping_problem()
+        if mapping is not None or not self.checkpoints.has_store or self.checkpoints.error is None:
+            return mapping
+        return f"what is mapped is not kept: {self.checkpoints.error}"
+
+    def report(self) -> dict[str, object]:
+        """What a program that watches the server is told; ``problem`` is as :meth:`problem`."""
+        epoch, progress = self.mapper.epochs.newest, self.mapper.progress
+        return {
+            "problem": self.problem(),
+            "map": self.map_name,
+            "server": self.server,
+            "epoch": epoch.number,
+            "settled": progress.settled and len(self.scans) == 0,
+            "scans_taken": progress.scans_taken,
+            "uptime_s": round(time.monotonic() - self.started_s, 3),
+        }
+
+    def _requests_refused(self) -> dict[str, int]:
+        """Refused requests of all operations, by error code."""
+        total: collections.Counter[str] = collections.Counter()
+        for counts in self.operations.copy().values():
+            total.update(counts.refused())
+        return dict(total)
 
 
 class Heartbeat:

@@ -18,6 +18,7 @@ from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.memory import give_back_early, spare_from_collection
 from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.session import listen_endpoints, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
@@ -88,6 +89,7 @@ def _open(options: LaunchOptions, stops: Stops, stack: ExitStack) -> None:
     """Open all parts of a server, to be closed by ``stack``."""
     device = choose_device(options.device)
     settings = options.settings
+    monitoring = _open_monitoring(settings, stack)
     store = None
     restored = None
     if options.store is not None:
@@ -117,7 +119,16 @@ def _open(options: LaunchOptions, stops: Stops, stack: ExitStack) -> None:
     failed = functools.partial(stops.put, Stop.INTERNAL_ERROR)
     service = Service(session, served, settings, failed=failed)
     stack.enter_context(closing(service))
+    if monitoring is not None:
+        stack.enter_context(monitoring.showing(service.metrics))
     _log_ready(options, service.epoch, device)
+
+
+def _open_monitoring(settings: Settings, stack: ExitStack) -> MonitoringServer | None:
+    """The port for metrics, where one is wanted: it listens before all else takes its time."""
+    if settings.metrics.port == 0:
+        return None
+    return stack.enter_context(closing(MonitoringServer(settings.metrics)))
 
 
 def _restored(store: Store, options: LaunchOptions) -> ValidCheckpoint | None:
