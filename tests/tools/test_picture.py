@@ -12,8 +12,15 @@ from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.pack import main
 from triquad_tools.plots.framing import framed
-from triquad_tools.plots.mesh_sheet import HEIGHT, WIDTH, ColourBar, Legend, save_mesh_sheet
-from triquad_tools.plots.picture import draw_mesh, notes_of
+from triquad_tools.plots.mesh_sheet import (
+    HEIGHT,
+    WIDTH,
+    ColourBar,
+    Heading,
+    Legend,
+    save_mesh_sheet,
+)
+from triquad_tools.plots.picture import draw_mesh, outside_notes
 from triquad_tools.plots.render import BACKGROUND
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -43,7 +50,7 @@ def read_picture(path):
 
 def shown(pixels):
     """``[HEIGHT, WIDTH]``: where the picture within the sheet has something."""
-    inside = pixels[60 : 60 + HEIGHT, :WIDTH]
+    inside = pixels[90 : 90 + HEIGHT, :WIDTH]
     return np.abs(inside - EMPTY).max(axis=2) > 8
 
 
@@ -64,7 +71,7 @@ def test_the_camera_has_all_of_a_map_in_its_picture(mesh):
     # As near as can be: along one axis it goes from edge to edge, but for a margin.
     filled = max(np.ptp(column) / WIDTH, np.ptp(row) / HEIGHT)
     assert filled > 0.9
-    assert len(notes_of(view)) == 1
+    assert outside_notes(view) == []
 
 
 def test_a_long_map_lies_along_the_picture():
@@ -83,7 +90,7 @@ def test_what_lies_far_away_is_left_out_and_told():
     alone, view = framed(mesh, ASPECT), framed(both, ASPECT)
     assert view.camera.height_m < 1.3 * alone.camera.height_m
     assert view.outside_share == pytest.approx(1 / 401)
-    assert notes_of(view)[1].startswith("outside of the picture: 0.25 % of the surface, up to 8")
+    assert outside_notes(view)[0].startswith("beyond the edges: 0.25 % of the faces, up to 8")
 
 
 def test_a_ceiling_does_not_hide_the_floor(tmp_path):
@@ -93,24 +100,39 @@ def test_a_ceiling_does_not_hide_the_floor(tmp_path):
         np.concatenate([floor.vertices, ceiling.vertices]),
         np.concatenate([floor.faces, ceiling.faces + len(floor.vertices)]),
     )
-    draw_mesh("map 'room'", both, tmp_path / "room.png")
-    pixels = read_picture(tmp_path / "room.png")[60 : 60 + HEIGHT, :WIDTH]
+    draw_mesh(Heading("map 'room'"), both, tmp_path / "room.png")
+    pixels = read_picture(tmp_path / "room.png")[90 : 90 + HEIGHT, :WIDTH]
     assert near(pixels, HEIGHT_STOPS[4]).mean() > 0.3  # the middle of its own scale
     assert not near(pixels, HEIGHT_STOPS[-1]).any()
 
 
-@pytest.mark.parametrize(("least", "most"), [(0.0, 1.0), (-1.0, 1.0), (0.0, 2.0), (-1.0, 2.0)])
-def test_the_legend_marks_values_beyond_its_scale(tmp_path, least, most):
-    bar = ColourBar("height in m", "m", HEIGHT_STOPS, low=0.0, high=1.0, least=least, most=most)
-    save_mesh_sheet(tmp_path / "sheet.png", EMPTY, Legend("map", bar, []))
+@pytest.mark.parametrize("below", ["", "down to -1 m"])
+@pytest.mark.parametrize("above", ["", "up to 2 m"])
+def test_the_legend_marks_values_beyond_its_scale(tmp_path, above, below):
+    bar = ColourBar("height in m", HEIGHT_STOPS, low=0.0, high=1.0, above=above, below=below)
+    save_mesh_sheet(tmp_path / "sheet.png", EMPTY, Legend(Heading("map"), bar))
     pixels = read_picture(tmp_path / "sheet.png")
     # The bar ends in an arrow, which has no corners.
-    assert near(pixels[194, 1404], BACKGROUND) == (most > 1.0)
-    assert near(pixels[515, 1404], BACKGROUND) == (least < 0.0)
-    assert near(pixels[508, 1415], HEIGHT_STOPS[0], within=16)
-    words_above, words_below = pixels[150:168, 1390:1600], pixels[540:570, 1390:1600]
-    assert (words_above < 128).any() == (most > 1.0)
-    assert (words_below < 128).any() == (least < 0.0)
+    assert near(pixels[194, 1360], BACKGROUND) == bool(above)
+    assert near(pixels[515, 1360], BACKGROUND) == bool(below)
+    assert near(pixels[508, 1371], HEIGHT_STOPS[0], within=16)
+    words_above, words_below = pixels[158:182, 1350:1600], pixels[530:560, 1350:1600]
+    assert (words_above < 128).any() == bool(above)
+    assert (words_below < 128).any() == bool(below)
+
+
+def test_the_legend_tells_heights_beyond_the_scale(tmp_path):
+    """A mast of few faces over a plain: its colour is that of the scale's end."""
+    plain = ground(30, 30)
+    mast = squares((15.0, 15.0, 50.0), side_m=0.5)
+    mesh = Mesh(
+        np.concatenate([plain.vertices, mast.vertices]),
+        np.concatenate([plain.faces, mast.faces + len(plain.vertices)]),
+    )
+    draw_mesh(Heading("map"), mesh, tmp_path / "mast.png")
+    draw_mesh(Heading("map"), ground(30, 30), tmp_path / "plain.png")
+    corners = [read_picture(tmp_path / f"{name}.png")[194, 1360] for name in ("mast", "plain")]
+    assert [bool(near(corner, BACKGROUND)) for corner in corners] == [True, False]
 
 
 # The command
@@ -123,7 +145,7 @@ def test_a_picture_of_a_map_has_the_colours_of_its_heights(tmp_path, capsys):
     assert "a picture of" in capsys.readouterr().out
     pixels = read_picture(out)
     assert pixels.shape == (900, 1600, 3)
-    inside = pixels[60 : 60 + HEIGHT, :WIDTH]
+    inside = pixels[90 : 90 + HEIGHT, :WIDTH]
     low, high = (near(inside, HEIGHT_STOPS[end]).mean() for end in (0, -1))
     assert low > 0.1  # the ground
     assert high > 0.02  # the table

@@ -19,6 +19,7 @@ from triquad_tools.demo.results import Intake, MapSize, Restart
 from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
 from triquad_tools.evaluation.metrics import MeshScores, score_against_drive
 from triquad_tools.plots.camera import PerspectiveCamera
+from triquad_tools.plots.mesh_sheet import Heading
 from triquad_tools.plots.picture import draw_view
 from triquad_tools.recordings.publishing import publish_all, wait_until_settled
 
@@ -33,7 +34,7 @@ _RESTART_POINTS = 50_000
 _EYE_M = (-14.0, 0.8, 12.0)
 _TARGET_M = (17.0, -0.3, 0.3)
 _VIEW_DEG = 46.0
-_NOTE = "down the street, from the start of the drive; dark: seen from behind, inside of houses"
+_SUMMARY = "from the start of the drive; dark: surface that is seen from behind, inside of houses"
 
 
 @dataclass(frozen=True)
@@ -136,5 +137,5 @@ def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
             surface.save(path)
         report(0.0, picture.name)
         camera = PerspectiveCamera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
-        title = f"map {MAP!r}, epoch {surface.epoch}"
-        draw_view(title, surface, camera, notes=[_NOTE], path=picture)
+        heading = Heading(f"map {MAP!r}, epoch {surface.epoch}", _SUMMARY)
+        draw_view(heading, surface, camera, notes=[], path=picture)

@@ -13,6 +13,15 @@ def is_endpoint(target: str) -> bool:
     return _ENDPOINT.match(target) is not None
 
 
+def newest_epoch(opened: Client | OfflineMap) -> int:
+    """The number of the epoch that a map answers from.
+
+    Raises:
+        TriquadError: the server does not answer.
+    """
+    return opened.epoch if isinstance(opened, OfflineMap) else opened.status().epoch
+
+
 def open_map(target: str, map_name: str) -> Client | OfflineMap:
     """The map in the file ``target``, or ``map_name`` of the server at the endpoint ``target``.
 

@@ -10,51 +10,61 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from triquad_format.mapfile.writer import replacing
 from triquad_format.records.arrays import Bytes, Doubles
 
-from triquad_tools.plots.camera import ParallelCamera
+from triquad_tools.plots.camera import Camera, ParallelCamera
 from triquad_tools.plots.render import BACKGROUND
 
-WIDTH, HEIGHT = 1380, 770
+WIDTH, HEIGHT = 1340, 740
 """Of the picture in the sheet, pixels."""
 
 _SHEET = (1600, 900)
-_LEFT, _TOP = 0, 60  # of the picture in the sheet
+_LEFT, _TOP = 0, 90  # of the picture in the sheet
 _DPI = 100
 _TITLE_PT, _LETTERS_PT = 20, 16  # can be read in half the size, too
-_BAR = (1400, 190, 30, 330)  # left, top, width, height
-_ARROWS_MIDDLE = (1485, 745)
+_BAR = (1356, 190, 30, 330)  # left, top, width, height
+_ARROWS_MIDDLE = (1465, 765)
 _ARROW_PIXELS = 95.0
 _LETTER_PIXELS = 16.0
 _NOTE_LINE = 28
+_LONGEST = 128  # letters in a line
 _INK = "#1a1a1a"
 
 
 @dataclass(frozen=True)
 class ColourBar:
-    """A scale of colours, and the values that are shown in them."""
+    """A scale of colours, with an arrow at each end beyond which there are values."""
 
     label: str
-    unit: str
     stops: Doubles  # [K, 3] sRGB, from low to high
     low: float
     high: float
-    least: float  # of all values
-    most: float
+    above: str = ""  # what is told of values beyond, if there are any
+    below: str = ""
+    beyond: str | None = None  # colour of values above, if it is none of the scale
+    limit: float | None = None  # a value that is marked by a line
+
+
+@dataclass(frozen=True)
+class Heading:
+    """What a sheet is about."""
+
+    title: str
+    summary: str = ""  # a line below it
 
 
 @dataclass(frozen=True)
 class Legend:
     """What a sheet says about its picture."""
 
-    title: str
+    heading: Heading
     bar: ColourBar
-    notes: Sequence[str]  # lines below the picture, two at most
-    camera: ParallelCamera | None = None  # whose scale is told
+    notes: Sequence[str] = ()  # lines below the picture, two at most
+    camera: Camera | None = None  # if it is parallel, its scale is told
     named: Sequence[tuple[str, str]] = ()  # further colours, and what they stand for
 
 
@@ -68,12 +78,13 @@ def save_mesh_sheet(path: Path, picture: Bytes, legend: Legend) -> None:
     with rc_context({"font.size": _LETTERS_PT, "text.color": _INK}):
         figure = Figure((width / _DPI, height / _DPI), _DPI, facecolor=tuple(BACKGROUND))
         figure.figimage(picture, _LEFT, height - _TOP - HEIGHT, origin="upper")
-        _text(figure, (16, 40), legend.title, fontsize=_TITLE_PT)
+        _text(figure, (16, 38), legend.heading.title, fontsize=_TITLE_PT)
+        _text(figure, (16, 74), legend.heading.summary)
         for line, note in enumerate(legend.notes):
             _text(figure, (16, _TOP + HEIGHT + _NOTE_LINE * (line + 1)), note)
         _draw_bar(figure, legend.bar)
         _draw_named(figure, legend.named)
-        if legend.camera is not None:
+        if isinstance(legend.camera, ParallelCamera):
             _draw_arrows(figure, legend.camera)
         packed = io.BytesIO()
         figure.savefig(packed, format="png", facecolor=figure.get_facecolor())
@@ -83,6 +94,8 @@ def save_mesh_sheet(path: Path, picture: Bytes, legend: Legend) -> None:
 
 def _text(figure: Figure, at: tuple[float, float], text: str, **style: Any) -> None:
     """Text whose base line begins at a pixel from the sheet's upper left corner."""
+    if len(text) > _LONGEST:  # such as of long paths
+        text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
     figure.text(at[0] / _SHEET[0], 1.0 - at[1] / _SHEET[1], text, **style)
 
 
@@ -93,25 +106,26 @@ def _box(left: float, top: float, width: float, height: float) -> tuple[float, f
 
 
 def _draw_bar(figure: Figure, bar: ColourBar) -> None:
-    """The scale, with an arrow and the extreme value where values lie beyond it."""
     left, top, _, height = _BAR
-    below, above = bar.least < bar.low, bar.most > bar.high
     axes = figure.add_axes(_box(*_BAR))
-    colours = LinearSegmentedColormap.from_list("bar", [tuple(stop) for stop in bar.stops])
+    colours: Colormap = LinearSegmentedColormap.from_list(
+        "bar", [tuple(stop) for stop in bar.stops]
+    )
+    colours = colours.with_extremes(over=bar.beyond) if bar.beyond else colours
     mapped = ScalarMappable(Normalize(bar.low, bar.high), colours)
-    extend = ("neither", "min", "max", "both")[below + 2 * above]
-    figure.colorbar(mapped, cax=axes, extend=extend, extendfrac=0.06)
-    _text(figure, (left, top - 50), bar.label, linespacing=1.2, verticalalignment="bottom")
-    if above:
-        _text(figure, (left, top - 28), f"up to {bar.most:.2g} {bar.unit}")
-    if below:
-        _text(figure, (left, top + height + 42), f"down to {bar.least:.2g} {bar.unit}")
+    extend = ("neither", "min", "max", "both")[bool(bar.below) + 2 * bool(bar.above)]
+    drawn = figure.colorbar(mapped, cax=axes, extend=extend, extendfrac=0.06)
+    if bar.limit is not None:
+        drawn.add_lines([bar.limit], [_INK], [3.0])
+    _text(figure, (left, top - 44), bar.label, linespacing=1.2, verticalalignment="bottom")
+    _text(figure, (left, top - 16), bar.above)
+    _text(figure, (left, top + height + 30), bar.below)
 
 
 def _draw_named(figure: Figure, named: Sequence[tuple[str, str]]) -> None:
     if named:
         handles = [Patch(facecolor=c, edgecolor=_INK, label=label) for c, label in named]
-        corner = ((_BAR[0] - 12) / _SHEET[0], 1.0 - (_BAR[1] + _BAR[3] + 20) / _SHEET[1])
+        corner = ((_BAR[0] - 12) / _SHEET[0], 1.0 - (_BAR[1] + _BAR[3] + 14) / _SHEET[1])
         figure.legend(
             handles=handles, loc="upper left", bbox_to_anchor=corner, frameon=False,
             handlelength=1.2, borderpad=0.3,

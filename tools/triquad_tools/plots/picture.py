@@ -1,5 +1,6 @@
 """A picture of a whole mesh, seen aslant from above."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,21 @@ from triquad_map.height_scale import HEIGHT_STOPS, HeightScale
 
 from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
-from triquad_tools.plots.camera import Camera, ParallelCamera
+from triquad_tools.plots.camera import Camera
 from triquad_tools.plots.framing import Framing, framed
-from triquad_tools.plots.mesh_sheet import HEIGHT, WIDTH, ColourBar, Legend, save_mesh_sheet
+from triquad_tools.plots.mesh_sheet import (
+    HEIGHT,
+    WIDTH,
+    ColourBar,
+    Heading,
+    Legend,
+    save_mesh_sheet,
+)
 from triquad_tools.plots.render import facing, render_mesh
+
+DIRECTION_NOTE = (
+    "looking to {} and down, in parallel projection; faces seen from behind (ceilings) are left out"
+)
 
 
 def export_picture(source: SourceMap, box: Box | None, cell_m: float | None, path: Path) -> str:
@@ -31,11 +43,12 @@ def export_picture(source: SourceMap, box: Box | None, cell_m: float | None, pat
         raise NothingLeftError(f"{path} is not written: no surface was seen{where}")
     record, stamp_ns = source.record, source.stamp_ns
     when = f", {utc_time(stamp_ns)}" if stamp_ns else ""
-    draw_mesh(f"map {record.name!r}, epoch {record.epoch}{when}", mesh, path)
-    return f"a picture of {len(mesh.faces):,} faces"
+    summary = f"{len(mesh.faces):,} faces"
+    draw_mesh(Heading(f"map {record.name!r}, epoch {record.epoch}{when}", summary), mesh, path)
+    return f"a picture of {summary}"
 
 
-def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
+def draw_mesh(heading: Heading, mesh: Mesh, path: Path) -> None:
     """Save a picture of a mesh with faces, coloured by height, by a camera that is chosen for it.
 
     Ceilings do not hide what is below them: faces that turn away from the camera are left out.
@@ -45,10 +58,13 @@ def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
     """
     view = framed(mesh, WIDTH / HEIGHT)
     shown = Mesh(mesh.vertices, mesh.faces[facing(mesh.vertices[mesh.faces], view.camera)])
-    draw_view(title, shown, view.camera, notes=notes_of(view), path=path)
+    notes = [DIRECTION_NOTE.format(view.looks_to), *outside_notes(view)]
+    draw_view(heading, shown, view.camera, notes=notes, path=path)
 
 
-def draw_view(title: str, mesh: Mesh, camera: Camera, notes: list[str], path: Path) -> None:
+def draw_view(
+    heading: Heading, mesh: Mesh, camera: Camera, notes: Sequence[str], path: Path
+) -> None:
     """Save a picture of a mesh, coloured by height, as a camera sees it.
 
     Raises:
@@ -58,21 +74,21 @@ def draw_view(title: str, mesh: Mesh, camera: Camera, notes: list[str], path: Pa
     scale = HeightScale.around(heights_m)
     colours = scale.colours(mesh.vertices[:, 2])
     image = render_mesh(mesh.vertices, mesh.faces, colours, camera, width=WIDTH, height=HEIGHT)
-    ends = {"least": float(heights_m.min()), "most": float(heights_m.max())}
-    bar = ColourBar("height z in m", "m", HEIGHT_STOPS, scale.low_m, scale.high_m, **ends)
-    flat = camera if isinstance(camera, ParallelCamera) else None
-    save_mesh_sheet(path, image, Legend(title, bar, notes, flat))
+    least_m, most_m = float(heights_m.min()), float(heights_m.max())
+    bar = ColourBar(
+        "height z in m",
+        HEIGHT_STOPS,
+        scale.low_m,
+        scale.high_m,
+        above=f"up to {most_m:.2g} m" if most_m > scale.high_m else "",
+        below=f"down to {least_m:.2g} m" if least_m < scale.low_m else "",
+    )
+    save_mesh_sheet(path, image, Legend(heading, bar, notes, camera))
 
 
-def notes_of(view: Framing) -> list[str]:
-    """What the picture of a mesh leaves out."""
-    notes = [
-        f"looking to {view.looks_to} and down, in parallel projection; faces seen from behind, "
-        "such as ceilings, are left out"
-    ]
-    if view.outside_share > 0.0:
-        share = f"{100.0 * view.outside_share:.2g} % of the surface"
-        notes.append(
-            f"outside of the picture: {share}, up to {view.farthest_m:.3g} m from its middle"
-        )
-    return notes
+def outside_notes(view: Framing) -> list[str]:
+    """What of a mesh lies outside of its picture, if anything does."""
+    if not view.outside_share:
+        return []
+    share = f"{100.0 * view.outside_share:.2g} % of the faces"
+    return [f"beyond the edges: {share}, up to {view.farthest_m:.3g} m from the picture's middle"]

@@ -36,6 +36,7 @@ def render_mesh(
     camera: Camera,
     width: int = 1600,
     height: int = 900,
+    plain: int = 0,
 ) -> Bytes:
     """A picture ``[height, width, 3]`` of a mesh.
 
@@ -47,6 +48,7 @@ def render_mesh(
         camera: where it is taken from.
         width: pixels.
         height: pixels.
+        plain: so many of the last faces have their colours from all sides, without any light.
     """
     wide, high = width * _SUPERSAMPLING, height * _SUPERSAMPLING
     picture = np.tile(_linear(BACKGROUND), (high, wide, 1))
@@ -54,31 +56,33 @@ def render_mesh(
         points = np.ascontiguousarray(vertices, np.float64)
         rows = np.ascontiguousarray(faces, np.int32)
         raster = rasterise(camera.project(points, wide, high), rows, width=wide, height=high)
-        light = _shade(points, rows, camera, raster=raster, colours=_linear(colours))
         covered = raster.faces >= 0
+        light = _shade(points, rows, camera, raster=raster, plain=plain)[:, None]
+        owners, weights = rows[raster.faces[covered]], raster.weights[covered]
+        light = light * _blend(_linear(colours), owners, weights)
         picture[covered] = light * _contact_shadow(raster, camera)[covered, None]
     fine = picture.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3)
     return _encode(fine.mean(axis=(1, 3)))
 
 
-def _shade(
-    points: Doubles, faces: Ints, camera: Camera, raster: Raster, colours: NDArray[np.floating]
-) -> Doubles:
-    """Light ``[P, 3]`` that the covered pixels send, in the order of the picture's rows."""
+def _shade(points: Doubles, faces: Ints, camera: Camera, raster: Raster, plain: int) -> Doubles:
+    """Light ``[P]`` that falls on the covered pixels, in the order of the picture's rows."""
+    shaded = len(faces) - plain
     covered = raster.faces >= 0
     owners, weights = faces[raster.faces[covered]], raster.weights[covered]
     places = camera.unproject(np.where(covered, raster.nearness, 1.0))[covered]
-    normals = _blend(vertex_normals(points, faces), owners, weights)
+    normals = _blend(vertex_normals(points, faces[:shaded]), owners, weights)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     inside = ~facing(points[owners], camera)
     normals[inside] *= -1.0
     towards_sun = _towards_sun(camera)
-    lit = _sunlit(points, faces, places, normals=normals, towards_sun=towards_sun)
+    lit = _sunlit(points, faces[:shaded], places, normals=normals, towards_sun=towards_sun)
     up = 0.5 + 0.5 * normals[:, 2]
     light = np.maximum(normals @ towards_sun, 0.0) * lit * _SUN
     light += up * _SKY_LIGHT + (1.0 - up) * _GROUND_LIGHT
     light[inside] *= _BACK
-    return light[:, None] * _blend(colours, owners, weights)
+    light[raster.faces[covered] >= shaded] = 1.0
+    return np.asarray(light)
 
 
 def _towards_sun(camera: Camera) -> Doubles:
