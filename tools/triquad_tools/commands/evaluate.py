@@ -40,8 +40,9 @@ from triquad_tools.evaluation.metrics import (
     drive_truth,
     scene_truth,
 )
-from triquad_tools.evaluation.open_map import is_endpoint, newest_epoch, open_map
+from triquad_tools.evaluation.open_map import newest_epoch, open_map
 from triquad_tools.mapfiles.meshfile import read_mesh
+from triquad_tools.mapfiles.source import is_endpoint
 from triquad_tools.recordings.cloud import is_withheld, merged, world_points
 from triquad_tools.recordings.folders.kitti import read_kitti_folder
 from triquad_tools.simulation.street import street_drive

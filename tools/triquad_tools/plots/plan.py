@@ -175,9 +175,3 @@ def draw_layers(axes: Axes, layers: Sequence[Layer]) -> None:
 def _draw_cells(axes: Axes, values: Values, **colours: Any) -> AxesImage:
     extent = (*axes.get_xlim(), *axes.get_ylim())
     return axes.imshow(values, origin="lower", extent=extent, interpolation="none", **colours)
-
-
-def draw_nothing(axes: Axes, reason: str) -> None:
-    """Say why a plan shows nothing."""
-    axes.set_facecolor("none")
-    axes.text(0.5, 0.5, reason, ha="center", va="center", transform=axes.transAxes)

@@ -12,8 +12,8 @@ from triquad_client import Grid, Status
 from triquad_format.records.seen_space import evidence_bounds
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.evaluation.open_map import is_endpoint, open_map
-from triquad_tools.mapfiles.source import read_whole
+from triquad_tools.evaluation.open_map import open_map
+from triquad_tools.mapfiles.source import is_endpoint, read_whole
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
