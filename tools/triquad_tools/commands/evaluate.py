@@ -20,9 +20,8 @@ from triquad_tools.console.arguments import (
 )
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.progress import progress
-from triquad_tools.console.report import Row, centimetres, json_text, percent, print_rows
+from triquad_tools.console.report import Row, json_text, print_rows
 from triquad_tools.evaluation.map_scores import (
-    StreetScores,
     WithheldAnswer,
     WithheldScores,
     ask_withheld,
@@ -39,8 +38,10 @@ from triquad_tools.evaluation.metrics import (
     compare_mesh,
     drive_truth,
     scene_truth,
+    scored_box,
 )
 from triquad_tools.evaluation.open_map import newest_epoch, open_map
+from triquad_tools.evaluation.score_rows import TRUSTED, mesh_rows, street_rows, withheld_rows
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapfiles.source import is_endpoint
 from triquad_tools.recordings.cloud import is_withheld, merged, world_points
@@ -50,7 +51,6 @@ from triquad_tools.simulation.street import street_drive
 _COMMAND = "triquad-eval"
 # Lines of the table that a picture has, too.
 _DRAWN = ("F-score", "accuracy", "accuracy ratio", "completion", "completion ratio", "outliers")
-_TRUSTED = "SURFACE points"
 _SEED = 0  # of the points that are drawn; scores can be repeated
 
 Results = dict[str, Any]
@@ -100,11 +100,11 @@ def evaluate_map(options: argparse.Namespace) -> Results:
 def _on_street(options: argparse.Namespace) -> Results:
     drive = street_drive(options.street, options.scans, options.step)
     probes = street_probes(drive, np.random.default_rng(_SEED))
+    truth = drive_truth(drive, STREET_SETTINGS)
     with open_map(options.target, options.map) as opened:
         street = score_street(opened.query_sdf, probes)
-        mesh = opened.mesh(drive.scene.box)
+        mesh = opened.mesh(scored_box(truth.points, STREET_SETTINGS))
     name = f"{_map_name(options)}, epoch {mesh.epoch}"
-    truth = drive_truth(drive, STREET_SETTINGS)
     return {"street": street, "mesh": _compared(options, name, mesh, truth, STREET_SETTINGS)}
 
 
@@ -160,7 +160,7 @@ def _drawn(options: argparse.Namespace, name: str, answers: list[WithheldAnswer]
     from triquad_tools.plots.mesh_sheet import Heading
 
     scores = score_withheld(answers)
-    summary = _summary([row for row in withheld_rows(scores) if row.note != _TRUSTED])
+    summary = _summary([row for row in withheld_rows(scores) if row.note != TRUSTED])
     heading = Heading(f"{name}, at withheld scans of {options.withheld}", summary)
     with progress("drawing"):
         draw_withheld(heading, answers, scores, path=options.plot)
@@ -178,48 +178,6 @@ def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
     if not len(points):
         raise ToolError(f"{path}: holds no points")
     return points
-
-
-def mesh_rows(scores: MeshScores) -> list[Row]:
-    """The scores of a mesh as lines of a table."""
-    return [
-        Row("accuracy", centimetres(scores.accuracy_m), "mean, mesh to truth, outliers left out"),
-        Row("accuracy, median", centimetres(scores.accuracy_median_m)),
-        Row("accuracy ratio", percent(scores.accuracy_ratio), "outliers left out"),
-        Row("completion", centimetres(scores.completion_m), "mean, truth to mesh"),
-        Row("completion ratio", percent(scores.completion_ratio)),
-        Row("F-score", percent(scores.f_score), "of both ratios"),
-        Row("outliers", percent(scores.outlier_ratio), "mesh beyond the accuracy cut"),
-        Row("mesh samples", f"{scores.samples:,}"),
-        Row("reference points", f"{scores.references:,}"),
-    ]
-
-
-def street_rows(scores: StreetScores) -> list[Row]:
-    """The scores of a map of a street as lines of a table."""
-    return [
-        Row("SDF error", centimetres(scores.sdf_error_m), "mean, within 10 cm of the surface"),
-        Row("SDF error, median", centimetres(scores.sdf_error_median_m)),
-        Row("SDF error, 95 %", centimetres(scores.sdf_error_p95_m)),
-        Row("gradient angle", f"{scores.gradient_angle_deg:.1f} deg", "median"),
-        Row("of these SURFACE", percent(scores.near_surface_ratio)),
-        Row("points", f"{scores.near_points:,}"),
-        Row("houses UNKNOWN", percent(scores.houses_unknown_ratio), "deeper than 0.5 m in them"),
-        Row("points in houses", f"{scores.house_points:,}"),
-    ]
-
-
-def withheld_rows(scores: WithheldScores) -> list[Row]:
-    """The scores of a map at withheld scans as lines of a table."""
-    return [
-        Row("SURFACE", percent(scores.surface_ratio), "of all points"),
-        Row("UNKNOWN", percent(scores.unknown_ratio), "of all points"),
-        Row("|SDF|, median", centimetres(scores.sdf_median_m), "all points"),
-        Row("|SDF|, 90 %", centimetres(scores.sdf_p90_m), "all points"),
-        Row("|SDF|, median", centimetres(scores.surface_sdf_median_m), _TRUSTED),
-        Row("|SDF|, 90 %", centimetres(scores.surface_sdf_p90_m), _TRUSTED),
-        Row("points", f"{scores.points:,}"),
-    ]
 
 
 _TABLES: dict[str, tuple[str, Callable[[Any], list[Row]]]] = {

@@ -17,7 +17,13 @@ from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.results import Intake, MapSize, Restart
 from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
-from triquad_tools.evaluation.metrics import MeshScores, score_against_drive
+from triquad_tools.evaluation.metrics import (
+    STREET_SETTINGS,
+    MeshScores,
+    compare_mesh,
+    drive_truth,
+    scored_box,
+)
 from triquad_tools.plots.camera import PerspectiveCamera
 from triquad_tools.plots.mesh_sheet import Heading
 from triquad_tools.plots.picture import draw_view
@@ -92,12 +98,13 @@ def score(endpoint: str, street: DrivenStreet) -> Scored:
         report(0.0, "distances")
         field = score_street(client.query_sdf, street.probes)
         report(0.0, "mesh")
-        surface = client.mesh(street.drive.scene.box)
+        truth = drive_truth(street.drive, STREET_SETTINGS)
+        surface = client.mesh(scored_box(truth.points, STREET_SETTINGS))
         checkpoint = client.checkpoint()
         answers = client.query_sdf(points)
         parameters = client.status().parameters
         report(0.0, "mesh against the exact surface")
-        scores = score_against_drive(surface, street.drive)
+        scores = compare_mesh(surface, truth, STREET_SETTINGS).scores
         report(0.0, f"{scores.samples:,} samples of the mesh")
     return Scored(
         street=field,

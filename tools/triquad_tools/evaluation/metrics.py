@@ -192,15 +192,21 @@ def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles
 
 
 def is_scored(places: Doubles, reference: Doubles, settings: ScoreSettings) -> Bools:
-    """Whether places ``[N, 3]`` lie in the truth's bounding box.
-
-    The box is grown by the accuracy's cut: a level road is the very bottom of its box, and
-    samples just below it are errors to be counted.
-    """
-    low = reference.min(axis=0) - settings.accuracy_cut_m
-    high = reference.max(axis=0) + settings.accuracy_cut_m
+    """Whether places ``[N, 3]`` lie where a mesh is scored."""
+    low, high = scored_box(reference, settings)
     inside: Bools = ((places >= low) & (places <= high)).all(axis=1)
     return inside
+
+
+def scored_box(reference: Doubles, settings: ScoreSettings) -> tuple[list[float], list[float]]:
+    """The truth's bounding box, in which a mesh is scored, metres: its lower and upper corner.
+
+    It is grown by the accuracy's cut: a level road is the very bottom of its box, and samples just
+    below it are errors to be counted.
+    """
+    margin_m = settings.accuracy_cut_m
+    low, high = reference.min(axis=0) - margin_m, reference.max(axis=0) + margin_m
+    return low.tolist(), high.tolist()
 
 
 def _tree(points: Doubles) -> cKDTree:

@@ -87,7 +87,7 @@ def draw_mesh_errors(heading: Heading, comparison: Comparison, path: Path) -> No
     beside = 1.0 - len(part.faces) / max(len(mesh.faces), 1)
     notes = [DIRECTION_NOTE.format(view.looks_to), *outside_notes(view)]
     if beside:
-        notes.append(f"not scored and not drawn, as it is beside the truth: {percent(beside)}")
+        notes.append(f"beside the truth, not scored: {100.0 * beside:.2g} %")
     legend = Legend(heading, bar, [notes[0], "; ".join(notes[1:])], view.camera, named)
     image = _rendered(part, colours, lacking, camera=view.camera)
     save_mesh_sheet(path, image, legend)

@@ -12,7 +12,7 @@ from matplotlib import rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 from triquad_format.mapfile.writer import replacing
 from triquad_format.records.arrays import Bytes, Doubles
 
@@ -32,6 +32,7 @@ _ARROW_PIXELS = 95.0
 _LETTER_PIXELS = 16.0
 _NOTE_LINE = 28
 _LONGEST = 128  # letters in a line
+_FRAME = "#b0b4b8"
 _INK = "#1a1a1a"
 
 
@@ -78,6 +79,7 @@ def save_mesh_sheet(path: Path, picture: Bytes, legend: Legend) -> None:
     with rc_context({"font.size": _LETTERS_PT, "text.color": _INK}):
         figure = Figure((width / _DPI, height / _DPI), _DPI, facecolor=tuple(BACKGROUND))
         figure.figimage(picture, _LEFT, height - _TOP - HEIGHT, origin="upper")
+        _draw_frame(figure)
         _text(figure, (16, 38), legend.heading.title, fontsize=_TITLE_PT)
         _text(figure, (16, 74), legend.heading.summary)
         for line, note in enumerate(legend.notes):
@@ -103,6 +105,13 @@ def _box(left: float, top: float, width: float, height: float) -> tuple[float, f
     """A box of pixels as matplotlib has it: from below, by the size of the sheet."""
     wide, high = _SHEET
     return (left / wide, 1.0 - (top + height) / high, width / wide, height / high)
+
+
+def _draw_frame(figure: Figure) -> None:
+    """What is cut off by it goes on beyond."""
+    left, low, width, height = _box(_LEFT, _TOP, WIDTH, HEIGHT)
+    frame = Rectangle((left, low), width, height, fill=False, edgecolor=_FRAME, linewidth=1)
+    figure.add_artist(frame)
 
 
 def _draw_bar(figure: Figure, bar: ColourBar) -> None:
