@@ -12,6 +12,14 @@ from triquad_format import __version__
 from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.metrics_messages import (
+    CheckpointMetrics,
+    OperationMetrics,
+    QueueMetrics,
+    ServerMetrics,
+    SourceMetrics,
+    TimeHistogram,
+)
 from triquad_map.asked import NotAskedError
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
@@ -63,6 +71,7 @@ __all__ = [
     "ChangeReport",
     "ChangedBox",
     "CheckpointInfo",
+    "CheckpointMetrics",
     "Client",
     "ClosedError",
     "ConnectError",
@@ -86,23 +95,28 @@ __all__ = [
     "NoReplyError",
     "NotAskedError",
     "OfflineMap",
+    "OperationMetrics",
     "PinnedMap",
     "Polyline",
     "Pose",
     "PoseLike",
+    "QueueMetrics",
     "RayRanges",
     "RefusedError",
     "RequestTimeoutError",
     "ScanSource",
     "SdfResult",
     "Segments",
+    "ServerMetrics",
     "ServerStatus",
+    "SourceMetrics",
     "SourceReport",
     "Spheres",
     "Status",
     "SyncReport",
     "SyncedMap",
     "TileList",
+    "TimeHistogram",
     "TriquadError",
     "Unknown",
     "UnknownMapError",

@@ -5,6 +5,7 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
 from triquad_client.calls import admin, changes, download, questions, sources
@@ -121,6 +122,9 @@ class AsyncClient(AsyncMapQueries):
 
     async def status(self) -> ServerStatus:
         return await self._run(admin.status())
+
+    async def metrics(self) -> ServerMetrics:
+        return await self._run(admin.metrics())
 
     async def checkpoint(self) -> CheckpointInfo:
         return await self._run(admin.checkpoint())

@@ -5,6 +5,7 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
 from triquad_client.calls import admin, changes, download, questions, sources
@@ -216,6 +217,13 @@ class Client(MapQueries):
     def status(self) -> ServerStatus:
         """How the server is doing."""
         return self._run(admin.status())
+
+    def metrics(self) -> ServerMetrics:
+        """How the server is doing, in figures: requests and their times, queues, memory.
+
+        Counts and times only grow while a server runs: take the difference of two answers.
+        """
+        return self._run(admin.metrics())
 
     def checkpoint(self) -> CheckpointInfo:
         """Have the server write the map to its store now.

@@ -135,6 +135,7 @@ class RepeatedSource:
     sizes: TileSizes
     followers: Mapping[int, RepeatedFollower]
     title: str = "2 km of street"
+    grows: bool = False
 
     @classmethod
     def of_street(cls, client: Client) -> "RepeatedSource":

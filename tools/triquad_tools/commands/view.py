@@ -3,7 +3,7 @@
 import argparse
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -11,10 +11,11 @@ import triquad_client
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 from triquad_tools.console.arguments import add_version
-from triquad_tools.console.command import OK, ToolError, complain, refuse, run
+from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.progress import progress
 from triquad_tools.viewer.file_source import FileSource
-from triquad_tools.viewer.history import DamagedError, History
+from triquad_tools.viewer.history import History
+from triquad_tools.viewer.history_source import newest_of
 from triquad_tools.viewer.live_source import LiveSource
 from triquad_tools.viewer.map_source import MapSource
 from triquad_tools.viewer.open_maps import OpenMaps
@@ -61,33 +62,21 @@ def _file(path: Path, maps: OpenMaps) -> FileSource:
     with progress(f"opening {path}") as report:
         source = maps.use(path)
         source.prepare(_PREPARED_S)
-        report(1, _told(source))
+        report(1, f"map {source.opened.name!r}, epoch {source.opened.epoch}")
     return source
 
 
 def _store(path: Path, maps: OpenMaps) -> History:
     """The checkpoints of a store; the newest that can be shown is ready."""
     history = History(path, maps)
-    while moments := history.moments:
-        with progress(f"opening {moments[-1].path}") as report, suppress(DamagedError):
-            source = history.use(moments[-1])
-            source.prepare(_PREPARED_S)
-            report(1, _told(source))
-            history.release(moments[-1])  # it stays open for whoever comes first
-            break
+    with progress(f"opening {path}") as report, closing(newest_of(history)) as source:
+        state = source.state()
+        report(1, f"map {state.map_name!r}, epoch {state.epoch}")
     for problem in history.damaged:
         complain(_COMMAND, problem, OK)
-    if not moments:
-        raise ToolError(f"{path}: nothing is left; triquad-pack --recover saves what is intact")
-    print(f"{len(moments)} checkpoints: epochs {moments[0].epoch} to {moments[-1].epoch}")
+    moments = history.moments
+    print(f"{len(moments)} checkpoints: {moments[0]} to {moments[-1]}")
     return history
-
-
-def _told(source: FileSource) -> str:
-    """What is worth knowing of a map that was opened."""
-    opened = source.opened
-    slow = "" if opened.compiled else "; slowly: pip install 'triquad[fast]'"
-    return f"map {opened.name!r}, epoch {opened.epoch}{slow}"
 
 
 def _parser() -> argparse.ArgumentParser:

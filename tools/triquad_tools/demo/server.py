@@ -15,11 +15,17 @@ _READY_TIMEOUT_S = 300.0  # kernels are compiled on the first start
 _STOP_TIMEOUT_S = 60.0
 
 
-def free_endpoint() -> str:
-    """An endpoint on a port of the loopback that nothing uses."""
+def free_port() -> int:
+    """A port of the loopback that nothing uses."""
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def free_endpoint() -> str:
+    """An endpoint on such a port."""
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 class DemoServer:

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from triquad_client import Grid, Status
+from triquad_client import Grid, OfflineMap, Status
 from triquad_format.records.seen_space import evidence_bounds
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.evaluation.open_map import is_endpoint, open_map
-from triquad_tools.mapfiles.source import read_whole
+from triquad_tools.evaluation.open_map import open_map
+from triquad_tools.mapfiles.source import is_endpoint, read_whole
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
@@ -55,13 +55,15 @@ def draw_slice(target: str, map_name: str, options: SliceOptions, path: Path) ->
     bounds = ((west, south, height), (east, north, height))
     with open_map(target, map_name) as opened:
         answer = opened.query_grid(bounds, options.cell_m, _MAX_DISTANCE_M)
+        name = opened.name if isinstance(opened, OfflineMap) else map_name
     shape = answer.shape
     grid = PlanGrid(shape.corner[:2], shape.cell_m, rows=shape.counts[1], columns=shape.counts[0])
     plans = [
         Plan("Distance", partial(_draw_distance, answer)),
         Plan("Status", partial(_draw_status, answer)),
     ]
-    save_sheet(path, f"{target} at z = {height:g} m, epoch {answer.epoch}", grid, plans=plans)
+    title = f"{target}: map {name!r}, epoch {answer.epoch}, at z = {height:g} m"
+    save_sheet(path, title, grid, plans=plans)
 
 
 def _seen_box(target: str) -> list[float]:

@@ -1,6 +1,6 @@
-"""What stands below a picture of a scene: the map, its state, and the scales of colours."""
+"""What stands below a picture of a scene: the map, its state, and what colours and lines mean."""
 
-from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 from matplotlib.font_manager import findfont
@@ -8,44 +8,70 @@ from PIL import Image, ImageDraw, ImageFont
 
 from triquad_tools.viewer.legend import Scale, scale_colours
 from triquad_tools.viewer.map_source import MapState
+from triquad_tools.viewer.shown_legends import LineMeaning, ShownLegends
 
 _TEXT_PX = 16
 _ROW_PX = 24
-_BAR_PX = (256, 12)
+_BAR_PX = (400, 12)
+_LINE_PX = (48, 3)
+_DASHES = 4
 _MARGIN_PX = 12
 _INK = "#222222"
 
 
-def captioned(picture: Image.Image, state: MapState, scales: Sequence[Scale]) -> Image.Image:
+def captioned(picture: Image.Image, state: MapState, legends: ShownLegends) -> Image.Image:
     """The picture with a strip below it."""
-    rows = 1 + 2 * len(scales)
+    scales, lines = list(legends.scales.values()), list(chain(*legends.lines.values()))
+    rows = 1 + 2 * len(scales) + len(lines)
     height = picture.height + rows * _ROW_PX + 2 * _MARGIN_PX
     sheet = Image.new("RGB", (picture.width, height), "white")
     sheet.paste(picture)
-    draw = ImageDraw.Draw(sheet)
-    font = ImageFont.truetype(findfont("DejaVu Sans"), _TEXT_PX)
-    top = picture.height + _MARGIN_PX
-    draw.text((_MARGIN_PX, top), _told(state), _INK, font)
+    strip = _Strip(sheet, picture.height + _MARGIN_PX)
+    strip.write(", ".join(filter(None, (state.map_name, f"epoch {state.epoch}", state.time))))
     for scale in scales:
-        top += _ROW_PX
-        _draw_scale(sheet, scale, top, font)
-        top += _ROW_PX
+        strip.draw_scale(scale)
+    for line in lines:
+        strip.draw_line(line)
     return sheet
 
 
-def _told(state: MapState) -> str:
-    return ", ".join(filter(None, (f"map {state.map_name}", f"epoch {state.epoch}", state.time)))
+class _Strip:
+    """Rows from top to bottom of a sheet."""
 
+    def __init__(self, sheet: Image.Image, top: int) -> None:
+        self._sheet = sheet
+        self._draw = ImageDraw.Draw(sheet)
+        self._font = ImageFont.truetype(findfont("DejaVu Sans"), _TEXT_PX)
+        self._top = top
 
-def _draw_scale(sheet: Image.Image, scale: Scale, top: int, font: ImageFont.FreeTypeFont) -> None:
-    """A bar with its label beside it and its values below."""
-    draw = ImageDraw.Draw(sheet)
-    width, height = _BAR_PX
-    colours = scale_colours(scale, np.linspace(scale.low, scale.high, width)) ** (1 / 2.2)
-    bar = np.broadcast_to(np.round(255 * colours).astype(np.uint8), (height, width, 3))
-    sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (_MARGIN_PX, top + 6))
-    draw.text((2 * _MARGIN_PX + width, top), scale.label, _INK, font)
-    texts = scale.tick_texts
-    for place, text in zip(np.linspace(0, width, len(texts)), texts, strict=True):
-        anchor = "la" if place == 0 else "ra" if place == width else "ma"
-        draw.text((_MARGIN_PX + place, top + _ROW_PX), text, _INK, font, anchor)
+    def write(self, text: str, left: int = _MARGIN_PX) -> None:
+        """A row of text."""
+        self._draw.text((left, self._top), text, _INK, self._font)
+        self._top += _ROW_PX
+
+    def draw_scale(self, scale: Scale) -> None:
+        """A bar with its label beside it and its values below."""
+        width, height = _BAR_PX
+        colours = scale_colours(scale, np.linspace(scale.low, scale.high, width)) ** (1 / 2.2)
+        row = np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8)
+        bar = np.ascontiguousarray(np.broadcast_to(row, (height, width, 3)))
+        self._sheet.paste(Image.fromarray(bar), (_MARGIN_PX, self._top + 5))
+        self.write(scale.label, 2 * _MARGIN_PX + width)
+        texts = scale.tick_texts
+        for number, text in enumerate(texts):
+            anchor = "la" if number == 0 else "ra" if number == len(texts) - 1 else "ma"
+            place = (_MARGIN_PX + number * width / (len(texts) - 1), self._top)
+            self._draw.text(place, text, _INK, self._font, anchor)
+        self._top += _ROW_PX
+
+    def draw_line(self, line: LineMeaning) -> None:
+        """A line, and what it says."""
+        width, thickness = _LINE_PX
+        middle = self._top + _TEXT_PX // 2
+        pieces = _DASHES if line.dashed else 1
+        step = width / pieces
+        for number in range(pieces):
+            left = _MARGIN_PX + number * step
+            right = left + (0.6 * step if line.dashed else step)
+            self._draw.line((left, middle, right, middle), line.colour, thickness)
+        self.write(line.text, 2 * _MARGIN_PX + width)

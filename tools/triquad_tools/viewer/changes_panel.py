@@ -1,6 +1,6 @@
 """What appeared, vanished and moved between two checkpoints: boxes in the scene, and a list."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -15,15 +15,23 @@ from triquad_tools.mapfiles.object_changes import (
     ObjectChanges,
     object_changes,
 )
-from triquad_tools.viewer.history import History, Moment
+from triquad_tools.viewer.history import Moment
+from triquad_tools.viewer.history_source import HistorySource
 from triquad_tools.viewer.panel import text_html
 from triquad_tools.viewer.refresher import Refresher
-from triquad_tools.viewer.stage import SceneOrigin
+from triquad_tools.viewer.shown_legends import LineMeaning, lines_html
+from triquad_tools.viewer.stage import Stage
 
 # Of Okabe and Ito's colours, which all can tell apart, those that stand out on mesh and background.
 APPEARED, VANISHED, MOVED = "#56b4e9", "#d55e00", "#cc79a7"
+_LINES = (
+    LineMeaning(APPEARED, False, "appeared (A): free space before"),
+    LineMeaning(VANISHED, True, "vanished (V): free space now"),
+    LineMeaning(MOVED, False, "moved (M): from the dashed box to the solid one"),
+)
 _PERIOD_S = 1.0
 _BEFORE = "the checkpoint before"
+_NOTHING = "There is no checkpoint before this one: choose another to compare with."
 _DRAWN, _LISTED = 50, 5  # at most, of each kind
 _BESIDE_M = 0.1  # outlines lie so far outside of what they surround
 _DASH_M = 0.8  # and a gap, together
@@ -57,81 +65,54 @@ class Change(NamedTuple):
 class ChangesPanel:
     """Shows on request what changed up to the checkpoint that a page shows."""
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        history: History,
-        origin: SceneOrigin,
-        *,
-        failed: Callable[[str], None],
-    ) -> None:
-        self._scene = client.scene
-        self._history = history
-        self._origin = origin
-        self._moments: tuple[Moment, ...] = ()
-        self._shown: Moment | None = None
+    def __init__(self, source: HistorySource, stage: Stage) -> None:
+        self._source = source
+        self._stage = stage
         self._compared: Between | None = None
         self._handles: list[viser.SceneNodeHandle] = []
-        self._folder = client.gui.add_folder("What changed")
+        self._folder = stage.gui.add_folder("What changed")
         with self._folder:
-            self._on = client.gui.add_checkbox("Show", False)
-            self._since = client.gui.add_dropdown("Since", (_BEFORE,))
-            self._text = client.gui.add_html("")
-        self._refresher = Refresher("changes", self._refresh, _PERIOD_S, failed)
+            self._on = stage.gui.add_checkbox("Show changes", False)
+            self._since = stage.gui.add_dropdown("Since", (_BEFORE,))
+            self._text = stage.gui.add_html("")
+        self._refresher = Refresher("changes", self._refresh, _PERIOD_S, stage.failed)
         for control in (self._on, self._since):
             control.on_update(lambda _: self._refresher.wake())
 
-    def offer(self, moments: tuple[Moment, ...]) -> None:
-        """Let one of these be chosen."""
-        self._moments = moments
-        options = (_BEFORE, *map(str, reversed(moments)))
-        if self._since.options != options:
-            self._since.options = options
-
-    def show(self, moment: Moment) -> None:
-        """Compare with this one, which the page shows."""
-        self._shown = moment
-        self._refresher.wake()
-
     def close(self) -> None:
-        """Draw no more."""
+        """Draw no more; what was drawn and the folder go."""
         self._refresher.close()
         self._clear()
         self._folder.remove()
 
     def _refresh(self) -> None:
-        shown = self._shown
-        if not self._on.value or shown is None:
-            self._compared = None
-            self._clear()
-            return
-        other = self._other(shown)
-        if other is None or other == shown:
-            self._compared = None
-            self._clear("There is no checkpoint before this one: choose another to compare with.")
-            return
-        between = Between(*sorted((other, shown), key=lambda moment: moment.epoch))
-        if between != self._compared:
+        moments = self._source.history.moments
+        options = (_BEFORE, *map(str, reversed(moments)))
+        if self._since.options != options:
+            self._since.options = options
+        shown = self._source.moment
+        other = self._other(shown, moments)
+        between = None
+        if self._on.value and other is not None and other != shown:
+            between = Between(*sorted((other, shown), key=lambda moment: moment.epoch))
+        if between is None:
+            self._clear(_NOTHING if self._on.value else "")
+        elif between != self._compared:
             self._clear(f"comparing epochs {between.before.epoch} and {between.after.epoch} …")
             self._draw(between, self._changes(between))
-            self._compared = between
+        self._compared = between
 
-    def _other(self, shown: Moment) -> Moment | None:
+    def _other(self, shown: Moment, moments: tuple[Moment, ...]) -> Moment | None:
+        """With what the moment that is shown is compared."""
         if self._since.value == _BEFORE:
-            earlier = [moment for moment in self._moments if moment.epoch < shown.epoch]
+            earlier = [moment for moment in moments if moment.epoch < shown.epoch]
             return earlier[-1] if earlier else None
-        return next((one for one in self._moments if str(one) == self._since.value), None)
+        return next((one for one in moments if str(one) == self._since.value), None)
 
     def _changes(self, between: Between) -> ObjectChanges:
-        old = self._history.use(between.before)
-        try:
-            new = self._history.use(between.after)
-            try:
-                return object_changes(compare(old.opened, new.opened))
-            finally:
-                self._history.release(between.after)
-        finally:
-            self._history.release(between.before)
+        history = self._source.history
+        with history.using(between.before) as old, history.using(between.after) as new:
+            return object_changes(compare(old.opened, new.opened))
 
     def _draw(self, between: Between, found: ObjectChanges) -> None:
         for change in _drawn(found):
@@ -139,22 +120,27 @@ class ChangesPanel:
         for number, move in enumerate(found.moved[:_DRAWN], start=1):
             way = np.array([[move.before.middle_m, move.after.middle_m]])
             self._add_lines(f"/changes/moved_{number}", way, MOVED)
-        self._text.content = text_html(_heading(between)) + _legend_html() + text_html(_list(found))
+        self._stage.legends.lines["changes"] = _LINES
+        self._text.content = (
+            text_html(_heading(between)) + lines_html(_LINES) + text_html(_list(found))
+        )
 
     def _outline(self, change: Change) -> None:
         lines = _outline(change.cluster)
         name = f"/changes/{change.name}"
         self._add_lines(name, _dashes(lines) if change.dashed else lines, change.colour)
         top = change.cluster.middle_m + [0, 0, change.cluster.size_m[2] / 2 + 2 * _BESIDE_M]
-        place = self._origin.in_scene(top)
-        self._handles.append(self._scene.add_label(f"{name}_name", change.name, position=place))
+        place = self._stage.in_scene(top)
+        self._handles.append(
+            self._stage.scene.add_label(f"{name}_name", change.name, position=place)
+        )
 
     def _add_lines(self, name: str, lines: Doubles, colour: str) -> None:
         """Draw lines [L, 2, 3], metres, map frame."""
         self._handles.append(
-            self._scene.add_line_segments(
+            self._stage.scene.add_line_segments(
                 name,
-                self._origin.in_scene(lines),
+                self._stage.in_scene(lines),
                 to_rgb(colour),
                 thickness=_LINE_PX,
                 thickness_units="screen",
@@ -165,6 +151,7 @@ class ChangesPanel:
         for handle in self._handles:
             handle.remove()
         self._handles.clear()
+        self._stage.legends.lines.pop("changes", None)
         content = text_html(text) if text else ""
         if self._text.content != content:
             self._text.content = content
@@ -199,20 +186,6 @@ def _dashes(lines: Doubles) -> Doubles:
 
 def _heading(between: Between) -> str:
     return f"From {between.before}\nto {between.after}:"
-
-
-def _legend_html() -> str:
-    entries = (
-        (APPEARED, "solid", "appeared (A): free space before"),
-        (VANISHED, "dashed", "vanished (V): free space now"),
-        (MOVED, "solid", "moved (M): from dashed to solid box"),
-    )
-    return "".join(
-        '<div style="padding: 0 1.3em; font-size: 0.8em">'
-        f'<span style="display: inline-block; width: 2.5em; border-top: 3px {style} {colour}; '
-        f'vertical-align: middle; margin-right: 0.6em"></span>{label}</div>'
-        for colour, style, label in entries
-    )
 
 
 def _list(found: ObjectChanges) -> str:

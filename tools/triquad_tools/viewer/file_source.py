@@ -22,6 +22,8 @@ _WAIT_S = 0.1
 class FileSource:
     """A map in memory; it is closed by who opened it."""
 
+    grows = False
+
     def __init__(self, opened: OfflineMap, path: Path, maker: TileMaker) -> None:
         """``path`` is the file that the map was read from."""
         self.opened = opened

@@ -21,7 +21,7 @@ class Framing:
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
-        self._taken = stage.keeps_camera
+        self._taken = False
         camera = stage.client.camera
         camera.fov = _VIEW_RAD
         camera.near = _NEAR_M

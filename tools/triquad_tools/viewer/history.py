@@ -1,6 +1,8 @@
 """The checkpoints of a store that can be shown, in the order of time."""
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +47,7 @@ class History:
             MapFileError: there are no checkpoints, or those of several maps.
             OSError: the folder cannot be read.
         """
-        self._folder = map_folder(store)
+        self.folder = map_folder(store)
         self._maps = maps
         self._moments: dict[CheckpointFile, Moment] = {}
         self._damaged: dict[CheckpointFile, str] = {}
@@ -73,7 +75,7 @@ class History:
         Raises:
             OSError: the folder cannot be read.
         """
-        found = checkpoint_files(self._folder)
+        found = checkpoint_files(self.folder)
         with self._reading:
             for file in found:
                 if file not in self._moments and file not in self._damaged:
@@ -100,6 +102,15 @@ class History:
     def release(self, moment: Moment) -> None:
         """It is shown no longer."""
         self._maps.release(moment.path)
+
+    @contextmanager
+    def using(self, moment: Moment) -> Iterator[FileSource]:
+        """The map as it was; errors as of :meth:`use`."""
+        source = self.use(moment)
+        try:
+            yield source
+        finally:
+            self.release(moment)
 
     def _read(self, file: CheckpointFile) -> None:
         time = ""

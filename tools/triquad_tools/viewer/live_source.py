@@ -17,6 +17,8 @@ _POINT = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 class LiveSource:
     """The map of a server; the client is closed by who opened it."""
 
+    grows = True
+
     def __init__(self, client: Client, endpoint: str) -> None:
         """Ask the server for the lengths of its mesh.
 

@@ -100,6 +100,10 @@ class MapSource(Protocol):
     def sizes(self) -> TileSizes:
         """Of its mesh."""
 
+    @property
+    def grows(self) -> bool:
+        """Whether more of it may become known while somebody looks."""
+
     def state(self) -> MapState:
         """What is shown now.
 

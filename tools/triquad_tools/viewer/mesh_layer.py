@@ -57,6 +57,7 @@ class MeshLayer:
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
         self._framing = Framing(stage)
+        self._framed = False
         self._whole = stage.source.follow(COARSEST)
         self._near = [NearTiles(stage.source, level) for level in range(COARSEST)]
         self._drawn: dict[Name, DrawnTile] = {}
@@ -66,8 +67,10 @@ class MeshLayer:
         levels = COARSEST + 1 + _THINNED_LEVELS
         self._cells_m = np.array([stage.source.sizes.cell_of(level) for level in range(levels)])
         self._folder = stage.gui.add_folder("Mesh")
+        # A file does not tell in which epoch a part of it changed.
+        colours = (_HEIGHT, _AGE, _CONFIDENCE) if stage.source.grows else (_HEIGHT, _CONFIDENCE)
         with self._folder:
-            self._by = stage.gui.add_dropdown("Colour", (_HEIGHT, _AGE, _CONFIDENCE))
+            self._by = stage.gui.add_dropdown("Colour", colours)
             self._legend = stage.gui.add_html("")
             self._pixels = stage.gui.add_slider("Pixels per cell", 1, 20, 1, _PIXELS)
         self._refresher = Refresher("mesh", self._refresh, _PERIOD_S, stage.failed)
@@ -78,6 +81,7 @@ class MeshLayer:
     def close(self) -> None:
         """Draw no more; what was drawn and the folder go."""
         self._refresher.close()
+        self._stage.legends.scales.pop("mesh", None)
         self._whole.close()
         for near in self._near:
             near.close()
@@ -97,7 +101,9 @@ class MeshLayer:
         if not roots:
             return
         points = _some_vertices(roots.values())
-        self._framing.follow(points)
+        if self._stage.source.grows or not self._framed:
+            self._framing.follow(points)
+            self._framed = self._whole.complete
         levels = self._wanted_levels(roots)
         for near in self._near:
             within = [index for index, level in levels.items() if level <= near.level]
@@ -116,7 +122,7 @@ class MeshLayer:
             colours = ConfidenceColours(self._stage.source.queries)
         else:
             colours = HeightColours.of_heights(points[:, 2])
-        self._stage.scales["mesh"] = colours.scale
+        self._stage.legends.scales["mesh"] = colours.scale
         legend = legend_html(colours.scale)
         if self._legend.content != legend:
             self._legend.content = legend
@@ -160,7 +166,8 @@ class MeshLayer:
         """Draw a tile; what stood for it before goes in the next round."""
         triangles = Triangles(want.tile.vertices, want.tile.faces)
         if want.level > COARSEST:
-            triangles = thinned(*triangles, cell_m=float(self._cells_m[want.level]))
+            side_m = self._stage.source.sizes.side_of(COARSEST)
+            triangles = thinned(triangles, float(self._cells_m[want.level]), side_m)
         handle = None
         if len(triangles.faces):
             self._number += 1

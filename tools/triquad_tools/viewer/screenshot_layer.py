@@ -30,7 +30,7 @@ class ScreenshotLayer:
         self._button.disabled = True
         try:
             state = self._stage.source.state()
-            picture = captioned(self._picture(), state, list(self._stage.scales.values()))
+            picture = captioned(self._picture(), state, self._stage.legends)
             encoded = io.BytesIO()
             picture.save(encoded, "PNG")
             self._stage.client.send_file_download(

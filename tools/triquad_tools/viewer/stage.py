@@ -9,8 +9,8 @@ import viser
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
-from triquad_tools.viewer.legend import Scale
 from triquad_tools.viewer.map_source import MapSource
+from triquad_tools.viewer.shown_legends import ShownLegends
 
 _GRID_M = 100.0
 
@@ -52,8 +52,7 @@ class Stage:
     source: MapSource
     failed: Callable[[str], None]  # shows what went wrong; an empty text: nothing does any more
     origin: SceneOrigin
-    scales: dict[str, Scale]  # of colours that are shown now, by what has them
-    keeps_camera: bool = False  # it shows the same place as what was shown before
+    legends: ShownLegends
 
     @property
     def scene(self) -> viser.SceneApi:

@@ -45,6 +45,7 @@ class Viewer:
         """Serve no longer."""
         with self._changing:
             visits = list(self._visits.values())
+            self._visits.clear()
         for visit in visits:
             visit.close()
         with redirect_stdout(io.StringIO()):
