@@ -25,12 +25,3 @@ def table_html(rows: Iterable[tuple[str, str]]) -> str:
         for name, value in rows
     )
     return f'<table style="{_TEXT}">{cells}</table>'
-
-
-def swatch_html(colour: str, meaning: str) -> str:
-    """A colour by itself, and its meaning."""
-    box = f"display: inline-block; width: 1.2em; height: 0.8em; background: {colour}"
-    return (
-        f'<div style="{_TEXT}"><span style="{box}; border: 1px solid #555"></span> '
-        f"{escape(meaning)}</div>"
-    )

@@ -1,6 +1,5 @@
 """Clicks into a scene: they ask the map at a point, or lay a path."""
 
-import warnings
 from collections.abc import Callable
 from functools import partial
 from queue import Empty, SimpleQueue
@@ -14,9 +13,6 @@ from triquad_tools.viewer.asking.questions import Pace
 from triquad_tools.viewer.asking.sight import surface_along
 from triquad_tools.viewer.refresher import Refresher
 from triquad_tools.viewer.stage import Stage
-
-# A person who has left is not told that clicks are not listened to any more.
-warnings.filterwarnings("ignore", "Queued a ScenePointerEnableMessage on a closed connection")
 
 _PERIOD_S = 0.5
 _ASKS, _LAYS, _NOTHING = "asks the map", "adds to the path", "does nothing"

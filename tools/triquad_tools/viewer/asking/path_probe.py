@@ -13,12 +13,17 @@ from triquad_tools.viewer.asking.distance_scale import distance_colours, distanc
 from triquad_tools.viewer.asking.path_check import PathAnswer, ask_path
 from triquad_tools.viewer.asking.questions import newest_epoch
 from triquad_tools.viewer.asking.tube import Tube, add_tube
-from triquad_tools.viewer.legend import Scale, legend_html
-from triquad_tools.viewer.panel import swatch_html, table_html, text_html
+from triquad_tools.viewer.legend import legend_html
+from triquad_tools.viewer.panel import table_html, text_html
+from triquad_tools.viewer.shown_legends import LineMeaning, lines_html
 from triquad_tools.viewer.stage import Stage
 
 _RADIUS_M = 0.3
-_SCALE = "path"
+_NAME = "path"
+_LINES = (
+    LineMeaning(BEHIND, False, "blocked: the robot touches a surface"),
+    LineMeaning(UNKNOWN, False, "the robot is in unknown space"),
+)
 _LEAST_LEG_M = 0.01  # a second click at the same place adds nothing
 _LEAST_WIDTH = 0.002  # radius of what is drawn, as a share of the distance of the eye
 _SKY = "No surface there: the path stays as it was."
@@ -39,7 +44,7 @@ class PathProbe:
         )
         self._undo = gui.add_button("Undo last point", visible=False)
         self._clear = gui.add_button("Clear path", visible=False)
-        self._text = gui.add_html("", visible=False)
+        self._text = gui.add_html(path_html([], None), visible=False)
         self._legend = gui.add_html("", visible=False)
         self._radius.on_update(lambda _: do(self._check))
         self._undo.on_click(lambda _: do(self._undo_last))
@@ -92,14 +97,15 @@ class PathProbe:
     def _check(self) -> None:
         """Ask about the path as it is now, and draw it."""
         self._answer = None
-        self._stage.scales.pop(_SCALE, None)
+        self._stage.legends.scales.pop(_NAME, None)
+        self._stage.legends.lines.pop(_NAME, None)
         if self.unanswered:
             queries = self._stage.source.queries
             points = np.array(self._points)
             self._answer = ask_path(queries, points, float(self._radius.value))
             scale = distance_scale("clearance of the robot's middle, m", self._answer.reach_m)
-            self._legend.content = path_legend_html(scale)
-            self._stage.scales[_SCALE] = scale
+            self._legend.content = legend_html(scale) + lines_html(_LINES)
+            self._stage.legends.scales[_NAME], self._stage.legends.lines[_NAME] = scale, _LINES
         self._text.content = path_html(self._points, self._answer)
         with self._stage.client.atomic():
             self._erase()
@@ -163,14 +169,3 @@ def path_html(points: list[Doubles], answer: PathAnswer | None) -> str:
         least = f"{answer.reach_m:g} m or more"
     rows += [("least clearance", least), ("epoch", f"{whole.epoch}")]
     return table_html(rows)
-
-
-def path_legend_html(scale: Scale) -> str:
-    """What the colours of a path mean."""
-    return "".join(
-        [
-            legend_html(scale),
-            swatch_html(BEHIND, "blocked: the robot touches a surface"),
-            swatch_html(UNKNOWN, "the robot is in unknown space"),
-        ]
-    )

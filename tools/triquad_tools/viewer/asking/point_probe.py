@@ -122,7 +122,7 @@ def point_html(point: AskedPoint, answer: Distances) -> str:
     unseen = ": not seen, so the distance is to what was" if status is Status.UNKNOWN else ""
     rows = [
         ("position", f"{x:.3f}, {y:.3f}, {z:.3f} m"),
-        ("", f"{point.raised_m:.2f} m above what was clicked at"),
+        ("raised by", f"{point.raised_m:.2f} m"),
         ("distance", distance),
         ("gradient", gradient),
         ("status", f"{status.name}{unseen}"),

@@ -10,8 +10,9 @@ from triquad_tools.viewer.asking.sight import ground_in_view
 from triquad_tools.viewer.asking.slice_drawing import SliceDrawing
 from triquad_tools.viewer.asking.slice_plane import HEIGHT_AXIS, SlicePlane, ask_slice
 from triquad_tools.viewer.legend import legend_html
-from triquad_tools.viewer.panel import swatch_html, text_html
+from triquad_tools.viewer.panel import text_html
 from triquad_tools.viewer.refresher import Refresher
+from triquad_tools.viewer.shown_legends import LineMeaning, lines_html
 from triquad_tools.viewer.stage import Stage
 
 _PERIOD_S = 0.5
@@ -20,7 +21,7 @@ _REACH_M = 20.0  # of the slider, to both sides of where the slice was put
 _STEP_M = 0.05
 _ABOVE_M = 0.75  # the ground in the middle of the view: where a level slice is put
 _MAX_DISTANCE_M = 3.0
-_SCALE = "slice"
+_NAME = "slice"
 
 
 class SliceLayer:
@@ -82,7 +83,8 @@ class SliceLayer:
     def _erase(self) -> None:
         self._drawing.erase()
         self._drawn = None
-        self._stage.scales.pop(_SCALE, None)
+        self._stage.legends.scales.pop(_NAME, None)
+        self._stage.legends.lines.pop(_NAME, None)
 
     def _place(self) -> None:
         """Put the slice through the middle of the view, with room to move it."""
@@ -96,13 +98,11 @@ class SliceLayer:
     def _explain(self, max_distance_m: float, epoch: int) -> None:
         step_m = contour_step(max_distance_m)
         scale = distance_scale("distance to the nearest surface, m", max_distance_m)
-        self._stage.scales[_SCALE] = scale
-        self._legend.content = "".join(
-            [
-                legend_html(scale),
-                swatch_html(BEHIND, "behind a surface"),
-                swatch_html(UNKNOWN, "unknown: not seen"),
-                swatch_html("#fff", f"lines every {step_m:g} m; black: the surface itself"),
-                text_html(f"epoch {epoch}"),
-            ]
+        lines = (
+            LineMeaning("#000000", False, "the surface itself"),
+            LineMeaning("#ffffff", False, f"every {step_m:g} m from it"),
+            LineMeaning(BEHIND, False, "behind a surface"),
+            LineMeaning(UNKNOWN, False, "unknown: not seen"),
         )
+        self._stage.legends.scales[_NAME], self._stage.legends.lines[_NAME] = scale, lines
+        self._legend.content = legend_html(scale) + lines_html(lines) + text_html(f"epoch {epoch}")

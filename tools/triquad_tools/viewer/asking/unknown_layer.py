@@ -12,13 +12,16 @@ from triquad_tools.viewer.asking.unknown_boundary import (
     ask_boundary,
     face_triangles,
 )
-from triquad_tools.viewer.panel import swatch_html, text_html
+from triquad_tools.viewer.panel import text_html
 from triquad_tools.viewer.refresher import Refresher
+from triquad_tools.viewer.shown_legends import LineMeaning, lines_html
 from triquad_tools.viewer.stage import Stage
 from triquad_tools.viewer.unlit_glb import unlit_glb
 
 _PERIOD_S = 1.0
 _COLOUR_HEX = "#cc79a7"
+_MEANING = (LineMeaning(_COLOUR_HEX, False, "between free and unknown space"),)
+_NAME = "unknown space"
 _COLOUR = np.array(to_rgb(_COLOUR_HEX))
 _SHADES = np.array([0.8, 0.65, 1.0])  # of faces across x, y and z: else no edge would be seen
 _GAMMA = 2.2  # from colours on a screen to light
@@ -73,15 +76,15 @@ class UnknownLayer:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-        self._legend.content = swatch_html(
-            _COLOUR_HEX, "between free and unknown space"
-        ) + text_html(_extent(box, boundary))
+        self._legend.content = lines_html(_MEANING) + text_html(_extent(box, boundary))
+        self._stage.legends.lines[_NAME] = _MEANING
         self._drawn, self._epoch = box, boundary.epoch
 
     def _erase(self) -> None:
         if self._surface is not None:
             self._surface.remove()
         self._surface = self._drawn = None
+        self._stage.legends.lines.pop(_NAME, None)
 
 
 def _extent(box: CellBox, boundary: Boundary) -> str:
