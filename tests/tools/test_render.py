@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
+from triquad_tools.plots.camera import Camera
 from triquad_tools.plots.raster import rasterise, vertex_normals
-from triquad_tools.plots.render import Camera, height_colours, render_mesh
+from triquad_tools.plots.render import height_colours, render_mesh
 
 SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -19,7 +19,8 @@ from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.results import Intake, MapSize, Restart
 from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
 from triquad_tools.evaluation.metrics import MeshScores, score_against_drive
-from triquad_tools.plots.render import Camera, height_colours, render_mesh
+from triquad_tools.plots.camera import Camera
+from triquad_tools.plots.render import height_colours, render_mesh
 from triquad_tools.recordings.publishing import publish_all, wait_until_settled
 
 MAP = "demo"

@@ -1,6 +1,5 @@
 """A picture of a whole mesh, seen from above and aside."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,8 @@ from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.source import Box
-from triquad_tools.plots.render import Camera, height_colours, render_mesh, view_axes
-
-_VIEW_DEG = 35.0
-_TOWARDS_EYE = np.array([-0.45, -0.65, 0.62])
-_FRAMED = (1.0, 99.0)  # percentiles: what lies far away from all else does not make it small
-_MARGIN = 1.05
-_ENOUGH = 200_000  # vertices, to find the place of the camera
-_ASPECT = 16 / 9
+from triquad_tools.plots.camera import camera_around
+from triquad_tools.plots.render import height_colours, render_mesh
 
 
 def export_picture(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
@@ -46,21 +39,6 @@ def draw_mesh(mesh: Mesh, path: Path) -> None:
     faces = _towards(mesh.vertices, mesh.faces, camera.eye)
     image = render_mesh(mesh.vertices, faces, height_colours(mesh.vertices), camera=camera)
     imsave(path, image)
-
-
-def camera_around(vertices: NDArray[np.floating]) -> Camera:
-    """A camera that looks down aslant and has nearly all vertices ``[V, 3]`` in its picture."""
-    if len(vertices) == 0:
-        return Camera(_TOWARDS_EYE, np.zeros(3), _VIEW_DEG)
-    some = vertices[:: max(1, len(vertices) // _ENOUGH)].astype(np.float64)
-    axes = view_axes(-_TOWARDS_EYE)
-    seen = some @ axes.T
-    middle = 0.5 * np.percentile(seen, _FRAMED, axis=0).sum(axis=0)
-    right, down, ahead = (seen - middle).T
-    tangent = math.tan(0.5 * math.radians(_VIEW_DEG))
-    needed = np.maximum(np.abs(right) / _ASPECT, np.abs(down)) / tangent - ahead
-    distance_m = _MARGIN * np.percentile(needed, _FRAMED[1])
-    return Camera((middle - [0.0, 0.0, distance_m]) @ axes, middle @ axes, _VIEW_DEG)
 
 
 def _towards(

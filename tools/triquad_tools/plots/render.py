@@ -3,17 +3,14 @@
 Own code, as the libraries that do this want a display, a GPU driver or hundreds of megabytes.
 """
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints
 
+from triquad_tools.plots.camera import Camera, view_axes
 from triquad_tools.plots.raster import Raster, rasterise, vertex_normals
 
-_NEAR_M = 0.1  # what is nearer than this to the eye is not drawn
 _SUPERSAMPLING = 2
 _SHADOW_PIXELS = 3072
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
@@ -35,52 +32,6 @@ _HEIGHT_STOPS = np.array(
         [0.78, 0.32, 0.25],
     ]
 )
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A perspective camera in the map frame; the picture's top is towards +z."""
-
-    eye: Doubles  # [3] metres
-    target: Doubles  # [3] metres, in the middle of the picture
-    view_deg: float = 35.0  # vertical opening angle
-
-    @property
-    def axes(self) -> Doubles:
-        """Unit vectors ``[3, 3]``: to the right, down, and forward, in the map frame."""
-        return view_axes(self.target - self.eye)
-
-    def project(self, points: Doubles, width: int, height: int) -> Doubles:
-        """Column, row and inverse depth ``[N, 3]`` of points ``[N, 3]``; NaN behind the eye."""
-        seen = (points - self.eye) @ self.axes.T
-        depth = np.where(seen[:, 2] > _NEAR_M, seen[:, 2], np.nan)
-        pixels = self._pixels_per_tangent(height)
-        column = 0.5 * width + pixels * seen[:, 0] / depth
-        row = 0.5 * height + pixels * seen[:, 1] / depth
-        return np.column_stack([column, row, 1.0 / depth])
-
-    def unproject(self, nearness: Doubles) -> Doubles:
-        """Points ``[H, W, 3]`` of the world that the pixels of a picture show."""
-        height, width = nearness.shape
-        pixels = self._pixels_per_tangent(height)
-        right, down, forward = self.axes
-        columns = (np.arange(width) + 0.5 - 0.5 * width) / pixels
-        rows = (np.arange(height) + 0.5 - 0.5 * height) / pixels
-        rays = columns[None, :, None] * right + rows[:, None, None] * down + forward
-        points: Doubles = self.eye + rays / nearness[:, :, None]
-        return points
-
-    def _pixels_per_tangent(self, height: int) -> float:
-        return 0.5 * height / math.tan(0.5 * math.radians(self.view_deg))
-
-
-def view_axes(forward: Doubles) -> Doubles:
-    """Unit vectors ``[3, 3]`` to the right, down and forward of a view in a direction ``[3]``."""
-    forward = forward / np.linalg.norm(forward)
-    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
 
 
 def render_mesh(

@@ -6,7 +6,7 @@ import numpy as np
 import viser
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.plots.picture import camera_around
+from triquad_tools.plots.camera import camera_around
 from triquad_tools.viewer.stage import Stage
 
 _NEAR_M, _FAR_M = 0.1, 20_000.0
