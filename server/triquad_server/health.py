@@ -14,7 +14,6 @@ from triquad_format.wire.messages import ServerStatus
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.mapping.thread_time import Activity
 from triquad_server.memory import resident_bytes
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.store.checkpoint_thread import CheckpointThread
@@ -24,7 +23,10 @@ _log = logging.getLogger(__name__)
 STATUS_PERIOD_S = 1.0
 
 STUCK_S = 120.0
-"""No step of mapping takes as long, not even where code is compiled first."""
+"""For no longer the mapper's thread waits without being stuck: for others that compile, at most."""
+
+ENDLESS_S = 1800.0
+"""Nothing that it computes takes longer, neither code to compile nor a large checkpoint."""
 
 _BEATS_PER_LOG_LINE = 5
 
@@ -74,17 +76,19 @@ class Health:
             samples_left=progress.samples_left,
         )
 
-    def mapping_problem(self) -> str | None:
+    def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
         """Why nothing is mapped any more, ``None`` where all is well.
 
-        Nothing but a restart helps.
+        Nothing but a restart helps. A thread that computes is alive, for :data:`ENDLESS_S` at most;
+        one that waits is alive if it hears the :class:`Heartbeat`, which wakes it.
         """
         if self.mapper.ended is not None:
             return self.mapper.ended
-        activity, for_s = self.mapper.time.current()
-        if activity is not Activity.IDLE and for_s > STUCK_S:
-            return f"mapping makes no progress: it is at {activity.value} since {for_s:.0f} s"
-        return None
+        current = self.mapper.time.current()
+        if current.waited_s <= stuck_s and current.for_s <= ENDLESS_S:
+            return None
+        at, for_s = current.activity.value, current.for_s
+        return f"mapping makes no progress: it is at {at} since {for_s:.0f} s"
 
     def problem(self) -> str | None:
         """Why the server does not do all that it should, ``None`` where it does.
@@ -96,6 +100,15 @@ class Health:
         if mapping is not None or not self.checkpoints.has_store or self.checkpoints.error is None:
             return mapping
         return f"what is mapped is not kept: {self.checkpoints.error}"
+
+    def summary(self) -> str:
+        """What the server does, and what keeps it from that, in a line."""
+        doing = (
+            f"serving map '{self.map_name}': epoch {self.mapper.epochs.newest.number}, "
+            f"{self.mapper.progress.scans_taken} scans taken"
+        )
+        problem = self.problem()
+        return doing if problem is None else f"{doing}; {problem}"
 
     def report(self) -> dict[str, object]:
         """What a program that watches the server is told; ``problem`` is as :meth:`problem`."""
@@ -147,6 +160,7 @@ class Heartbeat:
         while not self._stopping.wait(STATUS_PERIOD_S):
             beat += 1
             try:
+                self._health.mapper.wake()  # for a sign of life, even where nothing is to do
                 self._health.warnings.check()
                 status = self._health.status()
                 self._publisher.put(codec.encode(status))

@@ -114,7 +114,7 @@ class Service:
             period_s=self._settings.store.period_s,
             last=self._served.restored,
         )
-        health = Health(
+        self.health = health = Health(
             map_name=self._served.name,
             server=secrets.token_hex(8),
             device=self._served.device,

@@ -13,7 +13,7 @@ from triquad_tools.viewer.detail import Viewpoint, wanted_levels
 from triquad_tools.viewer.live_source import LiveSource
 from triquad_tools.viewer.map_source import COARSEST
 from triquad_tools.viewer.near_tiles import NearTiles
-from triquad_tools.viewer.thinning import thinned
+from triquad_tools.viewer.thinning import Triangles, thinned
 from triquad_tools.viewer.unlit_glb import unlit_glb
 
 CELLS_M = np.array([0.1, 0.2, 0.4, 0.8, 1.6])
@@ -39,20 +39,40 @@ def test_cells_are_as_coarse_as_their_pixels_allow(
 
 def test_a_thinned_mesh_is_smaller_and_stays_where_it_was() -> None:
     ball = trimesh.creation.icosphere(5, 3.0)
-    fewer = thinned(ball.vertices.astype(np.float32), ball.faces.astype(np.int32), 0.5)
+    middle = np.array([12.0, 12.0, 12.0])
+    mesh = Triangles((middle + ball.vertices).astype(np.float32), ball.faces.astype(np.int32))
+    fewer = thinned(mesh, 0.5, SIDE_M)
     assert 100 < len(fewer.faces) < 0.2 * len(ball.faces)
-    radii = np.linalg.norm(fewer.vertices, axis=1)
+    radii = np.linalg.norm(fewer.vertices - middle, axis=1)
     assert (np.abs(radii - 3.0) < 0.1).all()
     a, b, c = fewer.faces.T
     assert not ((a == b) | (b == c) | (a == c)).any()
     corners = fewer.vertices[fewer.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outwards = (across * corners.mean(axis=1)).sum(axis=1) > 0
+    outwards = (across * (corners.mean(axis=1) - middle)).sum(axis=1) > 0
     assert outwards.mean() > 0.99, "faces go on to look outwards"
 
 
+def test_tiles_that_are_thinned_alike_meet_without_cracks() -> None:
+    """A wavy ground across the side at x = 0 of two tiles."""
+    x, y = np.meshgrid(np.arange(65) * 0.1, np.arange(65) * 0.1, indexing="ij")
+    rows = np.arange(65 * 65).reshape(65, 65)
+    a, b, c, d = (rows[i : i + 64, j : j + 64].ravel() for i, j in np.ndindex(2, 2))
+    faces = np.concatenate([np.stack([a, c, d], 1), np.stack([a, d, b], 1)]).astype(np.int32)
+    sides = []
+    for shift in (0.0, -6.4):  # of the second tile, which lies at smaller x
+        z = 1.0 + 0.5 * np.sin(3 * (x + shift)) * np.cos(2 * y)
+        vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+        fewer = thinned(Triangles(vertices, faces), 0.8, 6.4)
+        assert len(fewer.faces) < 0.1 * len(faces)
+        at_m = -shift
+        sides.append(fewer.vertices[np.abs(fewer.vertices[:, 0] - at_m) < 1e-4][:, 1:])
+    assert len(sides[0]) > 8
+    np.testing.assert_allclose(*(np.sort(side, axis=0) for side in sides), atol=1e-4)
+
+
 def test_nothing_thinned_is_nothing() -> None:
-    none = thinned(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), 0.5)
+    none = thinned(Triangles(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)), 0.5, SIDE_M)
     assert none.vertices.shape == none.faces.shape == (0, 3)
 
 

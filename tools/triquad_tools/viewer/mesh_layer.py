@@ -166,7 +166,8 @@ class MeshLayer:
         """Draw a tile; what stood for it before goes in the next round."""
         triangles = Triangles(want.tile.vertices, want.tile.faces)
         if want.level > COARSEST:
-            triangles = thinned(*triangles, cell_m=float(self._cells_m[want.level]))
+            side_m = self._stage.source.sizes.side_of(COARSEST)
+            triangles = thinned(triangles, float(self._cells_m[want.level]), side_m)
         handle = None
         if len(triangles.faces):
             self._number += 1
