@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from triquad_client import OfflineMap
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.reader import MapFile
 
@@ -166,6 +165,8 @@ def _log(options: argparse.Namespace) -> int:
 
 def _diff(options: argparse.Namespace) -> int:
     """Two map files."""
+    from triquad_client import OfflineMap  # slow to import
+
     a, b = (read_whole(path) for path in options.files)
     with progress("comparing"), OfflineMap(a.record) as old, OfflineMap(b.record) as new:
         comparison = compare(old, new)
