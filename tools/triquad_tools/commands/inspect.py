@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from triquad_client import OfflineMap
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import MapFile
@@ -194,6 +193,8 @@ def _log(options: argparse.Namespace) -> int:
 
 def _diff(options: argparse.Namespace) -> int:
     """Two map files."""
+    from triquad_client import OfflineMap  # slow to import
+
     files, titles = [], []
     for letter, target in zip("AB", map(str, options.files), strict=True):
         with map_file(target, options.map or _MAP) as path:

@@ -193,7 +193,7 @@ def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles
 
 def is_scored(places: Doubles, reference: Doubles, settings: ScoreSettings) -> Bools:
     """Whether places ``[N, 3]`` lie where a mesh is scored."""
-    low, high = scored_box(reference, settings)
+    low, high = np.array(scored_box(reference, settings))
     inside: Bools = ((places >= low) & (places <= high)).all(axis=1)
     return inside
 

@@ -3,15 +3,18 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_client import OfflineMap
 from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.cells import rows_by_cell
 from triquad_format.records.status import Status
 
 from triquad_tools.console.report import print_columns
+
+if TYPE_CHECKING:  # slow to import
+    from triquad_client import OfflineMap
 
 NEAR_ENOUGH_M = 1e-4
 """A point this near to the zero of the field is on the surface."""
@@ -96,7 +99,7 @@ class MapDiff:
     tiles: tuple[TileChange, ...]  # those that differ, the greatest change first
 
 
-def compare(a: OfflineMap, b: OfflineMap) -> Comparison:
+def compare(a: "OfflineMap", b: "OfflineMap") -> Comparison:
     """The surface of each of two maps, asked in the other."""
     return Comparison(_sighting(a, b), _sighting(b, a))
 
@@ -108,7 +111,7 @@ def difference(comparison: Comparison, tile_m: float) -> MapDiff:
     return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
 
 
-def surface_points(opened: OfflineMap) -> Doubles:
+def surface_points(opened: "OfflineMap") -> Doubles:
     """Points ``[N, 3]`` where the field is zero, at most one for each voxel where rays ended.
 
     The middles of these voxels are moved along the gradient by Newton's method. Those that have
@@ -149,7 +152,7 @@ def print_diff(diff: MapDiff, limit: int) -> None:
         print(f"  and {left} more: --limit {len(diff.tiles)} shows all")
 
 
-def _sighting(of: OfflineMap, by: OfflineMap) -> Sighting:
+def _sighting(of: "OfflineMap", by: "OfflineMap") -> Sighting:
     points = surface_points(of)
     answer = by.query_sdf(points)
     return Sighting(points, answer.sdf, answer.status, leaf_m=of.leaf_m)

@@ -73,9 +73,12 @@ class History:
         """Take up what a server wrote or deleted meanwhile.
 
         Raises:
-            OSError: the folder cannot be read.
+            ToolError: the folder cannot be read.
         """
-        found = checkpoint_files(self.folder)
+        try:
+            found = checkpoint_files(self.folder)
+        except OSError as error:
+            raise ToolError(f"{self.folder} cannot be read: {error.strerror}") from error
         with self._reading:
             for file in found:
                 if file not in self._moments and file not in self._damaged:

@@ -86,4 +86,6 @@ class TimePanel:
     def _tell(self) -> None:
         shown = self._source.moment
         place = f"{self._place_of(shown)} of {len(self._moments)}"
+        if shown not in self._moments:
+            place = "no longer in the store"
         self._text.content = text_html(f"{shown}\n{place}")
