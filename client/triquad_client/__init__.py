@@ -12,6 +12,14 @@ from triquad_format import __version__
 from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.metrics_messages import (
+    CheckpointMetrics,
+    OperationMetrics,
+    QueueMetrics,
+    ServerMetrics,
+    SourceMetrics,
+    TimeHistogram,
+)
 from triquad_map.asked import NotAskedError
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
@@ -24,14 +32,16 @@ from triquad_sensors.depth_image import Intrinsics, depth_points
 from triquad_sensors.errors import InvalidScanError
 from triquad_sensors.pose import Pose
 
-from triquad_client.async_client import AsyncClient, connect_async
+from triquad_client.async_client import AsyncClient
 from triquad_client.calls.async_queries import AsyncPinnedMap
 from triquad_client.calls.changes import ChangedBox, ChangeKind, ChangeReport
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.questions import SdfResult
 from triquad_client.calls.scans import FlushReport
+from triquad_client.calls.sources import NewestScan, ScanSource, SourceReport
 from triquad_client.checks import Bounds, PoseLike
-from triquad_client.client import Client, connect
+from triquad_client.client import Client
+from triquad_client.connecting import connect, connect_async
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
@@ -61,6 +71,7 @@ __all__ = [
     "ChangeReport",
     "ChangedBox",
     "CheckpointInfo",
+    "CheckpointMetrics",
     "Client",
     "ClosedError",
     "ConnectError",
@@ -80,24 +91,32 @@ __all__ = [
     "MeshTile",
     "MeshUpdate",
     "MeshWatch",
+    "NewestScan",
     "NoReplyError",
     "NotAskedError",
     "OfflineMap",
+    "OperationMetrics",
     "PinnedMap",
     "Polyline",
     "Pose",
     "PoseLike",
+    "QueueMetrics",
     "RayRanges",
     "RefusedError",
     "RequestTimeoutError",
+    "ScanSource",
     "SdfResult",
     "Segments",
+    "ServerMetrics",
     "ServerStatus",
+    "SourceMetrics",
+    "SourceReport",
     "Spheres",
     "Status",
     "SyncReport",
     "SyncedMap",
     "TileList",
+    "TimeHistogram",
     "TriquadError",
     "Unknown",
     "UnknownMapError",

@@ -1,21 +1,18 @@
 """The client for programs with an event loop."""
 
-import asyncio
-from collections.abc import Callable, Generator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
-from triquad_client.calls import admin, changes, download, questions
+from triquad_client.calls import admin, changes, download, questions, sources
 from triquad_client.calls.async_queries import AsyncMapQueries, AsyncPinnedMap
 from triquad_client.calls.changes import ChangeReport
 from triquad_client.calls.scans import FlushReport, ScanPublisher
+from triquad_client.calls.sources import SourceReport
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.client import Client
 from triquad_client.documentation import documented_as
@@ -23,7 +20,7 @@ from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.net.async_driver import AsyncDriver
-from triquad_client.net.connection import Connection, open_connection
+from triquad_client.net.connection import Connection
 from triquad_client.offline.synced_map import AsyncSyncedMap
 
 
@@ -99,6 +96,11 @@ class AsyncClient(AsyncMapQueries):
     ) -> ChangeReport:
         return await self._run(changes.changes(since, bounds))
 
+    async def sources(
+        self, since: SourceReport | None = None, max_points: int = 5_000
+    ) -> SourceReport:
+        return await self._run(sources.sources(since, max_points))
+
     async def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
         return await self._run(fetch_tiles(bounds, level))
 
@@ -121,6 +123,9 @@ class AsyncClient(AsyncMapQueries):
     async def status(self) -> ServerStatus:
         return await self._run(admin.status())
 
+    async def metrics(self) -> ServerMetrics:
+        return await self._run(admin.metrics())
+
     async def checkpoint(self) -> CheckpointInfo:
         return await self._run(admin.checkpoint())
 
@@ -140,52 +145,3 @@ class AsyncClient(AsyncMapQueries):
 
     async def maps(self) -> list[str]:
         return await self._driver.maps()
-
-
-class Connecting:
-    """A client that is being connected: await it, or use it in an ``async with`` statement."""
-
-    def __init__(self, open_: Callable[[], Connection]) -> None:
-        """Use :func:`connect_async`."""
-        self._open = open_
-
-    def __await__(self) -> Generator[Any, None, AsyncClient]:
-        return self._connect().__await__()
-
-    async def __aenter__(self) -> AsyncClient:
-        self._client = await self
-        return self._client
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._client.close()
-
-    async def _connect(self) -> AsyncClient:
-        sender = ThreadPoolExecutor(1, "triquad-sender")
-        opening = sender.submit(self._open)
-        try:
-            connection = await asyncio.wrap_future(opening)
-        except BaseException:
-            opening.add_done_callback(_close_late)
-            sender.shutdown(wait=False)
-            raise
-        return AsyncClient(connection, AsyncDriver(connection, sender))
-
-
-def connect_async(
-    endpoint: str = DEFAULT_ENDPOINT,
-    map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
-    *,
-    timeout_s: float = 10.0,
-    config: str | Path | None = None,
-) -> Connecting:
-    """Connect to a map server: ``async with connect_async(...) as client``, or await it and close.
-
-    Arguments and errors are those of :func:`connect`.
-    """
-    return Connecting(lambda: open_connection(endpoint, map, timeout_s, config=config))
-
-
-def _close_late(opening: "Future[Connection]") -> None:
-    """Close what was opened although its task was cancelled meanwhile."""
-    if not opening.cancelled() and opening.exception() is None:
-        opening.result().close()

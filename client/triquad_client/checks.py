@@ -159,6 +159,13 @@ def level_of_detail(level: int) -> int:
     return level
 
 
+def count(name: str, value: int, most: int) -> int:
+    """``value`` where it is a number of things, ``most`` at most."""
+    if type(value) is not int or not 0 <= value <= most:
+        raise InvalidInputError(f"{name} = {_shown(value)}: use 0 to {most}")
+    return value
+
+
 def bytes_per_second(limit: int | None) -> int:
     """A limit as it is sent: 0 is none."""
     if limit is not None and (type(limit) is not int or limit < 1):

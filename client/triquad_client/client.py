@@ -4,19 +4,20 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
-from triquad_client.calls import admin, changes, download, questions
+from triquad_client.calls import admin, changes, download, questions, sources
 from triquad_client.calls.changes import ChangeReport
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport, ScanPublisher
+from triquad_client.calls.sources import SourceReport
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.net.connection import Connection, RemoteDriver, open_connection
+from triquad_client.net.connection import Connection, RemoteDriver
 from triquad_client.offline.synced_map import SyncedMap
 
 
@@ -30,7 +31,7 @@ class Client(MapQueries):
     """
 
     def __init__(self, connection: Connection) -> None:
-        """Use :func:`connect`."""
+        """Use :func:`triquad_client.connect`."""
         self._connection = connection
         self._driver = RemoteDriver(connection)
         self._scans = ScanPublisher(connection)
@@ -156,6 +157,20 @@ class Client(MapQueries):
         """
         return self._run(changes.changes(since, bounds))
 
+    def sources(self, since: SourceReport | None = None, max_points: int = 5_000) -> SourceReport:
+        """Where each source of scans has been, and what its newest scan looks like.
+
+        To follow them, give the report before: only what is new travels, and the report has all.
+
+        Args:
+            since: the report before; ``None``: nothing is known yet.
+            max_points: of each newest scan, 0 to 10,000: as many of its points come, evenly drawn.
+
+        Raises:
+            NoReplyError: the server may be of a release that does not know this question.
+        """
+        return self._run(sources.sources(since, max_points))
+
     def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
         """The mesh tiles that meet ``bounds``, with the epoch in which each last changed.
 
@@ -202,6 +217,13 @@ class Client(MapQueries):
     def status(self) -> ServerStatus:
         """How the server is doing."""
         return self._run(admin.status())
+
+    def metrics(self) -> ServerMetrics:
+        """How the server is doing, in figures: requests and their times, queues, memory.
+
+        Counts and times only grow while a server runs: take the difference of two answers.
+        """
+        return self._run(admin.metrics())
 
     def checkpoint(self) -> CheckpointInfo:
         """Have the server write the map to its store now.
@@ -273,27 +295,3 @@ class Client(MapQueries):
     def maps(self) -> list[str]:
         """Names of all maps that can be reached, also those of other servers."""
         return self._driver.maps()
-
-
-def connect(
-    endpoint: str = DEFAULT_ENDPOINT,
-    map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
-    *,
-    timeout_s: float = 10.0,
-    config: str | Path | None = None,
-) -> Client:
-    """Connect to a map server.
-
-    Args:
-        endpoint: of the server, or of a router that leads to it: a host such as ``robot`` or
-            ``robot:7447``, or an endpoint of Zenoh.
-        map: name of the map.
-        timeout_s: for connecting and for each request.
-        config: Zenoh configuration file (JSON5), for TLS or credentials; the endpoint is added.
-
-    Raises:
-        ConnectError: nothing listens at the endpoint, or it does not let us in.
-        UnknownMapError: no server there has this map.
-        InvalidInputError: there cannot be an endpoint or a map of this name.
-    """
-    return Client(open_connection(endpoint, map, timeout_s, config=config))

@@ -15,6 +15,10 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 
 from triquad_server.errors import ListenError, ServerError, StoreError
 from triquad_server.installed import require_libraries
+from triquad_server.process.log_output import LOG_FORMATS, TEXT, start_log
+
+_PROGRAM = "triquad-server"
+_LOG_FORMAT_VARIABLE = "TRIQUAD_LOG_FORMAT"
 
 OK, UNEXPECTED, USAGE, CANNOT_LISTEN, STORE = 0, 1, 2, 3, 4
 
@@ -23,7 +27,7 @@ exit codes:
   0  stopped by SIGINT or SIGTERM; the map is in the store, if there is one
   1  an unexpected error; the log has the details
   2  wrong usage or settings, or a missing extra (install triquad[server])
-  3  cannot listen on an endpoint (port in use), or cannot connect to one
+  3  cannot listen on an endpoint or on the port for metrics (in use), or cannot connect to one
   4  the store cannot be used: not readable or writable, in use, all checkpoints are damaged,
      or the newest needs a newer release or more memory; or the last one was not written
 """
@@ -34,14 +38,10 @@ _log = logging.getLogger("triquad_server")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the server until SIGINT or SIGTERM; returns the exit code."""
     _on_signals(_leave)
-    options = _parser().parse_args(argv)
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=options.log_level.upper(),
-        format="%(asctime)s %(levelname)s %(message)s",
-    )
-    for name in ("numba", "torch"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+    log_options = _log_options()
+    start_log(log_options.parse_known_args(argv)[0].log_format)  # wrong usage is told in it, too
+    options = _parser(log_options).parse_args(argv)
+    logging.getLogger().setLevel(options.log_level.upper())
     return _exit_code(options)
 
 
@@ -116,12 +116,39 @@ def _run(options: argparse.Namespace) -> int:
 
 def _implied(options: argparse.Namespace) -> list[str]:
     """The settings that flags stand for."""
-    return ["ros2.enabled=true"] if options.ros2 else []
+    implied = ["ros2.enabled=true"] if options.ros2 else []
+    if options.metrics_port is not None:
+        implied.append(f"metrics.port={options.metrics_port}")
+    return implied
 
 
-def _parser() -> argparse.ArgumentParser:
+def _log_options() -> argparse.ArgumentParser:
+    """What has to be known of the log before anything can be wrong."""
+    parser = argparse.ArgumentParser(prog=_PROGRAM, add_help=False)
+    parser.add_argument(
+        "--log-format",
+        type=_log_format,
+        default=os.environ.get(_LOG_FORMAT_VARIABLE) or TEXT,
+        metavar="FORMAT",
+        help="text, or json: an object per line, for what collects logs (default: "
+        f"{_LOG_FORMAT_VARIABLE} of the environment, or text)",
+    )
+    return parser
+
+
+def _log_format(name: str) -> str:
+    if name not in LOG_FORMATS:
+        formats = " or ".join(LOG_FORMATS)
+        raise argparse.ArgumentTypeError(
+            f"{name!r}, given here or in {_LOG_FORMAT_VARIABLE}, is no format: use {formats}"
+        )
+    return name
+
+
+def _parser(log_options: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="triquad-server",
+        prog=_PROGRAM,
+        parents=[log_options],
         description="A long-running map server: learns a signed-distance field from scans that "
         "arrive over Zenoh, and answers queries.",
         epilog=_EPILOG,
@@ -195,6 +222,12 @@ def _add_network(group: argparse._ArgumentGroup) -> None:
     )
     add("-m", "--mode", choices=("router", "peer", "client"), help="default: router")
     add("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration, JSON5")
+    add(
+        "--metrics-port",
+        metavar="PORT",
+        help="answer /metrics (Prometheus) and /healthz there, on this machine alone unless "
+        "metrics.address says otherwise: docs/metrics.md",
+    )
     add("--no-multicast-scouting", action="store_true", help="do not look for others by multicast")
 
 

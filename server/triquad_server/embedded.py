@@ -15,12 +15,15 @@ from triquad_format.wire.endpoints import full_endpoint
 
 from triquad_server.errors import ServerError
 from triquad_server.installed import require_libraries
+from triquad_server.phases import Phases
 from triquad_server.stop import Stop, Stops
 
 if TYPE_CHECKING:
     from triquad_client import Client
 
+    from triquad_server.health import Health
     from triquad_server.launch_options import LaunchOptions
+    from triquad_server.self_question import SelfQuestion
     from triquad_server.settings import Settings
 
 _log = logging.getLogger("triquad_server")
@@ -28,7 +31,7 @@ _log = logging.getLogger("triquad_server")
 _WAKE_S = 0.2  # for when two threads wait for the end
 
 
-class _Run:
+class _Run(Phases):
     """A server on a thread of its own, where no Ctrl-C cuts short an import or a checkpoint.
 
     Other threads wait for it by what C code alone locks: the locks of Python's own conditions and
@@ -50,7 +53,7 @@ class _Run:
         try:
             from triquad_server.launch import serve_until_stopped  # takes seconds
 
-            self._why = serve_until_stopped(options, self.stops, started=self._has_started)
+            self._why = serve_until_stopped(options, self.stops, self)
         except BaseException as error:
             self._error = error
             if self._is_started:
@@ -60,7 +63,8 @@ class _Run:
             self.has_ended = True
             self._running.release()
 
-    def _has_started(self) -> None:
+    def serving(self, health: "Health", question: "SelfQuestion") -> None:  # noqa: ARG002
+        """The server has started."""
         self._is_started = True
         self._started.put(None)
 

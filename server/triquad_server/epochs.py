@@ -3,9 +3,10 @@ gives way to that."""
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles
@@ -32,6 +33,7 @@ class FrozenRegion:
     vertices: int
     parameters: int
     changed: int  # epoch of its last change
+    live_bytes: Mapping[str, int]  # what the live region took beside this one, by part
 
 
 class Epoch(ComposedView):
@@ -76,6 +78,14 @@ class Epoch(ComposedView):
         return MapRecord(self._name, self.number, settings=self.field_settings, regions=regions)
 
 
+class KeptEpochs(NamedTuple):
+    """The epochs that can be asked for."""
+
+    epochs: tuple[Epoch, ...]  # the newest last
+    pinned: int  # of them, which stay because they were asked for by number
+    newest_age_s: float
+
+
 class QueryGate:
     """Counts the queries in flight: training waits a moment between slices while there are any."""
 
@@ -114,6 +124,7 @@ class EpochHistory:
         self._lock = threading.Lock()
         self._settings = settings
         self._clock = clock
+        self._published_s = clock()  # when the newest was
         self._epochs = {first.number: first}  # oldest first
         self._asked: dict[int, float] = {}  # when, by number; longest ago first
 
@@ -121,8 +132,16 @@ class EpochHistory:
         """Make ``epoch`` the newest; older ones may go."""
         with self._lock:
             self.newest = epoch
+            self._published_s = self._clock()
             self._epochs[epoch.number] = epoch
             self._tidy()
+
+    def kept(self) -> KeptEpochs:
+        """What is kept now."""
+        with self._lock:
+            epochs = tuple(self._epochs.values())
+            age_s = self._clock() - self._published_s
+        return KeptEpochs(epochs, max(0, len(epochs) - self._settings.epochs_kept), age_s)
 
     def get(self, number: int) -> Epoch:
         """The epoch of that number, or the newest for 0.

@@ -1,5 +1,6 @@
 """The server's status: put together from its parts, published once a second, and logged."""
 
+import collections
 import logging
 import threading
 import time
@@ -10,16 +11,23 @@ import zenoh
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus
 
-from triquad_server.counter import Counter
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.memory import resident_bytes
+from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.store.checkpoint_thread import CheckpointThread
 
 _log = logging.getLogger(__name__)
 
 STATUS_PERIOD_S = 1.0
+
+STUCK_S = 120.0
+"""For no longer the mapper's thread waits without being stuck: for others that compile, at most."""
+
+ENDLESS_S = 1800.0
+"""Nothing that it computes takes longer, neither code to compile nor a large checkpoint."""
+
 _BEATS_PER_LOG_LINE = 5
 
 
@@ -30,7 +38,7 @@ class Health:
     map_name: str
     server: str  # a name of this process
     device: str
-    requests_refused: Counter
+    operations: dict[str, OperationCounts]
     scans: ScanQueue
     warnings: ScanWarnings
     mapper: MapperThread
@@ -53,7 +61,7 @@ class Health:
             scans_lost=self.scans.ledger.lost(),
             scans_waiting=len(self.scans),
             points_dropped=self.mapper.points_dropped.counts(),
-            requests_refused=self.requests_refused.counts(),
+            requests_refused=self._requests_refused(),
             samples_trained=progress.samples_trained,
             rays_kept=progress.rays_kept,
             loss=float(progress.loss),
@@ -67,6 +75,60 @@ class Health:
             warnings=self.warnings.all(),
             samples_left=progress.samples_left,
         )
+
+    def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
+        """Why nothing is mapped any more, ``None`` where all is well.
+
+        Nothing but a restart helps. A thread that computes is alive, for :data:`ENDLESS_S` at most;
+        one that waits is alive if it hears the :class:`Heartbeat`, which wakes it.
+        """
+        if self.mapper.ended is not None:
+            return self.mapper.ended
+        current = self.mapper.time.current()
+        if current.waited_s <= stuck_s and current.for_s <= ENDLESS_S:
+            return None
+        at, for_s = current.activity.value, current.for_s
+        return f"mapping makes no progress: it is at {at} since {for_s:.0f} s"
+
+    def problem(self) -> str | None:
+        """Why the server does not do all that it should, ``None`` where it does.
+
+        Beside :meth:`mapping_problem`: a store that cannot be written. A server that was started
+        without one keeps no map, as it should.
+        """
+        mapping = self.mapping_problem()
+        if mapping is not None or not self.checkpoints.has_store or self.checkpoints.error is None:
+            return mapping
+        return f"what is mapped is not kept: {self.checkpoints.error}"
+
+    def summary(self) -> str:
+        """What the server does, and what keeps it from that, in a line."""
+        doing = (
+            f"serving map '{self.map_name}': epoch {self.mapper.epochs.newest.number}, "
+            f"{self.mapper.progress.scans_taken} scans taken"
+        )
+        problem = self.problem()
+        return doing if problem is None else f"{doing}; {problem}"
+
+    def report(self) -> dict[str, object]:
+        """What a program that watches the server is told; ``problem`` is as :meth:`problem`."""
+        epoch, progress = self.mapper.epochs.newest, self.mapper.progress
+        return {
+            "problem": self.problem(),
+            "map": self.map_name,
+            "server": self.server,
+            "epoch": epoch.number,
+            "settled": progress.settled and len(self.scans) == 0,
+            "scans_taken": progress.scans_taken,
+            "uptime_s": round(time.monotonic() - self.started_s, 3),
+        }
+
+    def _requests_refused(self) -> dict[str, int]:
+        """Refused requests of all operations, by error code."""
+        total: collections.Counter[str] = collections.Counter()
+        for counts in self.operations.copy().values():
+            total.update(counts.refused())
+        return dict(total)
 
 
 class Heartbeat:
@@ -98,6 +160,7 @@ class Heartbeat:
         while not self._stopping.wait(STATUS_PERIOD_S):
             beat += 1
             try:
+                self._health.mapper.wake()  # for a sign of life, even where nothing is to do
                 self._health.warnings.check()
                 status = self._health.status()
                 self._publisher.put(codec.encode(status))

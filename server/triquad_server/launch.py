@@ -16,14 +16,19 @@ from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_server.errors import ServerError
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.memory import give_back_early, spare_from_collection
+from triquad_server.memory import give_back_early
 from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.session import listen_endpoints, open_session
+from triquad_server.phases import Phases
+from triquad_server.process.service_manager import ServiceManager
+from triquad_server.self_question import SelfQuestion
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.stop import Stop, Stops, wait_for_stop
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
+from triquad_server.supervision import Supervision
 from triquad_server.threads import Teams
 
 _log = logging.getLogger("triquad_server")
@@ -56,10 +61,11 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         _log.info("no --listen: only this machine can connect")
     if options.store is None:
         _log.warning("no --store: the map is not kept when the server stops")
-    return serve_until_stopped(options, stops, started=spare_from_collection)
+    with closing(Supervision(ServiceManager())) as supervision:
+        return serve_until_stopped(options, stops, supervision)
 
 
-def serve_until_stopped(options: LaunchOptions, stops: Stops, started: Callable[[], None]) -> Stop:
+def serve_until_stopped(options: LaunchOptions, stops: Stops, phases: Phases) -> Stop:
     """Serve until something is put into ``stops``, write a last checkpoint, and return it.
 
     Signals, and what else belongs to the process as a whole, are left as they are.
@@ -67,37 +73,41 @@ def serve_until_stopped(options: LaunchOptions, stops: Stops, started: Callable[
     Args:
         options: what the server is started with.
         stops: where it is asked to stop; before it has started, too.
-        started: called once it serves.
+        phases: hears how it goes.
 
     Raises:
         ServerError: the server cannot start; subclasses tell what is in the way.
     """
     try:
         with ExitStack() as stack:
-            _open(options, stops, stack)
-            started()
+            _open(options, stops, phases, stack)
             why = wait_for_stop(stops)
             _log.info("stopping, %s", why.value)
+            phases.stopping()
     except _StoppedEarlyError:
         why = stops.get()
+        phases.stopping()
     _log.info("stopped")
     return why
 
 
-def _open(options: LaunchOptions, stops: Stops, stack: ExitStack) -> None:
+def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack) -> None:
     """Open all parts of a server, to be closed by ``stack``."""
     device = choose_device(options.device)
     settings = options.settings
+    monitoring = _open_monitoring(settings, stack)
     store = None
     restored = None
     if options.store is not None:
         store = Store(options.store, options.map_name, settings.store)
         stack.enter_context(closing(store))
+        phases.starting("restoring the newest checkpoint")
         restored = _restored(store, options)
     if restored is not None:
         settings = _settings_of(restored.record, settings)
     teams = stack.enter_context(closing(Teams()))
-    _prepare(settings, device, teams, stops=stops)
+    _prepare(settings, device, teams, next_stage=_unless_stopped(stops, phases))
+    phases.starting("opening the map")
     mapper = Mapper(
         options.map_name,
         settings,
@@ -117,7 +127,17 @@ def _open(options: LaunchOptions, stops: Stops, stack: ExitStack) -> None:
     failed = functools.partial(stops.put, Stop.INTERNAL_ERROR)
     service = Service(session, served, settings, failed=failed)
     stack.enter_context(closing(service))
+    if monitoring is not None:
+        stack.enter_context(monitoring.showing(service.metrics))
     _log_ready(options, service.epoch, device)
+    phases.serving(service.health, SelfQuestion(session, options.map_name))
+
+
+def _open_monitoring(settings: Settings, stack: ExitStack) -> MonitoringServer | None:
+    """The port for metrics, where one is wanted: it listens before all else takes its time."""
+    if settings.metrics.port == 0:
+        return None
+    return stack.enter_context(closing(MonitoringServer(settings.metrics)))
 
 
 def _restored(store: Store, options: LaunchOptions) -> ValidCheckpoint | None:
@@ -170,18 +190,30 @@ def choose_device(wanted: str) -> str:
     return wanted
 
 
-def _prepare(settings: Settings, device: str, teams: Teams, *, stops: Stops) -> None:
+def _unless_stopped(stops: Stops, phases: Phases) -> Callable[[str], None]:
+    """What tells the next stage of the start, or ends the start if the server is asked to stop."""
+
+    def next_stage(stage: str) -> None:
+        if not stops.empty():
+            raise _StoppedEarlyError
+        phases.starting(stage)
+
+    return next_stage
+
+
+def _prepare(
+    settings: Settings, device: str, teams: Teams, *, next_stage: Callable[[str], None]
+) -> None:
     """Have all kernels compiled; whoever waits for it is told how it goes.
 
     Raises:
-        _StoppedEarlyError: something was put into ``stops`` meanwhile.
+        _StoppedEarlyError: of ``next_stage``: the server is asked to stop.
     """
     _log.info("preparing compiled code")
     started = time.monotonic()
 
     def report(stage: str) -> None:
-        if not stops.empty():
-            raise _StoppedEarlyError
+        next_stage(f"preparing compiled code: {stage}")
         seconds = time.monotonic() - started
         if seconds > _QUICK_S:
             _log.info("%.0f s so far; next: %s", seconds, stage)

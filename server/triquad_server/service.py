@@ -18,6 +18,7 @@ from triquad_format.wire.messages import (
     TileListRequest,
     TileRequest,
 )
+from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import (
     AlignRequest,
     ChangesRequest,
@@ -28,10 +29,10 @@ from triquad_format.wire.query_messages import (
     SegmentsRequest,
     SpheresRequest,
 )
+from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.change_queries import ChangeQueries
-from triquad_server.counter import Counter
 from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan import ScanIntake
@@ -42,8 +43,11 @@ from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.net.requests import Handler, RequestHandlers, answering, payload_limit
+from triquad_server.monitoring.metrics import Metrics
+from triquad_server.net.requests import Handler, answering
+from triquad_server.served_operations import ServedOperations
 from triquad_server.settings import Settings
+from triquad_server.source_queries import SourceQueries
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.store import Store
@@ -78,7 +82,7 @@ class Service:
         self._session = session
         self._served = served
         self._settings = settings
-        self._requests_refused = Counter()
+        self._operations = ServedOperations(session, served.name, settings.service)
         self._scans = ScanQueue(settings.service.scan_queue)
         self._warnings = ScanWarnings(self._scans, settings)
         self._parts = ExitStack()  # closed in reverse order of opening
@@ -110,11 +114,11 @@ class Service:
             period_s=self._settings.store.period_s,
             last=self._served.restored,
         )
-        health = Health(
+        self.health = health = Health(
             map_name=self._served.name,
             server=secrets.token_hex(8),
             device=self._served.device,
-            requests_refused=self._requests_refused,
+            operations=self._operations.counts,
             scans=self._scans,
             warnings=self._warnings,
             mapper=self._mapper,
@@ -122,22 +126,27 @@ class Service:
         )
         self._serve_queries()
         self._serve_changes(health.server)
-        tiles = self._serve_mesh(health.server)
-        self._serve_status(health)
-        self._serve_downloads()
+        self._serve_sources(health.server)
+        feed, tiles = self._serve_mesh(health.server)
+        downloads = self._serve_downloads()
+        self.metrics = Metrics(
+            health, self._session, tiles=tiles, downloads=downloads, queues=self._operations.queues
+        )
+        self._serve_status()
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         # Closed before the last checkpoint is written: it shows every reset that was answered.
         self._serve(
+            "admin",
             {
                 keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
                 keys.RESET: answering(ResetRequest, self._mapper.reset),
-            }
+            },
         )
         self._parts.callback(self._mapper.rest)
         self._open_intake()
         if self._settings.ros2.enabled:
-            self._open_ros2(tiles)
+            self._open_ros2(feed)
         self._parts.callback(Heartbeat(self._session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
@@ -185,8 +194,9 @@ class Service:
             self._mapper.epochs.view,
             QuestionLimits(limits.max_query_points, limits.max_search_points),
         )
-        self._serve({keys.SDF: answering(SdfRequest, answers.sdf)}, limits.query_workers)
+        self._serve("field", {keys.SDF: answering(SdfRequest, answers.sdf)}, limits.query_workers)
         self._serve(
+            "distances",
             {
                 keys.DISTANCE: answering(DistanceRequest, answers.distance),
                 keys.SPHERES: answering(SpheresRequest, answers.spheres),
@@ -194,6 +204,7 @@ class Service:
             limits.query_workers,
         )
         self._serve(
+            "places",
             {
                 keys.SEGMENTS: answering(SegmentsRequest, answers.segments),
                 keys.RAYS: answering(RaysRequest, answers.rays),
@@ -202,14 +213,18 @@ class Service:
             },
             limits.query_workers,
         )
-        self._serve({keys.ALIGN: answering(AlignRequest, answers.align)})
+        self._serve("poses", {keys.ALIGN: answering(AlignRequest, answers.align)})
 
     def _serve_changes(self, server: str) -> None:
         queries = ChangeQueries(self._mapper.epochs, self._mapper.surface, server)
-        self._serve({keys.CHANGES: answering(ChangesRequest, queries.changes)})
+        self._serve("changes", {keys.CHANGES: answering(ChangesRequest, queries.changes)})
 
-    def _serve_mesh(self, server: str) -> TileFeed:
-        """Queries of mesh tiles, and following them; the feed of what changes."""
+    def _serve_sources(self, server: str) -> None:
+        queries = SourceQueries(self._mapper.trails, server)
+        self._serve("sources", {keys.SOURCES: answering(SourcesRequest, queries.sources)})
+
+    def _serve_mesh(self, server: str) -> tuple[TileFeed, TileCache]:
+        """Queries of mesh tiles, and following them; the feed of what changes, and all tiles."""
         cache = TileCache(self._settings.mesh, self._served.teams.meshing)
         feed = TileFeed(
             cache,
@@ -221,16 +236,18 @@ class Service:
         self._parts.callback(feed.close)
         tiles = TileQueries(self._mapper.epochs, cache)
         self._serve(
+            "tiles",
             {
                 keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
                 keys.TILE: answering(TileRequest, tiles.tile),
             },
             _TILE_WORKERS,
         )
-        self._serve({keys.TILE_UPDATES: feed.add})
-        return feed
+        self._serve("tile_updates", {keys.TILE_UPDATES: feed.add})
+        self._operations.queues["mesh_followers"] = lambda: feed.queue
+        return feed, cache
 
-    def _serve_status(self, health: Health) -> None:
+    def _serve_status(self) -> None:
         """How the server is doing, and whether scans are in the map."""
         flush = FlushHandler(
             self._scans.ledger,
@@ -240,31 +257,27 @@ class Service:
             warnings=self._warnings.of,
         )
         self._parts.callback(flush.close)
+        self._operations.queues["flushes"] = lambda: flush.queue
         self._serve(
+            "status",
             {
-                keys.STATUS: answering(StatusRequest, lambda _: health.status()),
+                keys.STATUS: answering(StatusRequest, lambda _: self.metrics.health.status()),
+                keys.METRICS: answering(MetricsRequest, lambda _: self.metrics.now()),
                 keys.FLUSH: flush.add,
-            }
+            },
         )
 
-    def _serve_downloads(self) -> None:
+    def _serve_downloads(self) -> MapDownloads:
         downloads = MapDownloads(self._mapper)
         self._serve(
+            "downloads",
             {
                 keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
                 keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
-            }
+            },
         )
+        return downloads
 
-    def _serve(self, handlers: Mapping[str, Handler], workers: int = 1) -> None:
-        """Answer a group of operations from now on; no other group waits for it."""
-        limits = self._settings.service
-        group = RequestHandlers(
-            self._session,
-            {keys.operation_key(self._served.name, key): h for key, h in handlers.items()},
-            self._requests_refused,
-            workers=workers,
-            waiting=limits.request_queue,
-            max_bytes=payload_limit(limits.max_query_points),
-        )
-        self._parts.callback(group.close)
+    def _serve(self, queue: str, handlers: Mapping[str, Handler], workers: int = 1) -> None:
+        """Answer a group of operations from now on, as :meth:`ServedOperations.serve`."""
+        self._parts.callback(self._operations.serve(queue, handlers, workers).close)

@@ -11,6 +11,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
 from triquad_server.leaf_lengths import DEFAULT_LEAF_M, at_leaf, follows_leaf, length
+from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.scan_settings import ScanSettings
 from triquad_server.settings_section import RECORD, SECTION
@@ -204,6 +205,7 @@ class Settings(BaseModel):
     mesh: MeshSettings = MeshSettings()
     store: StoreSettings = StoreSettings()
     service: ServiceSettings = ServiceSettings()
+    metrics: MetricsSettings = MetricsSettings()
     ros2: Ros2Settings = Ros2Settings()
     sources: dict[str, SourceSettings] = {}
 

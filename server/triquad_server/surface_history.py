@@ -56,6 +56,7 @@ class _Flips(NamedTuple):
 
 
 _NO_SURFACE = _Surface(np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8))
+_VOXEL_BYTES = 13  # three numbers of 32 bits, and whether it appeared
 _NO_VOXELS = np.zeros((0, 3), np.int32)
 
 
@@ -86,6 +87,11 @@ class SurfaceHistory:
                 forgotten = self._changes.popleft()
                 self._voxels -= len(forgotten.voxels)
                 self._oldest = forgotten.epoch
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the changes that are kept."""
+        return self._voxels * _VOXEL_BYTES
 
     def between(self, since: int, until: int) -> VoxelChanges:
         """What is different in epoch ``until`` from epoch ``since``.

@@ -258,9 +258,9 @@ def test_a_zenoh_configuration_file_is_used(endpoint: str, tmp_path: Path) -> No
     with triquad_client.connect(endpoint, config=file) as client:
         assert client.status().map_name == servers.MAP
     file.write_text("{ mode: 'submarine' }")
-    with pytest.raises(ConnectError):
+    with pytest.raises(ConnectError, match="client.json5: "):
         triquad_client.connect(endpoint, config=file)
-    with pytest.raises(ConnectError):
+    with pytest.raises(ConnectError, match="missing.json5: No such file"):
         open_connection(endpoint, servers.MAP, 1.0, tmp_path / "missing.json5")
 
 

@@ -20,6 +20,7 @@ DISTRIBUTIONS = {
     "skimage": "scikit-image",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
     "pydantic_core": "pydantic",
+    "prometheus_client": "prometheus-client",
     "pydantic_settings": "pydantic-settings",
 }
 USED_BY_OTHERS = {"tomli"}  # by pydantic-settings, before Python 3.11
@@ -31,6 +32,7 @@ WITHOUT_TORCH = (
     "plots",
     "recordings",
     "simulation",
+    "top",
 )
 
 

@@ -122,6 +122,10 @@ def test_sensors_are_sources_of_their_own(way: str) -> None:
         assert finds_sphere(client, (AT[0] - 5, AT[1], AT[2]))
         # Of the front one, all lies beyond the range that its own section sets.
         assert not finds_sphere(client, (AT[0] + 5, AT[1], AT[2]))
+        seen = client.sources().sources
+        assert seen["rear"].trail.tolist() == [[AT[0] - 5, AT[1], AT[2]]]
+        assert seen["lidar.front"].trail.tolist() == [[AT[0] + 5, AT[1], AT[2]]]
+        assert len(seen["lidar.front"].newest.points) == 0 < len(seen["rear"].newest.points)
 
 
 @pytest.mark.parametrize("way", WAYS)

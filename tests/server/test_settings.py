@@ -1,10 +1,13 @@
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import servers
 from triquad_format.errors import SettingsError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server import cli
@@ -81,11 +84,16 @@ def test_presets_are_all_that_lie_in_their_folder_and_each_is_valid() -> None:
     assert leaves["tabletop"] < leaves["indoor"] < leaves["street"] < leaves["long-range"]
 
 
-def test_an_unknown_preset_is_named_with_those_there_are(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    assert cli.main(["--preset", "../indoor", "--print-settings"]) == cli.USAGE
-    assert "there is no preset '../indoor': use street, indoor, tabletop, long-range" in caplog.text
+def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """``triquad-server`` as a process."""
+    line = [sys.executable, "-m", "triquad_server.cli", *arguments]
+    return subprocess.run(line, capture_output=True, text=True, timeout=servers.WAIT_S)
+
+
+def test_an_unknown_preset_is_named_with_those_there_are() -> None:
+    done = command("--preset", "../indoor", "--print-settings")
+    assert done.returncode == cli.USAGE
+    assert "there is no preset '../indoor': use street, indoor, tabletop, long-range" in done.stderr
 
 
 def test_errors_tell_what_a_preset_gave(tmp_path: Path) -> None:
@@ -196,9 +204,10 @@ def test_settings_that_are_printed_can_be_read(tmp_path: Path) -> None:
     assert load_settings(path) == settings
 
 
-def test_the_command_prints_the_settings_in_effect(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["--print-settings", "--set", "training.batch=4096"]) == cli.OK
-    assert "[training]\nbatch = 4096\n" in capsys.readouterr().out
+def test_the_command_prints_the_settings_in_effect() -> None:
+    done = command("--print-settings", "--set", "training.batch=4096")
+    assert (done.returncode, done.stderr) == (cli.OK, "")
+    assert "[training]\nbatch = 4096\n" in done.stdout
 
 
 @pytest.mark.parametrize(

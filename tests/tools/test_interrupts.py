@@ -16,6 +16,7 @@ NAMES = {
     "map_recording": "triquad-map",
     "pack": "triquad-pack",
     "replay": "triquad-replay",
+    "top": "triquad-top",
 }
 
 PRESSED_AT_IMPORT = """

@@ -9,6 +9,7 @@ from triquad_format.wire.messages import (
     ServerStatus,
     StatusRequest,
 )
+from triquad_format.wire.metrics_messages import MetricsRequest, ServerMetrics
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
@@ -21,6 +22,11 @@ _SLOW_S = 60.0
 def status() -> Call[ServerStatus]:
     """How the server is doing."""
     return ask(Ask(keys.STATUS, StatusRequest(), ServerStatus))
+
+
+def metrics() -> Call[ServerMetrics]:
+    """How the server is doing, in figures."""
+    return ask(Ask(keys.METRICS, MetricsRequest(), ServerMetrics))
 
 
 def checkpoint() -> Call[CheckpointInfo]:

@@ -115,8 +115,9 @@ class Connection:
         if self.map_name not in available:
             return UnknownMapError(self.map_name, available)
         return NoReplyError(
-            f"no reply on {self._key(ask)} although the map is there: the server is stopping, "
-            "access control forbids the request, or a message exceeds a size limit"
+            f"no reply on {self._key(ask)} although the map is there: the server is stopping "
+            "or older than this question, access control forbids the request, or a message "
+            "exceeds a size limit"
         )
 
     def put(self, key: str, message: Message) -> None:
@@ -212,10 +213,9 @@ def open_connection(
     try:
         session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except zenoh.ZError as error:
-        reason = str(error).split(" at /", 1)[0].strip()
         raise ConnectError(
-            f"cannot connect to {endpoint}: {reason} Start triquad-server there, or check the "
-            "endpoint and its credentials."
+            f"cannot connect to {endpoint}: {_reason(error)} Start triquad-server there, or check "
+            "the endpoint and its credentials."
         ) from error
     connection = Connection(session, map_name, timeout_s)
     try:
@@ -230,7 +230,7 @@ def open_connection(
 
 def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> zenoh.Config:
     if file is not None:
-        config: zenoh.Config = zenoh.Config.from_file(str(file))
+        config = _read_configuration(file)
     else:
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
@@ -240,3 +240,16 @@ def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> 
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
     config.insert_json5("transport/unicast/open_timeout", str(int(timeout_s * 1000)))
     return config
+
+
+def _read_configuration(file: str | Path) -> zenoh.Config:
+    try:
+        config: zenoh.Config = zenoh.Config.from_file(str(file))
+    except zenoh.ZError as error:
+        raise ConnectError(f"Zenoh configuration {file}: {_reason(error)}") from error
+    return config
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """What Zenoh says, on one line, without where in Zenoh it happened."""
+    return " ".join(str(error).split(" at /", 1)[0].split())

@@ -15,5 +15,8 @@ MAX_ITERATIONS = 200
 LEVELS = 3
 """Levels of detail of meshes: cells of level ``l`` are ``2**l`` times as large as those of 0."""
 
+MAX_SAMPLE_POINTS = 10_000
+"""Points of the newest scan of a source that are told of, at most."""
+
 MAX_KNOWN_TILES = 100_000
 """Mesh tiles that a client may name as known when it asks what changed."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest
+from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.intake.scan_queue import MAX_SEQUENCE, SourceLedger
 from triquad_server.net.requests import Request
@@ -72,6 +73,11 @@ class FlushHandler:
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="flush")
         self._thread.start()
+
+    @property
+    def queue(self) -> QueueMetrics:
+        """What is pending."""
+        return QueueMetrics(len(self._pending), self._limit)
 
     def close(self) -> None:
         """Refuse what is pending, and end."""

@@ -262,7 +262,9 @@ def usable_rays(
         robot_low=low,
         robot_high=high,
     )
-    found = _select(np.ascontiguousarray(points), limits, empty_keys(len(points)))
+    given = np.ascontiguousarray(points).view()
+    given.flags.writeable = False  # as those of the wire, for which nothing is compiled anew
+    found = _select(given, limits, empty_keys(len(points)))
     if len(found.kept) + len(found.beyond) + len(directions) == 0:
         raise ScanRefusedError(
             "empty", _why_empty(len(points), disbelieved, settings, source=source)

@@ -51,6 +51,8 @@ class ScanIntake:
 
     def _run(self) -> None:
         for sample in self._subscriber:
+            self._queue.received += 1
+            self._queue.received_bytes += len(sample.payload)
             try:
                 self._receive(str(sample.key_expr), sample.payload)
             except Exception:  # an internal error must not stop the intake of other scans

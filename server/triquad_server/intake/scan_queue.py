@@ -1,16 +1,20 @@
 """The queue of scans, and the ledger of what became of each: taken, refused or lost."""
 
 import threading
+import time
 from collections import OrderedDict, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from triquad_format.wire.messages import FlushReply, Scan
+from triquad_format.wire.metrics_messages import SourceMetrics
 
 from triquad_server.counter import Counter
 
 MAX_SESSIONS = 1024
 """Sessions of publishers that are remembered; the one heard of longest ago is forgotten."""
+
+MAX_SOURCES_LISTED = 64
 
 MAX_SEQUENCE = 2**48
 
@@ -40,6 +44,7 @@ class _Track:
     refused: int = 0
     lost: int = 0
     last_refusal: str | None = None
+    heard_s: float = field(default_factory=time.monotonic)  # of it last, monotonic
 
     def lose_up_to(self, sequence: int) -> None:
         """Count what did not arrive, up to and with ``sequence``, as lost."""
@@ -73,6 +78,7 @@ class SourceLedger:
             if not 0 <= scan.sequence < MAX_SEQUENCE:
                 return "bad_sequence"
             track = self._track(scan.source, scan.session)
+            track.heard_s = time.monotonic()
             if scan.sequence <= track.arrived:
                 return "sequence_backwards"
             track.lose_up_to(scan.sequence - 1)
@@ -170,6 +176,16 @@ class SourceLedger:
                     counts[source] = min(_MAX_COUNT, counts.get(source, 0) + track.lost)
             return counts
 
+    def sources(self) -> dict[str, SourceMetrics]:
+        """The scans of each source; those heard of longest ago are put together where many are."""
+        now = time.monotonic()
+        found: dict[str, SourceMetrics] = {}
+        with self.changed:
+            for (source, _), track in reversed(self._tracks.items()):
+                name = source if source in found or len(found) < MAX_SOURCES_LISTED else FORGOTTEN
+                found[name] = _with_track(found.get(name), track, now - track.heard_s)
+        return found
+
     def refused(self) -> dict[str, Refusals]:
         """Scans refused, by source."""
         with self.changed:
@@ -197,6 +213,19 @@ class SourceLedger:
         return track
 
 
+def _with_track(before: SourceMetrics | None, track: _Track, age_s: float) -> SourceMetrics:
+    """The scans of a source, with those of one more of its sessions."""
+    if before is None:
+        return SourceMetrics(1, track.taken, track.refused, track.lost, age_s)
+    return SourceMetrics(
+        sessions=before.sessions + 1,
+        taken=before.taken + track.taken,
+        refused=before.refused + track.refused,
+        lost=min(_MAX_COUNT, before.lost + track.lost),
+        age_s=min(before.age_s, age_s),
+    )
+
+
 class ScanQueue:
     """The newest scans that wait; where it is full, the oldest is pushed out and counted."""
 
@@ -205,12 +234,23 @@ class ScanQueue:
         self.limit = limit
         self.ledger = SourceLedger()
         self.dropped = Counter()  # scans that are not in the map, by reason
+        self.received = self.received_bytes = 0  # messages of scans, whatever became of them
         self._lock = threading.Lock()
         self._scans: deque[Scan] = deque()
         self._in_hand = False
 
     def __len__(self) -> int:
         return len(self._scans) + self._in_hand
+
+    @property
+    def bytes_waiting(self) -> int:
+        """Bytes of the scans that wait."""
+        with self._lock:
+            waiting = list(self._scans)
+        return sum(
+            scan.points.nbytes + (0 if scan.no_return is None else scan.no_return.nbytes)
+            for scan in waiting
+        )
 
     def put(self, scan: Scan) -> None:
         """Add a scan, unless its sequence or stamp refuses it."""

@@ -20,6 +20,7 @@ from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 
+from triquad_server.array_memory import buffers_of, bytes_by_part
 from triquad_server.engine.compiled_trainer import CompiledTrainer
 from triquad_server.engine.live_field import (
     LiveField,
@@ -232,6 +233,7 @@ class LiveRegion:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)
             self._restored = False
         self._forget_gone(surfels)
+        live = {"field": self.field, "evidence": self.evidence, "replay_pools": self.pool}
         return FrozenRegion(
             index=self.index,
             centre=self.centre,
@@ -241,6 +243,7 @@ class LiveRegion:
             vertices=self.field.vertices,
             parameters=self.field.parameters,
             changed=epoch,
+            live_bytes=bytes_by_part(live, without=buffers_of((field, evidence, surfels))),
         )
 
     def record(self) -> Region:

@@ -17,7 +17,9 @@ from triquad_server.epochs import EpochHistory
 from triquad_server.errors import MapperStoppedError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
+from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.thread_time import Activity, ThreadTime
 from triquad_server.mesh.mesher import check_box
 from triquad_server.settings import ServiceSettings
 from triquad_server.surface_history import SurfaceHistory
@@ -72,10 +74,11 @@ class MapperThread:
         self.points_dropped = Counter()  # of scans that were taken, by reason
         self._period_s = settings.publish_period_s
         self._failed = failed
+        self.time = ThreadTime()
         self._warnings = warnings
         self._lock = threading.Lock()
         self._commands: deque[_Command] = deque()
-        self._ended: str | None = None  # why there are no more commands
+        self.ended: str | None = None  # why there are no more commands
         self._wake = threading.Event()
         self._publish_soon = threading.Event()
         self._resting = threading.Event()
@@ -88,6 +91,7 @@ class MapperThread:
         first = mapper.publish()
         self.epochs = EpochHistory(first, settings)
         self.surface = SurfaceHistory(first, settings.changes_kept)
+        self.trails = SourceTrails(first.field_settings.leaf_m)
         self.progress = Progress()
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
@@ -127,8 +131,8 @@ class MapperThread:
         """
         result: Future[ResultT] = Future()
         with self._lock:
-            if self._ended is not None:
-                raise MapperStoppedError(self._ended)
+            if self.ended is not None:
+                raise MapperStoppedError(self.ended)
             self._commands.append(_Command(command, result))
         self._wake.set()
         return result.result()
@@ -143,6 +147,7 @@ class MapperThread:
 
         def reset(mapper: Mapper) -> int:
             mapper.reset(request.minimum, request.maximum)
+            self.trails.forget(request.minimum, request.maximum)
             return mapper.publish().number
 
         return ResetReply(self.call(reset))
@@ -167,12 +172,15 @@ class MapperThread:
         self._wake.clear()
         self._run_commands()
         if self._resting.is_set():
+            self.time.begin(Activity.IDLE)
             self._wake.wait()
             return
         took_scan = self._ingest_next()
         if not self._mapper.settled:
+            self.time.begin(Activity.GIVING_WAY)
             # However many ask, training waits a third of its time at most.
             self.epochs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
+            self.time.begin(Activity.TRAINING)
             started = time.monotonic()
             self._mapper.train()
             self._step_s = time.monotonic() - started
@@ -184,10 +192,12 @@ class MapperThread:
             self._publish()
         self._record_progress()
         if self._mapper.settled and not took_scan:
+            self.time.begin(Activity.IDLE)
             self._wake.wait(self._rest_s())
 
     def _run_commands(self) -> None:
         while (command := self._next_command()) is not None:
+            self.time.begin(Activity.COMMANDS)
             try:
                 result = command.run(self._mapper)
                 self._publish()  # first: whoever gets the result may ask for its epoch
@@ -204,7 +214,7 @@ class MapperThread:
     def _refuse_commands(self, why: str) -> None:
         """Take no more commands; those that are pending fail."""
         with self._lock:
-            self._ended = why
+            self.ended = why
             pending, self._commands = self._commands, deque()
         for command in pending:
             command.result.set_exception(MapperStoppedError(why))
@@ -214,6 +224,7 @@ class MapperThread:
         scan = self._scans.take()
         if scan is None:
             return False
+        self.time.begin(Activity.SCANS)
         try:
             rays = self._mapper.ingest(
                 scan.points,
@@ -235,12 +246,14 @@ class MapperThread:
                 self.points_dropped.add(reason, count)
             if self._warnings is not None:
                 self._warnings.add(scan.source, len(scan.points), rays)
+            self.trails.add(scan, rays)
             self._scans_taken += 1
             self._unpublished = True
             self._scans.ledger.take(scan)
         return True
 
     def _publish(self) -> None:
+        self.time.begin(Activity.PUBLISHING)
         started = time.monotonic()
         epoch = self._mapper.publish()
         if epoch is not self.epochs.newest:

@@ -170,6 +170,11 @@ class TileCache:
         """Number of the epoch of the last refresh; -1 before any."""
         return -1 if self._epoch is None else self._epoch.number
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the encoded tiles that are kept."""
+        return self._bytes.size
+
     def lattice(self, level: int) -> TileLattice:
         """Where the tiles of a level lie."""
         return self._levels[level].lattice

@@ -7,6 +7,7 @@ import time
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdatesRequest
+from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs import EpochHistory
@@ -65,6 +66,12 @@ class TileFeed:
         self._senders = TileSenders()
         self._thread = threading.Thread(target=self._run, name="meshing")
         self._thread.start()
+
+    @property
+    def queue(self) -> QueueMetrics:
+        """Followers that wait for tiles, or that tiles are being sent to."""
+        with self._changed:
+            return QueueMetrics(len(self._pending) + self._senders.sending, self._limit)
 
     def close(self) -> None:
         """Refuse what is pending, and end."""

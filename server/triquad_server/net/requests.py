@@ -4,15 +4,16 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import zenoh
 from triquad_format.errors import ProtocolVersionError, RefusedError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
+from triquad_format.wire.metrics_messages import QueueMetrics
 
-from triquad_server.counter import Counter
+from triquad_server.net.operation_counts import OperationCounts
 
 _log = logging.getLogger(__name__)
 
@@ -30,17 +31,22 @@ def payload_limit(points: int) -> int:
 class Request:
     """A query that waits for its answer."""
 
-    def __init__(self, query: zenoh.Query, key: str, refused: Counter) -> None:
-        """``key`` is the key of the operation; refusals are counted in ``refused``."""
+    def __init__(self, query: zenoh.Query, key: str, counts: OperationCounts) -> None:
+        """``key`` is the key of the operation, whose ``counts`` tell what becomes of it."""
         self.key = key
         self._query = query
-        self._refused = refused
+        self._counts = counts
+        self._arrived_s = counts.arrive(self.size)
 
     @property
     def size(self) -> int:
         """Bytes of the payload."""
         payload = self._query.payload
         return 0 if payload is None else len(payload)
+
+    def begin(self) -> None:
+        """It is its turn."""
+        self._counts.begin(self._arrived_s)
 
     def read(self, kind: type[RequestT]) -> RequestT:
         """The request's message.
@@ -64,10 +70,11 @@ class Request:
         self._finish(
             lambda: self._query.reply(self.key, payload, encoding=keys.encoding(type(message)))
         )
+        self._counts.answer(self._arrived_s, len(payload))
 
     def refuse(self, code: str, text: str) -> None:
         """Reply with an error; ``code`` is one of ``ERROR_CODES``."""
-        self._refused.add(code)
+        self._counts.refuse(code)
         _log.debug("request on %s refused (%s): %s", self.key, code, text)
         payload = codec.encode(ErrorReply(code, text[:4096]))
         self._finish(lambda: self._query.reply_err(payload, encoding=keys.encoding(ErrorReply)))
@@ -90,6 +97,13 @@ Handler = Callable[[Request], None]
 """Reads the request and answers it, or raises :class:`RefusedError`."""
 
 
+class Operation(NamedTuple):
+    """How the requests of an operation are handled, and where they are counted."""
+
+    handle: Handler
+    counts: OperationCounts
+
+
 def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Handler:
     """A handler that decodes a ``kind`` and replies with what ``answer`` makes of it."""
 
@@ -105,19 +119,17 @@ class RequestHandlers:
     def __init__(
         self,
         session: zenoh.Session,
-        handlers: Mapping[str, Handler],
-        refused: Counter,
+        operations: Mapping[str, Operation],
         *,
         workers: int,
         waiting: int,
         max_bytes: int,
     ) -> None:
-        """Begin to serve operations: ``handlers`` by key. What is refused is counted.
+        """Begin to serve ``operations``, by key.
 
         At most ``waiting`` requests, of ``max_bytes`` each, wait for one of the ``workers``.
         """
-        self._handlers = handlers
-        self._refused = refused
+        self._operations = operations
         self._max_bytes = max_bytes
         self._waiting: queue.Queue[Request | None] = queue.Queue(waiting)
         self._queryables: list[zenoh.Queryable[Any]] = []
@@ -126,7 +138,7 @@ class RequestHandlers:
             threading.Thread(target=self._work, name=f"worker-{number}")
             for number in range(workers)
         ]
-        for key in handlers:
+        for key in operations:
             channel = zenoh.handlers.FifoChannel(waiting)
             queryable = session.declare_queryable(key, channel, complete=True)
             receive = threading.Thread(
@@ -136,6 +148,11 @@ class RequestHandlers:
             self._receivers.append(receive)
         for thread in self._receivers + self._workers:
             thread.start()
+
+    @property
+    def queue(self) -> QueueMetrics:
+        """What waits for a worker."""
+        return QueueMetrics(self._waiting.qsize(), self._waiting.maxsize)
 
     def close(self) -> None:
         """Take no more requests, and handle those that wait."""
@@ -151,7 +168,7 @@ class RequestHandlers:
     def _receive(self, queryable: zenoh.Queryable[Any], key: str) -> None:
         """Empty the channel at once: a full one would stall the network's threads."""
         for query in queryable:
-            request = Request(query, key, self._refused)
+            request = Request(query, key, self._operations[key].counts)
             if request.size > self._max_bytes:
                 text = f"{request.size} bytes exceed the limit of {self._max_bytes}: split it"
                 request.refuse("too_large", text)
@@ -163,8 +180,9 @@ class RequestHandlers:
 
     def _work(self) -> None:
         while (request := self._waiting.get()) is not None:
+            request.begin()
             try:
-                self._handlers[request.key](request)
+                self._operations[request.key].handle(request)
             except RefusedError as error:
                 request.refuse(error.code, error.message)
             except Exception as error:

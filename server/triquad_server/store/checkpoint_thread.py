@@ -5,9 +5,11 @@ import queue
 import threading
 import time
 from concurrent.futures import Future
+from dataclasses import dataclass, replace
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
+from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import StoreBaseError, StoreError
@@ -19,6 +21,16 @@ from triquad_server.threads import NICENESS
 _log = logging.getLogger(__name__)
 
 _NO_STORE = "the server was started without a store: the map is not kept"
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """Checkpoints so far."""
+
+    written: int = 0
+    failed: int = 0
+    duration_s: float | None = None  # of writing the last
+    ended_s: float | None = None  # when the last was written, monotonic
 
 
 class CheckpointThread:
@@ -42,13 +54,25 @@ class CheckpointThread:
         self._stopping = threading.Event()
         self._wake = threading.Event()
         self.last = last
+        self._counts = _Counts()
         self.error = None if store else _NO_STORE
         self._thread = threading.Thread(target=self._run, name="checkpoints")
+
+    @property
+    def has_store(self) -> bool:
+        """Whether there is anywhere to write checkpoints to."""
+        return self._store is not None
 
     def start(self) -> None:
         """Begin to write checkpoints, while the map changes and on request."""
         if self._store is not None:
             self._thread.start()
+
+    def metrics(self) -> CheckpointMetrics:
+        """How many checkpoints were written, and how long the last took."""
+        counts = self._counts
+        age_s = None if counts.ended_s is None else time.monotonic() - counts.ended_s
+        return CheckpointMetrics(counts.written, counts.failed, counts.duration_s, age_s)
 
     def close(self) -> None:
         """Write a last checkpoint, if the map changed since the one before.
@@ -116,13 +140,23 @@ class CheckpointThread:
         # The base is the last checkpoint, as long as its files are as they were written.
         if last is not None and last.epoch == changes.record.epoch == base:
             return last
+        started = time.monotonic()
         try:
             info = self._write_changes(self._store, changes)
-        except StoreError as error:
-            self.error = str(error)
-            _log.error("%s", error)
+        except Exception as error:
+            self._counts = replace(self._counts, failed=self._counts.failed + 1)
+            if isinstance(error, StoreError):
+                self.error = str(error)
+                _log.error("%s", error)
             raise
         self.last, self.error = info, None
+        now = time.monotonic()
+        self._counts = replace(
+            self._counts,
+            written=self._counts.written + 1,
+            duration_s=now - started,
+            ended_s=now,
+        )
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
 

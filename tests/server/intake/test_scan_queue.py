@@ -104,6 +104,21 @@ def test_losses_of_a_hostile_publisher_still_fit_a_message():
     assert max(ledger.lost().values()) < 2**63
 
 
+def test_sources_that_are_listed_are_bounded_and_the_others_are_put_together(monkeypatch):
+    monkeypatch.setattr(scan_queue, "MAX_SOURCES_LISTED", 2)
+    ledger = SourceLedger()
+    for session, source in enumerate(["old", "older", "front", "rear", "front"]):
+        scan = servers.scan(3, source=source, session=session)
+        ledger.arrive(scan)
+        ledger.take(scan)
+    sources = ledger.sources()
+    assert set(sources) == {"front", "rear", "*"}
+    front, others = sources["front"], sources["*"]
+    assert (front.sessions, front.taken, front.lost) == (2, 2, 6)
+    assert (others.sessions, others.taken, others.lost) == (2, 2, 6)
+    assert 0 <= front.age_s <= sources["rear"].age_s <= others.age_s
+
+
 def test_a_full_queue_pushes_out_the_oldest_scan_and_counts_it():
     queue = ScanQueue(2)
     ledger = queue.ledger

@@ -30,7 +30,17 @@ if TYPE_CHECKING:
     from triquad_tools.benchmarks.street import BenchStreet
 
 _COMMAND = "triquad-bench"
-_USUAL_ON_STREET = ("core", "server", "file", "store", "mesh", "answers", "align", "offline")
+_USUAL_ON_STREET = (
+    "core",
+    "server",
+    "file",
+    "store",
+    "mesh",
+    "answers",
+    "align",
+    "offline",
+    "metrics",
+)
 _ON_STREET = (*_USUAL_ON_STREET, "tradeoffs")
 USUAL_PARTS = (*_USUAL_ON_STREET, "growth", "air", "moving", "sweeps", "ros2", "presets")
 PARTS = (*USUAL_PARTS, "tradeoffs", "ablation")
@@ -78,6 +88,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
     from triquad_tools.benchmarks.file import measure_file, measure_offline
     from triquad_tools.benchmarks.mesh import measure_mesh
     from triquad_tools.benchmarks.planners import measure_planners
+    from triquad_tools.benchmarks.scraping import measure_scraping
     from triquad_tools.benchmarks.server import measure_server
     from triquad_tools.benchmarks.store import measure_store
     from triquad_tools.benchmarks.street import bench_street
@@ -93,6 +104,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
         "align": partial(measure_align, folder=options.recorded),
         "offline": measure_offline,
         "tradeoffs": measure_tradeoffs,
+        "metrics": measure_scraping,
     }
     made = bench_street(options.seed)
     return [figure for part in parts for figure in measures[part](made)]
@@ -177,9 +189,9 @@ def _parser() -> argparse.ArgumentParser:
         description="Measure triquad on this machine, on a simulated street: a server under a "
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
         "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
-        "opened offline, open air, things that move, a lidar that moves while it turns, clouds of "
-        "ROS 2, and rooms, tables and streets with the presets that are for them. Takes over half "
-        "an hour; nothing else should run meanwhile.",
+        "opened offline, a server whose metrics are read, open air, things that move, a lidar that "
+        "moves while it turns, clouds of ROS 2, and rooms, tables and streets with the presets "
+        "that are for them. Takes over half an hour; nothing else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument

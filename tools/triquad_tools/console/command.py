@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from triquad_format.errors import FormatError, TriquadError
 
 from triquad_tools.console.interrupts import no_interrupt_lost
+from triquad_tools.console.printable import printable
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED, NOBODY_READS = 130, 141
@@ -68,7 +69,8 @@ def _in_words(error: OSError) -> str:
 
 def complain(command: str, message: object, status: int) -> int:
     """Print a line on standard error; returns ``status``."""
-    print(f"{command}: {message}", file=sys.stderr, flush=True)
+    text = "\n".join(map(printable, str(message).splitlines()))
+    print(f"{command}: {text}", file=sys.stderr, flush=True)
     return status
 
 

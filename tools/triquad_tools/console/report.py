@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -80,9 +81,12 @@ def _print(table: Table) -> None:
         print(line.rstrip())
 
 
-def json_text(value: object) -> str:
-    """Records, lists and numbers as JSON; what is not finite becomes null."""
-    return json.dumps(_plain(value), indent=2)
+def json_text(value: object, indent: int | None = 2) -> str:
+    """Records, lists, arrays and numbers as JSON; what is not finite becomes null.
+
+    Without an ``indent`` it is one line.
+    """
+    return json.dumps(_plain(value), indent=indent)
 
 
 def centimetres(metres: float) -> str:
@@ -100,6 +104,8 @@ def _plain(value: object) -> Any:
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
     if isinstance(value, (list, tuple)):
         return [_plain(entry) for entry in value]
     if isinstance(value, float) and not math.isfinite(value):

@@ -15,11 +15,12 @@ _READY_TIMEOUT_S = 300.0  # kernels are compiled on the first start
 _STOP_TIMEOUT_S = 60.0
 
 
-def _free_endpoint() -> str:
-    """An endpoint on a port of the loopback that nothing uses."""
+def free_port() -> int:
+    """A port of the loopback that nothing uses."""
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        port: int = probe.getsockname()[1]
+        return port
 
 
 class DemoServer:
@@ -33,7 +34,7 @@ class DemoServer:
         Raises:
             ToolError: it ended before, or took too long.
         """
-        self.endpoint = _free_endpoint()
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self._log = folder / "server.log"
         self._started = threading.Event()  # ready, or ended
         self._ready = False

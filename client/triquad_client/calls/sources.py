@@ -1,0 +1,109 @@
+"""Where scans come from: the trail of each source, and its newest scan."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from triquad_format.errors import InvalidInputError
+from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_SAMPLE_POINTS
+from triquad_format.wire.source_messages import (
+    ScanSample,
+    SourcesReply,
+    SourcesRequest,
+    SourceState,
+)
+
+from triquad_client import checks
+from triquad_client.errors import BadReplyError
+from triquad_client.net.call import Ask, Call, ask
+
+
+@dataclass(frozen=True)
+class NewestScan:
+    """The scan of a source that was taken into the map last."""
+
+    stamp_ns: int  # when it was taken, nanoseconds since 1970, as its publisher said
+    world_from_sensor: Doubles  # [4, 4] pose of the sensor in the map frame
+    points: Doubles  # [N, 3] metres, map frame: some of those that the map uses
+    points_used: int  # as many the map uses: in range, and thinned
+
+    @property
+    def position_m(self) -> Doubles:
+        """Where the sensor was: [3] metres, map frame."""
+        return self.world_from_sensor[:3, 3]
+
+
+@dataclass(frozen=True)
+class ScanSource:
+    """A source of scans, and where its sensor has been."""
+
+    name: str
+    scans: int  # that were taken into the map since the server heard of the source
+    trail: Doubles  # [N, 3] positions of the sensor, metres, map frame, oldest first
+    pieces: Longs  # [N] the piece of the trail each is part of: rises where the sensor jumped
+    newest: NewestScan | None  # None: a reset forgot it, and no scan has come since
+
+    def lines(self) -> list[Doubles]:
+        """The trail as lines to draw: [K, 3] for each piece, the last one up to the newest scan."""
+        lines = np.split(self.trail, np.flatnonzero(np.diff(self.pieces)) + 1)
+        if self.newest is not None:
+            lines[-1] = np.concatenate([lines[-1], self.newest.position_m[None]])
+        return [line for line in lines if len(line)]
+
+
+@dataclass(frozen=True)
+class SourceReport:
+    """All sources of scans that a server knows of, with their whole trails."""
+
+    server: str  # the run of the server, within which revisions compare
+    revision: int  # rises with each scan that is taken into the map
+    sources: Mapping[str, ScanSource]  # by name
+
+
+def sources(since: SourceReport | None, max_points: int) -> Call[SourceReport]:
+    """All sources; of what ``since`` told, only the news travels."""
+    if since is not None and not isinstance(since, SourceReport):
+        raise InvalidInputError(f"since = {since!r}: give what an earlier call returned")
+    limit = checks.count("max_points", max_points, MAX_SAMPLE_POINTS)
+    known = since or SourceReport(server="", revision=0, sources={})
+    request = SourcesRequest(server=known.server, revision=known.revision, max_points=limit)
+    reply = yield from ask(Ask(keys.SOURCES, request, SourcesReply, background=True))
+    before = known.sources if reply.server == known.server else {}
+    found = {name: _source(name, state, before) for name, state in reply.sources.items()}
+    return SourceReport(reply.server, reply.revision, found)
+
+
+def _source(name: str, state: SourceState, before: Mapping[str, ScanSource]) -> ScanSource:
+    """A source after what is new of it.
+
+    Raises:
+        BadReplyError: that does not fit together, or with what was told before.
+    """
+    if len(state.trail) != len(state.pieces):
+        raise BadReplyError(f"source {name!r}: {len(state.trail)} positions of a trail have "
+                            f"{len(state.pieces)} numbers of pieces")  # fmt: skip
+    newest = None if state.newest is None else _newest(state.newest)
+    if state.whole:
+        return ScanSource(name, state.scans, state.trail, pieces=state.pieces, newest=newest)
+    if name not in before:
+        raise BadReplyError(f"source {name!r}: only its news came, and nothing was known of it")
+    old = before[name]
+    return ScanSource(
+        name,
+        state.scans,
+        trail=np.concatenate([old.trail, state.trail]),
+        pieces=np.concatenate([old.pieces, state.pieces]),
+        newest=newest or old.newest,
+    )
+
+
+def _newest(sample: ScanSample) -> NewestScan:
+    pose = sample.world_from_sensor
+    return NewestScan(
+        stamp_ns=sample.stamp_ns,
+        world_from_sensor=pose,
+        points=pose[:3, 3] + sample.points,
+        points_used=sample.points_used,
+    )

@@ -1,0 +1,141 @@
+"""The messages in which a server tells how it is doing, in figures.
+
+Counts, sums and times only ever grow while a server runs: whoever wants to know of the last seconds
+takes the difference of two answers. ``docs/wire-protocol.md`` says more.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format.wire.codec import ArraySpec, Message
+from triquad_format.wire.messages import Integers
+
+Seconds = Annotated[NDArray[np.float64], ArraySpec("<f8", (None,))]
+
+
+@dataclass(frozen=True)
+class MetricsRequest(Message):
+    """How is the server doing, in figures?"""
+
+
+@dataclass(frozen=True)
+class TimeHistogram(Message):
+    """How long things took, as counts in the buckets of ``ServerMetrics.bounds_s``."""
+
+    counts: Integers  # [B + 1] of each bucket; the last one is of what took longer than all bounds
+    sum_s: float
+
+    @property
+    def count(self) -> int:
+        """How many things were timed."""
+        return int(self.counts.sum())
+
+
+@dataclass(frozen=True)
+class OperationMetrics(Message):
+    """The requests of one operation, since the server started."""
+
+    answers: TimeHistogram  # what was answered: from arrival until the reply was sent
+    waits: TimeHistogram  # what was begun with: from arrival until a worker took it
+    refused: dict[str, int]  # by error code
+    pending: int  # that arrived and are not replied to yet
+    received_bytes: int  # of requests
+    sent_bytes: int  # of answers
+
+    @property
+    def answered(self) -> int:
+        """How many requests were answered."""
+        return self.answers.count
+
+
+@dataclass(frozen=True)
+class QueueMetrics(Message):
+    """What waits in a queue now."""
+
+    waiting: int
+    limit: int
+
+
+@dataclass(frozen=True)
+class SourceMetrics(Message):
+    """The scans of one source, of all its sessions that are remembered."""
+
+    sessions: int
+    taken: int
+    refused: int
+    lost: int  # never arrived, or pushed out of the full queue
+    age_s: float  # since anything was heard of it
+
+
+@dataclass(frozen=True)
+class CheckpointMetrics(Message):
+    """Checkpoints since the server started."""
+
+    written: int
+    failed: int
+    last_duration_s: float | None  # None before any was written
+    age_s: float | None  # since the last one was written, by this server
+
+
+@dataclass(frozen=True)
+class ServerMetrics(Message):
+    """Answer to :class:`MetricsRequest`."""
+
+    server: str  # a name of this server process: all counts begin anew with it
+    uptime_s: float
+    problem: str | None  # why the server does not do what it should; None: it does
+    epoch: int
+    epoch_age_s: float  # since the newest epoch was published
+    epochs_kept: int  # that can be asked for by number, pinned ones included
+    epochs_pinned: int  # older ones that stay because they were asked for by number
+    bounds_s: Seconds  # [B] upper bounds of the buckets of all histograms, increasing
+    operations: dict[str, OperationMetrics]  # by name, such as "query/sdf"
+    queues: dict[str, QueueMetrics]
+    sources: dict[str, SourceMetrics]  # by name; "*" is of those there are too many of
+    scans_received: int
+    scan_bytes_received: int
+    memory_bytes: dict[str, int]  # by part
+    resident_bytes: int  # memory of the whole process
+    mapper_s: dict[str, float]  # how the mapper's thread spent its time, by activity
+    checkpoints: CheckpointMetrics
+    sessions: dict[str, str]  # Zenoh sessions that are connected, by id: client, peer or router
+
+    def answer_time_s(
+        self, operation: str, quantile: float, since: "ServerMetrics | None" = None
+    ) -> float | None:
+        """Within which time a share of an operation's requests was answered, seconds.
+
+        Args:
+            operation: its name, such as ``"query/sdf"``.
+            quantile: the share, in [0, 1]: 0.5 for the median.
+            since: an earlier answer, to count from there on; one of another server is left out.
+
+        Returns:
+            A value interpolated within its bucket; infinity beyond the last bound, ``None`` where
+            nothing was answered.
+        """
+        asked = self.operations.get(operation)
+        if asked is None:
+            return None
+        counts = asked.answers.counts
+        if since is not None and since.server == self.server and operation in since.operations:
+            counts = counts - since.operations[operation].answers.counts
+        return _quantile(self.bounds_s, counts, quantile)
+
+
+def _quantile(bounds: NDArray[np.float64], counts: NDArray[np.int64], share: float) -> float | None:
+    reached = np.cumsum(counts)
+    total = int(reached[-1])
+    if total == 0:
+        return None
+    wanted = share * total
+    bucket = int(np.searchsorted(reached, max(wanted, 1e-9)))
+    if bucket >= len(bounds):
+        return math.inf
+    low = bounds[bucket - 1] if bucket else 0.0
+    within = (wanted - (reached[bucket] - counts[bucket])) / counts[bucket]
+    return float(low + within * (bounds[bucket] - low))

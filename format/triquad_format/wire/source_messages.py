@@ -1,0 +1,46 @@
+"""The wire messages about sources of scans; see :mod:`triquad_format.wire.messages`."""
+
+from dataclasses import dataclass
+
+from triquad_format.wire.codec import Message
+from triquad_format.wire.messages import Integers, Pose, Positions
+from triquad_format.wire.query_messages import Corners
+
+
+@dataclass(frozen=True)
+class SourcesRequest(Message):
+    """Where the sources of scans have been, and what the newest scan of each looks like."""
+
+    server: str  # of the reply before, to which revision belongs; empty at first
+    revision: int  # of the reply before: what was told up to it is known; 0 at first
+    max_points: int  # of each newest scan
+
+
+@dataclass(frozen=True)
+class ScanSample(Message):
+    """Some of the points of a scan that is in the map."""
+
+    stamp_ns: int  # nanoseconds since 1970, as its publisher said
+    world_from_sensor: Pose
+    points: Positions  # [N, 3] metres, map frame, relative to the sensor's position
+    points_used: int  # of the scan, by the map: N or more
+
+
+@dataclass(frozen=True)
+class SourceState(Message):
+    """What is new of one source of scans."""
+
+    scans: int  # that were taken into the map since the server heard of the source
+    whole: bool  # what was told of this source before is void
+    trail: Corners  # [N, 3] metres, map frame: positions of the sensor, oldest first
+    pieces: Integers  # [N] the piece of the trail each is part of: rises where the sensor jumped
+    newest: ScanSample | None  # where it is new
+
+
+@dataclass(frozen=True)
+class SourcesReply(Message):
+    """Answer to :class:`SourcesRequest`: all sources that there are, by name."""
+
+    server: str
+    revision: int  # for the next request
+    sources: dict[str, SourceState]

@@ -1,0 +1,71 @@
+"""How much memory the arrays of a part of the server take."""
+
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+
+Buffers = Mapping[int, int]
+"""Bytes of pieces of memory, by where they begin: arrays that share one count once."""
+
+NO_BUFFERS: Buffers = MappingProxyType({})
+
+
+def buffers_of(part: object, without: Buffers = NO_BUFFERS) -> dict[int, int]:
+    """The memory of all arrays and tensors that a part of the program leads to.
+
+    Args:
+        part: an object, or containers of some, which must not change meanwhile; only those of
+            classes of this program are looked into.
+        without: memory that belongs to others.
+    """
+    found: dict[int, int] = {}
+    visited: set[int] = set()
+    open_parts: list[Any] = [part]
+    while open_parts:
+        part = open_parts.pop()
+        if id(part) in visited:
+            continue
+        visited.add(id(part))
+        if isinstance(part, np.ndarray):
+            root = _root(part)
+            found[root.ctypes.data] = root.nbytes
+        elif isinstance(part, torch.Tensor):
+            storage = part.untyped_storage()
+            found[storage.data_ptr()] = storage.nbytes()
+        else:
+            open_parts.extend(_within(part))
+    return {start: size for start, size in found.items() if start not in without}
+
+
+def bytes_by_part(parts: Mapping[str, object], without: Buffers = NO_BUFFERS) -> dict[str, int]:
+    """Bytes of each part; what several share counts for the first of them.
+
+    ``without`` is memory that belongs to others.
+    """
+    taken = dict(without)
+    sizes = {}
+    for name, part in parts.items():
+        own = buffers_of(part, without=taken)
+        sizes[name] = sum(own.values())
+        taken.update(own)
+    return sizes
+
+
+def _root(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array
+
+
+def _within(part: object) -> Iterable[object]:
+    """What a container or an object of this program holds."""
+    if isinstance(part, (tuple, list)):
+        return part
+    if isinstance(part, dict):
+        return list(part.values())
+    if type(part).__module__.startswith("triquad_"):
+        return list(getattr(part, "__dict__", {}).values())
+    return ()

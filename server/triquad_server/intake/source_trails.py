@@ -1,0 +1,208 @@
+"""Where each source of scans has been, and its newest scan: for those who watch."""
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+import numpy as np
+from triquad_format.records.arrays import Bools, Doubles, Longs
+from triquad_format.wire.limits import MAX_SAMPLE_POINTS
+from triquad_format.wire.messages import Scan
+
+from triquad_server.intake.rays import ScanRays
+
+MAX_SOURCES = 256
+"""Sources that are remembered; the one heard of longest ago is forgotten."""
+
+MAX_POSITIONS = 8192
+"""Of a trail. Once it has so many, every second one is dropped, and from then on they are twice as
+far apart: all of the way remains visible."""
+
+_JUMP_LEAVES = 250.0
+"""A sensor that is farther away than this from one scan to the next has not moved there: 50 m with
+the leaf of streets, where a car does 14 m a second and some of its scans may be lost."""
+
+_DRAWS = np.random.default_rng(0).random(MAX_SAMPLE_POINTS)
+"""Which point of each run is taken, always the same: to draw them anew takes longer."""
+
+
+@dataclass(frozen=True)
+class TakenScan:
+    """A scan that was taken into the map."""
+
+    stamp_ns: int
+    world_from_sensor: Doubles  # [4, 4]
+    points: Doubles  # [N, 3] metres, map frame: those that are used, or some of them
+    points_used: int
+    revision: int
+
+    @property
+    def position(self) -> Doubles:
+        """Where the sensor was: [3] metres, map frame."""
+        return self.world_from_sensor[:3, 3]
+
+
+@dataclass(frozen=True)
+class SourceNews:
+    """What is new of a source."""
+
+    scans: int
+    whole: bool  # what was told before is void
+    trail: Doubles  # [N, 3] metres, map frame
+    pieces: Longs  # [N] rise where the sensor jumped
+    newest: TakenScan | None  # where it is new
+
+
+@dataclass
+class _Trail:
+    """Where a sensor has been: a bounded number of positions, oldest first."""
+
+    count: int = 0
+    positions: Doubles = field(default_factory=lambda: np.empty((MAX_POSITIONS, 3)))
+    pieces: Longs = field(default_factory=lambda: np.empty(MAX_POSITIONS, np.int64))
+    revisions: Longs = field(default_factory=lambda: np.empty(MAX_POSITIONS, np.int64))
+
+    def add(self, position: Doubles, piece: int, revision: int) -> None:
+        """Add a position; there must be room."""
+        self.positions[self.count] = position
+        self.pieces[self.count] = piece
+        self.revisions[self.count] = revision
+        self.count += 1
+
+    def keep(self, kept: Bools) -> None:
+        """Drop the positions that are not ``kept`` [count]."""
+        before, self.count = self.count, int(kept.sum())
+        for column in (self.positions, self.pieces, self.revisions):
+            column[: self.count] = column[:before][kept]
+
+    def after(self, revision: int) -> slice:
+        """The positions that were added after a revision."""
+        first = np.searchsorted(self.revisions[: self.count], revision, side="right")
+        return slice(int(first), self.count)
+
+
+@dataclass
+class _Source:
+    """What is known of one source."""
+
+    rewritten: int  # revision since which the trail was only added to
+    spacing_m: float  # of the trail's positions
+    scans: int = 0
+    newest: TakenScan | None = None
+    trail: _Trail = field(default_factory=_Trail)
+
+    def add(self, taken: TakenScan, jump_m: float) -> None:
+        """Add its newest scan."""
+        jumped = self.newest is None or _apart(taken.position, self.newest.position) > jump_m
+        self.scans += 1
+        self.newest = taken
+        trail = self.trail
+        last = trail.count - 1
+        if not jumped and _apart(taken.position, trail.positions[last]) < self.spacing_m:
+            return
+        piece = int(trail.pieces[last]) + jumped if trail.count else 0
+        if trail.count == MAX_POSITIONS:
+            trail.keep(np.arange(trail.count) % 2 == 0)
+            self.spacing_m *= 2.0
+            self.rewritten = taken.revision
+        trail.add(taken.position, piece, taken.revision)
+
+    def forget(self, minimum: Doubles, maximum: Doubles, revision: int) -> None:
+        """Forget where it has been within a box; the trail is interrupted there.
+
+        Its newest scan is forgotten where it, or the last of the trail, lies in the box.
+        """
+        trail = self.trail
+        inside = _within(trail.positions[: trail.count], minimum, maximum)
+        newest = self.newest
+        if newest is not None:
+            here = _within(newest.position[None], minimum, maximum)
+            if here.any() or inside[-1:].any():
+                self.newest = None
+        if inside.any() or newest is not self.newest:
+            trail.pieces[: trail.count] += np.cumsum(inside)
+            trail.keep(~inside)
+            self.rewritten = revision
+
+    def news(self, revision: int) -> SourceNews:
+        """What is new since a revision."""
+        whole = self.rewritten > revision
+        chosen = slice(0, self.trail.count) if whole else self.trail.after(revision)
+        newest = self.newest
+        if newest is not None and not whole and newest.revision <= revision:
+            newest = None
+        return SourceNews(
+            self.scans,
+            whole,
+            trail=self.trail.positions[chosen].copy(),
+            pieces=self.trail.pieces[chosen].copy(),
+            newest=newest,
+        )
+
+
+class SourceTrails:
+    """Where each source has been, and its newest scan. One thread adds, any may ask."""
+
+    def __init__(self, leaf_m: float) -> None:
+        """Positions of a trail are a leaf apart, at first."""
+        self._spacing_m = leaf_m
+        self._jump_m = _JUMP_LEAVES * leaf_m
+        self._lock = threading.Lock()
+        self._revision = 0
+        self._sources: OrderedDict[str, _Source] = OrderedDict()  # the one heard of last is last
+
+    def add(self, scan: Scan, rays: ScanRays) -> None:
+        """A scan was taken into the map, and ``rays`` are what of it is used."""
+        points = evenly(rays.ends, MAX_SAMPLE_POINTS)
+        with self._lock:
+            self._revision += 1
+            source = self._sources.pop(scan.source, None)
+            if source is None:
+                source = _Source(rewritten=self._revision, spacing_m=self._spacing_m)
+            self._sources[scan.source] = source
+            if len(self._sources) > MAX_SOURCES:
+                self._sources.popitem(last=False)
+            taken = TakenScan(
+                scan.stamp_ns,
+                scan.world_from_sensor,
+                points=points,
+                points_used=len(rays.ends),
+                revision=self._revision,
+            )
+            source.add(taken, self._jump_m)
+
+    def forget(self, minimum: Doubles, maximum: Doubles) -> None:
+        """Forget what lies between two corners [3], metres, map frame."""
+        with self._lock:
+            self._revision += 1
+            for name, source in list(self._sources.items()):
+                source.forget(minimum, maximum, self._revision)
+                if source.newest is None and source.trail.count == 0:
+                    del self._sources[name]
+
+    def since(self, revision: int) -> tuple[int, dict[str, SourceNews]]:
+        """The revision now, and what is new of every source since an earlier one."""
+        with self._lock:
+            news = {name: source.news(revision) for name, source in self._sources.items()}
+            return self._revision, news
+
+
+def evenly(points: Doubles, count: int) -> Doubles:
+    """At most ``count`` of the points [N, 3]: one of each of as many runs of them.
+
+    Which one of a run is drawn: every tenth, say, may be of one laser of a lidar.
+    """
+    if len(points) <= count:
+        return points
+    runs = np.arange(count + 1) * len(points) // max(count, 1)
+    chosen = runs[:-1] + (_DRAWS[:count] * np.diff(runs)).astype(np.int64)
+    return points.take(chosen, axis=0)
+
+
+def _within(positions: Doubles, minimum: Doubles, maximum: Doubles) -> Bools:
+    """Whether each of the positions [N, 3] lies between two corners [3]."""
+    return np.asarray(((positions >= minimum) & (positions <= maximum)).all(axis=1))
+
+
+def _apart(one: Doubles, other: Doubles) -> float:
+    return float(np.linalg.norm(one - other))

@@ -1,0 +1,41 @@
+"""A question about the map that the server asks itself, to know whether it still answers."""
+
+import numpy as np
+import zenoh
+from triquad_format.errors import WireError
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import ErrorReply, SdfRequest
+
+
+class SelfQuestion:
+    """Asks for the field at one point, which goes the way of the questions of others."""
+
+    def __init__(self, session: zenoh.Session, map_name: str) -> None:
+        self._session = session
+        self._key = keys.operation_key(map_name, keys.SDF)
+        request = SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), gradient=False, epoch=0)
+        self._payload = codec.encode(request)
+
+    def problem(self, timeout_s: float) -> str | None:
+        """That no answer came in time; ``None`` where one came.
+
+        A refusal, where too many requests wait, is an answer.
+        """
+        replies = self._session.get(
+            self._key,
+            payload=self._payload,
+            timeout=timeout_s,
+            allowed_destination=zenoh.Locality.SESSION_LOCAL,
+        )
+        if any(reply.err is None or _is_ours(reply.err) for reply in replies):
+            return None
+        return f"a question that the server asked itself got no answer within {timeout_s:g} s"
+
+
+def _is_ours(error: zenoh.ReplyError) -> bool:
+    """Whether an error comes from the server, not from Zenoh, which has waited for long enough."""
+    try:
+        codec.decode(ErrorReply, error.payload.to_bytes())
+    except WireError:
+        return False
+    return True

@@ -1,0 +1,46 @@
+"""The operations that a server answers: in groups, counted each."""
+
+from collections.abc import Callable, Mapping
+
+import zenoh
+from triquad_format.wire import keys
+from triquad_format.wire.metrics_messages import QueueMetrics
+
+from triquad_server.net.operation_counts import OperationCounts
+from triquad_server.net.requests import Handler, Operation, RequestHandlers, payload_limit
+from triquad_server.settings import ServiceSettings
+
+ReadQueue = Callable[[], QueueMetrics]
+"""What waits in a queue now."""
+
+
+class ServedOperations:
+    """What is served of a map so far, what became of the requests, and where they wait."""
+
+    def __init__(self, session: zenoh.Session, map_name: str, limits: ServiceSettings) -> None:
+        self._session = session
+        self._map_name = map_name
+        self._limits = limits
+        self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
+        self.queues: dict[str, ReadQueue] = {}  # by name
+
+    def serve(
+        self, queue: str, handlers: Mapping[str, Handler], workers: int = 1
+    ) -> RequestHandlers:
+        """Answer a group of operations from now on; no other group waits for it.
+
+        ``queue`` is the name of what waits for them.
+        """
+        operations = {}
+        for name, handler in handlers.items():
+            counts = self.counts[name] = OperationCounts()
+            operations[keys.operation_key(self._map_name, name)] = Operation(handler, counts)
+        group = RequestHandlers(
+            self._session,
+            operations,
+            workers=workers,
+            waiting=self._limits.request_queue,
+            max_bytes=payload_limit(self._limits.max_query_points),
+        )
+        self.queues[queue] = lambda: group.queue
+        return group

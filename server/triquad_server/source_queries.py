@@ -1,0 +1,64 @@
+"""Answers to the question of where the sources of scans have been, and what they see."""
+
+import numpy as np
+from triquad_format.errors import RefusedError
+from triquad_format.wire.limits import MAX_SAMPLE_POINTS
+from triquad_format.wire.source_messages import (
+    ScanSample,
+    SourcesReply,
+    SourcesRequest,
+    SourceState,
+)
+
+from triquad_server.intake.source_trails import SourceNews, SourceTrails, TakenScan, evenly
+
+
+class SourceQueries:
+    """Answers what is new of the sources of scans."""
+
+    def __init__(self, trails: SourceTrails, server: str) -> None:
+        """``server`` is the name that replies carry."""
+        self._trails = trails
+        self._server = server
+
+    def sources(self, request: SourcesRequest) -> SourcesReply:
+        """All sources, with what is new of them since the request's revision.
+
+        Raises:
+            RefusedError: a field is out of range.
+        """
+        if not 0 <= request.max_points <= MAX_SAMPLE_POINTS:
+            raise RefusedError(
+                "bad_request", f"max_points = {request.max_points}: use 0 to {MAX_SAMPLE_POINTS}"
+            )
+        # What another run of the server told is known no more than nothing.
+        known = request.revision if request.server == self._server else 0
+        revision, news = self._trails.since(known)
+        if request.revision < 0 or known > revision:
+            raise RefusedError(
+                "bad_request",
+                f"revision = {request.revision} is not one that this server told: use that of the "
+                "reply before, or 0",
+            )
+        sources = {name: _state(source, request.max_points) for name, source in news.items()}
+        return SourcesReply(self._server, revision, sources)
+
+
+def _state(news: SourceNews, max_points: int) -> SourceState:
+    return SourceState(
+        scans=news.scans,
+        whole=news.whole,
+        trail=news.trail,
+        pieces=news.pieces,
+        newest=None if news.newest is None else _sample(news.newest, max_points),
+    )
+
+
+def _sample(taken: TakenScan, max_points: int) -> ScanSample:
+    points = evenly(taken.points, max_points) - taken.position
+    return ScanSample(
+        stamp_ns=taken.stamp_ns,
+        world_from_sensor=taken.world_from_sensor,
+        points=points.astype(np.float32),
+        points_used=taken.points_used,
+    )

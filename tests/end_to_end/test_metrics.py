@@ -1,0 +1,142 @@
+"""The figures of a server with a real map, asked by the real client over the loopback."""
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import RefusedError, ServerMetrics
+from triquad_server.settings import ServiceSettings
+
+PARTS = {
+    "field",
+    "evidence",
+    "replay_pools",
+    "epochs",
+    "surfels",
+    "surface_history",
+    "tile_cache",
+    "downloads",
+    "scan_queue",
+}
+
+
+def figures(client: triquad_client.Client, done) -> ServerMetrics:
+    """The figures, once they show what is ``done``: a request counts after its reply is sent."""
+    for _ in range(1000):
+        metrics = client.metrics()
+        if done(metrics):
+            return metrics
+    raise AssertionError(f"never came: {metrics}")
+
+
+def test_every_answer_is_counted_and_timed(client):
+    servers.learn(client)
+    before = client.metrics()
+    for _ in range(20):
+        client.query_sdf(servers.sphere(1000))
+    now = figures(client, lambda m: m.operations["query/sdf"].answered == 20)
+    asked = now.operations["query/sdf"]
+    assert asked.pending == 0
+    assert asked.refused == {}
+    assert asked.received_bytes > 20 * 12_000
+    assert asked.sent_bytes > 20 * 5_000
+    assert asked.waits.count == 20
+    assert 0 <= asked.waits.sum_s < asked.answers.sum_s
+    half, most = (now.answer_time_s("query/sdf", q, since=before) for q in (0.5, 0.99))
+    assert 0 < half <= most < servers.WAIT_S
+    assert now.answer_time_s("query/sdf", 0.5, since=now) is None
+    assert now.answer_time_s("query/nothing", 0.5) is None
+    assert now.operations["query/metrics"].answered > 0
+
+
+def test_refusals_are_counted_by_operation(client):
+    with pytest.raises(RefusedError):
+        client.query_sdf([[0, 0, 0]], at_epoch=10**6)
+    now = figures(client, lambda m: m.operations["query/sdf"].refused)
+    assert now.operations["query/sdf"].refused == {"epoch_gone": 1}
+    assert now.operations["query/sdf"].answered == 0
+    assert client.status().requests_refused == {"epoch_gone": 1}
+
+
+def test_what_is_held_counts_as_pending(client):
+    servers.learn(client)
+    client.settle(servers.WAIT_S)
+    with client.watch_mesh() as watch, ThreadPoolExecutor(1) as thread:
+        watch.catch_up(servers.WAIT_S)
+        update = thread.submit(watch.next, servers.WAIT_S)
+        held = figures(client, lambda m: m.queues["mesh_followers"].waiting == 1)
+        assert held.operations["query/tile_updates"].pending == 1
+        client.publish_scan(0.5 * servers.sphere(), np.eye(4))
+        assert update.result().changed
+    assert held.queues["mesh_followers"].limit == ServiceSettings().request_queue
+
+
+def test_scans_are_counted_by_source(client):
+    points = servers.sphere()
+    for source in ("front", "rear", "front"):
+        client.publish_scan(points, np.eye(4), source=source)
+    client.flush(servers.WAIT_S)
+    metrics = client.metrics()
+    assert metrics.scans_received == 3
+    assert metrics.scan_bytes_received > 3 * points.nbytes
+    taken = {name: source.taken for name, source in metrics.sources.items()}
+    assert taken == {"front": 2, "rear": 1}
+    assert 0 <= metrics.sources["rear"].age_s < servers.WAIT_S
+
+
+def test_memory_and_time_are_told_by_part(client):
+    servers.learn(client, 4)
+    client.settle(servers.WAIT_S)
+    client.mesh()
+    metrics = client.metrics()
+    assert set(metrics.memory_bytes) == PARTS
+    for part in ("field", "evidence", "replay_pools", "epochs", "surfels", "surface_history"):
+        assert metrics.memory_bytes[part] > 0, part
+    assert sum(metrics.memory_bytes.values()) < metrics.resident_bytes
+    assert metrics.mapper_s["training"] > 0
+    assert metrics.mapper_s["scans"] > 0
+    assert sum(metrics.mapper_s.values()) == pytest.approx(metrics.uptime_s, abs=1)
+    assert metrics.problem is None
+
+
+def test_connected_clients_are_listed(client, endpoint):
+    before = client.metrics().sessions
+    with triquad_client.connect(endpoint) as other:
+        assert len(other.metrics().sessions) == len(before) + 1
+        assert set(other.metrics().sessions.values()) == {"client"}
+
+
+def test_epochs_that_were_asked_for_by_number_are_pinned(client):
+    servers.learn(client)
+    pinned = client.pinned()
+    for _ in range(6):
+        pinned.query_sdf([[0, 0, 0]])
+        servers.learn(client, 1)
+    metrics = client.metrics()
+    assert metrics.epochs_pinned >= 1
+    assert metrics.epochs_kept > ServiceSettings().epochs_kept
+    assert metrics.epoch == client.status().epoch
+    assert metrics.epoch_age_s >= 0
+
+
+def test_checkpoints_are_counted_and_timed(tmp_path):
+    with servers.service_and_client(store=tmp_path) as client:
+        before = client.metrics().checkpoints
+        assert (before.written, before.last_duration_s, before.age_s) == (0, None, None)
+        servers.learn(client)
+        client.checkpoint()
+        now = client.metrics().checkpoints
+        assert (now.written, now.failed) == (1, 0)
+        assert now.last_duration_s > 0
+        assert now.age_s >= 0
+
+
+def test_event_loops_get_the_same_figures(endpoint):
+    async def ask():
+        async with triquad_client.connect_async(endpoint) as client:
+            return await client.metrics()
+
+    assert set(asyncio.run(ask()).memory_bytes) == PARTS

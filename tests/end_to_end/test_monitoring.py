@@ -1,0 +1,307 @@
+"""The port for Prometheus and supervisors, of a real server over real HTTP."""
+
+import json
+import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from contextlib import ExitStack, closing, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import triquad_client
+import triquad_server
+from prometheus_client.openmetrics import parser as openmetrics
+from prometheus_client.parser import text_string_to_metric_families
+from support import servers
+from triquad_client import RefusedError
+from triquad_server.errors import ListenError
+from triquad_server.metrics_settings import MetricsSettings
+from triquad_server.monitoring.families import FAMILIES
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "metrics.md").read_text(encoding="utf-8")
+DASHBOARD = DOCS / "deploy" / "grafana-dashboard.json"
+
+
+class Answer(NamedTuple):
+    code: int
+    content_type: str
+    body: str
+
+
+def get(port: int, path: str, accept: str = "text/plain") -> Answer:
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers={"Accept": accept})
+    try:
+        with urllib.request.urlopen(request, timeout=servers.WAIT_S) as reply:
+            return Answer(reply.status, reply.headers["Content-Type"], reply.read().decode())
+    except urllib.error.HTTPError as error:
+        with error:
+            return Answer(error.code, error.headers["Content-Type"], error.read().decode())
+
+
+def health(port: int) -> tuple[int, dict[str, object]]:
+    answer = get(port, "/healthz")
+    assert answer.content_type == "application/json"
+    return answer.code, json.loads(answer.body)
+
+
+def samples(port: int) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
+    """All values, by name and sorted labels."""
+    families = text_string_to_metric_families(get(port, "/metrics").body)
+    return {
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
+        for family in families
+        for sample in family.samples
+    }
+
+
+def free_port() -> int:
+    return int(servers.free_endpoint().rpartition(":")[2])
+
+
+@pytest.fixture(scope="module")
+def port():
+    """Of a server that was asked something of everything."""
+    port = free_port()
+    settings = servers.SMALL.model_copy(update={"metrics": MetricsSettings(port=port)})
+    servers.compiled()
+    with triquad_server.serve(settings=settings) as server, server.client() as client:
+        servers.learn(client)
+        client.settle(servers.WAIT_S)
+        client.mesh()
+        for _ in range(5):
+            client.query_sdf(servers.sphere(100))
+        with pytest.raises(RefusedError):
+            client.query_distance([[0, 0, 0]], at_epoch=10**6)
+        client.metrics()
+        yield port
+
+
+def test_prometheus_is_told_what_clients_are_told(port):
+    found = samples(port)
+    sdf = (("operation", "query/sdf"),)
+    assert found["triquad_request_duration_seconds_count", sdf] == 5
+    assert 0 < found["triquad_request_duration_seconds_sum", sdf] < servers.WAIT_S
+    assert found["triquad_request_duration_seconds_bucket", (("le", "+Inf"), *sdf)] == 5
+    gone = (("code", "epoch_gone"), ("operation", "query/distance"))
+    assert found["triquad_requests_refused_total", gone] == 1
+    assert found["triquad_scans_taken_total", ()] == 2
+    taken = (("outcome", "taken"), ("source", "default"))
+    assert found["triquad_source_scans_total", taken] == 2
+    assert found["triquad_settled", ()] == 1
+    assert found["triquad_healthy", ()] == 1
+    assert found["triquad_samples_trained_total", ()] > 0
+    assert found["triquad_memory_bytes", (("part", "field"),)] > 0
+    assert found["triquad_mapper_seconds_total", (("activity", "training"),)] > 0
+    assert found["triquad_sessions", (("kind", "client"),)] == 1
+    assert not any("query/align" in dict(labels).values() for _, labels in found)
+
+
+def test_buckets_count_up_to_their_bounds(port):
+    buckets = [
+        (float(dict(labels)["le"]), count)
+        for (name, labels), count in samples(port).items()
+        if name == "triquad_request_duration_seconds_bucket"
+        and ("operation", "query/tile") in labels
+    ]
+    assert len(buckets) > 20
+    assert buckets == sorted(buckets)
+    assert [count for _, count in buckets] == sorted(count for _, count in buckets)
+
+
+def test_the_strict_format_is_spoken_too(port):
+    answer = get(port, "/metrics", accept="application/openmetrics-text; version=1.0.0")
+    assert answer.content_type.startswith("application/openmetrics-text")
+    families = {family.name for family in openmetrics.text_string_to_metric_families(answer.body)}
+    assert families == {family.name.removesuffix("_total") for family in FAMILIES}
+
+
+def test_the_page_lists_what_is_exposed(port):
+    rows = re.findall(r"^\| `(triquad_\w+)` \| (\w+) \| (.*?) \| (.*) \|$", PAGE, re.M)
+    listed = {(name, kind, labels, text) for name, kind, labels, text in rows}
+    exposed = set()
+    families = {
+        family.name: family for family in text_string_to_metric_families(get(port, "/metrics").body)
+    }
+    for family in FAMILIES:
+        found = families[family.name.removesuffix("_total")]
+        for sample in found.samples:
+            assert set(sample.labels) - {"le"} == set(family.labels), family.name
+        labels = ", ".join(f"`{label}`" for label in family.labels)
+        exposed.add((family.name, found.type, labels, found.documentation))
+    assert listed == exposed
+    assert len(rows) == len(FAMILIES) == len(families)
+
+
+def test_the_dashboard_shows_metrics_and_labels_that_there_are():
+    dashboard = json.loads(DASHBOARD.read_text(encoding="utf-8"))
+    panels = [panel for panel in dashboard["panels"] if panel["type"] != "row"]
+    assert len({panel["id"] for panel in dashboard["panels"]}) == len(dashboard["panels"])
+    labels = {
+        name: {*family.labels, "instance", "le"}
+        for family in FAMILIES
+        for name in (family.name, *(f"{family.name}_{part}" for part in ("bucket", "count", "sum")))
+    }
+    shown = set()
+    for target in (target for panel in panels for target in panel["targets"]):
+        names = re.findall(r"triquad_\w+", target["expr"])
+        assert names, target
+        used = set(re.findall(r'(\w+)!?[=~]+"', target["expr"]))
+        used |= set(re.findall(r"{{(\w+)}}", target["legendFormat"]))
+        for name in names:
+            assert used <= labels[name], (target, name)
+        shown |= {re.sub("_(bucket|count|sum)$", "", name) for name in names}
+    left_out = {family.name for family in FAMILIES} - shown
+    assert left_out == {
+        "triquad_scans_received_total",  # what became of them is shown
+        "triquad_scans_taken_total",  # by source
+    }
+
+
+def test_nothing_else_is_answered_and_nothing_breaks_it(port):
+    assert get(port, "/").code == 404
+    assert "/healthz" in get(port, "/map").body
+    assert get(port, "/metrics?name=x").code == 200
+    assert get(port, "/%0d%0aX:%20y" + "a" * 5000).code == 404
+    hostile = [b"\xff" * 100_000, b"GET /metrics HTTP/9.9\r\n\r\n", b"\r\n" * 10, b"GET " * 10]
+    for words in hostile:
+        with socket.create_connection(("127.0.0.1", port)) as connection, suppress(OSError):
+            connection.sendall(words)
+            connection.shutdown(socket.SHUT_WR)
+    with socket.create_connection(("127.0.0.1", port)) as connection:
+        connection.sendall(b"POST /healthz HTTP/1.0\r\n\r\n")
+        assert b"501" in connection.recv(1000)
+    assert health(port)[0] == 200
+
+
+def test_idle_connections_take_no_more_than_some_threads(port):
+    with ExitStack() as stack:
+        silent = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(20)
+        ]
+        for connection in silent:
+            connection.settimeout(servers.WAIT_S)
+        closed = silent[-1].recv(1)  # at once, while the first ones are still waited for
+        assert closed == b""
+    until(lambda: is_healthy(port))  # once it noticed that they were closed
+
+
+def is_healthy(port: int) -> bool:
+    try:
+        return get(port, "/healthz").code == 200
+    except OSError:
+        return False
+
+
+def until(is_so: Callable[[], bool]) -> None:
+    """Ask until something is so, which takes a moment."""
+    assert any(is_so() for _ in range(1000))
+
+
+@pytest.fixture
+def arguments(tmp_path):
+    path = tmp_path / "server.toml"
+    path.write_text(servers.SMALL_TOML)
+    return ["--settings", path, "--store", tmp_path / "store"]
+
+
+def test_a_process_is_watched_from_its_start_to_its_end(arguments):
+    port = free_port()
+    process = servers.server_process([*arguments, "--metrics-port", str(port)], ready=False)
+    with process as server:
+        server.wait_for("metrics on")
+        code, report = health(port)
+        if code != 200:  # as a rule: it takes a second to start
+            assert "starting" in report["problem"]
+        server.wait_for("ready: ")
+        until(lambda: is_healthy(port))  # the line comes a moment before
+        with triquad_client.connect(server.endpoint) as client:
+            servers.learn(client)
+            status = client.status()
+        code, report = health(port)
+        assert (code, report["problem"]) == (200, None)
+        assert (report["map"], report["scans_taken"]) == (servers.MAP, 2)
+        assert report["epoch"] >= status.epoch
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    with pytest.raises(OSError, match="refused"):
+        get(port, "/healthz")
+    assert "Traceback" not in server.log
+
+
+def test_a_store_that_cannot_be_written_is_a_problem_until_it_can(arguments):
+    port = free_port()
+    with (
+        servers.server_process([*arguments, "--set", f"metrics.port={port}"]) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        servers.learn(client)
+        _, hard = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (10_000, hard))
+        with pytest.raises(RefusedError, match="cannot be written"):
+            client.checkpoint()
+        code, report = health(port)
+        assert code == 503
+        assert "cannot be written" in report["problem"]
+        assert samples(port)["triquad_healthy", ()] == 0
+        assert samples(port)["triquad_checkpoints_total", (("outcome", "failed"),)] == 1
+        assert client.metrics().problem == report["problem"]
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
+        client.checkpoint()
+        assert health(port)[0] == 200
+
+
+def test_a_port_that_is_taken_ends_the_server_at_once(arguments):
+    with closing(socket.socket()) as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with servers.server_process([*arguments, "--metrics-port", port], ready=False) as server:
+            assert server.wait() == 3
+    assert f"cannot listen on 127.0.0.1:{port} for metrics" in server.log
+    assert "--metrics-port" in server.log
+    assert "preparing" not in server.log
+
+
+@pytest.mark.parametrize("address", ["nowhere.invalid", "203.0.113.7", "a" * 200, "\0"])
+def test_an_address_that_is_not_ours_is_named(address):
+    settings = servers.SMALL.model_copy(
+        update={"metrics": MetricsSettings(port=free_port(), address=address)}
+    )
+    with pytest.raises(ListenError, match=address):
+        triquad_server.serve(settings=settings)
+
+
+def test_a_server_within_a_program_closes_its_port():
+    port = free_port()
+    settings = servers.SMALL.model_copy(
+        update={"metrics": MetricsSettings(port=port, address="::1")}
+    )
+    servers.compiled()
+    for _ in range(2):  # the port is free again at once
+        with triquad_server.serve(settings=settings):
+            url = f"http://[::1]:{port}/healthz"
+            with urllib.request.urlopen(url, timeout=servers.WAIT_S) as reply:
+                assert reply.status == 200
+        with pytest.raises(OSError, match="refused"):
+            socket.create_connection(("::1", port))
+
+
+@pytest.mark.parametrize("port", ["-1", "65536", "http"])
+def test_ports_that_are_none_are_refused(port):
+    command = [sys.executable, "-m", "triquad_server.cli", "--metrics-port", port]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "metrics.port" in ended.stderr
+
+
+def test_prometheus_client_is_imported_only_where_it_is_wanted():
+    script = "import sys, triquad_server.launch; sys.exit('prometheus_client' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -1,0 +1,181 @@
+"""A server process and the service manager that started it, over a real socket."""
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import triquad_client
+from support import servers, stopped_threads
+from support.servers import ServerProcess
+from support.service_manager import Manager, service_manager
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import ServerStatus, StatusRequest
+
+WATCHDOG_S = 2
+
+TELLS_ITS_THREADS = """
+import sys, threading
+from triquad_server.cli import main
+
+def tell():
+    for name in sys.stdin:
+        names = [t.native_id for t in threading.enumerate() if t.name.startswith(name.strip())]
+        print(*names, flush=True)
+
+threading.Thread(target=tell, daemon=True).start()
+sys.exit(main())
+"""
+
+
+@pytest.fixture
+def arguments(tmp_path):
+    settings = tmp_path / "server.toml"
+    settings.write_text(servers.SMALL_TOML)
+    return ["--settings", str(settings), "--store", str(tmp_path / "store")]
+
+
+@pytest.fixture
+def manager(tmp_path, monkeypatch) -> Iterator[Manager]:
+    with service_manager(str(tmp_path / "notify")) as manager:
+        monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
+        monkeypatch.setenv("WATCHDOG_USEC", str(WATCHDOG_S * 1_000_000))
+        yield manager
+
+
+@contextmanager
+def server_whose_threads_are_known(arguments: list[str]) -> Iterator[ServerProcess]:
+    endpoint = servers.free_endpoint()
+    command = [sys.executable, "-c", TELLS_ITS_THREADS, "--listen", endpoint]
+    command += ["--no-multicast-scouting", "--device", "cpu", *arguments]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        server = ServerProcess(process, endpoint)
+        try:
+            server.wait_for("ready: ")
+            yield server
+        finally:
+            process.kill()
+            server.wait()
+
+
+def threads_of(server: ServerProcess, name: str) -> list[int]:
+    """Ids of the threads whose names begin with ``name``."""
+    assert server.process.stdin is not None
+    assert server.process.stdout is not None
+    server.process.stdin.write(f"{name}\n")
+    server.process.stdin.flush()
+    return [int(number) for number in server.process.stdout.readline().split()]
+
+
+def assert_answers_at_once(endpoint: str) -> None:
+    """No client that tries again: a single request."""
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    socket.create_connection((host, int(port))).close()
+    with servers.raw_session("client", connect=endpoint) as session:
+        answer = servers.RawPeer(session).ask(keys.STATUS, codec.encode(StatusRequest()))
+    assert isinstance(answer, bytes)
+    assert codec.decode(ServerStatus, answer).epoch >= 1
+
+
+def told(manager: Manager, key: str) -> list[str]:
+    return [line for lines in manager.heard for line in lines if line.startswith(f"{key}=")]
+
+
+def test_it_is_ready_once_it_answers_and_says_when_it_stops(manager, arguments) -> None:
+    with servers.server_process(arguments, ready=False) as server:
+        ready = manager.wait_for("READY=1")
+        assert_answers_at_once(server.endpoint)
+        assert ready[1].startswith("STATUS=serving map 'default': epoch 1")
+        stages = told(manager, "STATUS")[:-1]
+        assert stages[0] == "STATUS=restoring the newest checkpoint"
+        assert "STATUS=preparing compiled code: training" in stages
+        assert told(manager, "EXTEND_TIMEOUT_USEC")
+        with triquad_client.connect(server.endpoint) as client:
+            servers.learn(client)
+            client.settle(servers.WAIT_S)
+            epoch = client.status().epoch
+        manager.wait_for(f"STATUS=serving map 'default': epoch {epoch}, 2 scans taken")
+        server.process.send_signal(signal.SIGTERM)
+        manager.wait_for("STOPPING=1")
+        assert server.wait() == 0
+    assert [line for lines in manager.heard for line in lines].count("READY=1") == 1
+
+
+def test_an_abstract_socket_will_do(tmp_path, monkeypatch, arguments) -> None:
+    with service_manager(f"@triquad-{tmp_path.name}-{id(tmp_path)}") as manager:
+        monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
+        with servers.server_process(arguments, ready=False) as server:
+            manager.wait_for("READY=1")
+            server.process.send_signal(signal.SIGTERM)
+            manager.wait_for("STOPPING=1")
+            assert server.wait() == 0
+    assert told(manager, "WATCHDOG") == []  # it did not ask
+
+
+def test_asked_to_stop_while_it_starts_it_says_that_it_stops(manager, arguments) -> None:
+    with servers.server_process(arguments, ready=False) as server:
+        manager.wait_for("STATUS=preparing compiled code")
+        server.process.send_signal(signal.SIGTERM)
+        manager.wait_for("STOPPING=1")
+        assert server.wait() == 0
+    assert told(manager, "READY") == []
+
+
+def assert_nothing_more_is_well(manager: Manager, server: ServerProcess, why: str) -> None:
+    server.wait_for(f"is not told any more that all is well: {why}")
+    before = len(manager.heard)
+    for _ in range(12):  # more than a period of the watchdog has
+        manager.wait_for("STATUS=")
+    assert not any("WATCHDOG=1" in lines for lines in manager.heard[before:])
+
+
+def test_while_the_mapper_hangs_the_watchdog_is_not_told_that_all_is_well(
+    manager, arguments
+) -> None:
+    with server_whose_threads_are_known(arguments) as server:
+        manager.wait_for("WATCHDOG=1")
+        (mapper,) = threads_of(server, "mapper")
+        with stopped_threads.stopped([mapper]):
+            assert_nothing_more_is_well(manager, server, "mapping makes no progress")
+            assert_answers_at_once(server.endpoint)  # all else goes on
+        manager.wait_for("WATCHDOG=1")  # and so does the mapper, once it can
+
+
+def test_while_nobody_answers_the_watchdog_is_not_told_that_all_is_well(manager, arguments) -> None:
+    with server_whose_threads_are_known(arguments) as server:
+        manager.wait_for("WATCHDOG=1")
+        with stopped_threads.stopped(threads_of(server, "worker")):
+            assert_nothing_more_is_well(manager, server, "a question that the server asked itself")
+        manager.wait_for("WATCHDOG=1")
+
+
+def test_given_up_by_the_watchdog_it_leaves_the_stacks_of_its_threads(manager, arguments) -> None:
+    with servers.server_process(arguments) as server:
+        manager.wait_for("READY=1")
+        server.process.send_signal(signal.SIGABRT)  # as systemd does
+        assert server.wait() == -signal.SIGABRT
+    assert 'mapper_thread.py", line' in server.log
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("NOTIFY_SOCKET", "vsock:2:1234", "neither a path nor an abstract socket"),
+        ("NOTIFY_SOCKET", "/nowhere/at/all", "could not be told"),
+        ("WATCHDOG_USEC", "soon", "'soon' is no time in microseconds"),
+    ],
+)
+def test_a_manager_that_cannot_be_told_stops_nothing(
+    manager, monkeypatch, arguments, name, value, text
+) -> None:
+    monkeypatch.setenv(name, value)
+    with servers.server_process(arguments) as server:
+        assert_answers_at_once(server.endpoint)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    assert text in server.log
+    assert told(manager, "WATCHDOG") == []

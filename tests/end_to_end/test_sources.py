@@ -1,0 +1,280 @@
+"""Where sources have been and what they see, asked by the real client over the loopback."""
+
+import asyncio
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import (
+    BadReplyError,
+    Client,
+    InvalidInputError,
+    NoReplyError,
+    RefusedError,
+    SourceReport,
+)
+from triquad_format.records.arrays import Doubles
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import FlushRequest
+from triquad_format.wire.source_messages import SourcesReply, SourcesRequest, SourceState
+from triquad_server.intake.source_trails import MAX_SOURCES
+
+BOX = ((2.5, -1, -1), (3.5, 1, 1))
+
+
+def pose(x: float, y: float = 0.0) -> Doubles:
+    """A sensor that looks along the y axis."""
+    return np.array([[0, -1, 0, x], [1, 0, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
+
+
+def drive(client: Client, xs: list[float], source: str = "lidar", y: float = 0.0) -> None:
+    """Take scans of a sphere around the sensor, which is at each of ``xs`` in turn."""
+    for x in xs:
+        client.publish_scan(servers.sphere(500), pose(x, y), source=source)
+    client.flush(servers.WAIT_S)
+
+
+def trail(report: SourceReport, source: str = "lidar") -> list[float]:
+    """The x of each position of a trail."""
+    return report.sources[source].trail[:, 0].tolist()
+
+
+def lines(report: SourceReport, source: str = "lidar") -> list[list[float]]:
+    """The x along each line of a trail."""
+    return [line[:, 0].tolist() for line in report.sources[source].lines()]
+
+
+def asked(peer: servers.RawPeer, server: str = "", revision: int = 0) -> SourcesReply:
+    """A reply as it travels."""
+    answer = peer.ask(keys.SOURCES, codec.encode(SourcesRequest(server, revision, 100)))
+    assert isinstance(answer, bytes), answer
+    return codec.decode(SourcesReply, answer)
+
+
+def test_a_program_follows_the_sources_with_the_report_before(client):
+    report = client.sources()
+    assert report.sources == {}
+    drive(client, [1, 2, 3])
+    first = client.sources(report)
+    assert trail(first) == [1, 2, 3]
+    drive(client, [4, 5])
+    drive(client, [7, 8], source="camera", y=3)
+    report = client.sources(since=first)
+    assert trail(report) == [1, 2, 3, 4, 5]
+    assert trail(report, "camera") == [7, 8]
+    assert trail(first) == [1, 2, 3]  # what a program holds stays as it is
+    scans = {name: source.scans for name, source in report.sources.items()}
+    assert scans == {"lidar": 5, "camera": 2}
+    at_once = client.sources()
+    assert (trail(at_once), trail(at_once, "camera")) == ([1, 2, 3, 4, 5], [7, 8])
+    unmoved = client.sources(report).sources["lidar"]
+    np.testing.assert_array_equal(unmoved.newest.points, report.sources["lidar"].newest.points)
+
+
+def test_only_what_is_new_travels(client, endpoint):
+    drive(client, [1, 2, 3])
+    drive(client, [7], source="camera")
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        first = asked(peer)
+        assert all(state.whole for state in first.sources.values())
+        drive(client, [4])
+        second = asked(peer, first.server, first.revision)
+        lidar, camera = second.sources["lidar"], second.sources["camera"]
+        assert (lidar.whole, lidar.trail[:, 0].tolist()) == (False, [4])
+        assert lidar.newest.world_from_sensor[0, 3] == 4
+        assert (camera.whole, len(camera.trail), camera.newest) == (False, 0, None)
+        assert len(codec.encode(asked(peer, second.server, second.revision))) < 600
+        of_another = asked(peer, "another", second.revision + 1000)
+        assert all(state.whole for state in of_another.sources.values())
+
+
+def test_the_newest_scan_lies_in_the_map_frame(client):
+    client.publish_scan(servers.sphere(500), pose(1.0), stamp_s=10.0)
+    client.publish_scan(servers.sphere(500), pose(9000.0, -7), stamp_s=12.5)
+    client.flush(servers.WAIT_S)
+    newest = client.sources().sources["default"].newest
+    assert newest.stamp_ns == 12_500_000_000
+    np.testing.assert_array_equal(newest.world_from_sensor, pose(9000.0, -7))
+    np.testing.assert_array_equal(newest.position_m, [9000, -7, 0])
+    assert 0 < len(newest.points) == newest.points_used <= 500
+    sent = servers.sphere(500) @ pose(9000.0, -7)[:3, :3].T + (9000.0, -7, 0)
+    apart = np.linalg.norm(newest.points[:, None] - sent, axis=2).min(axis=1)
+    assert apart.max() < 1e-5
+
+
+def test_as_many_points_come_as_are_wanted_of_all_that_are_used(client):
+    with np.errstate(divide="ignore"):
+        rays = servers.sphere(60_000)
+        walls = (np.sign(rays) * (20, 20, 20)) / rays
+    client.publish_scan(rays * walls.min(axis=1, keepdims=True), pose(0), source="lidar")
+    client.flush(servers.WAIT_S)
+    everything = client.sources(max_points=10_000).sources["lidar"].newest
+    assert len(everything.points) == 10_000 < everything.points_used
+    some = client.sources(max_points=600).sources["lidar"].newest
+    assert len(np.unique(some.points, axis=0)) == 600
+    for wall in range(6):  # all of which are as large
+        away = some.points[:, wall // 2] * (-1) ** wall
+        assert 60 < (away > 19.9).sum() < 140
+    none = client.sources(max_points=0).sources["lidar"].newest
+    assert none.points.shape == (0, 3)
+    assert none.points_used == everything.points_used
+
+
+def test_refused_scans_leave_no_trace(client):
+    drive(client, [1])
+    before = client.sources()
+    client.publish_scan(servers.sphere(50, radius_m=0.5), pose(2), source="lidar")  # too near
+    client.publish_scan(servers.sphere(50), pose(200_000), source="lidar")
+    client.publish_scan(servers.sphere(50), pose(200_000), source="elsewhere")
+    assert client.flush(servers.WAIT_S).refused == 3
+    after = client.sources(before)
+    assert after.revision == before.revision
+    assert (list(after.sources), trail(after)) == (["lidar"], [1])
+
+
+def test_a_sensor_that_stands_adds_nothing_but_its_newest_scan(client):
+    drive(client, [1, 1.05, 1.1, 1.05])
+    report = client.sources()
+    assert trail(report) == [1]
+    assert lines(report) == [[1, 1.05]]
+    assert report.sources["lidar"].scans == 4
+
+
+def test_no_line_is_drawn_where_a_sensor_jumped(client, endpoint):
+    drive(client, [1, 2])
+    before = client.sources()
+    drive(client, [60, 61])
+    with triquad_client.connect(endpoint) as later:  # whose clock may be an earlier one
+        later.publish_scan(servers.sphere(500), pose(62), stamp_s=5.0, source="lidar")
+        later.flush(servers.WAIT_S)
+        later.publish_scan(servers.sphere(500), pose(3), stamp_s=6.0, source="lidar")
+        later.flush(servers.WAIT_S)
+    for report in (client.sources(), client.sources(before)):
+        assert lines(report) == [[1, 2], [60, 61, 62], [3, 3]]
+        assert report.sources["lidar"].newest.stamp_ns == 6_000_000_000
+
+
+def test_what_a_reset_forgets_leaves_the_trail(client):
+    drive(client, [1, 2, 3, 4, 5])
+    drive(client, [3], source="camera")
+    before = client.sources()
+    client.reset(BOX)
+    for report in (client.sources(), client.sources(before)):
+        assert list(report.sources) == ["lidar"]
+        assert lines(report) == [[1, 2], [4, 5, 5]]
+    drive(client, [6, 3])
+    client.reset(BOX)
+    forgotten = client.sources(before)
+    assert forgotten.sources["lidar"].newest is None
+    assert lines(forgotten) == [[1, 2], [4, 5, 6]]
+    drive(client, [7])
+    assert lines(client.sources(forgotten)) == [[1, 2], [4, 5, 6], [7, 7]]
+    client.reset()
+    assert client.sources(forgotten).sources == {}
+    drive(client, [8])
+    assert lines(client.sources(forgotten)) == [[8, 8]]
+
+
+def test_after_a_restart_everything_is_anew(tmp_path):
+    with servers.service_and_client(store=tmp_path) as client:
+        drive(client, [1, 2, 3])
+        before = client.sources()
+        client.checkpoint()
+    with servers.service_and_client(store=tmp_path) as client:
+        empty = client.sources(before)
+        assert empty.sources == {}
+        assert empty.server != before.server
+        drive(client, [4, 5])
+        assert trail(client.sources(before)) == trail(client.sources(empty)) == [4, 5]
+
+
+def test_the_sources_that_are_remembered_are_bounded(client, endpoint):
+    names = [f"s{number}" for number in range(MAX_SOURCES + 10)]
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+
+        def take(source: str, sequence: int = 0) -> None:
+            scan = servers.scan(sequence, source=source, points=servers.sphere(20))
+            peer.put(source, codec.encode(scan))
+            assert peer.flush(scan).taken == sequence + 1
+
+        for name in names:
+            take(name)
+        first = client.sources()
+        assert sorted(first.sources) == sorted(names[10:])
+        take(names[10], 1)
+        take(names[0], 1)
+    report = client.sources(first)
+    assert sorted(report.sources) == sorted([names[0], names[10], *names[12:]])
+
+
+def test_what_cannot_be_asked_is_refused_at_both_ends(client, endpoint):
+    drive(client, [1])
+    for bad in (-1, 10_001, 1.5, "many", True, None):
+        with pytest.raises(InvalidInputError, match="max_points = "):
+            client.sources(max_points=bad)
+    for bad in (1, "since", {}):
+        with pytest.raises(InvalidInputError, match="since = "):
+            client.sources(since=bad)
+    report = client.sources()
+    with pytest.raises(RefusedError, match="revision = 99") as caught:
+        client.sources(SourceReport(report.server, 99, report.sources))
+    assert caught.value.code == "bad_request"
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        for request in (
+            SourcesRequest("", 0, -1),
+            SourcesRequest("", 0, 10_001),
+            SourcesRequest("", -1, 0),
+            SourcesRequest(report.server, -(2**63), 0),
+            SourcesRequest(report.server, 2**63 - 1, 0),
+            b"\xc1",
+            FlushRequest("a", 0, 0, 1.0),
+        ):
+            payload = request if isinstance(request, bytes) else codec.encode(request)
+            assert peer.refusal(keys.SOURCES, payload) == "bad_request"
+    assert trail(client.sources()) == [1]
+
+
+def test_a_server_that_does_not_know_the_question_is_told_apart():
+    with (
+        servers.answering({}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+        pytest.raises(NoReplyError, match="older than this question"),
+    ):
+        client.sources()
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (SourceState(1, True, np.zeros((2, 3)), np.zeros(1, np.int64), None), "2 positions"),
+        (SourceState(1, False, np.zeros((0, 3)), np.zeros(0, np.int64), None), "only its news"),
+    ],
+)
+def test_replies_that_do_not_fit_together_are_named(state, words):
+    def answer(query, key):
+        with query:
+            query.reply(key, codec.encode(SourcesReply("x", 1, {"lidar": state})))
+
+    with (
+        servers.answering({keys.SOURCES: answer}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+        pytest.raises(BadReplyError, match=f"'lidar'.*{words}"),
+    ):
+        client.sources()
+
+
+def test_it_can_be_awaited(endpoint):
+    async def use():
+        async with triquad_client.connect_async(endpoint) as client:
+            start = await client.sources()
+            await client.publish_scan(servers.sphere(), pose(1), source="lidar")
+            await client.flush(servers.WAIT_S)
+            return await client.sources(since=start, max_points=10)
+
+    report = asyncio.run(use())
+    assert trail(report) == [1]
+    assert len(report.sources["lidar"].newest.points) == 10

@@ -1,0 +1,127 @@
+"""Whether mapping goes on, as a supervisor is told."""
+
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from threading import Event, Thread
+
+from support import servers
+from support.small_world import settings, world
+from triquad_server.health import ENDLESS_S, STUCK_S, Health
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.scan_warnings import ScanWarnings
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.mapping.thread_time import ThreadTime
+from triquad_server.settings import ServiceSettings, Settings
+from triquad_server.store.checkpoint_thread import CheckpointThread
+
+COMPUTED_S = 0.5
+
+
+class Clock:
+    """Seconds that pass when the test says so."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@contextmanager
+def running(
+    mapper: Mapper, clock: Clock, failed: Event | None = None
+) -> Iterator[tuple[MapperThread, Health]]:
+    """A mapper's thread without a store, and its health."""
+    scans = ScanQueue(8)
+    thread = MapperThread(mapper, scans, ServiceSettings(), (failed or Event()).set)
+    thread.time = ThreadTime(clock)
+    health = Health(
+        map_name="test",
+        server="s",
+        device="cpu",
+        operations={},
+        scans=scans,
+        warnings=ScanWarnings(scans, Settings()),
+        mapper=thread,
+        checkpoints=CheckpointThread(thread, None, period_s=0, last=None),
+    )
+    with closing(thread):
+        thread.start()
+        yield thread, health
+
+
+def test_a_server_that_waits_for_scans_is_healthy_as_long_as_it_hears_its_heartbeat() -> None:
+    clock = Clock()
+    with running(Mapper("test", settings(), "cpu"), clock) as (thread, health):
+        for _ in range(3):
+            assert any(thread.time.current().waited_s == 0 for _ in range(10**6))
+            assert health.problem() is None
+            clock.now_s += 10 * STUCK_S
+            assert health.mapping_problem() is not None
+            thread.wake()  # as the heartbeat does, each second
+
+
+def test_a_thread_that_computes_for_long_is_healthy_until_that_is_absurd() -> None:
+    clock, begun, go_on = Clock(), Event(), Event()
+
+    def compute(_: Mapper) -> None:
+        until_s = time.thread_time() + COMPUTED_S
+        while time.thread_time() < until_s:
+            pass
+        begun.set()
+        assert go_on.wait(servers.WAIT_S)
+
+    with running(Mapper("test", settings(), "cpu"), clock) as (thread, health):
+        caller = Thread(target=thread.call, args=(compute,))
+        caller.start()
+        assert begun.wait(servers.WAIT_S)
+        clock.now_s += COMPUTED_S + STUCK_S / 2
+        assert health.mapping_problem(stuck_s=STUCK_S / 2 + COMPUTED_S / 2) is None
+        assert health.mapping_problem(stuck_s=STUCK_S / 2 - COMPUTED_S / 2) is not None
+        clock.now_s += ENDLESS_S
+        assert health.mapping_problem(stuck_s=2 * ENDLESS_S) is not None
+        go_on.set()
+        caller.join()
+
+
+def test_a_thread_that_comes_to_no_end_is_a_problem_until_it_does() -> None:
+    clock, begun, go_on = Clock(), Event(), Event()
+
+    def hang(_: Mapper) -> None:
+        begun.set()
+        assert go_on.wait(servers.WAIT_S)
+
+    with running(Mapper("test", settings(), "cpu"), clock) as (thread, health):
+        caller = Thread(target=thread.call, args=(hang,))
+        caller.start()
+        assert begun.wait(servers.WAIT_S)
+        clock.now_s += STUCK_S - 1
+        assert health.mapping_problem() is None
+        clock.now_s += 2
+        problem = health.mapping_problem()
+        assert problem == f"mapping makes no progress: it is at commands since {STUCK_S + 1:.0f} s"
+        assert health.problem() == problem
+        go_on.set()
+        caller.join()
+        thread.call(lambda mapper: mapper.settled)
+        assert health.problem() is None
+
+
+class FailingMapper(Mapper):
+    """Its training meets an internal error."""
+
+    def train(self) -> None:
+        raise RuntimeError("training failed")
+
+
+def test_mapping_that_was_stopped_by_an_error_is_a_problem() -> None:
+    mapper = FailingMapper("test", settings(samples_per_ray=1000.0), "cpu")
+    scan = world(1).scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    failed = Event()
+    with running(mapper, Clock(), failed) as (thread, health):
+        assert failed.wait(servers.WAIT_S)
+    problem = health.mapping_problem()
+    assert problem is not None
+    assert "internal error" in problem

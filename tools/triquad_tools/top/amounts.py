@@ -1,0 +1,62 @@
+"""Amounts as people read them: three digits and a unit."""
+
+import math
+
+_SCALES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
+_LEAST_SCALED = 10_000.0  # what is less is told without a prefix
+_LEAST_SHOWN = 0.01
+
+_SCALES_S = ((86_400, "d"), (3_600, "h"), (60, "min"), (1, "s"))
+_FEW_S = 10.0  # below this, tenths of a second count
+
+
+def count(number: int) -> str:
+    """How many of something, such as ``9,999`` and ``12.3 k``."""
+    return f"{number:,}" if number < _LEAST_SCALED else _scaled(float(number))
+
+
+def rate(per_s: float) -> str:
+    """How many of something a second, such as ``0.25``, ``12.5`` and ``812 k``."""
+    return _three_digits(per_s) if per_s < _LEAST_SCALED else _scaled(per_s)
+
+
+def size(number_bytes: float) -> str:
+    """Bytes, such as ``812 B``, ``40.1 kB`` and ``1.24 GB``."""
+    scaled = _scaled(number_bytes)
+    return f"{scaled}B" if scaled[-1].isalpha() else f"{scaled} B"
+
+
+def duration(seconds: float) -> str:
+    """A time, such as ``0.4 s``, ``32 s``, ``5 min 12 s`` and ``3 h 12 min``."""
+    if not math.isfinite(seconds):
+        return str(seconds)
+    if round(seconds, 1) < _FEW_S:
+        return f"{seconds:.1f} s"
+    left = round(seconds)
+    for position, (unit_s, unit) in enumerate(_SCALES_S[:-1]):
+        if left >= unit_s:
+            whole, rest = divmod(left, unit_s)
+            smaller_s, smaller = _SCALES_S[position + 1]
+            return f"{whole} {unit} {rest // smaller_s} {smaller}"
+    return f"{left} s"
+
+
+def milliseconds(seconds: float) -> str:
+    """A short time in milliseconds, without the unit: ``0.85``, ``4.20``, ``1,200``."""
+    return _three_digits(1e3 * seconds)
+
+
+def _scaled(value: float) -> str:
+    for scale, prefix in _SCALES:
+        if float(f"{value:.3g}") >= scale:
+            return f"{_three_digits(value / scale)} {prefix}"
+    return _three_digits(value)
+
+
+def _three_digits(value: float) -> str:
+    if 0.0 < value < _LEAST_SHOWN:
+        return f"<{_LEAST_SHOWN}"
+    rounded = float(f"{value:.3g}")
+    if rounded >= 100.0 or rounded == 0.0:
+        return f"{rounded:,.0f}"
+    return f"{rounded:.1f}" if rounded >= 10.0 else f"{rounded:.2f}"
