@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from scipy.ndimage import binary_opening, label
 from triquad_tools.benchmarks.figures import CurvePoint, Figure, compare, markdown
 from triquad_tools.benchmarks.tradeoff_sheet import (
     ACCURACY,
@@ -64,7 +65,7 @@ def test_files_that_cannot_be_written_are_refused_before_anything_is_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for option in ("--json", "--record", "--plot"):
-        missing = tmp_path / "nowhere" / "figures"
+        missing = tmp_path / "nowhere" / "figures.png"
         assert bench.main([option, str(missing)]) == bench.BAD_INPUT
         assert str(missing) in capsys.readouterr().err
 
@@ -85,6 +86,16 @@ def test_the_picture_of_a_saved_run_needs_no_second_one(tmp_path: Path) -> None:
     for colour, seen in ((np.array([0, 114, 178]), [True, True]), ((213, 94, 0), [True, False])):
         near = [np.abs(255 * one - colour).max(axis=2) < 3 for one in pictures]
         assert [bool(pixels.sum() > 100) for pixels in near] == seen
+
+
+def test_every_point_is_within_its_panel(tmp_path: Path) -> None:
+    """Whatever the order of panels: the neighbour's scores differ from curve to curve."""
+    picture = tmp_path / "out.png"
+    saved = saved_figures(tmp_path / "figures.json")
+    assert bench.main(["--plot", str(picture), "--from", str(saved)]) == bench.OK
+    near = np.abs(255 * imread(picture)[..., :3] - (213, 94, 0)).max(axis=2) < 30
+    squares = label(binary_opening(near, np.ones((6, 6))))[1]
+    assert squares == 2 * (1 + 1 + 4) + 1  # in two rows, and in the legend
 
 
 def test_curves_come_back_as_they_were_saved(tmp_path: Path) -> None:
@@ -129,3 +140,15 @@ def test_saved_figures_are_drawn_without_measuring_or_not_at_all(
     for arguments in (["--from", saved], ["core", "--from", saved, "--plot", picture]):
         assert bench.main(arguments) == bench.BAD_INPUT
         assert "--plot OUT.png" in capsys.readouterr().err
+    assert bench.main(["--from", saved, "--plot", str(tmp_path / "out.txt")]) == bench.BAD_INPUT
+    assert ".png" in capsys.readouterr().err
+
+
+def test_half_of_a_curve_is_not_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    saved, picture = saved_figures(tmp_path / "figures.json"), tmp_path / "out.png"
+    halved = json.loads(saved.read_text())
+    halved["figures"] = halved["figures"][:2]
+    saved.write_text(json.dumps(halved))
+    assert bench.main(["--plot", str(picture), "--from", str(saved)]) != bench.OK
+    assert "no curve" in capsys.readouterr().err
+    assert not picture.exists()

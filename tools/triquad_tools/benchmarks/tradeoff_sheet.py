@@ -77,7 +77,7 @@ def saved_tradeoffs(path: Path) -> Tradeoffs:
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ToolError(f"{path}: is not what triquad-bench --json writes: {error!r}") from error
     if not figures:
-        raise ToolError(f"{path}: has no curves: measure the part tradeoffs with --json")
+        raise ToolError(f"{path}: has no curves: measure the part tradeoffs, with --json")
     return found
 
 
@@ -85,9 +85,12 @@ def draw_tradeoffs(found: Tradeoffs, path: Path) -> None:
     """Save a picture of the curves that there are.
 
     Raises:
+        ToolError: there is none with all of its scores.
         OSError: it cannot be written.
     """
-    curves = [curve for curve in _AXES if _points(found, curve, F_SCORE)]
+    curves = [name for name in _AXES if all(_points(found, name, score) for score in _UPWARDS)]
+    if not curves:
+        raise ToolError(f"{path}: no curve to draw: measure the part tradeoffs")
     rows = [[_panel(found, curve, measure) for curve in curves] for measure in _UPWARDS]
     notes = [
         f"Simulated street {found.street}: 110 m, 100 scans, noise of 1 cm. All meshes are scored",

@@ -52,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.drawn_from is not None and (options.plot is None or options.parts):
         message = "--from draws what is in a file: give --plot OUT.png and no parts"
         return complain(_COMMAND, message, BAD_INPUT)
+    if options.plot is not None and options.plot.suffix.lower() != ".png":
+        return complain(_COMMAND, f"{options.plot}: its name must end in .png", BAD_INPUT)
     for path in (options.json, options.record, options.plot):
         if path is not None and not os.access(path.parent, os.W_OK):
             message = f"{path}: cannot be written: choose another folder"

@@ -39,7 +39,7 @@ class Panel:
     across: str
     upwards: str
     ticks: Sequence[float]
-    limits: tuple[float | None, float | None]  # of the ordinate; None: as the points are
+    limits: tuple[float | None, float | None]  # of the ordinate of its row; None: as points are
     curves: Sequence[Curve]
 
 
@@ -59,6 +59,8 @@ def save_panels(
         places = figure.subplots(*shape, squeeze=False, sharex="col", sharey="row")
         for axes, panel in zip(places.flat, (one for row in panels for one in row), strict=True):
             _draw(axes, panel)
+        for axes, row in zip(places[:, 0], panels, strict=True):
+            axes.set_ylim(*row[0].limits)  # now: what is drawn later would not widen it
         named = {handle.get_label(): handle for axes in places.flat for handle in axes.get_lines()}
         figure.legend(handles=list(named.values()), loc="outside lower left", frameon=False)
         figure.supxlabel("\n".join(notes), x=0.99, ha="right", fontsize="small")
@@ -73,7 +75,6 @@ def _draw(axes: Axes, panel: Panel) -> None:
         colour, marker, line = curve.style
         across, upwards = zip(*sorted(curve.points), strict=True)
         axes.plot(across, upwards, line, color=colour, marker=marker, ms=8, label=curve.label)
-    axes.set_ylim(*panel.limits)
     axes.set_xticks(panel.ticks)
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
