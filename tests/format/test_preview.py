@@ -72,7 +72,7 @@ def test_viewers_see_the_surface(ground_file):
     for (name, scene), x in zip(found, (0.0, SETTINGS.region_pitch_m), strict=True):
         assert name == "foxglove.SceneUpdate"
         vertices, faces = mesh_of(scene)
-        assert 500 < len(faces) < 2000  # few where all is flat
+        assert 200 < len(faces) < 1000  # few where all is flat
         assert faces.max() < len(vertices)
         np.testing.assert_allclose(vertices[:, 2], GROUND_M, atol=0.04)
         extent = np.abs(vertices[:, :2] - (x, 0)).max(axis=0)
@@ -111,7 +111,7 @@ def test_colours_tell_the_height():
     assert {colour.a for colour in shown} == {1.0}
     exact = HeightScale.around(vertices[:, 2]).colours(vertices[:, 2])
     assert np.abs(colours - exact).max() < 0.04  # a step of the colours, and rounding
-    assert len(np.unique(colours, axis=0)) > 20
+    assert len(np.unique(colours, axis=0)) > 12
 
 
 def test_schema_is_complete():

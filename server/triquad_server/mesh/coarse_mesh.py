@@ -13,15 +13,19 @@ from triquad_format.records.region import Region
 
 from triquad_server.mesh.surface_net import NET_LEAVES, Distances, SurfaceNet, surface_net
 
-CLUSTER_LEVELS = 2
-"""Cubes of up to ``2**CLUSTER_LEVELS`` cells along each side become one vertex: 1.6 m."""
+CLUSTER_LEVELS = 3
+"""Cubes of up to ``2**CLUSTER_LEVELS`` cells along each side become one vertex: 3.2 m."""
 
 FACES_MAX = 100_000
-"""Where a region has more, larger cubes become one vertex, flat or not."""
+PARAMETERS_A_FACE = 150  # so that a preview takes some 2.5 % of a map file of fp16
+FACES_MIN = 2_000  # which any preview may have
+"""How many faces a region has at most, by the size of its field."""
 
 _FLAT_CELLS = 0.2
-"""Vertices are merged that lie so near to a plane: 8 cm."""
+"""Vertices are merged that lie so near to a plane: 8 cm; more, where a mesh is too large."""
 
+_COARSER = 1.5  # times that, in each step
+_FORCED = 6  # steps after which cubes are merged whatever they hold
 _ONE_SIDE = 0.5  # length of the mean of unit normals: less where they look to many sides
 _FOLDED = -0.8  # cosine of the angle by which merging turned a face
 
@@ -33,12 +37,17 @@ def coarse_mesh(
 ) -> tuple[Doubles, Longs]:
     """Vertices [V, 3], metres, map frame, and faces [F, 3], counter-clockwise from free space."""
     net = without_shreds(surface_net(region, settings, distances))
-    for forced in range(_LEVELS_MAX):
-        vertices, faces = _merged(net, _clusters(net, forced))
-        if len(faces) <= FACES_MAX:
+    for coarser in range(_FORCED + _LEVELS_MAX):
+        vertices, faces = _merged(net, _clusters(net, coarser))
+        if len(faces) <= faces_max(region):
             break
     side_m, origin = settings.leaf_m * NET_LEAVES, settings.region_corner(region.index)
     return vertices * side_m + origin, faces
+
+
+def faces_max(region: Region) -> int:
+    """The most faces that the preview of a region may have: a bounded part of any map file."""
+    return min(max(region.parameters // PARAMETERS_A_FACE, FACES_MIN), FACES_MAX)
 
 
 def without_shreds(net: SurfaceNet) -> SurfaceNet:
@@ -54,23 +63,25 @@ def without_shreds(net: SurfaceNet) -> SurfaceNet:
     return net.of_faces(kept) if 2 * kept.sum() >= len(kept) else net
 
 
-def _clusters(net: SurfaceNet, forced: int) -> Longs:
-    """The cluster [V] of each vertex, named by one of its vertices.
+def _clusters(net: SurfaceNet, coarser: int) -> Longs:
+    """The cluster [V] of each vertex, named by one of its vertices, in so many steps from fine.
 
-    Cubes of up to ``2**forced`` cells are merged, flat or not, and larger ones that are flat.
+    Cubes are merged where they are flat, and at last whatever they hold.
     """
+    forced = coarser - _FORCED  # level up to which that is so
+    limit = _FLAT_CELLS * _COARSER**coarser
     codes = morton.encode(net.cells)
     clusters = np.arange(len(codes))
     merged = np.ones(len(codes), np.bool_)
     for level in range(1, max(forced, CLUSTER_LEVELS) + 1):
         _, first, cube = np.unique(codes >> 3 * level, return_index=True, return_inverse=True)
-        merged &= level <= forced or _flat(net, cube)[cube]
+        merged &= level <= forced or _flat(net, cube, limit)[cube]
         merged = (np.bincount(cube, ~merged) == 0)[cube]  # all of a cube, or nothing
         clusters[merged] = first[cube][merged]
     return clusters
 
 
-def _flat(net: SurfaceNet, group: NDArray[np.intp]) -> Bools:
+def _flat(net: SurfaceNet, group: NDArray[np.intp], limit: float) -> Bools:
     """Which groups [G] of vertices [V] lie nearly in a plane, and look to one side of it.
 
     The other side may be that of a thin wall, or of a post: merged, they would vanish.
@@ -79,7 +90,7 @@ def _flat(net: SurfaceNet, group: NDArray[np.intp]) -> Bools:
     offsets = net.points - (_sums(net.points, group) / counts[:, None])[group]
     products = offsets[:, :, None] * offsets[:, None, :]
     moments = _sums(products.reshape(-1, 9), group).reshape(-1, 3, 3) / counts[:, None, None]
-    thin = np.linalg.eigvalsh(moments)[:, 0] < _FLAT_CELLS**2
+    thin = np.linalg.eigvalsh(moments)[:, 0] < limit**2
     corners = group[net.quads.ravel()]
     normals = np.nan_to_num(_normals(net.points, net.quads[:, :3])).repeat(4, axis=0)
     mean = np.linalg.norm(_sums(normals, corners), axis=1) / np.bincount(corners)

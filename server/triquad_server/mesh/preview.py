@@ -22,10 +22,10 @@ from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.mesh.coarse_mesh import coarse_mesh
 from triquad_server.mesh.surface_net import Distances
 
-_STEPS_A_LEAF = 4
+_STEPS_A_LEAF = 2
 """Positions are rounded to a power of two, finer than a leaf by so much: zeros compress."""
 
-_BANDS = 64
+_BANDS = 32
 """Different colours, at most: they compress, too."""
 
 
