@@ -1,6 +1,7 @@
 """What a browser shows of the mesh of a server."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from playwright.sync_api import Page, expect
@@ -48,7 +49,7 @@ def test_colours_say_what_the_legend_says(page_of: PageOf) -> None:
             page.get_by_role("combobox", name="Colour").click()
             page.get_by_role("option", name=name).click()
             expect(page.get_by_text(legend, exact=True).first).to_be_visible()
-            wait_until(page, lambda: _left(page, before) < 0.5, f"colours are those of {name}")
+            wait_until(page, partial(_few_left, page, before), f"colours are those of {name}")
 
 
 def test_a_server_that_is_gone_is_told_of_until_it_is_back(page_of: PageOf) -> None:
@@ -63,9 +64,9 @@ def test_a_server_that_is_gone_is_told_of_until_it_is_back(page_of: PageOf) -> N
         expect(page.get_by_text("0 taken")).to_be_visible(timeout=60_000)
 
 
-def _left(page: Page, colours: set[tuple[int, ...]]) -> float:
-    """Share of colours that are drawn still."""
-    return len(colours & _colours(page)) / len(colours)
+def _few_left(page: Page, colours: set[tuple[int, ...]]) -> bool:
+    """Whether most of some colours are drawn no more."""
+    return len(colours & _colours(page)) < 0.5 * len(colours)
 
 
 def _colours(page: Page) -> set[tuple[int, ...]]:
