@@ -84,8 +84,8 @@ def test_a_picture_is_saved(tmp_path: Path, page_without_server: PageWithoutServ
     pixels = np.asarray(Image.open(io.BytesIO(download.path().read_bytes())))
     canvas = page.locator("canvas").first.bounding_box()
     assert canvas is not None
-    height, width = round(canvas["height"]), round(canvas["width"])
-    assert pixels.shape[1] == width
+    height = round(1920 * canvas["height"] / canvas["width"])
+    assert pixels.shape[1] == 1920
     assert pixels.shape[0] > height, "a caption stands below"
     mesh, caption = pixels[:height], pixels[height:]
     assert (mesh.min(axis=-1) < 200).mean() > drawn_share(page) / 4
