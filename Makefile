@@ -1,7 +1,8 @@
-# make test    set up a virtual environment and run every check and test
-# make check   the checks alone: style, types, which package may import which
-# make docs    write the tables of docs/settings.md from the settings
-# make demo    set up a virtual environment and map a street, end to end
+# make test      set up a virtual environment and run every check and test
+# make check     the checks alone: style, types, which package may import which
+# make docs      write the tables of docs/settings.md from the settings
+# make pictures  make the pictures of the documentation anew; those of the viewer need Chromium
+# make demo      set up a virtual environment and map a street, end to end
 VENV ?= .venv
 PYTHON ?= python3
 # Extra flags for pip; --extra-index-url https://download.pytorch.org/whl/cpu takes torch's CPU build.
@@ -10,7 +11,7 @@ PIP_FLAGS ?=
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 
-.PHONY: check clean demo docs test
+.PHONY: check clean demo docs pictures test
 
 demo: $(INSTALLED)
 	$(BIN)/triquad-demo --out demo-out
@@ -20,6 +21,11 @@ test: check
 
 docs: $(INSTALLED)
 	$(BIN)/python docs/settings_tables.py
+
+pictures: $(INSTALLED)
+	$(BIN)/python docs/pictures.py
+	$(BIN)/python docs/top_picture.py
+	$(BIN)/python docs/viewer_pictures.py
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -1,8 +1,8 @@
 """Colours of heights, the same in all that shows a map: pictures, viewers, previews in map files.
 
-They are the upper four fifths of viridis, from blue below to yellow above: steps of the same height
-look the same, also to those who see no red or no green, and the darkest is bright enough to be
-shaded.
+They are the upper three quarters of viridis, from blue below to yellow above: steps of the same
+height look the same, also to those who see no red or no green, and the darkest is bright enough to
+be shaded.
 """
 
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from triquad_format.records.arrays import Doubles
 
 HEIGHT_STOPS: Doubles = np.array(
     [
-        [0.254, 0.265, 0.530],
-        [0.207, 0.372, 0.553],
-        [0.164, 0.471, 0.558],
-        [0.128, 0.567, 0.551],
-        [0.135, 0.659, 0.518],
-        [0.267, 0.749, 0.441],
-        [0.478, 0.821, 0.318],
-        [0.741, 0.873, 0.150],
+        [0.230, 0.322, 0.546],
+        [0.186, 0.419, 0.557],
+        [0.149, 0.508, 0.557],
+        [0.121, 0.596, 0.544],
+        [0.158, 0.684, 0.502],
+        [0.304, 0.765, 0.420],
+        [0.516, 0.831, 0.294],
+        [0.762, 0.876, 0.137],
         [0.993, 0.906, 0.144],
     ]
 )

@@ -13,7 +13,7 @@ from support.ros_server import accounted, until
 from triquad_client import Client
 from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.settings import ScanSettings, ServiceSettings, Settings, TrainingSettings
-from triquad_tools.evaluation.map_scores import score_withheld
+from triquad_tools.evaluation.map_scores import ask_withheld, score_withheld
 from triquad_tools.recordings.cloud import is_withheld, world_points
 from triquad_tools.recordings.folders.kitti import KittiFolder, read_kitti_folder
 
@@ -54,7 +54,7 @@ def mapped(
         assert (status.scans_taken, status.scans_lost) == (len(taken), {}), status
         client.settle(600.0)
         clouds = (world_points(scan, *RANGES_M) for scan in folder.read(withheld))
-        return score_withheld(client.query_sdf, clouds).sdf_median_m
+        return score_withheld(ask_withheld(client.query_sdf, clouds)).sdf_median_m
 
 
 def test_the_map_is_as_good_as_that_of_the_client() -> None:

@@ -40,7 +40,7 @@ def oklab(light):
 
 
 def test_stops_are_those_of_viridis():
-    wanted = colormaps["viridis"](np.linspace(0.2, 1.0, len(HEIGHT_STOPS)))[:, :3]
+    wanted = colormaps["viridis"](np.linspace(0.25, 1.0, len(HEIGHT_STOPS)))[:, :3]
     np.testing.assert_allclose(HEIGHT_STOPS, wanted, atol=6e-4)
 
 

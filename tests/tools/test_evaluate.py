@@ -107,7 +107,8 @@ def test_a_map_is_scored_at_withheld_scans(server, sphere_folder, tmp_path, caps
 
 
 def test_a_map_of_a_street_is_scored_against_it(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(metrics, "STREET_SAMPLES_MAX", 100_000)
+    fewer = metrics.ScoreSettings(samples_max=100_000)
+    monkeypatch.setattr(evaluate, "STREET_SETTINGS", fewer)
     drive = street_drive(1, 1)
     with servers.running_service() as endpoint:
         with triquad_client.connect(endpoint) as client:

@@ -184,7 +184,7 @@ def test_faults_are_one_line(map_file, tmp_path, capsys):
     assert main([str(tmp_path / "none.triquad")]) == 2
     assert "none.triquad" in capsys.readouterr().err
     assert main([str(tmp_path)]) == 2
-    assert "is a folder: --log" in capsys.readouterr().err
+    assert "is not a folder of checkpoints" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         main([])
 

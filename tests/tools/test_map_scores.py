@@ -8,6 +8,7 @@ from triquad_tools.evaluation.map_scores import (
     HOUSE_MARGIN_M,
     NEAR_M,
     StreetProbes,
+    ask_withheld,
     score_street,
     score_withheld,
     street_probes,
@@ -91,7 +92,7 @@ def test_withheld_points_are_scored_over_all_clouds() -> None:
 
     points = np.zeros((10, 3))
     points[:, 0] = np.arange(10)
-    scores = score_withheld(query, [points[:3], points[:0], points[3:]])
+    scores = score_withheld(ask_withheld(query, [points[:3], points[:0], points[3:]]))
     assert scores.points == 10
     assert (scores.surface_ratio, scores.unknown_ratio) == (0.5, 0.1)
     assert scores.sdf_median_m == pytest.approx(0.04)
@@ -101,6 +102,6 @@ def test_withheld_points_are_scored_over_all_clouds() -> None:
 
 
 def test_no_withheld_points_score_nothing() -> None:
-    scores = score_withheld(_exact(DRIVE.scene), [])
+    scores = score_withheld(ask_withheld(_exact(DRIVE.scene), []))
     assert scores.points == 0
     assert np.isnan([scores.surface_ratio, scores.sdf_median_m]).all()

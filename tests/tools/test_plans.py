@@ -1,14 +1,17 @@
 import numpy as np
 import pytest
+import triquad_client
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from support import servers
 from support.checkpoint_folder import FIRST, SECOND, write_checkpoints
 from support.exact_maps import SEEN_M, exact_map, flat, table
 from support.map_records import random_record
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.mapfile.writer import write_map
+from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.inspect import main
 from triquad_tools.plots.diff_plan import APPEARED, VANISHED
 from triquad_tools.plots.map_plan import latest_epochs, sample_errors, seen_columns
@@ -145,9 +148,41 @@ def test_picture_of_a_map(tmp_path, capsys):
     assert main([str(path), "--plot", str(picture)]) == 0
     assert "map 'ground'" in capsys.readouterr().out
     pixels = read_picture(picture)
-    coverage = pixels[:, : pixels.shape[1] // 3]
-    ground, top = (share(coverage, colormaps["viridis"](end)[:3]) for end in (0.0, 1.0))
+    coverage = pixels[:, : pixels.shape[1] // 2]  # beside the errors
+    ground, top = (share(coverage, HEIGHT_STOPS[end]) for end in (0, -1))
     assert top / ground == pytest.approx(4.0 / 96.0, rel=0.1)
+
+
+def test_a_folder_of_checkpoints_is_drawn_at_its_newest(tmp_path, capsys):
+    write_checkpoints(tmp_path, (9, 12, 15))
+    picture = tmp_path / "a.png"
+    for options, epoch in (((), 15), (("--at", "13"), 12)):
+        assert main([str(tmp_path), "--plot", str(picture), *options]) == 0
+        output = capsys.readouterr().out
+        assert f"epoch {epoch}," in output
+        assert f"epoch-{epoch:09}" in output
+        assert read_picture(picture).shape[0] > 300
+    assert main([str(tmp_path), "--at", "3"]) == 2
+    assert main([str(tmp_path), "--log", "--at", "13"]) == 2
+    assert "--at is for one map" in capsys.readouterr().err
+    file = next(tmp_path.glob("*.triquad"))
+    assert main([str(file), "--at", "13"]) == 2
+    assert "is one map file: --at asks for a folder" in capsys.readouterr().err
+
+
+def test_the_map_of_a_server_is_drawn(tmp_path, capsys):
+    picture = tmp_path / "a.png"
+    with servers.running_service() as endpoint:
+        with triquad_client.connect(endpoint) as client:
+            client.publish_scan(servers.sphere(3000), np.eye(4))
+            client.flush()
+        assert main([endpoint, "--plot", str(picture)]) == 0
+        assert f"{endpoint}: map 'default'" in capsys.readouterr().out
+        assert share(read_picture(picture), FREE) > 0.01
+        assert main([endpoint, "--at", "1", "--plot", str(picture)]) == 2
+        assert "leave out --at" in capsys.readouterr().err
+    assert main([str(tmp_path), "--map", "other"]) == 2
+    assert "--map is of a server" in capsys.readouterr().err
 
 
 def test_pictures_of_maps_that_lack_something(tmp_path):

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
-from triquad_tools.plots.camera import Camera
+from triquad_tools.plots.camera import ParallelCamera, PerspectiveCamera
 from triquad_tools.plots.raster import rasterise, vertex_normals
-from triquad_tools.plots.render import height_colours, render_mesh
+from triquad_tools.plots.render import BACKGROUND, render_mesh
 
 SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
-FROM_ABOVE = Camera(np.array([0.0, 0.0, 10.0]), np.array([0.0, 0.0, 0.0]))
-FROM_BELOW = Camera(np.array([0.0, 0.0, -10.0]), np.array([0.0, 0.0, 0.0]))
+FROM_ABOVE = PerspectiveCamera(np.array([0.0, 0.0, 10.0]), np.array([0.0, 0.0, 0.0]))
+FROM_BELOW = PerspectiveCamera(np.array([0.0, 0.0, -10.0]), np.array([0.0, 0.0, 0.0]))
 CLAY = np.full((4, 3), 0.6)
 RED, GREEN = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
 
@@ -39,7 +39,7 @@ def test_a_roof_throws_a_shadow() -> None:
     floor = SQUARE * np.array([10.0, 10.0, 1.0])
     vertices = np.vstack([floor, SQUARE + np.array([0.0, 0.0, 3.0])])
     faces = np.vstack([SQUARE_FACES, SQUARE_FACES + 4])
-    camera = Camera(np.array([0.0, 0.0, 40.0]), np.array([0.0, 0.0, 0.0]))
+    camera = PerspectiveCamera(np.array([0.0, 0.0, 40.0]), np.array([0.0, 0.0, 0.0]))
     bare = render_mesh(floor, SQUARE_FACES, CLAY, camera, 96, 96).astype(int)
     shaded = render_mesh(vertices, faces, np.vstack([CLAY, CLAY]), camera, 96, 96).astype(int)
     darker = np.any(bare - shaded > 40, axis=2)
@@ -48,28 +48,34 @@ def test_a_roof_throws_a_shadow() -> None:
     assert 0.3 < np.sum(darker) * metres**2 / square_m2 < 1.5
 
 
-def _sky() -> np.ndarray:
+def _of_nothing() -> np.ndarray:
     """A picture of no mesh."""
     nothing = np.empty((0, 3))
     return render_mesh(nothing, nothing.astype(np.int64), nothing, FROM_ABOVE, 32, 16)
 
 
-def test_an_empty_mesh_is_all_sky() -> None:
-    picture = _sky()
+def test_an_empty_mesh_is_all_background() -> None:
+    picture = _of_nothing()
     assert picture.shape == (16, 32, 3)
     assert picture.dtype == np.uint8
-    assert np.all(picture == picture[:, :1])
-    assert picture[-1, 0].sum() > picture[0, 0].sum()
+    np.testing.assert_allclose(picture, np.broadcast_to(255 * BACKGROUND, picture.shape), atol=1)
 
 
 def test_things_behind_the_eye_are_not_drawn() -> None:
-    away = Camera(np.array([0.0, 0.0, 10.0]), np.array([0.0, 0.0, 20.0]))
-    sky = _sky()
-    np.testing.assert_array_equal(render_mesh(SQUARE, SQUARE_FACES, CLAY, away, 32, 16), sky)
+    away = PerspectiveCamera(np.array([0.0, 0.0, 10.0]), np.array([0.0, 0.0, 20.0]))
+    seen = render_mesh(SQUARE, SQUARE_FACES, CLAY, away, 32, 16)
+    np.testing.assert_array_equal(seen, _of_nothing())
 
 
-def test_projection_and_its_inverse_agree() -> None:
-    camera = Camera(np.array([3.0, -8.0, 6.0]), np.array([0.5, 0.2, 0.0]))
+EYE = np.array([3.0, -8.0, 6.0])
+ASLANT = [
+    PerspectiveCamera(EYE, np.array([0.5, 0.2, 0.0])),
+    ParallelCamera(-EYE, np.array([0.5, 0.2, 0.0]), height_m=6.0),
+]
+
+
+@pytest.mark.parametrize("camera", ASLANT)
+def test_projection_and_its_inverse_agree(camera) -> None:
     nearness = np.random.default_rng(0).uniform(0.05, 0.5, (9, 16))
     places = camera.unproject(nearness)
     seen = camera.project(places.reshape(-1, 3), 16, 9).reshape(9, 16, 3)
@@ -78,8 +84,33 @@ def test_projection_and_its_inverse_agree() -> None:
     np.testing.assert_allclose(seen[:, 7, 1], np.arange(9) + 0.5)
 
 
+@pytest.mark.parametrize("camera", ASLANT)
+def test_what_is_nearer_to_the_eye_hides_the_rest(camera) -> None:
+    ahead = camera.axes[2]
+    near, far = camera.project(camera.target + [-0.5 * ahead, 0.5 * ahead], 16, 9)
+    np.testing.assert_allclose(near[:2], far[:2])
+    assert near[2] > far[2]
+    assert camera.relative_depth(near[2]) < camera.relative_depth(far[2])
+
+
+def test_a_metre_is_as_long_everywhere_in_parallel_projection() -> None:
+    camera = ASLANT[1]
+    places = np.random.default_rng(0).uniform(-50.0, 50.0, (20, 3))
+    for direction in np.eye(3):
+        ends = (camera.project(places + step * direction, 160, 90) for step in (0.0, 1.0))
+        lengths = np.linalg.norm(np.subtract(*ends)[:, :2], axis=1)
+        np.testing.assert_allclose(lengths, lengths[0])
+
+
+def test_level_ground_in_the_sun_has_its_own_colour() -> None:
+    colours = np.tile([[0.15, 0.6, 0.5]], (4, 1))
+    for camera in ASLANT:
+        picture = render_mesh(5 * SQUARE, SQUARE_FACES, colours, camera, 64, 48)
+        np.testing.assert_allclose(picture[24, 32], 255 * colours[0], atol=4)
+
+
 def test_right_and_up_in_the_picture_are_right_and_up_in_the_world() -> None:
-    camera = Camera(np.array([0.0, -10.0, 0.0]), np.array([0.0, 0.0, 0.0]))
+    camera = PerspectiveCamera(np.array([0.0, -10.0, 0.0]), np.array([0.0, 0.0, 0.0]))
     column, row, _ = camera.project(np.array([[1.0, 0.0, 1.0]]), 100, 100)[0]
     assert column > 50.0  # looking along +y, +x is to the right
     assert row < 50.0
@@ -103,15 +134,3 @@ def test_faces_that_are_not_finite_are_left_out() -> None:
 def test_normals_of_vertices_are_those_around_them() -> None:
     normals = vertex_normals(SQUARE, SQUARE_FACES.astype(np.int32))
     np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (4, 1)))
-
-
-def test_height_colours_rise_from_blue_to_red() -> None:
-    heights = np.column_stack([np.zeros((101, 2)), np.linspace(0.0, 5.0, 101)])
-    colours = height_colours(heights)
-    assert colours.shape == (101, 3)
-    assert colours[0, 2] > colours[0, 0]
-    assert colours[-1, 0] > colours[-1, 2]
-
-
-def test_a_mesh_without_vertices_has_no_colours() -> None:
-    assert height_colours(np.zeros((0, 3))).shape == (0, 3)

@@ -9,7 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.servers import SMALL, learn, running_service
 from triquad_client import connect
+from triquad_tools.plots.camera import view_axes
 from triquad_tools.viewer.detail import Viewpoint, wanted_levels
+from triquad_tools.viewer.framing import view_of
 from triquad_tools.viewer.live_source import LiveSource
 from triquad_tools.viewer.map_source import COARSEST
 from triquad_tools.viewer.near_tiles import NearTiles
@@ -115,3 +117,22 @@ def test_near_tiles_are_those_of_the_server(level: int) -> None:
         near.move([(40, 40, 40)])
         assert not near.ready & set(roots)
         near.close()
+
+
+@given(
+    corner=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
+    side=st.tuples(*[st.floats(0.5, 500)] * 3),
+    aspect=st.floats(0.3, 3),
+)
+def test_all_of_a_map_is_in_view(
+    corner: tuple[float, ...], side: tuple[float, ...], aspect: float
+) -> None:
+    """98 of 100 points of a box are in the picture, and they fill a good part of it."""
+    points = np.random.default_rng(1).uniform(size=(500, 3)) * side + corner
+    view = view_of(points, aspect)
+    right, down, ahead = ((points - view.eye) @ view_axes(view.target - view.eye).T).T
+    assert (ahead > 0).mean() > 0.98
+    height = np.tan(np.radians(25)) * ahead
+    outmost = np.maximum(np.abs(right) / aspect, np.abs(down)) / height
+    assert (outmost < 1).mean() > 0.98
+    assert np.percentile(outmost, 99) > 0.5

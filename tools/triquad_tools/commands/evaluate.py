@@ -7,32 +7,50 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.console.arguments import add_version, count, not_negative, positive, seed
+from triquad_tools.console.arguments import (
+    add_version,
+    count,
+    not_negative,
+    picture,
+    positive,
+    seed,
+)
 from triquad_tools.console.command import OK, ToolError, run
-from triquad_tools.console.report import Row, centimetres, json_text, percent, print_rows
+from triquad_tools.console.progress import progress
+from triquad_tools.console.report import Row, json_text, print_rows
 from triquad_tools.evaluation.map_scores import (
-    StreetScores,
+    WithheldAnswer,
     WithheldScores,
+    ask_withheld,
     score_street,
     score_withheld,
     street_probes,
 )
 from triquad_tools.evaluation.metrics import (
+    STREET_SETTINGS,
     MeshScores,
     ScoreSettings,
-    score_against_cloud,
-    score_against_drive,
-    score_against_scene,
+    Truth,
+    cloud_truth,
+    compare_mesh,
+    drive_truth,
+    scene_truth,
+    scored_box,
 )
-from triquad_tools.evaluation.open_map import open_map
+from triquad_tools.evaluation.open_map import newest_epoch, open_map
+from triquad_tools.evaluation.score_rows import TRUSTED, mesh_rows, street_rows, withheld_rows
 from triquad_tools.mapfiles.meshfile import read_mesh
+from triquad_tools.mapfiles.source import is_endpoint
 from triquad_tools.recordings.cloud import is_withheld, merged, world_points
 from triquad_tools.recordings.folders.kitti import read_kitti_folder
 from triquad_tools.simulation.street import street_drive
 
 _COMMAND = "triquad-eval"
+# Lines of the table that a picture has, too.
+_DRAWN = ("F-score", "accuracy", "accuracy ratio", "completion", "completion ratio", "outliers")
 _SEED = 0  # of the points that are drawn; scores can be repeated
 
 Results = dict[str, Any]
@@ -67,10 +85,11 @@ def evaluate_mesh(options: argparse.Namespace) -> Results:
     )
     if options.street is None:
         reference = _reference(options.reference, settings.voxel_m, options.range_min)
-        return {"mesh": score_against_cloud(mesh, reference, settings)}
-    drive = street_drive(options.street, options.scans, options.step)
-    visible = drive.true_hits(settings.voxel_m)
-    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings=settings)}
+        truth = cloud_truth(reference, settings)
+    else:
+        drive = street_drive(options.street, options.scans, options.step)
+        truth = scene_truth(drive.scene, drive.true_hits(settings.voxel_m), settings)
+    return {"mesh": _compared(options, str(options.mesh), mesh, truth, settings)}
 
 
 def evaluate_map(options: argparse.Namespace) -> Results:
@@ -81,10 +100,38 @@ def evaluate_map(options: argparse.Namespace) -> Results:
 def _on_street(options: argparse.Namespace) -> Results:
     drive = street_drive(options.street, options.scans, options.step)
     probes = street_probes(drive, np.random.default_rng(_SEED))
+    truth = drive_truth(drive, STREET_SETTINGS)
     with open_map(options.target, options.map) as opened:
-        results: Results = {"street": score_street(opened.query_sdf, probes)}
-        results["mesh"] = score_against_drive(opened.mesh(drive.scene.box), drive)
-    return results
+        street = score_street(opened.query_sdf, probes)
+        mesh = opened.mesh(scored_box(truth.points, STREET_SETTINGS))
+    name = f"{_map_name(options)}, epoch {mesh.epoch}"
+    return {"street": street, "mesh": _compared(options, name, mesh, truth, STREET_SETTINGS)}
+
+
+def _compared(
+    options: argparse.Namespace, name: str, mesh: Mesh, truth: Truth, settings: ScoreSettings
+) -> MeshScores:
+    """Scores of a mesh, which ``--plot`` draws."""
+    comparison = compare_mesh(mesh, truth, settings)
+    if options.plot is not None:
+        from triquad_tools.plots.error_picture import draw_mesh_errors  # slow to import
+        from triquad_tools.plots.mesh_sheet import Heading
+
+        against = f"street {options.street}" if options.street is not None else options.reference
+        rows = [row for row in mesh_rows(comparison.scores) if row.name in _DRAWN]
+        with progress("drawing"):
+            heading = Heading(f"{name}, against {against}", _summary(rows))
+            draw_mesh_errors(heading, comparison, options.plot)
+    return comparison.scores
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    return " · ".join(f"{row.name} {row.value}" for row in rows)
+
+
+def _map_name(options: argparse.Namespace) -> str:
+    server = is_endpoint(options.target)
+    return f"map {options.map!r} of {options.target}" if server else str(options.target)
 
 
 def _at_withheld(options: argparse.Namespace) -> Results:
@@ -99,7 +146,25 @@ def _at_withheld(options: argparse.Namespace) -> Results:
     limits = (options.range_min, options.range_max)
     with open_map(options.target, options.map) as opened:
         clouds = (world_points(scan, *limits) for scan in folder.read(indices))
-        return {"withheld": score_withheld(opened.query_sdf, clouds)}
+        answers = ask_withheld(opened.query_sdf, clouds)
+        if options.plot is None:
+            return {"withheld": score_withheld(answers)}
+        kept = list(answers)
+        name = f"{_map_name(options)}, epoch {newest_epoch(opened)}"
+    return {"withheld": _drawn(options, name, kept)}
+
+
+def _drawn(options: argparse.Namespace, name: str, answers: list[WithheldAnswer]) -> WithheldScores:
+    """Scores at withheld scans, drawn into ``--plot``."""
+    from triquad_tools.plots.error_picture import draw_withheld  # slow to import
+    from triquad_tools.plots.mesh_sheet import Heading
+
+    scores = score_withheld(answers)
+    summary = _summary([row for row in withheld_rows(scores) if row.note != TRUSTED])
+    heading = Heading(f"{name}, at withheld scans of {options.withheld}", summary)
+    with progress("drawing"):
+        draw_withheld(heading, answers, scores, path=options.plot)
+    return scores
 
 
 def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
@@ -113,48 +178,6 @@ def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
     if not len(points):
         raise ToolError(f"{path}: holds no points")
     return points
-
-
-def mesh_rows(scores: MeshScores) -> list[Row]:
-    """The scores of a mesh as lines of a table."""
-    return [
-        Row("accuracy", centimetres(scores.accuracy_m), "mean, mesh to truth, outliers left out"),
-        Row("accuracy, median", centimetres(scores.accuracy_median_m)),
-        Row("accuracy ratio", percent(scores.accuracy_ratio), "outliers left out"),
-        Row("completion", centimetres(scores.completion_m), "mean, truth to mesh"),
-        Row("completion ratio", percent(scores.completion_ratio)),
-        Row("F-score", percent(scores.f_score), "of both ratios"),
-        Row("outliers", percent(scores.outlier_ratio), "mesh beyond the accuracy cut"),
-        Row("mesh samples", f"{scores.samples:,}"),
-        Row("reference points", f"{scores.references:,}"),
-    ]
-
-
-def street_rows(scores: StreetScores) -> list[Row]:
-    """The scores of a map of a street as lines of a table."""
-    return [
-        Row("SDF error", centimetres(scores.sdf_error_m), "mean, within 10 cm of the surface"),
-        Row("SDF error, median", centimetres(scores.sdf_error_median_m)),
-        Row("SDF error, 95 %", centimetres(scores.sdf_error_p95_m)),
-        Row("gradient angle", f"{scores.gradient_angle_deg:.1f} deg", "median"),
-        Row("of these SURFACE", percent(scores.near_surface_ratio)),
-        Row("points", f"{scores.near_points:,}"),
-        Row("houses UNKNOWN", percent(scores.houses_unknown_ratio), "deeper than 0.5 m in them"),
-        Row("points in houses", f"{scores.house_points:,}"),
-    ]
-
-
-def withheld_rows(scores: WithheldScores) -> list[Row]:
-    """The scores of a map at withheld scans as lines of a table."""
-    return [
-        Row("SURFACE", percent(scores.surface_ratio), "of all points"),
-        Row("UNKNOWN", percent(scores.unknown_ratio), "of all points"),
-        Row("|SDF|, median", centimetres(scores.sdf_median_m), "all points"),
-        Row("|SDF|, 90 %", centimetres(scores.sdf_p90_m), "all points"),
-        Row("|SDF|, median", centimetres(scores.surface_sdf_median_m), "SURFACE points"),
-        Row("|SDF|, 90 %", centimetres(scores.surface_sdf_p90_m), "SURFACE points"),
-        Row("points", f"{scores.points:,}"),
-    ]
 
 
 _TABLES: dict[str, tuple[str, Callable[[Any], list[Row]]]] = {
@@ -231,4 +254,5 @@ def _add_street(parser: argparse.ArgumentParser, truth: Any) -> None:
     add = parser.add_argument
     add("--scans", type=count, default=60, metavar="N", help="of the drive (default: 60)")
     add("--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)")
+    add("--plot", type=picture, metavar="OUT.png", help="draw the errors, and what is missing")
     add("--json", action="store_true", help="print JSON")

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from triquad_format.errors import DamagedMapFileError
+from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import MapFile
 
 from triquad_tools.console.arguments import add_version, count, positive
@@ -16,7 +17,13 @@ from triquad_tools.console.report import json_text
 from triquad_tools.mapfiles.checks import FailedCheckError, verify
 from triquad_tools.mapfiles.diff import compare, difference, print_diff
 from triquad_tools.mapfiles.object_changes import object_changes, print_objects
-from triquad_tools.mapfiles.source import MissingFilesError, read_whole
+from triquad_tools.mapfiles.source import (
+    MissingFilesError,
+    chosen_file,
+    is_endpoint,
+    map_file,
+    read_whole,
+)
 from triquad_tools.mapfiles.store_log import print_log, read_log
 from triquad_tools.mapfiles.summary import print_summary, summarise
 
@@ -26,6 +33,7 @@ _TILE_M = 6.4
 _LEAST_TILE_M = 0.1
 _ROWS = 20
 _CELL_M = 0.1
+_MAP = "default"  # of a server
 _PICTURE_SUFFIX = ".png"
 
 
@@ -44,7 +52,21 @@ def _parser() -> argparse.ArgumentParser:
         "2 not readable (missing, or of a newer version), or wrong usage.",
     )
     add = parser.add_argument
-    add("files", type=Path, nargs="+", metavar="FILE", help="map file; with --slice also a server")
+    add(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="map file; folder of checkpoints, of which the newest is meant; or endpoint of a "
+        "server, such as tcp/127.0.0.1:7447, whose map is fetched",
+    )
+    add("--map", metavar="NAME", help="of the server (default: default)")
+    add(
+        "--at",
+        metavar="EPOCH_OR_TIME",
+        help="the newest checkpoint of the folder FILE that is not after this, such as 120 or "
+        "2026-01-31T12:00:00Z",
+    )
     add(
         "--verify",
         action="store_true",
@@ -67,8 +89,7 @@ def _add_slice(group: argparse._ArgumentGroup) -> None:
         "--slice",
         type=float,
         metavar="Z",
-        help="draw distance and status at this height, metres, into --plot; FILE may be the "
-        "endpoint of a server, such as tcp/127.0.0.1:7447",
+        help="draw distance and status at this height, metres, into --plot",
     )
     add(
         "--box",
@@ -78,7 +99,6 @@ def _add_slice(group: argparse._ArgumentGroup) -> None:
         help="what it shows, metres, map frame (default: all that a file has seen)",
     )
     add("--cell", type=positive, metavar="M", help=f"side of its cells (default: {_CELL_M:g})")
-    add("--map", metavar="NAME", help="of the server (default: default)")
 
 
 def _check_usage(options: argparse.Namespace) -> None:
@@ -94,10 +114,13 @@ def _check_usage(options: argparse.Namespace) -> None:
         f"--tile {options.tile} m is too small: use {_LEAST_TILE_M} or more": (
             options.tile and options.tile < _LEAST_TILE_M
         ),
+        "--at is for one map, not for --log or --diff": options.at
+        and (options.log or options.diff),
         "--slice needs --plot OUT.png": sliced and not plot,
         "--slice excludes --log, --diff, --verify and --json": sliced and other,
-        "--box, --cell and --map go with --slice": (
-            (options.box or options.cell or options.map) and not sliced
+        "--box and --cell go with --slice": (options.box or options.cell) and not sliced,
+        "--map is of a server, and none is given": (
+            options.map and not any(is_endpoint(str(path)) for path in options.files)
         ),
         "--plot is for map files, not for --log": options.log and plot,
         f"--plot {plot}: its name must end in {_PICTURE_SUFFIX}": (
@@ -121,20 +144,22 @@ def _inspect(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace) -> int:
-    """One map file."""
-    path = options.files[0]
-    file = read_whole(path)
-    summary = summarise(file)
-    if options.verify:
-        summary = dataclasses.replace(summary, checks=verify(path, file))
+    """One map."""
+    target = str(options.files[0])
+    with map_file(target, options.map or _MAP, options.at) as path:
+        name = target if is_endpoint(target) else str(path)
+        file = read_whole(path)
+        summary = summarise(file)
+        if options.verify:
+            summary = dataclasses.replace(summary, checks=verify(path, file))
     if options.plot:
         from triquad_tools.plots.map_plan import draw_map  # slow to import
 
-        draw_map(_title(path, file), file, options.plot)
+        draw_map(_title(name, file), file, options.plot)
     if options.json:
         print(json_text(summary))
     else:
-        print_summary(str(path), summary)
+        print_summary(name, summary)
     return OK
 
 
@@ -143,7 +168,10 @@ def _slice(options: argparse.Namespace) -> int:
     from triquad_tools.plots.slice_plan import SliceOptions, draw_slice  # slow to import
 
     wanted = SliceOptions(options.slice, options.box, options.cell or _CELL_M)
-    draw_slice(str(options.files[0]), options.map or "default", wanted, path=options.plot)
+    target = str(options.files[0])
+    if not is_endpoint(target):
+        target = str(chosen_file(Path(target), options.at))
+    draw_slice(target, options.map or _MAP, wanted, path=options.plot)
     return OK
 
 
@@ -167,15 +195,17 @@ def _diff(options: argparse.Namespace) -> int:
     """Two map files."""
     from triquad_client import OfflineMap  # slow to import
 
-    a, b = (read_whole(path) for path in options.files)
+    files, titles = [], []
+    for letter, target in zip("AB", map(str, options.files), strict=True):
+        with map_file(target, options.map or _MAP) as path:
+            files.append(read_whole(path))
+            name = target if is_endpoint(target) else str(path)
+        titles.append(f"{letter}  {_title(name, files[-1])}")
+    a, b = files
     with progress("comparing"), OfflineMap(a.record) as old, OfflineMap(b.record) as new:
         comparison = compare(old, new)
     diff = difference(comparison, options.tile or _TILE_M)
     objects = object_changes(comparison)
-    titles = [
-        f"{letter}  {_title(path, file)}"
-        for letter, path, file in zip("AB", options.files, (a, b), strict=True)
-    ]
     if options.plot:
         from triquad_tools.plots.diff_plan import draw_diff  # slow to import
 
@@ -189,5 +219,7 @@ def _diff(options: argparse.Namespace) -> int:
     return OK
 
 
-def _title(path: Path, file: MapFile) -> str:
-    return f"{path}: map {file.record.name!r}, epoch {file.record.epoch}"
+def _title(name: str, file: MapFile) -> str:
+    stamp_ns = file.manifest.stamp_ns
+    when = f", {utc_time(stamp_ns)}" if stamp_ns else ""
+    return f"{name}: map {file.record.name!r}, epoch {file.record.epoch}{when}"

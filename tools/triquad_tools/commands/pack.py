@@ -31,7 +31,7 @@ _DAMAGE = (DamagedMapFileError, NothingLeftError)
 _MAP, _MESHES, _GRID, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".npz", ".png"
 _SUFFIXES = (_MAP, *_MESHES, _GRID, _PICTURE)
 _PLANES = ("XY", "XZ", "YZ")
-_MESH_CELL_M, _GRID_CELL_M = 0.1, 0.2
+_GRID_CELL_M = 0.2
 _CELL_RANGE_M = (0.01, 10.0)
 _MARGIN_CELLS = 16  # so far around its box a map is needed for a mesh or a grid
 
@@ -95,7 +95,7 @@ def _add_target(add: _Add) -> None:
         "--cell",
         type=positive,
         metavar="M",
-        help=f"side of cells (default: {_MESH_CELL_M:g} of a mesh, {_GRID_CELL_M:g} of {_GRID})",
+        help=f"side of cells (default: half a leaf of a mesh, {_GRID_CELL_M:g} of {_GRID})",
     )
     add("--sparse", action="store_true", help=f"{_GRID}: only blocks around surface, not a box")
     add("--force", action="store_true", help="replace OUT where it exists")
@@ -171,22 +171,22 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
 
 def _export(options: argparse.Namespace, path: Path) -> int:
     box, output = _box(options.crop), options.output
-    grid = output.suffix == _GRID
-    cell_m = options.cell or (_GRID_CELL_M if grid else _MESH_CELL_M)
-    check_range("--cell", cell_m, *_CELL_RANGE_M)
-    margin_m = _MARGIN_CELLS * cell_m
+    if options.cell is not None:
+        check_range("--cell", options.cell, *_CELL_RANGE_M)
+    margin_m = _MARGIN_CELLS * (options.cell or _GRID_CELL_M)
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
-    if grid:
+    if output.suffix == _GRID:
+        cell_m = options.cell or _GRID_CELL_M
         written = export_grid(source.record, box, cell_m, sparse=options.sparse, path=output)
     elif output.suffix == _PICTURE:
         from triquad_tools.plots.picture import export_picture  # slow to import
 
-        written = export_picture(source.record, box, cell_m, path=output)
+        written = export_picture(source, box, options.cell, path=output)
     else:
         from triquad_tools.mapfiles.meshfile import export_mesh  # slow to import
 
-        written = export_mesh(source.record, box, cell_m, path=output)
+        written = export_mesh(source.record, box, options.cell, path=output)
     print(f"{output}: {written}")
     return OK if complete else FAILED
 

@@ -3,6 +3,7 @@
 import argparse
 import math
 import re
+from pathlib import Path
 
 import triquad_format
 
@@ -33,6 +34,17 @@ def not_negative(text: str) -> float:
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
     return value
+
+
+def picture(text: str) -> Path:
+    """The name of a picture to be written, in a folder that exists."""
+    path = Path(text)
+    if path.suffix != ".png":
+        raise argparse.ArgumentTypeError(f"{text}: its name must end in .png")
+    if path.is_dir() or not path.parent.is_dir():
+        kind = "it is a folder" if path.is_dir() else "its folder does not exist"
+        raise argparse.ArgumentTypeError(f"{text}: {kind}")
+    return path
 
 
 def error_limit(text: str) -> float:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.image import imsave
 from triquad_client import CheckpointInfo, Client, Mesh, SdfResult, connect
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
@@ -18,9 +17,16 @@ from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.results import Intake, MapSize, Restart
 from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
-from triquad_tools.evaluation.metrics import MeshScores, score_against_drive
-from triquad_tools.plots.camera import Camera
-from triquad_tools.plots.render import height_colours, render_mesh
+from triquad_tools.evaluation.metrics import (
+    STREET_SETTINGS,
+    MeshScores,
+    compare_mesh,
+    drive_truth,
+    scored_box,
+)
+from triquad_tools.plots.camera import PerspectiveCamera
+from triquad_tools.plots.mesh_sheet import Heading
+from triquad_tools.plots.picture import draw_view
 from triquad_tools.recordings.publishing import publish_all, wait_until_settled
 
 MAP = "demo"
@@ -34,6 +40,7 @@ _RESTART_POINTS = 50_000
 _EYE_M = (-14.0, 0.8, 12.0)
 _TARGET_M = (17.0, -0.3, 0.3)
 _VIEW_DEG = 46.0
+_SUMMARY = "from the start of the drive; dark: surface that is seen from behind, inside of houses"
 
 
 @dataclass(frozen=True)
@@ -91,12 +98,13 @@ def score(endpoint: str, street: DrivenStreet) -> Scored:
         report(0.0, "distances")
         field = score_street(client.query_sdf, street.probes)
         report(0.0, "mesh")
-        surface = client.mesh(street.drive.scene.box)
+        truth = drive_truth(street.drive, STREET_SETTINGS)
+        surface = client.mesh(scored_box(truth.points, STREET_SETTINGS))
         checkpoint = client.checkpoint()
         answers = client.query_sdf(points)
         parameters = client.status().parameters
         report(0.0, "mesh against the exact surface")
-        scores = score_against_drive(surface, street.drive)
+        scores = compare_mesh(surface, truth, STREET_SETTINGS).scores
         report(0.0, f"{scores.samples:,} samples of the mesh")
     return Scored(
         street=field,
@@ -135,7 +143,6 @@ def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
             report(0.0, path.name)
             surface.save(path)
         report(0.0, picture.name)
-        camera = Camera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
-        colours = height_colours(surface.vertices)
-        image = render_mesh(surface.vertices, surface.faces, colours, camera=camera)
-        imsave(picture, image)
+        camera = PerspectiveCamera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
+        heading = Heading(f"map {MAP!r}, epoch {surface.epoch}", _SUMMARY)
+        draw_view(heading, surface, camera, notes=[], path=picture)

@@ -3,13 +3,13 @@
 ``docs/tools.md`` defines every figure. What is asked, a file or a server, is a callable here.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import SdfResult
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 from triquad_map.view import FieldAnswer
 
@@ -118,16 +118,29 @@ def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     )
 
 
-def score_withheld(query: MapQuery, clouds: Iterable[Doubles]) -> WithheldScores:
-    """Scores of a map at the points ``[N, 3]`` of scans it never saw, map frame.
+@dataclass(frozen=True)
+class WithheldAnswer:
+    """What a map says at points of a scan that it never saw."""
 
-    A point without any region around it has no distance: it counts as infinitely far off.
-    """
-    distances = [np.empty(0, np.float32)]
-    statuses = [np.empty(0, np.uint8)]
+    points: Doubles  # [N, 3] map frame
+    distance_m: Floats  # [N] magnitude; infinite where no region is around
+    status: Bytes  # [N]
+
+
+def ask_withheld(query: MapQuery, clouds: Iterable[Doubles]) -> Iterator[WithheldAnswer]:
+    """Ask a map at the points ``[N, 3]`` of scans that it never saw, map frame."""
     for cloud in clouds:
         answer = query(cloud)
-        distances.append(np.nan_to_num(np.abs(answer.sdf), nan=np.inf))
+        distance_m = np.nan_to_num(np.abs(answer.sdf), nan=np.inf)
+        yield WithheldAnswer(cloud, distance_m, answer.status)
+
+
+def score_withheld(answers: Iterable[WithheldAnswer]) -> WithheldScores:
+    """Scores of a map by what it says of scans that it never saw."""
+    distances = [np.empty(0, np.float32)]
+    statuses = [np.empty(0, np.uint8)]
+    for answer in answers:
+        distances.append(answer.distance_m)
         statuses.append(answer.status)
     distance, status = np.concatenate(distances), np.concatenate(statuses)
     on_surface = distance[status == Status.SURFACE]

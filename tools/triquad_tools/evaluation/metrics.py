@@ -6,13 +6,14 @@ bounding box are left out, and so are those farther from the truth than the accu
 count in ``outlier_ratio`` alone.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_client import Mesh
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Bools, Doubles
 
 from triquad_tools.recordings.cloud import thin
 from triquad_tools.simulation.lidar import SimulatedDrive
@@ -23,6 +24,9 @@ STREET_VOXEL_M = 0.05
 
 STREET_SAMPLES_MAX = 3_000_000
 """Of its mesh: more change the scores by little."""
+
+Distances = Callable[[Doubles], Doubles]
+"""Distances ``[N]`` of places ``[N, 3]`` to a surface, metres; infinite beyond a limit, perhaps."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,10 @@ class ScoreSettings:
     voxel_m: float = 0.02  # samples and truth are thinned to this
     samples_max: int = 10_000_000  # drawn from the mesh before thinning
     seed: int = 0  # of these samples: scores can be repeated
+
+
+STREET_SETTINGS = ScoreSettings(samples_max=STREET_SAMPLES_MAX)
+"""For meshes of a simulated street."""
 
 
 @dataclass(frozen=True)
@@ -52,40 +60,88 @@ class MeshScores:
     references: int  # points of the truth
 
 
-def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> MeshScores:
-    """Scores of a mesh against a cloud ``[M, 3]`` of true surface points, metres, same frame.
+@dataclass(frozen=True)
+class Truth:
+    """What a mesh should be."""
+
+    points: Doubles  # [M, 3] of surface that it should have, one per voxel
+    distances: Distances
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A mesh beside the truth."""
+
+    mesh: Mesh
+    truth: Truth
+    settings: ScoreSettings
+    scores: MeshScores
+    missing: Doubles  # [K, 3] points of the truth: the mesh is no nearer than the threshold
+
+
+def cloud_truth(reference: Doubles, settings: ScoreSettings) -> Truth:
+    """A cloud ``[M, 3]`` of true surface points, metres.
 
     The spacing of the cloud bounds the accuracy from below: a cloud of 3 cm spacing shows no
     mesh as better than about 1.5 cm.
     """
-    reference = _thinned_reference(reference, settings)
-    samples = _samples(mesh, reference, settings)
-    cut = settings.accuracy_cut_m
-    distances = _tree(reference).query(samples, distance_upper_bound=cut, workers=-1)[0]
-    return _scores(distances, samples, reference, settings=settings)
+    points = _thinned_reference(reference, settings)
+    tree, cut = _tree(points), settings.accuracy_cut_m
+
+    def distances(places: Doubles) -> Doubles:
+        found: Doubles = tree.query(places, distance_upper_bound=cut, workers=-1)[0]
+        return found
+
+    return Truth(points, distances)
+
+
+def scene_truth(scene: Scene, visible: Doubles, settings: ScoreSettings) -> Truth:
+    """An exact scene, of which completion asks for points that a sensor has seen.
+
+    Args:
+        scene: gives the exact distance of each sample, without the floor that a cloud has.
+        visible: ``[M, 3]`` exact surface points that the sensor has seen
+            (see :meth:`triquad_tools.simulation.lidar.SimulatedDrive.true_hits`).
+        settings: thresholds.
+    """
+    points = _thinned_reference(visible, settings)
+    return Truth(points, lambda places: np.abs(scene.sdf(places)))
+
+
+def drive_truth(drive: SimulatedDrive, settings: ScoreSettings) -> Truth:
+    """All that the lidar of a simulated drive hit, 5 cm apart."""
+    return scene_truth(drive.scene, drive.true_hits(STREET_VOXEL_M), settings)
+
+
+def compare_mesh(mesh: Mesh, truth: Truth, settings: ScoreSettings) -> Comparison:
+    """A mesh beside the truth, in the same frame."""
+    samples = _samples(mesh, truth.points, settings)
+    missing_m = np.full(len(truth.points), settings.completion_cut_m)
+    if len(samples):
+        found = _tree(samples).query(
+            truth.points, distance_upper_bound=settings.completion_cut_m, workers=-1
+        )[0]
+        missing_m = np.minimum(missing_m, found)
+    scores = _scores(truth.distances(samples), missing_m, settings)
+    missing = truth.points[missing_m >= settings.threshold_m]
+    return Comparison(mesh, truth, settings, scores, missing)
+
+
+def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> MeshScores:
+    """Scores of a mesh against a cloud; see :func:`cloud_truth`."""
+    return compare_mesh(mesh, cloud_truth(reference, settings), settings).scores
 
 
 def score_against_scene(
     mesh: Mesh, scene: Scene, visible: Doubles, settings: ScoreSettings
 ) -> MeshScores:
-    """Scores of a mesh against an exact scene.
-
-    Args:
-        mesh: in the scene's frame.
-        scene: gives the exact distance of each sample, without the floor that a cloud has.
-        visible: ``[M, 3]`` exact surface points that the sensor has seen, which completion
-            asks for (see :meth:`triquad_tools.simulation.lidar.SimulatedDrive.true_hits`).
-        settings: thresholds.
-    """
-    visible = _thinned_reference(visible, settings)
-    samples = _samples(mesh, visible, settings)
-    return _scores(np.abs(scene.sdf(samples)), samples, visible, settings=settings)
+    """Scores of a mesh against an exact scene; see :func:`scene_truth`."""
+    return compare_mesh(mesh, scene_truth(scene, visible, settings), settings).scores
 
 
 def score_against_drive(mesh: Mesh, drive: SimulatedDrive) -> MeshScores:
     """Scores of a mesh against all that the lidar of a simulated drive hit."""
-    settings = ScoreSettings(samples_max=STREET_SAMPLES_MAX)
-    return score_against_scene(mesh, drive.scene, drive.true_hits(STREET_VOXEL_M), settings)
+    return compare_mesh(mesh, drive_truth(drive, STREET_SETTINGS), STREET_SETTINGS).scores
 
 
 def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
@@ -125,51 +181,54 @@ def _thinned_reference(reference: Doubles, settings: ScoreSettings) -> Doubles:
 
 
 def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles:
-    """Thinned samples of the mesh in the truth's bounding box.
-
-    The box is grown by the accuracy's cut: a level road is the very bottom of its box, and
-    samples just below it are errors to be counted.
-    """
+    """Thinned samples of the mesh where it is scored."""
     # More than four samples per voxel's face would only be thinned away again.
     wanted = int(mesh_area_m2(mesh) / (0.5 * settings.voxel_m) ** 2)
     count = min(wanted, settings.samples_max)
     if count == 0:
         return np.empty((0, 3))
     samples = sample_mesh(mesh, count, np.random.default_rng(settings.seed))
-    low = reference.min(axis=0) - settings.accuracy_cut_m
-    high = reference.max(axis=0) + settings.accuracy_cut_m
-    samples = samples[np.all((samples >= low) & (samples <= high), axis=1)]
-    return thin(samples, settings.voxel_m)
+    return thin(samples[is_scored(samples, reference, settings)], settings.voxel_m)
+
+
+def is_scored(places: Doubles, reference: Doubles, settings: ScoreSettings) -> Bools:
+    """Whether places ``[N, 3]`` lie where a mesh is scored."""
+    low, high = np.array(scored_box(reference, settings))
+    inside: Bools = ((places >= low) & (places <= high)).all(axis=1)
+    return inside
+
+
+def scored_box(reference: Doubles, settings: ScoreSettings) -> tuple[list[float], list[float]]:
+    """The truth's bounding box, in which a mesh is scored, metres: its lower and upper corner.
+
+    It is grown by the accuracy's cut: a level road is the very bottom of its box, and samples just
+    below it are errors to be counted.
+    """
+    margin_m = settings.accuracy_cut_m
+    low, high = reference.min(axis=0) - margin_m, reference.max(axis=0) + margin_m
+    return low.tolist(), high.tolist()
 
 
 def _tree(points: Doubles) -> cKDTree:
     return cKDTree(points, balanced_tree=False, compact_nodes=False)  # much faster to build
 
 
-def _scores(
-    distances: Doubles, samples: Doubles, reference: Doubles, settings: ScoreSettings
-) -> MeshScores:
+def _scores(distances: Doubles, missing_m: Doubles, settings: ScoreSettings) -> MeshScores:
     """Scores from the distances of samples to the truth, and of the truth to the samples."""
     kept = distances[distances < settings.accuracy_cut_m]
-    missing = np.full(len(reference), settings.completion_cut_m)
-    if len(samples):
-        found = _tree(samples).query(
-            reference, distance_upper_bound=settings.completion_cut_m, workers=-1
-        )[0]
-        missing = np.minimum(missing, found)
     accuracy_ratio = mean_or_nan(kept < settings.threshold_m)
-    completion_ratio = mean_or_nan(missing < settings.threshold_m)
+    completion_ratio = mean_or_nan(missing_m < settings.threshold_m)
     total = accuracy_ratio + completion_ratio
     return MeshScores(
         accuracy_m=mean_or_nan(kept),
         accuracy_median_m=float(np.median(kept)) if len(kept) else float("nan"),
         accuracy_ratio=accuracy_ratio,
-        completion_m=mean_or_nan(missing),
+        completion_m=mean_or_nan(missing_m),
         completion_ratio=completion_ratio,
         f_score=2.0 * accuracy_ratio * completion_ratio / total if total > 0.0 else 0.0,
         outlier_ratio=1.0 - len(kept) / len(distances) if len(distances) else float("nan"),
-        samples=len(samples),
-        references=len(reference),
+        samples=len(distances),
+        references=len(missing_m),
     )
 
 

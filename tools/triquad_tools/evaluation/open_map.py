@@ -1,16 +1,18 @@
 """A map to ask, whether it is a file or a server has it."""
 
-import re
-
 import triquad_client
 from triquad_client import Client, OfflineMap
 
-_ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
+from triquad_tools.mapfiles.source import is_endpoint
 
 
-def is_endpoint(target: str) -> bool:
-    """Whether ``target`` is a Zenoh endpoint, and not the name of a file."""
-    return _ENDPOINT.match(target) is not None
+def newest_epoch(opened: Client | OfflineMap) -> int:
+    """The number of the epoch that a map answers from.
+
+    Raises:
+        TriquadError: the server does not answer.
+    """
+    return opened.epoch if isinstance(opened, OfflineMap) else opened.status().epoch
 
 
 def open_map(target: str, map_name: str) -> Client | OfflineMap:

@@ -45,10 +45,11 @@ def read_mesh(path: Path) -> Mesh:
     return Mesh(vertices, faces)
 
 
-def export_mesh(record: MapRecord, box: Box | None, cell_m: float, path: Path) -> str:
-    """Write the mesh of a map, with cells of side ``cell_m``; returns what was written.
+def export_mesh(record: MapRecord, box: Box | None, cell_m: float | None, path: Path) -> str:
+    """Write the mesh of a map; returns what was written.
 
-    Given a box, it has the faces whose centroids lie in it.
+    Its cells have the side ``cell_m``, half a leaf where that is not given. Given a box, it has
+    the faces whose centroids lie in it.
 
     Raises:
         InvalidInputError: the mesh is too large, or a library is missing.

@@ -1,6 +1,9 @@
-"""Where a map is read from: a file with those that it needs, or a folder of checkpoints."""
+"""Where a map is read from: a file with those it needs, a folder of checkpoints, a server."""
 
-from contextlib import closing
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +18,13 @@ from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.progress import progress
 
 Box = Doubles
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
+
+
+_ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
 
 
 class MissingFilesError(ToolError):
@@ -52,6 +59,38 @@ def chosen_file(path: Path, when: str | None) -> Path:
         return path
     folder = map_folder(path)
     return (checkpoint_files(folder)[0] if when is None else checkpoint_at(folder, when)).path
+
+
+def is_endpoint(target: str) -> bool:
+    """Whether ``target`` is a Zenoh endpoint, and not the name of a file."""
+    return _ENDPOINT.match(target) is not None
+
+
+@contextmanager
+def map_file(target: str, map_name: str, when: str | None = None) -> Iterator[Path]:
+    """A map as a file: ``target`` itself, a checkpoint of that folder, or a server's newest epoch.
+
+    What a server has is downloaded, with its training state, and deleted afterwards. ``when`` says
+    which checkpoint of a folder; see :func:`chosen_file`.
+
+    Raises:
+        ToolError: ``when`` is given, but ``target`` is no folder.
+        TriquadError: no server there has the map.
+        FormatError: the folder has no such checkpoint.
+        OSError: it cannot be read.
+    """
+    if not is_endpoint(target):
+        yield chosen_file(Path(target), when)
+        return
+    if when is not None:
+        raise ToolError(f"{target} is a server, which has its newest epoch only: leave out --at")
+    import triquad_client  # slow to import
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.triquad"
+        with progress("downloading"), triquad_client.connect(target, map_name) as client:
+            client.download_map(path, training=True)
+        yield path
 
 
 def read_whole(path: Path) -> MapFile:

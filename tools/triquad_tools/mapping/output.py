@@ -9,6 +9,7 @@ from triquad_format.records.region import MapRecord
 from triquad_server.mesh.preview import previews_of
 
 from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES, export_mesh
+from triquad_tools.mapfiles.source import SourceMap
 from triquad_tools.plots.picture import export_picture
 
 MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
@@ -27,5 +28,6 @@ def write_output(record: MapRecord, path: Path, *, cell_m: float, training: bool
         kept = record if training else without_training(record)
         info = write_map(kept, path, stamp_ns=time.time_ns(), previews=previews_of(kept))
         return f"{info.bytes:,} bytes, {len(record.regions)} regions, epoch {record.epoch}"
-    export = export_picture if path.suffix == PICTURE_SUFFIX else export_mesh
-    return export(record, None, cell_m, path)
+    if path.suffix == PICTURE_SUFFIX:
+        return export_picture(SourceMap(record, time.time_ns()), None, cell_m, path)
+    return export_mesh(record, None, cell_m, path)

@@ -1,71 +1,118 @@
-"""Cameras: where they look from, and what lies where in their pictures."""
+"""Cameras: from the map frame to a picture and back."""
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 
 _NEAR_M = 0.1  # what is nearer than this to the eye is not drawn
-_VIEW_DEG = 35.0
-_TOWARDS_EYE = np.array([-0.45, -0.65, 0.62])
-_FRAMED = (1.0, 99.0)  # percentiles: what lies far away from all else does not make it small
-_MARGIN = 1.05
-_ENOUGH = 200_000  # vertices, to find the place of the camera
-_ASPECT = 16 / 9
+
+
+class Camera(Protocol):
+    """Where a picture is taken from; its top is towards +z.
+
+    What is nearer hides what is farther; the nearness of a place is any number that is linear in
+    the picture and grows towards the eye.
+    """
+
+    @property
+    def axes(self) -> Doubles:
+        """Unit vectors ``[3, 3]``: to the right, down, and forward, in the map frame."""
+
+    def project(self, points: Doubles, width: int, height: int) -> Doubles:
+        """Column, row and nearness ``[N, 3]`` of points ``[N, 3]``; NaN where it sees none."""
+
+    def unproject(self, nearness: Doubles) -> Doubles:
+        """Points ``[H, W, 3]`` of the world that the pixels of a picture show."""
+
+    def towards_eye(self, places: Doubles) -> Doubles:
+        """Vectors ``[N, 3]`` of any length from places ``[N, 3]`` to the eye."""
+
+    def relative_depth(self, nearness: Doubles) -> Doubles:
+        """Depth, by the height of what the picture shows there."""
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A perspective camera in the map frame; the picture's top is towards +z."""
+class PerspectiveCamera:
+    """A camera like the human eye: what is farther away is smaller."""
 
-    eye: Doubles  # [3] metres
+    eye: Doubles  # [3] metres, map frame
     target: Doubles  # [3] metres, in the middle of the picture
     view_deg: float = 35.0  # vertical opening angle
 
     @property
     def axes(self) -> Doubles:
-        """Unit vectors ``[3, 3]``: to the right, down, and forward, in the map frame."""
+        """See :class:`Camera`."""
         return view_axes(self.target - self.eye)
 
     def project(self, points: Doubles, width: int, height: int) -> Doubles:
-        """Column, row and inverse depth ``[N, 3]`` of points ``[N, 3]``; NaN behind the eye."""
+        """See :class:`Camera`; the nearness is the inverse depth."""
         seen = (points - self.eye) @ self.axes.T
         depth = np.where(seen[:, 2] > _NEAR_M, seen[:, 2], np.nan)
-        pixels = self._pixels_per_tangent(height)
+        pixels = 0.5 * height / self._tangent
         column = 0.5 * width + pixels * seen[:, 0] / depth
         row = 0.5 * height + pixels * seen[:, 1] / depth
         return np.column_stack([column, row, 1.0 / depth])
 
     def unproject(self, nearness: Doubles) -> Doubles:
-        """Points ``[H, W, 3]`` of the world that the pixels of a picture show."""
-        height, width = nearness.shape
-        pixels = self._pixels_per_tangent(height)
+        """See :class:`Camera`."""
         right, down, forward = self.axes
-        columns = (np.arange(width) + 0.5 - 0.5 * width) / pixels
-        rows = (np.arange(height) + 0.5 - 0.5 * height) / pixels
-        rays = columns[None, :, None] * right + rows[:, None, None] * down + forward
+        columns, rows = _pixels(nearness.shape)
+        rays = self._tangent * (columns * right + rows * down) + forward
         points: Doubles = self.eye + rays / nearness[:, :, None]
         return points
 
-    def _pixels_per_tangent(self, height: int) -> float:
-        return 0.5 * height / math.tan(0.5 * math.radians(self.view_deg))
+    def towards_eye(self, places: Doubles) -> Doubles:
+        """See :class:`Camera`."""
+        vectors: Doubles = self.eye - places
+        return vectors
+
+    def relative_depth(self, nearness: Doubles) -> Doubles:
+        """See :class:`Camera`; a logarithm, as the height grows with the depth."""
+        return np.log(1.0 / nearness) / (2.0 * self._tangent)
+
+    @property
+    def _tangent(self) -> float:
+        return math.tan(0.5 * math.radians(self.view_deg))
 
 
-def camera_around(vertices: NDArray[np.floating]) -> Camera:
-    """A camera that looks down aslant and has nearly all vertices ``[V, 3]`` in its picture."""
-    if len(vertices) == 0:
-        return Camera(_TOWARDS_EYE, np.zeros(3), _VIEW_DEG)
-    some = vertices[:: max(1, len(vertices) // _ENOUGH)].astype(np.float64)
-    axes = view_axes(-_TOWARDS_EYE)
-    seen = some @ axes.T
-    middle = 0.5 * np.percentile(seen, _FRAMED, axis=0).sum(axis=0)
-    right, down, ahead = (seen - middle).T
-    tangent = math.tan(0.5 * math.radians(_VIEW_DEG))
-    needed = np.maximum(np.abs(right) / _ASPECT, np.abs(down)) / tangent - ahead
-    distance_m = _MARGIN * np.percentile(needed, _FRAMED[1])
-    return Camera((middle - [0.0, 0.0, distance_m]) @ axes, middle @ axes, _VIEW_DEG)
+@dataclass(frozen=True)
+class ParallelCamera:
+    """A camera from infinitely far away: a metre is as long everywhere in the picture."""
+
+    from_eye: Doubles  # [3] the direction in which it looks
+    target: Doubles  # [3] metres, in the middle of the picture
+    height_m: float  # of what the picture shows, across the view
+
+    @property
+    def axes(self) -> Doubles:
+        """See :class:`Camera`."""
+        return view_axes(self.from_eye)
+
+    def project(self, points: Doubles, width: int, height: int) -> Doubles:
+        """See :class:`Camera`; the nearness is in metres before the target."""
+        pixels = height / self.height_m
+        seen = (points - self.target) @ self.axes.T
+        column, row = 0.5 * width + pixels * seen[:, 0], 0.5 * height + pixels * seen[:, 1]
+        return np.column_stack([column, row, -seen[:, 2]])
+
+    def unproject(self, nearness: Doubles) -> Doubles:
+        """See :class:`Camera`."""
+        right, down, forward = self.axes
+        columns, rows = _pixels(nearness.shape)
+        across = 0.5 * self.height_m * (columns * right + rows * down)
+        points: Doubles = self.target + across - nearness[:, :, None] * forward
+        return points
+
+    def towards_eye(self, places: Doubles) -> Doubles:
+        """See :class:`Camera`."""
+        return np.broadcast_to(-self.from_eye, places.shape)
+
+    def relative_depth(self, nearness: Doubles) -> Doubles:
+        """See :class:`Camera`."""
+        return -nearness / self.height_m
 
 
 def view_axes(forward: Doubles) -> Doubles:
@@ -75,3 +122,17 @@ def view_axes(forward: Doubles) -> Doubles:
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(forward, right), forward])
+
+
+class _Pixels(NamedTuple):
+    """Middles of pixels, from that of the picture, in halves of its height."""
+
+    columns: Doubles  # [1, W, 1]
+    rows: Doubles  # [H, 1, 1]
+
+
+def _pixels(shape: tuple[int, ...]) -> _Pixels:
+    height, width = shape
+    columns = (np.arange(width) - 0.5 * (width - 1)) / np.float64(0.5 * height)
+    rows = (np.arange(height) - 0.5 * (height - 1)) / np.float64(0.5 * height)
+    return _Pixels(columns[None, :, None], rows[:, None, None])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex
+from matplotlib.colors import LinearSegmentedColormap, to_hex
 from triquad_format.mapfile.manifest import Manifest
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
@@ -17,6 +17,7 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import owned_evidence
+from triquad_map.height_scale import HEIGHT_STOPS, HeightScale
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import centimetres
@@ -28,12 +29,10 @@ from triquad_tools.plots.plan import (
     Scale,
     Window,
     draw_layers,
-    draw_nothing,
     draw_values,
     save_sheet,
 )
 
-_LEAST_RANGE_M = 0.1  # of heights
 _NEVER = -1
 _MOST_COLOURS = 6
 _PLAN_PLANE = 0  # XY
@@ -44,17 +43,20 @@ _LEAST_RANGE_CM = 2.0  # of errors
 def draw_map(title: str, file: MapFile, path: Path) -> None:
     """Draw plans of a map's coverage, of its latest changes and of its errors.
 
+    Where all of it changed in one epoch, or it has no training samples, there is no such plan.
+
     Raises:
         OSError: ``path`` cannot be written.
     """
     record = file.record
     surface, seen = seen_columns(record, surface_only=True), seen_columns(record)
     grid = PlanGrid.around(seen.middles, record.settings.leaf_m)
-    plans = [
-        Plan("Coverage", partial(_draw_coverage, grid, surface, seen)),
-        _ages_plan(grid, file.manifest, seen),
-        _errors_plan(grid, record),
-    ]
+    plans = [Plan("Coverage", partial(_draw_coverage, grid, surface, seen))]
+    if len({entry.epoch for entry in file.manifest.entries}) > 1:
+        plans.append(_ages_plan(grid, file.manifest, seen))
+    errors = sample_errors(record)
+    if len(errors.points):
+        plans.append(_errors_plan(grid, errors, record.settings))
     save_sheet(path, title, grid, plans=plans)
 
 
@@ -84,9 +86,9 @@ def seen_columns(record: MapRecord, surface_only: bool = False) -> Columns:
 
 def _draw_coverage(grid: PlanGrid, surface: Columns, seen: Columns, axes: Axes) -> None:
     draw_layers(axes, [Layer("only free space was seen", FREE, grid.marked(seen.middles))])
-    low, high = np.quantile(surface.tops, [0.01, 0.99]) if len(surface.tops) else (0.0, 0.0)
-    label = "height of the topmost surface in m"
-    scale = Scale(label, "viridis", low=float(low), high=float(max(high, low + _LEAST_RANGE_M)))
+    heights = HeightScale.around(surface.tops)
+    colours = LinearSegmentedColormap.from_list("height", HEIGHT_STOPS.tolist())
+    scale = Scale("height of the topmost surface in m", colours, heights.low_m, heights.high_m)
     draw_values(axes, grid.statistic(surface.middles, surface.tops, "max"), scale)
 
 
@@ -159,18 +161,14 @@ def sample_errors(record: MapRecord) -> SampleErrors:
     return SampleErrors(asked, np.abs(answer.sdf - np.concatenate(labels)[::every]))
 
 
-def _errors_plan(grid: PlanGrid, record: MapRecord) -> Plan:
+def _errors_plan(grid: PlanGrid, found: SampleErrors, settings: FieldSettings) -> Plan:
     """A plan of the mean error in each column."""
-    heading = "Error at the training samples"
-    found = sample_errors(record)
-    if not len(found.points):
-        return Plan(heading, lambda axes: draw_nothing(axes, "no samples in this file"))
     cells = grid.statistic(found.points, 100 * found.errors_m, "mean")
     high = max(float(np.ceil(np.nanquantile(cells, 0.99))), _LEAST_RANGE_CM)
     scale = Scale("mean |signed distance - label| in cm", "plasma_r", low=0.0, high=high)
     mean, p95 = found.errors_m.mean(), np.quantile(found.errors_m, 0.95)
     note = (
         f"mean {centimetres(mean)}, 95 % {centimetres(p95)} at {len(found.points):,} samples "
-        f"within {100 * record.settings.leaf_m / 2:g} cm of the surface"
+        f"within {100 * settings.leaf_m / 2:g} cm of the surface"
     )
-    return Plan(heading, lambda axes: draw_values(axes, cells, scale), note)
+    return Plan("Error at the training samples", lambda axes: draw_values(axes, cells, scale), note)

@@ -140,15 +140,28 @@ def save_sheet(path: Path, title: str, grid: PlanGrid, plans: Sequence[Plan]) ->
     with rc_context({"font.size": _LETTERS_PT}):
         figure = Figure((width, height), _DPI, layout="constrained")
         figure.suptitle(title, x=0.01, ha="left")
+        drawn = []
         for plan, part in zip(plans, figure.subfigures(*shape, squeeze=False).flat, strict=True):
-            axes = part.subplots()
+            drawn.append(axes := part.subplots())
             axes.set_title(plan.heading, loc="left")
             axes.set_facecolor(UNKNOWN)
             axes.set(xlabel=f"x in m\n{plan.note}".rstrip(), ylabel="y in m", aspect="equal")
             axes.set_xlim(grid.low_m[0], grid.high_m[0])
             axes.set_ylim(grid.low_m[1], grid.high_m[1])
             plan.draw(axes)
+        _align(figure, drawn)
         figure.savefig(path)
+
+
+def _align(figure: Figure, drawn: Sequence[Axes]) -> None:
+    """Give all plans the same place and size within their parts: then they can be compared."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    boxes = [axes.get_position() for axes in drawn]
+    width, height = (min(getattr(box, side) for box in boxes) for side in ("width", "height"))
+    left, low, top = max(b.x0 for b in boxes), max(b.y0 for b in boxes), min(b.y1 for b in boxes)
+    for axes in drawn:
+        axes.set_position((left, low, width * (top - low) / height, top - low))
 
 
 def draw_values(axes: Axes, values: Values, scale: Scale) -> None:
@@ -175,9 +188,3 @@ def draw_layers(axes: Axes, layers: Sequence[Layer]) -> None:
 def _draw_cells(axes: Axes, values: Values, **colours: Any) -> AxesImage:
     extent = (*axes.get_xlim(), *axes.get_ylim())
     return axes.imshow(values, origin="lower", extent=extent, interpolation="none", **colours)
-
-
-def draw_nothing(axes: Axes, reason: str) -> None:
-    """Say why a plan shows nothing."""
-    axes.set_facecolor("none")
-    axes.text(0.5, 0.5, reason, ha="center", va="center", transform=axes.transAxes)

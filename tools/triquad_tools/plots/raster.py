@@ -75,6 +75,6 @@ def vertex_normals(vertices: Doubles, faces: Ints) -> Doubles:
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     shares = [np.bincount(faces.ravel(), part, len(vertices)) for part in across.repeat(3, 0).T]
-    normals: Doubles = np.stack(shares, axis=1)
+    normals: Doubles = np.stack(shares, axis=1).astype(np.float64)  # integers of no face
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     return normals

@@ -1,7 +1,10 @@
 """Pictures of meshes: shaded in software, with a sun, its shadows and a soft sky.
 
+All light is white, so that shading makes a colour darker, but never another one: a legend holds.
 Own code, as the libraries that do this want a display, a GPU driver or hundreds of megabytes.
 """
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,25 +16,17 @@ from triquad_tools.plots.raster import Raster, rasterise, vertex_normals
 
 _SUPERSAMPLING = 2
 _SHADOW_PIXELS = 3072
-_TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
+_SUN_BESIDE_DEG, _SUN_UP_DEG = 45.0, 40.0  # over the left shoulder, as maps are lit
 
-# Colours are linear light in [0, 1].
-_SUN = np.array([1.0, 0.93, 0.80]) * 1.08
-_SKY_LIGHT = np.array([0.55, 0.68, 0.90]) * 0.50
-_GROUND_LIGHT = np.array([0.50, 0.44, 0.38]) * 0.22
-_SKY_TOP = np.array([0.52, 0.67, 0.85])
-_SKY_LOW = np.array([0.90, 0.93, 0.96])
+# Linear light: level ground in the sun has its own colour.
+_SUN = 0.85
+_SKY_LIGHT = 0.45
+_GROUND_LIGHT = 0.20
 _BACK = 0.45  # brightness of faces seen from inside
+_GAMMA = 2.2  # of sRGB, near enough
 
-_HEIGHT_STOPS = np.array(
-    [
-        [0.13, 0.30, 0.45],
-        [0.18, 0.52, 0.50],
-        [0.62, 0.72, 0.42],
-        [0.90, 0.65, 0.32],
-        [0.78, 0.32, 0.25],
-    ]
-)
+BACKGROUND: Doubles = np.array([0.93, 0.94, 0.95])
+"""sRGB of where nothing is."""
 
 
 def render_mesh(
@@ -41,6 +36,7 @@ def render_mesh(
     camera: Camera,
     width: int = 1600,
     height: int = 900,
+    plain: int = 0,
 ) -> Bytes:
     """A picture ``[height, width, 3]`` of a mesh.
 
@@ -48,51 +44,54 @@ def render_mesh(
         vertices: ``[V, 3]`` metres, map frame.
         faces: ``[F, 3]`` rows of vertices, counter-clockwise seen from outside; those seen from
             inside are drawn darker.
-        colours: ``[V, 3]`` of the vertices, linear in [0, 1].
+        colours: ``[V, 3]`` of the vertices, sRGB in [0, 1].
         camera: where it is taken from.
         width: pixels.
         height: pixels.
+        plain: so many of the last faces have their colours from all sides, without any light.
     """
     wide, high = width * _SUPERSAMPLING, height * _SUPERSAMPLING
-    picture = _sky(wide, high)
+    picture = np.tile(_linear(BACKGROUND), (high, wide, 1))
     if len(faces):
         points = np.ascontiguousarray(vertices, np.float64)
         rows = np.ascontiguousarray(faces, np.int32)
         raster = rasterise(camera.project(points, wide, high), rows, width=wide, height=high)
-        light = _shade(points, rows, camera, raster=raster, colours=colours)
         covered = raster.faces >= 0
-        picture[covered] = light * _contact_shadow(raster)[covered, None]
+        light = _shade(points, rows, camera, raster=raster, plain=plain)[:, None]
+        owners, weights = rows[raster.faces[covered]], raster.weights[covered]
+        light = light * _blend(_linear(colours), owners, weights)
+        picture[covered] = light * _contact_shadow(raster, camera)[covered, None]
     fine = picture.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3)
     return _encode(fine.mean(axis=(1, 3)))
 
 
-def height_colours(vertices: NDArray[np.floating]) -> Doubles:
-    """Colours ``[V, 3]`` of vertices by their height, blue below to red above."""
-    if not len(vertices):
-        return np.zeros((0, 3))
-    low, high = np.quantile(vertices[:, 2], [0.01, 0.99])
-    place = (vertices[:, 2] - low) / max(float(high - low), 1e-6)
-    stops = np.linspace(0.0, 1.0, len(_HEIGHT_STOPS))
-    return np.stack([np.interp(place, stops, channel) for channel in _HEIGHT_STOPS.T], axis=1)
-
-
-def _shade(
-    points: Doubles, faces: Ints, camera: Camera, raster: Raster, colours: NDArray[np.floating]
-) -> Doubles:
-    """Light ``[P, 3]`` that the covered pixels send, in the order of the picture's rows."""
+def _shade(points: Doubles, faces: Ints, camera: Camera, raster: Raster, plain: int) -> Doubles:
+    """Light ``[P]`` that falls on the covered pixels, in the order of the picture's rows."""
+    shaded = len(faces) - plain
     covered = raster.faces >= 0
     owners, weights = faces[raster.faces[covered]], raster.weights[covered]
     places = camera.unproject(np.where(covered, raster.nearness, 1.0))[covered]
-    normals = _blend(vertex_normals(points, faces), owners, weights)
+    normals = _blend(vertex_normals(points, faces[:shaded]), owners, weights)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    inside = _seen_from_inside(points[owners], camera.eye)
+    inside = ~facing(points[owners], camera)
     normals[inside] *= -1.0
-    sun = np.maximum(normals @ _TOWARDS_SUN, 0.0) * _sunlit(points, faces, places, normals)
-    up = (0.5 + 0.5 * normals[:, 2])[:, None]
-    light: Doubles = sun[:, None] * _SUN + up * _SKY_LIGHT + (1.0 - up) * _GROUND_LIGHT
-    light *= _blend(colours, owners, weights)
+    towards_sun = _towards_sun(camera)
+    lit = _sunlit(points, faces[:shaded], places, normals=normals, towards_sun=towards_sun)
+    up = 0.5 + 0.5 * normals[:, 2]
+    light = np.maximum(normals @ towards_sun, 0.0) * lit * _SUN
+    light += up * _SKY_LIGHT + (1.0 - up) * _GROUND_LIGHT
     light[inside] *= _BACK
-    return light
+    light[raster.faces[covered] >= shaded] = 1.0
+    return np.asarray(light)
+
+
+def _towards_sun(camera: Camera) -> Doubles:
+    """The direction ``[3]`` of the sun: behind the camera, and to its left."""
+    right = camera.axes[0]
+    beside, up = math.radians(_SUN_BESIDE_DEG), math.radians(_SUN_UP_DEG)
+    back = np.array([right[1], -right[0], 0.0])
+    level = math.cos(beside) * back - math.sin(beside) * right
+    return np.asarray(math.cos(up) * level + [0.0, 0.0, math.sin(up)])
 
 
 def _blend(values: NDArray[np.floating], owners: Ints, weights: Floats) -> Doubles:
@@ -103,16 +102,19 @@ def _blend(values: NDArray[np.floating], owners: Ints, weights: Floats) -> Doubl
     return blended
 
 
-def _seen_from_inside(corners: Doubles, eye: Doubles) -> Bools:
-    """Whether faces with corners ``[P, 3, 3]`` turn their back to the eye."""
+def facing(corners: NDArray[np.floating], camera: Camera) -> Bools:
+    """Whether faces with corners ``[F, 3, 3]`` show the camera their outer side."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    away: Bools = np.einsum("pi,pi->p", normals, corners[:, 0] - eye) > 0.0
-    return away
+    towards = camera.towards_eye(corners[:, 0].astype(np.float64))
+    shown: Bools = (normals * towards).sum(axis=1) > 0.0
+    return shown
 
 
-def _sunlit(points: Doubles, faces: Ints, places: Doubles, normals: Doubles) -> Doubles:
+def _sunlit(
+    points: Doubles, faces: Ints, places: Doubles, normals: Doubles, towards_sun: Doubles
+) -> Doubles:
     """Share of the sun ``[P]`` that reaches places ``[P, 3]``: a shadow map, softened."""
-    axes = view_axes(-_TOWARDS_SUN)
+    axes = view_axes(-towards_sun)
     seen = points @ axes.T
     low = seen[:, :2].min(axis=0)
     metres = max(float((seen[:, :2].max(axis=0) - low).max()) / (_SHADOW_PIXELS - 2), 1e-9)
@@ -135,27 +137,28 @@ def _sunlit(points: Doubles, faces: Ints, places: Doubles, normals: Doubles) -> 
     return lit
 
 
-def _contact_shadow(raster: Raster) -> Floats:
+def _contact_shadow(raster: Raster, camera: Camera) -> Doubles:
     """Brightness ``[H, W]``: darker where a pixel lies behind what surrounds it."""
     step = _SUPERSAMPLING  # soft: the finer pixels would show no more
-    nearness = raster.nearness[::step, ::step].astype(np.float32)
+    nearness = raster.nearness[::step, ::step]
     covered = np.isfinite(nearness)
-    depth = np.where(covered, 1.0 / np.where(covered, nearness, 1.0), 0.0)
+    depth = camera.relative_depth(np.where(covered, nearness, 1.0))
     brightness = np.ones_like(depth)
     for sigma in (0.004 * len(depth), 0.016 * len(depth)):
         share = np.maximum(gaussian_filter(covered.astype(np.float32), sigma), 1e-6)
-        around = gaussian_filter(depth, sigma) / share
-        behind = np.maximum(depth - around, 0.0) / np.maximum(depth, 1e-6)
-        brightness -= 0.3 * np.minimum(behind * 60.0, 1.0)
+        around = gaussian_filter(depth * covered, sigma) / share
+        behind = np.maximum(depth - around, 0.0)
+        brightness -= 0.3 * np.minimum(behind * 38.0, 1.0)
     return brightness.repeat(step, axis=0).repeat(step, axis=1)
 
 
-def _sky(width: int, height: int) -> Doubles:
-    down = np.linspace(0.0, 1.0, height)[:, None, None]
-    return np.repeat(_SKY_TOP + (_SKY_LOW - _SKY_TOP) * down, width, axis=1)
+def _linear(colours: NDArray[np.floating]) -> Doubles:
+    """Linear light of sRGB colours."""
+    light: Doubles = np.asarray(colours, np.float64) ** _GAMMA
+    return light
 
 
 def _encode(light: Doubles) -> Bytes:
-    """Linear light as 8-bit sRGB, near enough."""
-    levels = np.round(255.0 * np.clip(light, 0.0, 1.0) ** (1.0 / 2.2))
+    """Linear light as 8-bit sRGB."""
+    levels = np.round(255.0 * np.clip(light, 0.0, 1.0) ** (1.0 / _GAMMA))
     return np.asarray(levels, np.uint8)

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from triquad_client import Grid, Status
+from triquad_client import Grid, OfflineMap, Status
 from triquad_format.records.seen_space import evidence_bounds
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.evaluation.open_map import is_endpoint, open_map
-from triquad_tools.mapfiles.source import read_whole
+from triquad_tools.evaluation.open_map import open_map
+from triquad_tools.mapfiles.source import is_endpoint, read_whole
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
@@ -27,7 +27,9 @@ from triquad_tools.plots.plan import (
 
 _MAX_DISTANCE_M = 3.0
 SURFACE = "#a3341f"
-_BEHIND = "#d55e00"
+BEHIND = "#d55e00"
+DISTANCE_COLOURS = colormaps["viridis"].with_extremes(under=BEHIND)
+"""Of distances from 0 up; those behind a surface stand out."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +55,15 @@ def draw_slice(target: str, map_name: str, options: SliceOptions, path: Path) ->
     bounds = ((west, south, height), (east, north, height))
     with open_map(target, map_name) as opened:
         answer = opened.query_grid(bounds, options.cell_m, _MAX_DISTANCE_M)
+        name = opened.name if isinstance(opened, OfflineMap) else map_name
     shape = answer.shape
     grid = PlanGrid(shape.corner[:2], shape.cell_m, rows=shape.counts[1], columns=shape.counts[0])
     plans = [
         Plan("Distance", partial(_draw_distance, answer)),
         Plan("Status", partial(_draw_status, answer)),
     ]
-    save_sheet(path, f"{target} at z = {height:g} m, epoch {answer.epoch}", grid, plans=plans)
+    title = f"{target}: map {name!r}, epoch {answer.epoch}, at z = {height:g} m"
+    save_sheet(path, title, grid, plans=plans)
 
 
 def _seen_box(target: str) -> list[float]:
@@ -74,13 +78,12 @@ def _seen_box(target: str) -> list[float]:
 
 def _draw_distance(answer: Grid, axes: Axes) -> None:
     """Where nothing was seen, no distance either: there it only says how far the last wall is."""
-    colours = colormaps["viridis"].with_extremes(under=_BEHIND)
     label = (
         f"m to the nearest surface, {_MAX_DISTANCE_M:g} or more\norange: behind it; grey: not seen"
     )
     seen = answer.status != Status.UNKNOWN
     distance_m = np.where(seen, answer.distance_m.astype(np.float64), np.nan)
-    draw_values(axes, distance_m[:, :, 0].T, Scale(label, colours, low=0.0, high=_MAX_DISTANCE_M))
+    draw_values(axes, distance_m[:, :, 0].T, Scale(label, DISTANCE_COLOURS, 0.0, _MAX_DISTANCE_M))
 
 
 def _draw_status(answer: Grid, axes: Axes) -> None:

@@ -11,6 +11,11 @@ from triquad_map.height_scale import HEIGHT_STOPS
 
 _TICKS = 5
 
+Stops = tuple[tuple[float, float, float], ...]
+"""Colours, sRGB in [0, 1], evenly spaced from the lower to the upper end of a scale."""
+
+_HEIGHTS: Stops = tuple((red, green, blue) for red, green, blue in HEIGHT_STOPS.tolist())
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -22,6 +27,7 @@ class Scale:
     open_below: bool = False  # there may be values below
     open_above: bool = False
     ticks: Sequence[str] = ()  # at equal steps; empty: the values
+    stops: Stops = _HEIGHTS
 
     @property
     def tick_texts(self) -> list[str]:
@@ -36,14 +42,14 @@ class Scale:
 def scale_colours(scale: Scale, values: NDArray[np.floating]) -> Doubles:
     """Linear colours [N, 3] of values [N]."""
     places = (np.asarray(values, np.float64) - scale.low) / (scale.high - scale.low)
-    stops = np.linspace(0.0, 1.0, len(HEIGHT_STOPS))
-    encoded = [np.interp(places, stops, channel) for channel in HEIGHT_STOPS.T]
+    stops = np.linspace(0.0, 1.0, len(scale.stops))
+    encoded = [np.interp(places, stops, channel) for channel in np.transpose(scale.stops)]
     return np.stack(encoded, axis=1) ** 2.2
 
 
 def legend_html(scale: Scale) -> str:
     """The scale for the panel."""
-    stops = ", ".join(to_hex(stop) for stop in HEIGHT_STOPS)
+    stops = ", ".join(to_hex(stop) for stop in scale.stops)
     ticks = "".join(f"<span>{text}</span>" for text in scale.tick_texts)
     return (
         '<div style="padding: 0.2em 1em; font-size: 0.8em">'

@@ -15,19 +15,25 @@ _HEADER = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<I4s")
 
 
-def unlit_glb(vertices: NDArray[np.float32], faces: NDArray[np.int32], colours: Doubles) -> bytes:
+def unlit_glb(
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    colours: Doubles,
+    opacity: float = 1.0,
+) -> bytes:
     """A GLB file.
 
     Args:
         vertices: [V, 3], at least one.
         faces: [F, 3] rows of vertices.
         colours: [V, 3] of the vertices, linear in [0, 1].
+        opacity: below 1, what is behind shines through, and faces are seen from both sides.
     """
-    opaque = np.ones((len(vertices), 4))
-    opaque[:, :3] = np.clip(colours, 0.0, 1.0)
+    shades = np.full((len(vertices), 4), opacity)
+    shades[:, :3] = np.clip(colours, 0.0, 1.0)
     arrays = (
         np.ascontiguousarray(vertices, "<f4").tobytes(),
-        np.round(opaque * 65535.0).astype("<u2").tobytes(),
+        np.round(shades * 65535.0).astype("<u2").tobytes(),
         np.ascontiguousarray(faces, "<u4").tobytes(),
     )
     starts = [0, len(arrays[0]), len(arrays[0]) + len(arrays[1])]
@@ -37,7 +43,13 @@ def unlit_glb(vertices: NDArray[np.float32], faces: NDArray[np.int32], colours: 
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "extensionsUsed": ["KHR_materials_unlit"],
-        "materials": [{"extensions": {"KHR_materials_unlit": {}}}],
+        "materials": [
+            {
+                "extensions": {"KHR_materials_unlit": {}},
+                "alphaMode": "OPAQUE" if opacity == 1.0 else "BLEND",
+                "doubleSided": opacity != 1.0,
+            }
+        ],
         "meshes": [
             {
                 "primitives": [

@@ -7,6 +7,9 @@ from typing import Protocol
 import viser
 from triquad_format.errors import TriquadError
 
+from triquad_tools.viewer.asking.click_layer import ClickLayer
+from triquad_tools.viewer.asking.slice_layer import SliceLayer
+from triquad_tools.viewer.asking.unknown_layer import UnknownLayer
 from triquad_tools.viewer.changes_panel import ChangesPanel
 from triquad_tools.viewer.history import History
 from triquad_tools.viewer.history_source import HistorySource, newest_of
@@ -29,7 +32,13 @@ class Layer(Protocol):
         """Draw no more; what was drawn and the folder go."""
 
 
-_LAYERS: tuple[Callable[[Stage], Layer], ...] = (MeshLayer, ScreenshotLayer)
+_LAYERS: tuple[Callable[[Stage], Layer], ...] = (
+    MeshLayer,
+    SliceLayer,
+    UnknownLayer,
+    ClickLayer,
+    ScreenshotLayer,
+)
 _HISTORY_LAYERS: tuple[Callable[[HistorySource, Stage], Layer], ...] = (TimePanel, ChangesPanel)
 _LIVE_LAYERS: tuple[Callable[[LiveSource, Stage], Layer], ...] = (StatusLayer, TrailLayer)
 

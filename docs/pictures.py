@@ -1,0 +1,125 @@
+"""Makes the pictures of the documentation anew: ``make pictures``, or one by its name.
+
+Each is what a command draws, made narrower and of few colours, as it is shown beside text. Maps
+come from ``demo-out``, which ``make demo`` leaves and which is made where it is missing.
+"""
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+from triquad_server import serve
+from triquad_tools.simulation.lidar import SimulatedDrive
+from triquad_tools.simulation.solids import Solid, box
+from triquad_tools.simulation.street import street_drive
+
+IMAGES = Path(__file__).with_name("images")
+ROOT = IMAGES.parents[1]
+
+_WIDTH, _COLOURS = 1200, 256
+_DEMO, _STREET, _SCANS = "demo-out", 1, 25
+_AROUND_M = ((-1.0, -8.0, -1.0), (24.0, 8.0, 4.0))
+_BOX_HALF_M = (0.6, 0.5, 0.9)
+_MONDAY = [(6.0, 2.0), (11.0, 1.2), (15.0, 2.5)]  # boxes on the road, x and y
+_TUESDAY = [(7.5, 2.0), (15.0, 2.5), (19.0, 1.0)]  # one moved, one gone, one more
+
+
+def street(out: Path) -> None:
+    """The README's: what the demonstration draws."""
+    out.write_bytes((ROOT / _DEMO / "street.png").read_bytes())
+
+
+def map_from_above(out: Path) -> None:
+    """A picture of a map."""
+    _run("triquad-pack", f"{_DEMO}/map.triquad", out, "--force")
+
+
+def plan(out: Path) -> None:
+    """Plans of a map."""
+    _run("triquad-inspect", f"{_DEMO}/store", "--plot", out)
+
+
+def height_slice(out: Path) -> None:
+    """Distance and status at one height."""
+    area = ("--box", 0, -12, 40, 12)
+    _run("triquad-inspect", f"{_DEMO}/map.triquad", "--slice", 1, *area, "--plot", out)
+
+
+def errors(out: Path) -> None:
+    """The errors of a map of an exact street."""
+    _run("triquad-eval", "map", f"{_DEMO}/map.triquad", "--street", _STREET, "--plot", out)
+
+
+def difference(out: Path) -> None:
+    """What changed between two drives down a street with boxes on it."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = {"monday.triquad": _MONDAY, "tuesday.triquad": _TUESDAY}
+        for name, places in files.items():
+            boxes = [box((x, y, _BOX_HALF_M[2]), _BOX_HALF_M) for x, y in places]
+            _map_of(_with_boxes(boxes), Path(folder) / name)
+        _run("triquad-inspect", *files, "--diff", "--plot", out, folder=Path(folder))
+
+
+PICTURES: dict[str, Callable[[Path], None]] = {
+    "street.png": street,
+    "map.png": map_from_above,
+    "plan.png": plan,
+    "slice.png": height_slice,
+    "errors.png": errors,
+    "difference.png": difference,
+}
+"""What makes each: it is given the path to write to."""
+
+
+def _with_boxes(boxes: list[Solid]) -> SimulatedDrive:
+    made = street_drive(_STREET, _SCANS)
+    return replace(made, scene=replace(made.scene, solids=(*made.scene.solids, *boxes)))
+
+
+def _map_of(drive: SimulatedDrive, path: Path) -> None:
+    with serve(map="street") as server, server.client() as client:
+        for scan in drive:
+            client.publish_scan(scan.points, scan.world_from_sensor)
+            client.flush()
+        client.settle()
+        client.download_box(path, _AROUND_M)
+
+
+def _run(command: str, *arguments: object, folder: Path = ROOT) -> None:
+    """Run a command of this environment, which says itself what went wrong."""
+    program = Path(sys.executable).with_name(command)
+    subprocess.run([program, *map(str, arguments)], cwd=folder, check=True, stdout=sys.stderr)
+
+
+def _for_pages(picture: Image.Image) -> Image.Image:
+    """The picture no wider than a page, and of few colours: a small file."""
+    shown = picture.convert("RGB")
+    if shown.width > _WIDTH:
+        height = round(shown.height * _WIDTH / shown.width)
+        shown = shown.resize((_WIDTH, height), Image.Resampling.LANCZOS)
+    # So that also rare colours, as those of legends, remain what they are.
+    coverage = Image.Quantize.MAXCOVERAGE
+    return shown.quantize(_COLOURS, coverage, kmeans=4, dither=Image.Dither.NONE)
+
+
+def main(names: list[str]) -> None:
+    """Make the pictures of these names, or all of them."""
+    unknown = sorted(set(names) - set(PICTURES))
+    if unknown:
+        sys.exit(f"no picture is called {', '.join(unknown)}; there are {', '.join(PICTURES)}")
+    if not (ROOT / _DEMO / "map.triquad").is_file():
+        _run("triquad-demo", "--out", _DEMO)
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names or PICTURES:
+            made = Path(folder) / name
+            PICTURES[name](made)
+            with Image.open(made) as picture:
+                _for_pages(picture).save(IMAGES / name, optimize=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,50 @@
+"""Scores as lines of tables."""
+
+from triquad_tools.console.report import Row, centimetres, percent
+from triquad_tools.evaluation.map_scores import StreetScores, WithheldScores
+from triquad_tools.evaluation.metrics import MeshScores
+
+TRUSTED = "SURFACE points"
+"""Of which points some figures are: those that a user would trust."""
+
+
+def mesh_rows(scores: MeshScores) -> list[Row]:
+    """The scores of a mesh as lines of a table."""
+    return [
+        Row("accuracy", centimetres(scores.accuracy_m), "mean, mesh to truth, outliers left out"),
+        Row("accuracy, median", centimetres(scores.accuracy_median_m)),
+        Row("accuracy ratio", percent(scores.accuracy_ratio), "outliers left out"),
+        Row("completion", centimetres(scores.completion_m), "mean, truth to mesh"),
+        Row("completion ratio", percent(scores.completion_ratio)),
+        Row("F-score", percent(scores.f_score), "of both ratios"),
+        Row("outliers", percent(scores.outlier_ratio), "mesh beyond the accuracy cut"),
+        Row("mesh samples", f"{scores.samples:,}"),
+        Row("reference points", f"{scores.references:,}"),
+    ]
+
+
+def street_rows(scores: StreetScores) -> list[Row]:
+    """The scores of a map of a street as lines of a table."""
+    return [
+        Row("SDF error", centimetres(scores.sdf_error_m), "mean, within 10 cm of the surface"),
+        Row("SDF error, median", centimetres(scores.sdf_error_median_m)),
+        Row("SDF error, 95 %", centimetres(scores.sdf_error_p95_m)),
+        Row("gradient angle", f"{scores.gradient_angle_deg:.1f} deg", "median"),
+        Row("of these SURFACE", percent(scores.near_surface_ratio)),
+        Row("points", f"{scores.near_points:,}"),
+        Row("houses UNKNOWN", percent(scores.houses_unknown_ratio), "deeper than 0.5 m in them"),
+        Row("points in houses", f"{scores.house_points:,}"),
+    ]
+
+
+def withheld_rows(scores: WithheldScores) -> list[Row]:
+    """The scores of a map at withheld scans as lines of a table."""
+    return [
+        Row("SURFACE", percent(scores.surface_ratio), "of all points"),
+        Row("UNKNOWN", percent(scores.unknown_ratio), "of all points"),
+        Row("|SDF|, median", centimetres(scores.sdf_median_m), "all points"),
+        Row("|SDF|, 90 %", centimetres(scores.sdf_p90_m), "all points"),
+        Row("|SDF|, median", centimetres(scores.surface_sdf_median_m), TRUSTED),
+        Row("|SDF|, 90 %", centimetres(scores.surface_sdf_p90_m), TRUSTED),
+        Row("points", f"{scores.points:,}"),
+    ]
