@@ -59,7 +59,7 @@ def test_what_changed_is_drawn_and_listed(
     page = page_without_server(tmp_path)
     wait_until_drawn(page)
     page.get_by_role("checkbox", name="Show changes").check()
-    expect(page.get_by_text("vanished (V): free space now")).to_be_visible()
+    expect(page.get_by_text("vanished (V): free space in epoch 3")).to_be_visible()
     expect(page.get_by_text("1 vanished")).to_be_visible()
     wait_until(page, lambda: _pixels(page, VERMILION) > 50, "the box is outlined")
     assert _pixels(page, SKY_BLUE) < 20
