@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import triquad_client
 from numpy.typing import NDArray
 from PIL import Image, ImageColor
@@ -94,6 +95,28 @@ def test_the_mesh_of_a_file_is_like_that_of_its_server(endpoint: str, tmp_path: 
     assert len(mesh.faces) == pytest.approx(len(served.faces), rel=0.01)
     distances = cKDTree(served.vertices).query(mesh.vertices)[0]
     assert np.quantile(distances, 0.99) < 0.005
+
+
+def test_the_preview_of_a_file_is_read_without_triquad(endpoint: str, tmp_path: Path) -> None:
+    file, saved = tmp_path / "map.triquad", tmp_path / "preview.glb"
+    with triquad_client.connect(endpoint, "demo") as client:
+        client.download_map(file)
+        served = client.mesh()
+    program = EXAMPLES / "map_file_as_mcap.py"
+    done = subprocess.run(
+        [sys.executable, program, file, saved], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert "triquad" not in program.read_text().partition("import")[2]
+    assert re.search(r"^ +1 /preview/mesh +foxglove.SceneUpdate$", done.stdout, re.M)
+    preview = trimesh.load(saved, force="mesh")
+    assert f"{len(preview.faces):,} faces" in done.stdout
+    x, height, z = preview.vertices.T  # glTF has y up
+    off_m = cKDTree(served.vertices).query(np.stack([x, -z, height], axis=1))[0]
+    assert np.quantile(off_m, 0.95) < 0.3
+    lowest, highest = (preview.visual.vertex_colors[height.argsort()[end]] for end in (0, -1))
+    assert lowest[2] > lowest[0]  # blue below,
+    assert highest[0] > highest[2]  # yellow above
 
 
 def test_the_planned_path_is_free(run: Run) -> None:

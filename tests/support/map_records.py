@@ -100,13 +100,27 @@ def _mlp(rng: np.random.RandomState, settings: FieldSettings) -> Mlp:
 
 
 def _evidence(rng: np.random.RandomState, leaves: NDArray[np.int64]) -> Evidence:
-    codes = np.unique(morton.encode(leaves // BLOCK_VOXELS))
-    surface = np.zeros((len(codes), BLOCK_BYTES), np.uint8)
-    rows = np.searchsorted(codes, morton.encode(leaves // BLOCK_VOXELS))
-    x, y, z = (leaves % BLOCK_VOXELS).T
-    np.bitwise_or.at(surface, (rows, x * BLOCK_VOXELS + y), (1 << z).astype(np.uint8))
+    codes, surface = _surface(leaves)
     free = rng.randint(0, 256, surface.shape, np.int64).astype(np.uint8)
     return Evidence(codes, surface, free)
+
+
+def surface_evidence(points: NDArray[np.float64], settings: FieldSettings) -> Evidence:
+    """Evidence of surface at points [N, 3], metres from a region's centre."""
+    leaves = np.floor(points / settings.leaf_m).astype(np.int64) + (1 << (settings.depth - 1))
+    codes, surface = _surface(leaves)
+    return Evidence(codes, surface, np.zeros_like(surface))
+
+
+def _surface(leaves: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Codes [B] and masks [B, BLOCK_BYTES] of the blocks with leaves [N, 3]."""
+    blocks = morton.encode(leaves // BLOCK_VOXELS)
+    codes = np.unique(blocks)
+    surface = np.zeros((len(codes), BLOCK_BYTES), np.uint8)
+    x, y, z = (leaves % BLOCK_VOXELS).T
+    rows = np.searchsorted(codes, blocks)
+    np.bitwise_or.at(surface, (rows, x * BLOCK_VOXELS + y), (1 << z).astype(np.uint8))
+    return codes, surface
 
 
 def _training(

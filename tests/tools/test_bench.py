@@ -1,9 +1,37 @@
+import dataclasses
+import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
-from triquad_tools.benchmarks.figures import Figure, compare, markdown
+from matplotlib.image import imread
+from scipy.ndimage import binary_opening, label
+from triquad_tools.benchmarks.figures import CurvePoint, Figure, compare, markdown
+from triquad_tools.benchmarks.tradeoff_sheet import (
+    ACCURACY,
+    BYTES,
+    F_SCORE,
+    SPACING,
+    TIME,
+    saved_tradeoffs,
+)
 from triquad_tools.commands import bench
+from triquad_tools.console.command import ToolError
+
+CURVES = {TIME: (5.0, 50.0), BYTES: (2e6, 4e6), SPACING: (1.0, 10.0)}
+
+
+def saved_figures(path: Path, street: int = 1) -> Path:
+    """What a run leaves, with a figure that is on no curve."""
+    figures = [Figure("publish an epoch", 1.4, "ms")]
+    for curve, costs in CURVES.items():
+        for cost in costs:
+            figures.append(Figure("F", 99.0, "%", point=CurvePoint(curve, F_SCORE, cost)))
+            figures.append(Figure("error", 0.9, "cm", point=CurvePoint(curve, ACCURACY, cost)))
+    shown = [dataclasses.asdict(figure) for figure in figures]
+    path.write_text(json.dumps({"title": "today", "street": street, "figures": shown}))
+    return path
 
 
 def test_a_figure_keeps_to_its_bounds_or_not() -> None:
@@ -36,8 +64,8 @@ def test_both_ways_are_timed_in_turns() -> None:
 def test_files_that_cannot_be_written_are_refused_before_anything_is_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for option in ("--json", "--record"):
-        missing = tmp_path / "nowhere" / "figures"
+    for option in ("--json", "--record", "--plot"):
+        missing = tmp_path / "nowhere" / "figures.png"
         assert bench.main([option, str(missing)]) == bench.BAD_INPUT
         assert str(missing) in capsys.readouterr().err
 
@@ -46,3 +74,81 @@ def test_unknown_parts_are_refused() -> None:
     with pytest.raises(SystemExit) as refusal:
         bench.main(["everything"])
     assert refusal.value.code == bench.BAD_INPUT
+
+
+def test_the_picture_of_a_saved_run_needs_no_second_one(tmp_path: Path) -> None:
+    pictures = []
+    for street in (1, 2):
+        saved, picture = saved_figures(tmp_path / "figures.json", street), tmp_path / "out.png"
+        assert bench.main(["--plot", str(picture), "--from", str(saved)]) == bench.OK
+        pictures.append(imread(picture)[..., :3])
+    # Okabe and Ito's blue and vermilion: the neighbour was measured on street 1 alone.
+    for colour, seen in ((np.array([0, 114, 178]), [True, True]), ((213, 94, 0), [True, False])):
+        near = [np.abs(255 * one - colour).max(axis=2) < 3 for one in pictures]
+        assert [bool(pixels.sum() > 100) for pixels in near] == seen
+
+
+def test_every_point_is_within_its_panel(tmp_path: Path) -> None:
+    """Whatever the order of panels: the neighbour's scores differ from curve to curve."""
+    picture = tmp_path / "out.png"
+    saved = saved_figures(tmp_path / "figures.json")
+    assert bench.main(["--plot", str(picture), "--from", str(saved)]) == bench.OK
+    near = np.abs(255 * imread(picture)[..., :3] - (213, 94, 0)).max(axis=2) < 30
+    squares = label(binary_opening(near, np.ones((6, 6))))[1]
+    assert squares == 2 * (1 + 1 + 4) + 1  # in two rows, and in the legend
+
+
+def test_curves_come_back_as_they_were_saved(tmp_path: Path) -> None:
+    found = saved_tradeoffs(saved_figures(tmp_path / "figures.json", 3))
+    assert found.street == 3
+    assert {figure.point.curve for figure in found.figures if figure.point} == set(CURVES)
+    assert len(found.figures) == 12  # not the one that is on no curve
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"title": "", "street": 1, "figures": []}',
+        '{"title": "", "street": 1, "figures": [{"point": {"curve": "time"}}]}',
+        '{"title": "", "street": 1, "figures": [{"name": "", "value": 1, "unit": "", '
+        '"point": {"curve": "luck", "measure": "F-score at 10 cm", "cost": 1}}]}',
+        '{"title": "", "street": 1, "figures": [{"name": "", "value": "much", "unit": "", '
+        '"point": {"curve": "time", "measure": "F-score at 10 cm", "cost": 1}}]}',
+        '{"title": "", "street": 1, "figures": [{"name": "", "value": 1, "unit": "", '
+        '"point": {"curve": "time", "measure": "F-score at 10 cm", "cost": 0}}]}',
+    ],
+)
+def test_files_without_curves_are_refused(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "figures.json"
+    path.write_text(text)
+    with pytest.raises(ToolError, match=r"figures\.json"):
+        saved_tradeoffs(path)
+    assert bench.main(["--plot", str(tmp_path / "o.png"), "--from", str(path)]) != bench.OK
+    assert str(path) in capsys.readouterr().err
+
+
+def test_saved_figures_are_drawn_without_measuring_or_not_at_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved = str(saved_figures(tmp_path / "figures.json"))
+    picture = str(tmp_path / "out.png")
+    for arguments in (["--from", saved], ["core", "--from", saved, "--plot", picture]):
+        assert bench.main(arguments) == bench.BAD_INPUT
+        assert "--plot OUT.png" in capsys.readouterr().err
+    assert bench.main(["--from", saved, "--plot", str(tmp_path / "out.txt")]) == bench.BAD_INPUT
+    assert ".png" in capsys.readouterr().err
+
+
+def test_half_of_a_curve_is_not_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    saved, picture = saved_figures(tmp_path / "figures.json"), tmp_path / "out.png"
+    halved = json.loads(saved.read_text())
+    halved["figures"] = halved["figures"][:2]
+    saved.write_text(json.dumps(halved))
+    assert bench.main(["--plot", str(picture), "--from", str(saved)]) != bench.OK
+    assert "no curve" in capsys.readouterr().err
+    assert not picture.exists()

@@ -9,6 +9,15 @@ _FIRST_SCANS = 20
 
 
 @dataclass(frozen=True)
+class CurvePoint:
+    """Where a figure stands on a curve of figures."""
+
+    curve: str  # what is varied
+    measure: str  # what is measured
+    cost: float  # how much of what is varied
+
+
+@dataclass(frozen=True)
 class Figure:
     """One measured number; a target is a bound that it should keep to."""
 
@@ -17,6 +26,7 @@ class Figure:
     unit: str
     at_least: float | None = None
     at_most: float | None = None
+    point: CurvePoint | None = None
 
     @property
     def shown(self) -> str:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from triquad_tools.benchmarks.street import BenchStreet
 
 _COMMAND = "triquad-bench"
-_ON_STREET = (
+_USUAL_ON_STREET = (
     "core",
     "server",
     "file",
@@ -40,16 +40,21 @@ _ON_STREET = (
     "align",
     "offline",
     "metrics",
-    "viewer",
 )
-USUAL_PARTS = (*_ON_STREET, "growth", "air", "moving", "sweeps", "ros2", "presets")
-PARTS = (*USUAL_PARTS, "ablation")
+_ON_STREET = (*_USUAL_ON_STREET, "tradeoffs", "viewer")
+USUAL_PARTS = (*_USUAL_ON_STREET, "growth", "air", "moving", "sweeps", "ros2", "presets")
+PARTS = (*USUAL_PARTS, "tradeoffs", "viewer", "ablation")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, whatever the figures; 1 a part failed; 2 wrong usage."""
     options = _parser().parse_args(argv)
-    for path in (options.json, options.record):
+    if options.drawn_from is not None and (options.plot is None or options.parts):
+        message = "--from draws what is in a file: give --plot OUT.png and no parts"
+        return complain(_COMMAND, message, BAD_INPUT)
+    if options.plot is not None and options.plot.suffix.lower() != ".png":
+        return complain(_COMMAND, f"{options.plot}: its name must end in .png", BAD_INPUT)
+    for path in (options.json, options.record, options.plot):
         if path is not None and not os.access(path.parent, os.W_OK):
             message = f"{path}: cannot be written: choose another folder"
             return complain(_COMMAND, message, BAD_INPUT)
@@ -58,10 +63,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    parts = options.parts or USUAL_PARTS
+    if options.drawn_from is not None:
+        return _draw_saved(options)
+    parts = options.parts or (("tradeoffs",) if options.plot is not None else USUAL_PARTS)
+    if options.plot is not None and "tradeoffs" not in parts:
+        parts = (*parts, "tradeoffs")
     figures = _on_street([part for part in _ON_STREET if part in parts], options)
     figures += _alone([part for part in PARTS if part in parts and part not in _ON_STREET], options)
     _present(figures, options)
+    return OK
+
+
+def _draw_saved(options: argparse.Namespace) -> int:
+    from triquad_tools.benchmarks.tradeoff_sheet import draw_tradeoffs, saved_tradeoffs
+
+    draw_tradeoffs(saved_tradeoffs(options.drawn_from), options.plot)
     return OK
 
 
@@ -78,7 +94,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
     from triquad_tools.benchmarks.server import measure_server
     from triquad_tools.benchmarks.store import measure_store
     from triquad_tools.benchmarks.street import bench_street
-    from triquad_tools.benchmarks.viewer import measure_viewer
+    from triquad_tools.benchmarks.tradeoffs import measure_tradeoffs
 
     measures: dict[str, Callable[[BenchStreet], list[Figure]]] = {
         "core": measure_core,
@@ -89,11 +105,23 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
         "answers": measure_planners,
         "align": partial(measure_align, folder=options.recorded),
         "offline": measure_offline,
+        "tradeoffs": measure_tradeoffs,
         "metrics": measure_scraping,
-        "viewer": measure_viewer,
+        "viewer": _viewer,
     }
     made = bench_street(options.seed)
     return [figure for part in parts for figure in measures[part](made)]
+
+
+def _viewer(made: "BenchStreet") -> "list[Figure]":
+    """Measured where playwright is installed, and Chromium."""
+    try:
+        from triquad_tools.benchmarks.viewer import measure_viewer
+    except ModuleNotFoundError as error:
+        if error.name != "playwright":
+            raise
+        raise ToolError("playwright is missing: install triquad[browser]") from error
+    return measure_viewer(made)
 
 
 def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
@@ -145,11 +173,16 @@ def _present(figures: "list[Figure]", options: argparse.Namespace) -> None:
     rows = [Row(figure.name, figure.shown, _note(figure)) for figure in figures]
     print_rows(title, rows)
     if options.json is not None:
-        result = {"title": title, "figures": [asdict(figure) for figure in figures]}
+        shown = [asdict(figure) for figure in figures]
+        result = {"title": title, "street": options.seed, "figures": shown}
         options.json.write_text(json_text(result) + "\n", encoding="utf-8")
     if options.record is not None:
         with options.record.open("a", encoding="utf-8") as page:
             page.write("\n" + markdown(title, figures))
+    if options.plot is not None:
+        from triquad_tools.benchmarks.tradeoff_sheet import Tradeoffs, draw_tradeoffs
+
+        draw_tradeoffs(Tradeoffs(title, options.seed, figures), options.plot)
 
 
 def _note(figure: "Figure") -> str:
@@ -171,9 +204,9 @@ def _parser() -> argparse.ArgumentParser:
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
         "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
         "opened offline, a server whose metrics are read, open air, things that move, a lidar that "
-        "moves while it turns, clouds of ROS 2, rooms, tables and streets with the presets "
-        "that are for them, and the viewer in a browser. Takes over half an hour; nothing else "
-        "should run meanwhile.",
+        "moves while it turns, clouds of ROS 2, rooms, tables and streets with the presets that "
+        "are for them, and, if asked for, the viewer in a browser and the ablation. Takes over "
+        "half an hour; nothing else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument
@@ -182,7 +215,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="*",
         type=_part,
         metavar="PART",
-        help=f"of {', '.join(PARTS)} (default: all but the ablation)",
+        help=f"of {', '.join(PARTS)} (default: all but tradeoffs, viewer and ablation)",
     )
     add(
         "--seed",
@@ -199,6 +232,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--scans", type=count, default=60, metavar="N", help="of the ablation (default: 60)")
     add("--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)")
+    add(
+        "--plot",
+        type=Path,
+        metavar="OUT.png",
+        help="draw accuracy by time, by bytes and by scan spacing: the part tradeoffs, which takes "
+        "a few minutes; without PART nothing else is measured",
+    )
+    add(
+        "--from",
+        dest="drawn_from",
+        type=Path,
+        metavar="FILE",
+        help="draw what --json FILE saved of it, and measure nothing",
+    )
     add("--json", type=Path, metavar="FILE", help="write the figures there, too")
     add("--record", type=Path, metavar="FILE.md", help="add a table to this page")
     add_version(parser)

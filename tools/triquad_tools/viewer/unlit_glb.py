@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 
-_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+from triquad_tools.viewer.tone import untoned
+
+_FLOAT, _UINT32 = 5126, 5125
 _HEADER = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<I4s")
 
@@ -26,14 +28,12 @@ def unlit_glb(
     Args:
         vertices: [V, 3], at least one.
         faces: [F, 3] rows of vertices.
-        colours: [V, 3] of the vertices, linear in [0, 1].
+        colours: [V, 3] of the vertices, linear in [0, 1], as the screen shall show them.
         opacity: below 1, what is behind shines through, and faces are seen from both sides.
     """
-    shades = np.full((len(vertices), 4), opacity)
-    shades[:, :3] = np.clip(colours, 0.0, 1.0)
     arrays = (
         np.ascontiguousarray(vertices, "<f4").tobytes(),
-        np.round(shades * 65535.0).astype("<u2").tobytes(),
+        untoned(np.clip(colours, 0.0, 1.0)).astype("<f4").tobytes(),
         np.ascontiguousarray(faces, "<u4").tobytes(),
     )
     starts = [0, len(arrays[0]), len(arrays[0]) + len(arrays[1])]
@@ -46,6 +46,7 @@ def unlit_glb(
         "materials": [
             {
                 "extensions": {"KHR_materials_unlit": {}},
+                "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, opacity]},
                 "alphaMode": "OPAQUE" if opacity == 1.0 else "BLEND",
                 "doubleSided": opacity != 1.0,
             }
@@ -68,10 +69,9 @@ def unlit_glb(
             },
             {
                 "bufferView": 1,
-                "componentType": _UINT16,
-                "normalized": True,
+                "componentType": _FLOAT,
                 "count": len(vertices),
-                "type": "VEC4",
+                "type": "VEC3",
             },
             {"bufferView": 2, "componentType": _UINT32, "count": 3 * len(faces), "type": "SCALAR"},
         ],
