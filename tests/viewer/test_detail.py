@@ -16,6 +16,7 @@ from triquad_tools.viewer.live_source import LiveSource
 from triquad_tools.viewer.map_source import COARSEST
 from triquad_tools.viewer.near_tiles import NearTiles
 from triquad_tools.viewer.thinning import Triangles, thinned
+from triquad_tools.viewer.tone import toned, untoned
 from triquad_tools.viewer.unlit_glb import unlit_glb
 
 CELLS_M = np.array([0.1, 0.2, 0.4, 0.8, 1.6])
@@ -80,14 +81,18 @@ def test_nothing_thinned_is_nothing() -> None:
 
 def test_a_glb_holds_the_mesh_and_its_colours() -> None:
     ball = trimesh.creation.icosphere(2, 3.0)
-    colours = np.random.default_rng(0).uniform(size=(len(ball.vertices), 3))
+    colours = np.random.default_rng(0).uniform(0.0, 0.95, (len(ball.vertices), 3))
     vertices, faces = ball.vertices.astype(np.float32), ball.faces.astype(np.int32)
     data = unlit_glb(vertices, faces, colours)
     (read,) = trimesh.load(io.BytesIO(data), file_type="glb", process=False).geometry.values()
     np.testing.assert_array_equal(read.vertices.astype(np.float32), vertices)
     np.testing.assert_array_equal(read.faces, faces)
-    shown = read.visual.vertex_attributes["color"][:, :3]
-    np.testing.assert_allclose(np.asarray(shown, float) / 65535, colours, atol=1e-4)
+    shown = toned(read.visual.vertex_attributes["color"][:, :3])
+    np.testing.assert_allclose(shown, colours, atol=1e-4)
+
+
+def test_white_stays_nearly_white() -> None:
+    assert toned(untoned(np.ones((1, 3)))).min() > 0.95
 
 
 @pytest.mark.parametrize("level", range(COARSEST))

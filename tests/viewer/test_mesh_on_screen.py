@@ -43,12 +43,12 @@ def test_colours_say_what_the_legend_says(page_of: PageOf) -> None:
         page = page_of(endpoint)
         wait_until_drawn(page)
         expect(page.get_by_text("height, m")).to_be_visible()
-        by_height = _colours(page)
         for name, legend in (("age", "epochs since it changed"), ("confidence", "confidence")):
+            before = _colours(page)
             page.get_by_role("combobox", name="Colour").click()
             page.get_by_role("option", name=name).click()
             expect(page.get_by_text(legend, exact=True).first).to_be_visible()
-            wait_until(page, lambda: _left(page, by_height) < 0.5, f"colours are those of {name}")
+            wait_until(page, lambda: _left(page, before) < 0.5, f"colours are those of {name}")
 
 
 def test_a_server_that_is_gone_is_told_of_until_it_is_back(page_of: PageOf) -> None:
