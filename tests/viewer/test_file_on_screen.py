@@ -59,7 +59,7 @@ def test_what_changed_is_drawn_and_listed(
     page = page_without_server(tmp_path)
     wait_until_drawn(page)
     page.get_by_role("checkbox", name="Show changes").check()
-    expect(page.get_by_text("vanished (V): free space now")).to_be_visible()
+    expect(page.get_by_text("vanished (V): free space in epoch 3")).to_be_visible()
     expect(page.get_by_text("1 vanished")).to_be_visible()
     wait_until(page, lambda: _pixels(page, VERMILION) > 50, "the box is outlined")
     assert _pixels(page, SKY_BLUE) < 20
@@ -84,8 +84,8 @@ def test_a_picture_is_saved(tmp_path: Path, page_without_server: PageWithoutServ
     pixels = np.asarray(Image.open(io.BytesIO(download.path().read_bytes())))
     canvas = page.locator("canvas").first.bounding_box()
     assert canvas is not None
-    height, width = round(canvas["height"]), round(canvas["width"])
-    assert pixels.shape[1] == width
+    height = round(1920 * canvas["height"] / canvas["width"])
+    assert pixels.shape[1] == 1920
     assert pixels.shape[0] > height, "a caption stands below"
     mesh, caption = pixels[:height], pixels[height:]
     assert (mesh.min(axis=-1) < 200).mean() > drawn_share(page) / 4

@@ -10,12 +10,12 @@ from triquad_tools.viewer.legend import Scale, scale_colours
 from triquad_tools.viewer.map_source import MapState
 from triquad_tools.viewer.shown_legends import LineMeaning, ShownLegends
 
-_TEXT_PX = 16
-_ROW_PX = 24
-_BAR_PX = (400, 12)
-_LINE_PX = (48, 3)
+_TEXT_PX = 28
+_ROW_PX = 40
+_BAR_PX = (640, 20)
+_LINE_PX = (80, 5)
 _DASHES = 4
-_MARGIN_PX = 12
+_MARGIN_PX = 20
 _INK = "#222222"
 
 
@@ -55,7 +55,7 @@ class _Strip:
         colours = scale_colours(scale, np.linspace(scale.low, scale.high, width)) ** (1 / 2.2)
         row = np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8)
         bar = np.ascontiguousarray(np.broadcast_to(row, (height, width, 3)))
-        self._sheet.paste(Image.fromarray(bar), (_MARGIN_PX, self._top + 5))
+        self._sheet.paste(Image.fromarray(bar), (_MARGIN_PX, self._top + 8))
         self.write(scale.label, 2 * _MARGIN_PX + width)
         texts = scale.tick_texts
         for number, text in enumerate(texts):

@@ -24,11 +24,6 @@ from triquad_tools.viewer.stage import Stage
 
 # Of Okabe and Ito's colours, which all can tell apart, those that stand out on mesh and background.
 APPEARED, VANISHED, MOVED = "#56b4e9", "#d55e00", "#cc79a7"
-_LINES = (
-    LineMeaning(APPEARED, False, "appeared (A): free space before"),
-    LineMeaning(VANISHED, True, "vanished (V): free space now"),
-    LineMeaning(MOVED, False, "moved (M): from the dashed box to the solid one"),
-)
 _PERIOD_S = 1.0
 _BEFORE = "the checkpoint before"
 _NOTHING = "There is no checkpoint before this one: choose another to compare with."
@@ -120,9 +115,9 @@ class ChangesPanel:
         for number, move in enumerate(found.moved[:_DRAWN], start=1):
             way = np.array([[move.before.middle_m, move.after.middle_m]])
             self._add_lines(f"/changes/moved_{number}", way, MOVED)
-        self._stage.legends.lines["changes"] = _LINES
+        lines = self._stage.legends.lines["changes"] = _meanings(between)
         self._text.content = (
-            text_html(_heading(between)) + lines_html(_LINES) + text_html(_list(found))
+            text_html(_heading(between)) + lines_html(lines) + text_html(_list(found))
         )
 
     def _outline(self, change: Change) -> None:
@@ -182,6 +177,16 @@ def _dashes(lines: Doubles) -> Doubles:
         lows = start + np.arange(count)[:, None] / count * (end - start)
         dashes.append(np.stack([lows, lows + _DASH_SHARE / count * (end - start)], axis=1))
     return np.concatenate(dashes)
+
+
+def _meanings(between: Between) -> tuple[LineMeaning, ...]:
+    """What the lines in the scene say."""
+    before, after = between.before.epoch, between.after.epoch
+    return (
+        LineMeaning(APPEARED, False, f"appeared (A): free space in epoch {before}"),
+        LineMeaning(VANISHED, True, f"vanished (V): free space in epoch {after}"),
+        LineMeaning(MOVED, False, "moved (M): dashed before, solid after"),
+    )
 
 
 def _heading(between: Between) -> str:

@@ -54,7 +54,7 @@ class OpenMaps:
 
     def release(self, path: Path) -> None:
         """It is used no longer; to be called as often as :meth:`use`."""
-        with self._changing, suppress(KeyError):
+        with self._changing, suppress(KeyError):  # all may be closed already
             self._maps[path].users -= 1
             self._forget()
 

@@ -11,6 +11,7 @@ from triquad_tools.viewer.caption import captioned
 from triquad_tools.viewer.map_source import MapState
 from triquad_tools.viewer.stage import Stage
 
+_LONGER_PX = 1920  # side of a picture
 _LONGEST_S = 60.0  # a browser without a graphics card takes seconds
 
 
@@ -43,10 +44,13 @@ class ScreenshotLayer:
             self._button.disabled = False
 
     def _picture(self) -> Image.Image:
-        """The scene as it is on the screen, on white."""
-        camera = self._stage.client.camera
+        """What is on the screen, on white; a slow browser draws coarser than this on its screen."""
+        aspect = self._stage.client.camera.aspect
+        width, height = (_LONGER_PX, round(_LONGER_PX / aspect))
+        if aspect < 1.0:
+            width, height = (round(_LONGER_PX * aspect), _LONGER_PX)
         pixels = self._stage.client.get_render(
-            camera.image_height, camera.image_width, transport_format="png", timeout=_LONGEST_S
+            height, width, transport_format="png", timeout=_LONGEST_S
         )
         scene = Image.fromarray(pixels, "RGBA")
         white = Image.new("RGBA", scene.size, "white")
