@@ -1,7 +1,7 @@
 # make test      set up a virtual environment and run every check and test
 # make check     the checks alone: style, types, which package may import which
 # make docs      write the tables of docs/settings.md from the settings
-# make pictures  make the pictures of the documentation anew, of the map that make demo leaves
+# make pictures  make the pictures of the documentation anew; those of the viewer need Chromium
 # make demo      set up a virtual environment and map a street, end to end
 VENV ?= .venv
 PYTHON ?= python3
@@ -24,6 +24,8 @@ docs: $(INSTALLED)
 
 pictures: $(INSTALLED)
 	$(BIN)/python docs/pictures.py
+	$(BIN)/python docs/top_picture.py
+	$(BIN)/python docs/viewer_pictures.py
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -141,3 +141,18 @@ def test_it_needs_neither_numba_nor_torch_nor_the_tools(tmp_path: Path) -> None:
     assert compiled == "False"
     assert int(faces) == len(mesh_of(RECORD, cell_m=0.4).faces)
     assert (tmp_path / "mesh.ply").exists()
+
+
+def test_block_by_block_it_is_the_same_surface() -> None:
+    with OfflineMap(RECORD) as offline:
+        whole = offline.mesh(cell_m=0.2)
+        blocks = offline.mesh_blocks(cell_m=0.2)
+        parts = [(np.array(index) * blocks.side_m, blocks.mesh(index)) for index in blocks.indices]
+    assert len(parts) >= 4
+    assert sum(len(part.faces) for _, part in parts) == len(whole.faces)
+    for low, part in parts:
+        middles = centroids(part)
+        assert ((middles >= low) & (middles <= low + blocks.side_m)).all()
+    together = np.concatenate([centroids(part) for _, part in parts])
+    sums = [np.sort(points @ [1.0, 2.0, 3.0]) for points in (together, centroids(whole))]
+    np.testing.assert_allclose(*sums, atol=1e-6)

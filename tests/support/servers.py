@@ -73,10 +73,11 @@ def running_service(
     map_name: str = MAP,
     store: Path | None = None,
     connect: tuple[str, ...] = (),
+    endpoint: str | None = None,
 ) -> Iterator[str]:
-    """A service in this process; yields its endpoint."""
+    """A service in this process; yields its endpoint, a free one unless it is given."""
     compiled()
-    endpoint = free_endpoint()
+    endpoint = endpoint or free_endpoint()
     network = NetworkOptions((endpoint,), connect, multicast_scouting=False)
     opened = Store(store, map_name, settings.store) if store else None
     restored: ValidCheckpoint | None = opened.newest() if opened else None

@@ -6,6 +6,7 @@ import pytest
 from support.exact_maps import exact_map, flat, table
 from support.map_records import random_record
 from support.small_world import settings, settled_mapper, world
+from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_tools.commands.inspect import main
@@ -19,7 +20,8 @@ IN_SQUARE = 20 * 20
 
 
 def diff(a, b, tile_m=1.0):
-    return difference(compare(a, b), tile_m)
+    with OfflineMap(a) as old, OfflineMap(b) as new:
+        return difference(compare(old, new), tile_m)
 
 
 def tile_at(found, *corner):
@@ -27,7 +29,8 @@ def tile_at(found, *corner):
 
 
 def test_surface_points_lie_on_the_surface_of_their_voxel():
-    points = surface_points(RAISED)
+    with OfflineMap(RAISED) as raised:
+        points = surface_points(raised)
     assert len(points) == POINTS
     assert np.abs(MapEvaluator(RAISED).query(points).sdf).max() <= 1e-4
     inside = np.abs(points[:, :2]).max(axis=1) < 1.9

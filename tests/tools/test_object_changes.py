@@ -9,6 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from support.small_world import settings, settle
+from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
 from triquad_server.mapping.mapper import Mapper
 from triquad_tools.commands.inspect import main
@@ -49,9 +50,14 @@ def after():
     return mapped(2, APPEARS, MOVED)
 
 
+def objects(a, b):
+    with OfflineMap(a) as old, OfflineMap(b) as new:
+        return object_changes(compare(old, new))
+
+
 @cache
 def found_between(one, other):
-    return object_changes(compare(one(), other()))
+    return objects(one(), other())
 
 
 def middles(found):
@@ -95,7 +101,7 @@ def test_where_a_box_stood_the_road_is_newly_seen_and_under_it_no_longer_known()
 
 
 def test_another_drive_with_other_noise_shows_no_objects():
-    found = object_changes(compare(before(), mapped(3, VANISHES, MOVES)))
+    found = objects(before(), mapped(3, VANISHES, MOVES))
     assert (found.moved, found.vanished, found.appeared) == ((), (), ())
     assert found.small.vanished > 0
     assert found.small.appeared > 0
@@ -103,7 +109,7 @@ def test_another_drive_with_other_noise_shows_no_objects():
 
 def test_where_only_one_map_has_been_nothing_appeared_or_vanished():
     nowhere = dataclasses.replace(before(), regions=())
-    found = object_changes(compare(before(), nowhere))
+    found = objects(before(), nowhere)
     assert (found.moved, found.vanished, found.appeared, found.newly_seen) == ((), (), (), ())
     assert max(cluster.points for cluster in found.no_longer_known) > 10_000
     assert all(cluster.points >= LEAST_POINTS for cluster in found.no_longer_known)

@@ -73,6 +73,7 @@ class FollowedMesh:
     name: str  # on which the server counts these bytes
     server: str = ""  # which told all below
     tile_side_m: float = math.nan
+    cell_m: float = math.nan
     tiles: Mapping[TileIndex, MeshTile] = field(default_factory=dict)
     stale: frozenset[TileIndex] = frozenset()  # tiles of a server that is no more
     revision: int = 0
@@ -143,6 +144,7 @@ class FollowedMesh:
             self,
             server=reply.server,
             tile_side_m=reply.tile_side_m,
+            cell_m=reply.cell_m,
             tiles={index: tile for index, tile in tiles.items() if index not in removed},
             stale=stale - removed,
             revision=reply.revision,

@@ -55,6 +55,16 @@ class WatchedMesh:
         """Level of detail."""
         return self._followed.level
 
+    @property
+    def cell_m(self) -> float:
+        """Side of the cells of which faces are made; NaN before the first update."""
+        return self._followed.cell_m
+
+    @property
+    def tile_side_m(self) -> float:
+        """Side of the tiles; NaN before the first update, unless tiles were known."""
+        return self._followed.tile_side_m
+
     def known_tiles(self) -> KnownTiles:
         """The tiles, for a later watch to go on with."""
         return self._followed.known_tiles()

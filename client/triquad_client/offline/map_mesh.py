@@ -5,11 +5,10 @@ agree on the points that they share. Only faces where rays have seen a surface a
 the field has zeros that nobody taught it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.cells import cells_of_boxes, rows_by_cell
@@ -24,12 +23,17 @@ from triquad_client.mesh.mesh import Mesh, joined
 CELL_RANGE_M = (0.005, 10.0)
 MAX_FACES = 50_000_000
 
-_BLOCK_CELLS = 32  # along the side of a block: bounds the memory that is needed at once
+BLOCK_CELLS = 64
+"""Along each side of a block, as in the tiles of a server's mesh."""
+
 _REACH_LEAVES = 0.1  # how far beside a voxel with seen surface the middle of a face may lie
 _CELL_LEAVES = 0.5
 
 Report = Callable[[int, int], None]
 """Is told how many blocks are done, and of how many."""
+
+
+BlockIndex = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,80 @@ class _Voxels:
     first: Longs  # [N, 3] least cell
     last: Longs  # [N, 3] greatest cell
 
-    def __getitem__(self, rows: NDArray[np.intp]) -> "_Voxels":
-        return _Voxels(self.places[rows], self.first[rows], self.last[rows])
+
+class MeshBlocks:
+    """The surface of a map, cut into cubes that are meshed one by one; for several threads.
+
+    Each face is in one block. Blocks agree on the lattice points that they share, so there are no
+    gaps between them.
+    """
+
+    def __init__(
+        self, view: MapView, seen: MapRecord, cell_m: float, box: tuple[Doubles, Doubles]
+    ) -> None:
+        """Use ``OfflineMap.mesh_blocks``; ``box`` are corners [3]."""
+        self._view = view
+        self.cell_m = cell_m
+        self.side_m = BLOCK_CELLS * cell_m
+        """Of a block."""
+        self._leaf_m = seen.settings.leaf_m
+        self._reach_m = (0.5 + _REACH_LEAVES) * self._leaf_m + cell_m / 2  # to a cell's middle
+        middles = surface_voxels(seen)
+        low, high = box[0] - 2 * self._reach_m, box[1] + 2 * self._reach_m
+        self._middles = middles[((middles >= low) & (middles <= high)).all(axis=1)]
+        around = self._voxels(self._middles)
+        blocks, rows = cells_of_boxes(around.first // BLOCK_CELLS, around.last // BLOCK_CELLS)
+        self._rows = {
+            (int(x), int(y), int(z)): rows[here] for (x, y, z), here in rows_by_cell(blocks)
+        }
+
+    @property
+    def indices(self) -> Collection[BlockIndex]:
+        """The blocks in which there may be faces: their least corners, in sides of a block."""
+        return self._rows.keys()
+
+    def mesh(self, index: BlockIndex) -> Mesh:
+        """The faces in one of :attr:`indices`.
+
+        Raises:
+            InvalidInputError: scikit-image is not installed.
+        """
+        voxels = self._voxels(self._middles[self._rows[index]])
+        origin = np.array(index, np.int64) * BLOCK_CELLS
+        cells = _covered(voxels.first - origin, voxels.last - origin)
+        asked = np.argwhere(_any_of_eight(np.pad(cells, 1)))  # lattice points at their corners
+        # Points that nobody asks for lie in free space.
+        volume = np.ones((BLOCK_CELLS + 1,) * 3, np.float32)
+        points = np.asarray((origin + asked) * self.cell_m, np.float64)
+        volume[tuple(asked.T)] = self._view.query(points).sdf
+        unknown = np.isnan(volume)  # beside the regions
+        cells &= ~_any_of_eight(unknown)
+        volume[unknown] = 1.0
+        surface = _marched(volume, cells)
+        vertices = (origin + surface.vertices) * self.cell_m
+        middles = vertices[surface.faces].mean(axis=1)
+        seen = _beside(voxels.places, middles, self._leaf_m)
+        return Mesh(vertices, surface.faces[seen], self._view.epoch)
+
+    def _voxels(self, middles: Doubles) -> _Voxels:
+        """The voxels with these middles [N, 3]."""
+        return _Voxels(
+            np.floor(middles / self._leaf_m).astype(np.int64),
+            np.ceil((middles - self._reach_m) / self.cell_m - 0.5).astype(np.int64),
+            np.floor((middles + self._reach_m) / self.cell_m - 0.5).astype(np.int64),
+        )
+
+
+def mesh_blocks(
+    view: MapView, seen: MapRecord, cell_m: float | None, bounds: Bounds | None
+) -> MeshBlocks:
+    """The blocks of a map; ``OfflineMap.mesh_blocks`` documents the rest.
+
+    ``view`` answers for the field of the map, and ``seen`` holds its evidence; no more is read.
+    """
+    chosen_m = _CELL_LEAVES * view.voxel_m if cell_m is None else cell_m
+    checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
+    return MeshBlocks(view, seen, checked_m, checks.box(bounds))
 
 
 def map_mesh(
@@ -51,64 +127,21 @@ def map_mesh(
     cell_m: float | None,
     report: Report | None,
 ) -> Mesh:
-    """The surface of a map where rays have seen one; ``OfflineMap.mesh`` documents the rest.
-
-    ``view`` answers for the field of the map, and ``seen`` holds its evidence; no more is read.
-    """
-    chosen_m = _CELL_LEAVES * view.voxel_m if cell_m is None else cell_m
-    cell_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
-    box = checks.box(bounds)
-    blocks = list(_blocks(_voxels(seen, *box, cell_m=cell_m)))
-    tiles: list[Mesh] = []
+    """The surface of a map where rays have seen one, whole; arguments as of :func:`mesh_blocks`."""
+    blocks = mesh_blocks(view, seen, cell_m, bounds)
+    parts: list[Mesh] = []
     faces = 0
-    for number, (block, voxels) in enumerate(blocks, start=1):
-        tiles.append(_block_mesh(view, block, voxels, cell_m=cell_m))
-        faces += len(tiles[-1].faces)
+    for number, index in enumerate(blocks.indices, start=1):
+        parts.append(blocks.mesh(index))
+        faces += len(parts[-1].faces)
         if faces > MAX_FACES:
             raise InvalidInputError(
-                f"the mesh has more than {MAX_FACES:,} faces with cells of {cell_m:g} m: "
+                f"the mesh has more than {MAX_FACES:,} faces with cells of {blocks.cell_m:g} m: "
                 "ask for a smaller box, or larger cells"
             )
         if report is not None:
-            report(number, len(blocks))
-    return joined(tiles, _BLOCK_CELLS * cell_m, box=box, epoch=view.epoch)
-
-
-def _voxels(seen: MapRecord, low: Doubles, high: Doubles, cell_m: float) -> _Voxels:
-    """The voxels of which faces may lie between two corners [3]."""
-    leaf_m = seen.settings.leaf_m
-    middles = surface_voxels(seen)
-    reach_m = (0.5 + _REACH_LEAVES) * leaf_m + cell_m / 2  # from a voxel's middle to that of a cell
-    near = (middles >= low - 2 * reach_m) & (middles <= high + 2 * reach_m)
-    middles = middles[near.all(axis=1)]
-    return _Voxels(
-        np.floor(middles / leaf_m).astype(np.int64),
-        np.ceil((middles - reach_m) / cell_m - 0.5).astype(np.int64),
-        np.floor((middles + reach_m) / cell_m - 0.5).astype(np.int64),
-    )
-
-
-def _blocks(voxels: _Voxels) -> Iterator[tuple[Longs, _Voxels]]:
-    """The blocks of cells [3] that voxels reach into, each with these voxels."""
-    first, last = voxels.first // _BLOCK_CELLS, voxels.last // _BLOCK_CELLS
-    blocks, rows = cells_of_boxes(first, last)
-    return ((block, voxels[rows[here]]) for block, here in rows_by_cell(blocks))
-
-
-def _block_mesh(view: MapView, block: Longs, voxels: _Voxels, cell_m: float) -> Mesh:
-    origin = block * _BLOCK_CELLS
-    cells = _covered(voxels.first - origin, voxels.last - origin)
-    asked = np.argwhere(_any_of_eight(np.pad(cells, 1)))  # lattice points at their corners
-    # Points that nobody asks for lie in free space.
-    volume = np.ones((_BLOCK_CELLS + 1,) * 3, np.float32)
-    volume[tuple(asked.T)] = view.query(np.asarray((origin + asked) * cell_m, np.float64)).sdf
-    unknown = np.isnan(volume)  # beside the regions
-    cells &= ~_any_of_eight(unknown)
-    volume[unknown] = 1.0
-    surface = _marched(volume, cells)
-    vertices = (origin + surface.vertices) * cell_m
-    seen = _beside(voxels.places, vertices[surface.faces].mean(axis=1), view.voxel_m)
-    return Mesh(vertices, surface.faces[seen])
+            report(number, len(blocks.indices))
+    return joined(parts, blocks.side_m, box=checks.box(bounds), epoch=view.epoch)
 
 
 def _marched(volume: Floats, cells: Bools) -> Mesh:
@@ -128,10 +161,10 @@ def _marched(volume: Floats, cells: Bools) -> Mesh:
 
 def _covered(first: Longs, last: Longs) -> Bools:
     """The cells of a block that lie in any of the boxes ``first`` to ``last`` [N, 3]."""
-    low = np.clip(first, 0, _BLOCK_CELLS)
-    beyond = np.clip(last + 1, 0, _BLOCK_CELLS)
+    low = np.clip(first, 0, BLOCK_CELLS)
+    beyond = np.clip(last + 1, 0, BLOCK_CELLS)
     # How many boxes begin less how many end, summed up along each axis.
-    changes = np.zeros((_BLOCK_CELLS + 1,) * 3, np.int32)
+    changes = np.zeros((BLOCK_CELLS + 1,) * 3, np.int32)
     for corner in np.ndindex(2, 2, 2):
         at = np.where(corner, beyond, low)
         np.add.at(changes, tuple(at.T), (-1) ** sum(corner))

@@ -9,7 +9,9 @@ from typing import Any
 from triquad_format.errors import RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.reader import read_map_file
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
+from triquad_format.records.seen_space import surface_voxels
 from triquad_map.questions.answers import Answers, QuestionLimits
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
@@ -19,7 +21,7 @@ from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.call import Batch, BlockingDriver, Call, ResultT
-from triquad_client.offline.map_mesh import Report, map_mesh
+from triquad_client.offline.map_mesh import MeshBlocks, Report, map_mesh, mesh_blocks
 
 _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
 """Nobody else waits."""
@@ -71,6 +73,8 @@ class OfflineMap(MapQueries):
         )
         self.name = record.name
         self.epoch = record.epoch
+        self.leaf_m = record.settings.leaf_m
+        """Side of the voxels in which rays ended."""
         self.stamp_ns = stamp_ns
         """When its epoch was written, nanoseconds since 1970; 0: the file does not tell."""
         self.compiled = driver.opened.compiled
@@ -108,6 +112,22 @@ class OfflineMap(MapQueries):
             ClosedError: the map was closed.
         """
         return map_mesh(self._opened().view, self._seen, bounds, cell_m=cell_m, report=report)
+
+    def mesh_blocks(self, cell_m: float | None = None) -> MeshBlocks:
+        """The surface as :meth:`mesh` has it, everywhere, to be made block by block.
+
+        Args:
+            cell_m: as of :meth:`mesh`.
+
+        Raises:
+            InvalidInputError: the cells are out of range.
+            ClosedError: the map was closed.
+        """
+        return mesh_blocks(self._opened().view, self._seen, cell_m, bounds=None)
+
+    def surface_voxels(self) -> Doubles:
+        """Middles [N, 3] of the voxels in which rays ended, metres, map frame."""
+        return surface_voxels(self._seen)
 
     def _answer(self, call: Call[ResultT]) -> ResultT:
         return self._opened().run(call)

@@ -71,7 +71,7 @@ class TileDelta:
 
     ready: list[CachedTile]  # by increasing revision; empty ones are to be removed
     removed: list[TileIndex]  # that the other side has, and that were never here
-    to_make: list[TileIndex]  # those that changed first come first
+    to_make: list[TileIndex]  # those that were never made, then those made longest ago
     revision: int  # who knows all of this knows everything up to here
 
 
@@ -88,6 +88,11 @@ class _TileLevel:
         """The tile where it shows what the map has; None where it has to be made."""
         tile = self.tiles.get(index)
         return tile if tile is not None and self.changed.get(index, 0) <= tile.made else None
+
+    def _made(self, index: TileIndex) -> int:
+        """Epoch with which a tile was last made; -1: never."""
+        tile = self.tiles.get(index)
+        return -1 if tile is None else tile.made
 
     def record(self, changes: Changes, half_m: float, epoch: int) -> None:
         """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
@@ -124,7 +129,7 @@ class _TileLevel:
             if unknown and (not tile.empty or known_to or index in known):
                 ready.append(tile)
         ready.sort(key=lambda tile: tile.revision)
-        to_make.sort(key=lambda index: (self.changed[index], index))
+        to_make.sort(key=lambda index: (self._made(index), index))
         removed = [index for index in known if index not in self.changed]
         return TileDelta(ready, removed, to_make, revision=revision)
 

@@ -260,6 +260,20 @@ def test_who_knows_everything_is_told_nothing() -> None:
     assert delta.removed == [(500, 0, 0)]
 
 
+def test_no_tile_is_made_again_before_all_were_made() -> None:
+    """While the whole map changes with each epoch, as it does in training, all of it appears."""
+    cache = TileCache(MESH, TEAM)
+    cache.refresh(ground(flat(0.3)))
+    made: list[TileIndex] = []
+    for time in range(6):
+        made.append(cache.delta(0, *EVERYWHERE, 0, {}).to_make[0])
+        cache.make(0, made[-1])
+        cache.refresh(ground(flat(0.32 if time % 2 else 0.34)))
+    assert len(set(made)) == 6
+    # After all the others those come first that were made longest ago.
+    assert cache.delta(0, *EVERYWHERE, 0, {}).to_make[-6:] == made
+
+
 def test_a_box_has_the_tiles_that_meet_it() -> None:
     cache = TileCache(MESH, TEAM)
     cache.refresh(ground(flat(0.3)))

@@ -41,9 +41,9 @@ _USUAL_ON_STREET = (
     "offline",
     "metrics",
 )
-_ON_STREET = (*_USUAL_ON_STREET, "tradeoffs")
+_ON_STREET = (*_USUAL_ON_STREET, "tradeoffs", "viewer")
 USUAL_PARTS = (*_USUAL_ON_STREET, "growth", "air", "moving", "sweeps", "ros2", "presets")
-PARTS = (*USUAL_PARTS, "tradeoffs", "ablation")
+PARTS = (*USUAL_PARTS, "tradeoffs", "viewer", "ablation")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -107,9 +107,21 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
         "offline": measure_offline,
         "tradeoffs": measure_tradeoffs,
         "metrics": measure_scraping,
+        "viewer": _viewer,
     }
     made = bench_street(options.seed)
     return [figure for part in parts for figure in measures[part](made)]
+
+
+def _viewer(made: "BenchStreet") -> "list[Figure]":
+    """Measured where playwright is installed, and Chromium."""
+    try:
+        from triquad_tools.benchmarks.viewer import measure_viewer
+    except ModuleNotFoundError as error:
+        if error.name != "playwright":
+            raise
+        raise ToolError("playwright is missing: install triquad[browser]") from error
+    return measure_viewer(made)
 
 
 def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
@@ -192,8 +204,9 @@ def _parser() -> argparse.ArgumentParser:
         "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
         "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
         "opened offline, a server whose metrics are read, open air, things that move, a lidar that "
-        "moves while it turns, clouds of ROS 2, and rooms, tables and streets with the presets "
-        "that are for them. Takes over half an hour; nothing else should run meanwhile.",
+        "moves while it turns, clouds of ROS 2, rooms, tables and streets with the presets that "
+        "are for them, and, if asked for, the viewer in a browser and the ablation. Takes over "
+        "half an hour; nothing else should run meanwhile.",
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument
@@ -202,7 +215,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="*",
         type=_part,
         metavar="PART",
-        help=f"of {', '.join(PARTS)} (default: all but tradeoffs and ablation)",
+        help=f"of {', '.join(PARTS)} (default: all but tradeoffs, viewer and ablation)",
     )
     add(
         "--seed",

@@ -4,10 +4,14 @@ import argparse
 import os
 import shutil
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+
+from triquad_client import connect
 
 from triquad_tools.console.arguments import add_version, count, seed
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, run
@@ -15,9 +19,11 @@ from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo import steps
 from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
-from triquad_tools.demo.server import DemoServer
+from triquad_tools.demo.server import DemoServer, free_endpoint
 from triquad_tools.evaluation.map_scores import driven_street
 from triquad_tools.simulation.street import street_drive
+from triquad_tools.viewer.live_source import LiveSource
+from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-demo"
 
@@ -35,18 +41,57 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    results = run_demo(options.out, options.scans, options.seed)
+    with ExitStack() as opened:
+        endpoint = free_endpoint()
+        show = partial(_show, opened, options.port, endpoint)
+        results = run_demo(
+            options.out,
+            options.scans,
+            options.seed,
+            endpoint=endpoint,
+            started=show if options.view else None,
+        )
+        status = _report(options.out, results)
+        if options.view:
+            with DemoServer(options.out, steps.MAP, endpoint=endpoint):
+                _say("the page shows what the server has now; Ctrl-C ends both")
+                threading.Event().wait()
+    return status
+
+
+def _report(out: Path, results: DemoResults) -> int:
     print_rows(f"Street {results.seed}, {results.intake.scans} scans", table_rows(results))
     files = "map.triquad, street.glb, street.ply, street.png, results.json, server.log"
-    print(f"In {options.out}: {files}")
+    print(f"In {out}: {files}")
+    print(
+        f"To look at the map in a browser: {_beside_python('triquad-view')} {out / 'map.triquad'}"
+    )
     broken = broken_promises(results)
     for line in broken:
         complain(_COMMAND, line, FAILED)
     return FAILED if broken else OK
 
 
-def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
+def _beside_python(command: str) -> str:
+    """A command as it has to be typed: with its folder, where that is not on the path."""
+    return command if shutil.which(command) else str(Path(sys.executable).parent / command)
+
+
+def _show(opened: ExitStack, port: int, endpoint: str) -> None:
+    """Serve a page that shows the server's map, and wait until somebody looks at it."""
+    client = opened.enter_context(connect(endpoint, steps.MAP))
+    viewer = Viewer(LiveSource(client, endpoint), "127.0.0.1", port)
+    opened.callback(viewer.close)
+    _say(f"open {viewer.url} in a browser: the drive begins as soon as the page is there")
+    viewer.wait_for_visit()
+
+
+def run_demo(
+    out: Path, scans: int, street_seed: int, *, endpoint: str, started: Callable[[], None] | None
+) -> DemoResults:
     """Map a street of ``scans`` scans, and leave all results in the folder ``out``.
+
+    Its servers listen on ``endpoint``; ``started`` is called once the first one serves.
 
     Raises:
         ToolError, TriquadError, FormatError, OSError: a step failed; the server is stopped.
@@ -59,8 +104,11 @@ def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
     street = driven_street(street_drive(street_seed, scans))
     laps.end("simulate")
     _say("starting triquad-server (the first run of all compiles kernels: a minute more) ...")
-    with DemoServer(out, steps.MAP) as server:
+    with DemoServer(out, steps.MAP, endpoint=endpoint) as server:
         laps.end("start")
+        if started is not None:
+            started()
+            laps.end("wait")
         learnt = steps.learn(server.endpoint, street)
         laps.end("learn")
         if not learnt.intake.settled:
@@ -70,7 +118,7 @@ def run_demo(out: Path, scans: int, street_seed: int) -> DemoResults:
         server.stop()
         laps.end("stop")
     _say("starting triquad-server again, from its checkpoint ...")
-    with DemoServer(out, steps.MAP) as server:
+    with DemoServer(out, steps.MAP, endpoint=endpoint) as server:
         restart = steps.compare(server.endpoint, scored)
         server.stop()
     laps.end("restart")
@@ -114,6 +162,14 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
     add("--scans", type=count, default=60, metavar="N", help="a metre apart (default: 60)")
+    add("--view", action="store_true", help="show in a browser how the street grows")
+    add(
+        "--port",
+        type=count,
+        default=DEFAULT_PORT,
+        metavar="N",
+        help=f"of that page ({DEFAULT_PORT})",
+    )
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
     add_version(parser)
     return parser

@@ -193,6 +193,8 @@ def _log(options: argparse.Namespace) -> int:
 
 def _diff(options: argparse.Namespace) -> int:
     """Two map files."""
+    from triquad_client import OfflineMap  # slow to import
+
     files, titles = [], []
     for letter, target in zip("AB", map(str, options.files), strict=True):
         with map_file(target, options.map or _MAP) as path:
@@ -200,8 +202,8 @@ def _diff(options: argparse.Namespace) -> int:
             name = target if is_endpoint(target) else str(path)
         titles.append(f"{letter}  {_title(name, files[-1])}")
     a, b = files
-    with progress("comparing"):
-        comparison = compare(a.record, b.record)
+    with progress("comparing"), OfflineMap(a.record) as old, OfflineMap(b.record) as new:
+        comparison = compare(old, new)
     diff = difference(comparison, options.tile or _TILE_M)
     objects = object_changes(comparison)
     if options.plot:

@@ -23,18 +23,26 @@ def free_port() -> int:
         return port
 
 
-class DemoServer:
-    """A running server on a free port; leaving the ``with`` statement stops it in any case."""
+def free_endpoint() -> str:
+    """An endpoint on such a port."""
+    return f"tcp/127.0.0.1:{free_port()}"
 
-    def __init__(self, folder: Path, map_name: str, arguments: Sequence[str] = ()) -> None:
+
+class DemoServer:
+    """A running server; leaving the ``with`` statement stops it in any case."""
+
+    def __init__(
+        self, folder: Path, map_name: str, arguments: Sequence[str] = (), endpoint: str = ""
+    ) -> None:
         """Start the process, with store and log in a folder, and wait until it is ready.
 
-        ``arguments`` are further ones of its command line.
+        ``arguments`` are further ones of its command line; without an ``endpoint`` a free one of
+        the loopback is taken.
 
         Raises:
             ToolError: it ended before, or took too long.
         """
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.endpoint = endpoint or free_endpoint()
         self._log = folder / "server.log"
         self._started = threading.Event()  # ready, or ended
         self._ready = False

@@ -3,17 +3,18 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.cells import rows_by_cell
-from triquad_format.records.region import MapRecord
-from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
-from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import print_columns
+
+if TYPE_CHECKING:  # slow to import
+    from triquad_client import OfflineMap
 
 NEAR_ENOUGH_M = 1e-4
 """A point this near to the zero of the field is on the surface."""
@@ -98,7 +99,7 @@ class MapDiff:
     tiles: tuple[TileChange, ...]  # those that differ, the greatest change first
 
 
-def compare(a: MapRecord, b: MapRecord) -> Comparison:
+def compare(a: "OfflineMap", b: "OfflineMap") -> Comparison:
     """The surface of each of two maps, asked in the other."""
     return Comparison(_sighting(a, b), _sighting(b, a))
 
@@ -110,20 +111,19 @@ def difference(comparison: Comparison, tile_m: float) -> MapDiff:
     return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
 
 
-def surface_points(record: MapRecord) -> Doubles:
+def surface_points(opened: "OfflineMap") -> Doubles:
     """Points ``[N, 3]`` where the field is zero, at most one for each voxel where rays ended.
 
     The middles of these voxels are moved along the gradient by Newton's method. Those that have
     not come to a zero within a voxel's diagonal, at which the map says ``SURFACE``, are left out.
     """
-    evaluator = MapEvaluator(record)
-    leaf_m = record.settings.leaf_m
-    middles = surface_voxels(record)
+    leaf_m = opened.leaf_m
+    middles = opened.surface_voxels()
     points = middles.copy()
     arrived = np.zeros(len(points), np.bool_)
     under_way = np.arange(len(points))
     for _ in range(_STEPS):
-        answer = evaluator.query(points[under_way], gradient=True)
+        answer = opened.query_sdf(points[under_way], gradient=True)
         there = np.abs(answer.sdf) <= NEAR_ENOUGH_M
         arrived[under_way[there & (answer.status == Status.SURFACE)]] = True
         sdf, gradient, under_way = answer.sdf[~there], answer.gradient[~there], under_way[~there]
@@ -152,10 +152,10 @@ def print_diff(diff: MapDiff, limit: int) -> None:
         print(f"  and {left} more: --limit {len(diff.tiles)} shows all")
 
 
-def _sighting(of: MapRecord, by: MapRecord) -> Sighting:
+def _sighting(of: "OfflineMap", by: "OfflineMap") -> Sighting:
     points = surface_points(of)
-    answer = MapEvaluator(by).query(points)
-    return Sighting(points, answer.sdf, answer.status, leaf_m=of.settings.leaf_m)
+    answer = by.query_sdf(points)
+    return Sighting(points, answer.sdf, answer.status, leaf_m=of.leaf_m)
 
 
 def _tiles(comparison: Comparison, tile_m: float) -> Iterator[TileChange]:

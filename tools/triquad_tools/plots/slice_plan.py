@@ -27,7 +27,9 @@ from triquad_tools.plots.plan import (
 
 _MAX_DISTANCE_M = 3.0
 SURFACE = "#a3341f"
-_BEHIND = "#d55e00"
+BEHIND = "#d55e00"
+DISTANCE_COLOURS = colormaps["viridis"].with_extremes(under=BEHIND)
+"""Of distances from 0 up; those behind a surface stand out."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +78,12 @@ def _seen_box(target: str) -> list[float]:
 
 def _draw_distance(answer: Grid, axes: Axes) -> None:
     """Where nothing was seen, no distance either: there it only says how far the last wall is."""
-    colours = colormaps["viridis"].with_extremes(under=_BEHIND)
     label = (
         f"m to the nearest surface, {_MAX_DISTANCE_M:g} or more\norange: behind it; grey: not seen"
     )
     seen = answer.status != Status.UNKNOWN
     distance_m = np.where(seen, answer.distance_m.astype(np.float64), np.nan)
-    draw_values(axes, distance_m[:, :, 0].T, Scale(label, colours, low=0.0, high=_MAX_DISTANCE_M))
+    draw_values(axes, distance_m[:, :, 0].T, Scale(label, DISTANCE_COLOURS, 0.0, _MAX_DISTANCE_M))
 
 
 def _draw_status(answer: Grid, axes: Axes) -> None:

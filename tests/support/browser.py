@@ -1,0 +1,40 @@
+"""A real browser for tests, which skip where there is none."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from playwright.sync_api import Browser
+from triquad_tools.benchmarks import browser
+from triquad_tools.benchmarks.browser import (
+    HEIGHT,
+    WIDTH,
+    drawn_share,
+    opened_page,
+    picture,
+    wait_until,
+    wait_until_drawn,
+)
+from triquad_tools.console.command import ToolError
+
+__all__ = [
+    "HEIGHT",
+    "WIDTH",
+    "drawn_share",
+    "opened_page",
+    "picture",
+    "running_browser",
+    "wait_until",
+    "wait_until_drawn",
+]
+
+
+@contextmanager
+def running_browser() -> Iterator[Browser]:
+    """Chromium; the test is skipped where it is not installed."""
+    try:
+        browser.installed()
+    except ToolError as missing:
+        pytest.skip(str(missing))
+    with browser.running_browser() as running:
+        yield running

@@ -1,0 +1,42 @@
+"""``triquad-view`` of what cannot be shown."""
+
+from pathlib import Path
+
+import pytest
+from support.changing_store import EMPTY, write_checkpoint
+from triquad_tools.commands.view import main
+
+
+def told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that the command ends with, after what it was at."""
+    assert main(arguments) == 2
+    *before, line = capsys.readouterr().err.splitlines()
+    assert all("opening" in other for other in before)
+    assert line.startswith("triquad-view: ")
+    return line
+
+
+def test_files_that_cannot_be_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = write_checkpoint(tmp_path, 1, EMPTY)
+    data = good.read_bytes()
+    damaged, foreign, empty = (tmp_path / name for name in ("damaged", "foreign.png", "empty"))
+    damaged.write_bytes(data[: len(data) // 2])
+    foreign.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
+    empty.mkdir()
+    for path in (damaged, foreign, empty, tmp_path / "nowhere"):
+        assert str(path) in told([str(path)], capsys)
+
+
+def test_a_store_without_intact_checkpoints(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_checkpoint(tmp_path, 1, EMPTY)
+    path.write_bytes(path.read_bytes()[:-1000])
+    assert "no checkpoint can be shown" in told([str(tmp_path)], capsys)
+
+
+@pytest.mark.parametrize("option", ["--connect", "--map", "--config"])
+def test_a_file_and_a_server_exclude_each_other(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "for a server, not for a file" in told(["map.triquad", option, "x"], capsys)

@@ -1,0 +1,101 @@
+"""``triquad-view``: a map in the browser, as it grows, or as a file or a store has it."""
+
+import argparse
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+
+import triquad_client
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
+
+from triquad_tools.console.arguments import add_version
+from triquad_tools.console.command import OK, complain, refuse, run
+from triquad_tools.console.progress import progress
+from triquad_tools.viewer.file_source import FileSource
+from triquad_tools.viewer.history import History
+from triquad_tools.viewer.history_source import newest_of
+from triquad_tools.viewer.live_source import LiveSource
+from triquad_tools.viewer.map_source import MapSource
+from triquad_tools.viewer.open_maps import OpenMaps
+from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
+
+_COMMAND = "triquad-view"
+_PREPARED_S = 10.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool until it is interrupted: 130 then, 1 the server failed, 2 bad input."""
+    return run(_COMMAND, partial(_view, _parser().parse_args(argv)))
+
+
+def _view(options: argparse.Namespace) -> int:
+    _check_usage(options)
+    with _shown(options) as shown, closing(Viewer(shown, options.host, options.port)) as viewer:
+        print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
+        threading.Event().wait()
+    return OK
+
+
+def _check_usage(options: argparse.Namespace) -> None:
+    """Refuse what does not go together."""
+    server = options.connect or options.map or options.config
+    refuse(
+        {"--connect, --map and --config are for a server, not for a file": options.file and server}
+    )
+
+
+@contextmanager
+def _shown(options: argparse.Namespace) -> Iterator[MapSource | History]:
+    if options.file is None:
+        endpoint, name = options.connect or DEFAULT_ENDPOINT, options.map or "default"
+        with triquad_client.connect(endpoint, name, config=options.config) as client:
+            yield LiveSource(client, endpoint)
+        return
+    with closing(OpenMaps()) as maps:
+        yield _store(options.file, maps) if options.file.is_dir() else _file(options.file, maps)
+
+
+def _file(path: Path, maps: OpenMaps) -> FileSource:
+    """The map in a file, ready to be shown."""
+    with progress(f"opening {path}") as report:
+        source = maps.use(path)
+        source.prepare(_PREPARED_S)
+        report(1, f"map {source.opened.name!r}, epoch {source.opened.epoch}")
+    return source
+
+
+def _store(path: Path, maps: OpenMaps) -> History:
+    """The checkpoints of a store; the newest that can be shown is ready."""
+    history = History(path, maps)
+    with progress(f"opening {path}") as report, closing(newest_of(history)) as source:
+        state = source.state()
+        report(1, f"map {state.map_name!r}, epoch {state.epoch}")
+    for problem in history.damaged:
+        complain(_COMMAND, problem, OK)
+    moments = history.moments
+    print(f"{len(moments)} checkpoints: {moments[0]} to {moments[-1]}")
+    return history
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=_COMMAND,
+        description="Show a map in the browser: of a server, as it grows, or of a file.",
+    )
+    add = parser.add_argument
+    add(
+        "file",
+        type=Path,
+        nargs="?",
+        metavar="FILE_OR_STORE",
+        help="a map file, or a store with its history, to be shown without a server",
+    )
+    add("--connect", metavar="ENDPOINT", help=f"of the server (default: {DEFAULT_ENDPOINT})")
+    add("--map", metavar="NAME", help="of the server's map (default: default)")
+    add("--config", metavar="FILE", help="Zenoh configuration (JSON5), for TLS or credentials")
+    add("--host", default="127.0.0.1", metavar="ADDRESS", help="to serve the page at")
+    add("--port", type=int, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
+    add_version(parser)
+    return parser

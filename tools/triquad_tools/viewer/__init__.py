@@ -1,0 +1,1 @@
+"""A map in the browser, as it grows: pages of viser, fed by an ordinary client."""

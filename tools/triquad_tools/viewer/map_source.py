@@ -1,0 +1,115 @@
+"""Where a page takes its map from: a server that learns, or a file."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_client.calls.queries import MapQueries
+from triquad_client.checks import Bounds
+from triquad_client.mesh.followed_mesh import TileIndex
+from triquad_format.wire.limits import LEVELS
+
+COARSEST = LEVELS - 1
+"""Level of detail of the tiles of which a whole map is shown."""
+
+
+class Tile(Protocol):
+    """The mesh of one tile."""
+
+    @property
+    def version(self) -> int:
+        """Epoch (a published state of the map) in which it last changed."""
+
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """[3] metres, map frame: the minimum corner."""
+
+    @property
+    def vertices(self) -> NDArray[np.float32]:
+        """[V, 3] metres, relative to the origin."""
+
+    @property
+    def faces(self) -> NDArray[np.int32]:
+        """[F, 3] counter-clockwise seen from free space."""
+
+
+class TileFollower(Protocol):
+    """The mesh tiles of a level within a box, kept up to date by :meth:`refresh`."""
+
+    @property
+    def tiles(self) -> Mapping[TileIndex, Tile]:
+        """The tiles as of the last refresh, by their indices."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last refresh left nothing waiting."""
+
+    def refresh(self) -> None:
+        """Fetch some of what changed; returns soon, also where there is more.
+
+        Raises:
+            TriquadError: it cannot be had now; the tiles stay.
+        """
+
+    def moved(self, bounds: Bounds) -> "TileFollower":
+        """Follow another box instead, and go on with the tiles that both have."""
+
+    def close(self) -> None:
+        """Follow no longer."""
+
+
+@dataclass(frozen=True)
+class TileSizes:
+    """Lengths of the mesh, metres."""
+
+    cell_m: float  # of level 0
+    tile_side_m: float  # of level 0
+
+    def cell_of(self, level: int) -> float:
+        """Side of the cells of a level."""
+        return self.cell_m * (1 << level)
+
+    def side_of(self, level: int) -> float:
+        """Side of the tiles of a level."""
+        return self.tile_side_m * (1 << level)
+
+
+@dataclass(frozen=True)
+class MapState:
+    """Of which map a page shows what state."""
+
+    map_name: str
+    epoch: int  # number of a published state of the map
+    time: str  # when that was, UTC as in RFC 3339; empty: nobody knows
+
+
+class MapSource(Protocol):
+    """A map to look at."""
+
+    @property
+    def title(self) -> str:
+        """Name of the map, and where it is from."""
+
+    @property
+    def queries(self) -> MapQueries:
+        """Answers questions about the map as it is now."""
+
+    @property
+    def sizes(self) -> TileSizes:
+        """Of its mesh."""
+
+    @property
+    def grows(self) -> bool:
+        """Whether more of it may become known while somebody looks."""
+
+    def state(self) -> MapState:
+        """What is shown now.
+
+        Raises:
+            TriquadError: nobody can tell.
+        """
+
+    def follow(self, level: int, bounds: Bounds | None = None) -> TileFollower:
+        """The mesh tiles of a level that meet ``bounds``, metres, map frame; ``None``: all."""

@@ -1,0 +1,64 @@
+"""The web server that shows a map."""
+
+import io
+import threading
+import warnings
+from contextlib import redirect_stdout
+
+import viser
+
+from triquad_tools.viewer.history import History
+from triquad_tools.viewer.map_source import MapSource
+from triquad_tools.viewer.visit import Visit
+
+DEFAULT_PORT = 8080
+
+_OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
+"""Warnings of viser: a browser that leaves takes with it what is being drawn or removed there."""
+
+
+class Viewer:
+    """Serves a page that shows a map, to several browsers, until it is closed."""
+
+    def __init__(self, shown: MapSource | History, host: str, port: int) -> None:
+        self._shown = shown
+        self._visits: dict[int, Visit] = {}
+        self._changing = threading.Lock()
+        self._visited = threading.Event()
+        for message in _OF_ONE_WHO_LEFT:
+            warnings.filterwarnings("ignore", message, UserWarning)
+        with redirect_stdout(io.StringIO()):  # it has announcements of its own
+            self._server = viser.ViserServer(host, port, label="triquad", verbose=False)
+        self._server.on_client_connect(self._enter)
+        self._server.on_client_disconnect(self._leave)
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    def wait_for_visit(self) -> None:
+        """Wait until a browser has opened the page."""
+        self._visited.wait()
+
+    def close(self) -> None:
+        """Serve no longer."""
+        with self._changing:
+            visits = list(self._visits.values())
+            self._visits.clear()
+        for visit in visits:
+            visit.close()
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def _enter(self, client: viser.ClientHandle) -> None:
+        visit = Visit(client, self._shown)
+        with self._changing:
+            self._visits[client.client_id] = visit
+        self._visited.set()
+
+    def _leave(self, client: viser.ClientHandle) -> None:
+        with self._changing:
+            visit = self._visits.pop(client.client_id, None)
+        if visit is not None:
+            visit.close()
