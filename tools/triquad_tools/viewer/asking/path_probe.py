@@ -1,6 +1,7 @@
 """A path that is laid by clicks, checked for a robot of some size."""
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import viser
@@ -125,16 +126,21 @@ class PathProbe:
         self._marks.append(add_tube(self._stage, "/path/tube", tube))
         whole = answer.whole
         if whole.meets_unknown:
-            place = answer.at(whole.unknown_contact_m)
-            self._mark("/path/unknown", f"unknown from {whole.unknown_contact_m:.2f} m", place)
+            text = f"unknown from {whole.unknown_contact_m:.2f} m"
+            self._mark("/path/unknown", text, answer.at(whole.unknown_contact_m), "top-center")
         if whole.blocked:
-            self._mark(
-                "/path/blocked", f"✖ blocked at {whole.contact_m:.2f} m", answer.at(whole.contact_m)
-            )
+            text = f"✖ blocked at {whole.contact_m:.2f} m"
+            self._mark("/path/blocked", text, answer.at(whole.contact_m))
 
-    def _mark(self, name: str, text: str, place: Doubles) -> None:
+    def _mark(
+        self,
+        name: str,
+        text: str,
+        place: Doubles,
+        anchor: Literal["bottom-center", "top-center"] = "bottom-center",
+    ) -> None:
         label = self._stage.scene.add_label(
-            name, text, position=self._stage.in_scene(place), anchor="bottom-center"
+            name, text, position=self._stage.in_scene(place), anchor=anchor
         )
         self._marks.append(label)
 

@@ -100,7 +100,7 @@ class SliceLayer:
         scale = distance_scale("distance to the nearest surface, m", max_distance_m)
         lines = (
             LineMeaning("#000000", False, "the surface itself"),
-            LineMeaning("#ffffff", False, f"every {step_m:g} m from it"),
+            LineMeaning("#ffffff", False, f"white: every {step_m:g} m from it"),
             LineMeaning(BEHIND, False, "behind a surface"),
             LineMeaning(UNKNOWN, False, "unknown: not seen"),
         )
