@@ -7,7 +7,7 @@ from triquad_format.records.arrays import Bools, Bytes
 
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import DISTANCE_COLOURS
-from triquad_tools.viewer.legend import Scale, Stops
+from triquad_tools.viewer.page.legend import Scale, Stops
 
 _STOPS: Stops = tuple(to_rgb(DISTANCE_COLOURS(place)) for place in np.linspace(0.0, 1.0, 17))
 

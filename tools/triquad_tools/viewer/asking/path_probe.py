@@ -14,10 +14,10 @@ from triquad_tools.viewer.asking.distance_scale import distance_colours, distanc
 from triquad_tools.viewer.asking.path_check import PathAnswer, ask_path
 from triquad_tools.viewer.asking.questions import newest_epoch
 from triquad_tools.viewer.asking.tube import Tube, add_tube
-from triquad_tools.viewer.legend import legend_html
-from triquad_tools.viewer.panel import table_html, text_html
-from triquad_tools.viewer.shown_legends import LineMeaning, lines_html
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.legend import legend_html
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.panel_html import table_html, text_html
+from triquad_tools.viewer.page.shown_legends import LineMeaning, lines_html
 
 _RADIUS_M = 0.3
 _NAME = "path"
@@ -33,13 +33,13 @@ _SKY = "No surface there: the path stays as it was."
 class PathProbe:
     """The path, its controls, and what the map says about it."""
 
-    def __init__(self, stage: Stage, do: Callable[[Callable[[], None]], None]) -> None:
+    def __init__(self, page: Page, do: Callable[[Callable[[], None]], None]) -> None:
         """``do`` has something done on the thread that changes paths."""
-        self._stage = stage
+        self._page = page
         self._points: list[Doubles] = []
         self._answer: PathAnswer | None = None
         self._marks: list[viser.SceneNodeHandle] = []
-        gui = stage.gui
+        gui = page.gui
         self._radius = gui.add_number(
             "Radius (m)", _RADIUS_M, min=0.0, max=50.0, step=0.05, visible=False
         )
@@ -82,7 +82,7 @@ class PathProbe:
             TriquadError: the map does not answer.
         """
         answer = self._answer
-        asked = answer is None or newest_epoch(self._stage.source.queries) == answer.whole.epoch
+        asked = answer is None or newest_epoch(self._page.source.queries) == answer.whole.epoch
         if self.unanswered or not asked:
             self._check()
 
@@ -98,17 +98,17 @@ class PathProbe:
     def _check(self) -> None:
         """Ask about the path as it is now, and draw it."""
         self._answer = None
-        self._stage.legends.scales.pop(_NAME, None)
-        self._stage.legends.lines.pop(_NAME, None)
+        self._page.legends.scales.pop(_NAME, None)
+        self._page.legends.lines.pop(_NAME, None)
         if self.unanswered:
-            queries = self._stage.source.queries
+            queries = self._page.source.queries
             points = np.array(self._points)
             self._answer = ask_path(queries, points, float(self._radius.value))
             scale = distance_scale("clearance of the robot's middle, m", self._answer.reach_m)
             self._legend.content = legend_html(scale) + lines_html(_LINES)
-            self._stage.legends.scales[_NAME], self._stage.legends.lines[_NAME] = scale, _LINES
+            self._page.legends.scales[_NAME], self._page.legends.lines[_NAME] = scale, _LINES
         self._text.content = path_html(self._points, self._answer)
-        with self._stage.client.atomic():
+        with self._page.client.atomic():
             self._erase()
             self._draw_points()
             if self._answer is not None:
@@ -119,11 +119,11 @@ class PathProbe:
             self._mark(f"/path/points/{number}", f"{number}", point)
 
     def _draw_path(self, answer: PathAnswer) -> None:
-        eye = self._stage.in_map(self._stage.client.camera.position)
+        eye = self._page.in_map(self._page.client.camera.position)
         least_m = _LEAST_WIDTH * float(np.linalg.norm(answer.points[-1] - eye))
         radii_m = np.full(len(answer.cuts), max(answer.radius_m, least_m))
         tube = Tube(answer.cuts, radii_m, piece_colours(answer) / 255.0)
-        self._marks.append(add_tube(self._stage, "/path/tube", tube))
+        self._marks.append(add_tube(self._page, "/path/tube", tube))
         whole = answer.whole
         if whole.meets_unknown:
             text = f"unknown from {whole.unknown_contact_m:.2f} m"
@@ -139,8 +139,8 @@ class PathProbe:
         place: Doubles,
         anchor: Literal["bottom-center", "top-center"] = "bottom-center",
     ) -> None:
-        label = self._stage.scene.add_label(
-            name, text, position=self._stage.in_scene(place), anchor=anchor
+        label = self._page.scene.add_label(
+            name, text, position=self._page.in_scene(place), anchor=anchor
         )
         self._marks.append(label)
 

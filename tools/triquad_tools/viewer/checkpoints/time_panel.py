@@ -3,11 +3,11 @@
 from triquad_format.errors import TriquadError
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.history import Moment
-from triquad_tools.viewer.history_source import HistorySource
-from triquad_tools.viewer.panel import problem_html, text_html
-from triquad_tools.viewer.refresher import Refresher
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.panel_html import problem_html, text_html
+from triquad_tools.viewer.page.refresher import Refresher
+from triquad_tools.viewer.sources.history import Moment
+from triquad_tools.viewer.sources.history_source import HistorySource
 
 _PERIOD_S = 1.0
 _PREVIOUS, _NEXT = "◀ Previous", "Next ▶"
@@ -16,18 +16,18 @@ _PREVIOUS, _NEXT = "◀ Previous", "Next ▶"
 class TimePanel:
     """A slider over the checkpoints of a store, to which a server may add."""
 
-    def __init__(self, source: HistorySource, stage: Stage) -> None:
+    def __init__(self, source: HistorySource, page: Page) -> None:
         self._source = source
         self._moments: tuple[Moment, ...] = ()
         self._wanted = source.moment
-        self._folder = stage.gui.add_folder("Time")
+        self._folder = page.gui.add_folder("Time")
         with self._folder:
-            self._slider = stage.gui.add_slider("Checkpoint", 1, 1, 1, 1)
-            self._buttons = stage.gui.add_button_group("", (_PREVIOUS, _NEXT))
-            self._text = stage.gui.add_html("")
-            self._damaged = stage.gui.add_html("")
+            self._slider = page.gui.add_slider("Checkpoint", 1, 1, 1, 1)
+            self._buttons = page.gui.add_button_group("", (_PREVIOUS, _NEXT))
+            self._text = page.gui.add_html("")
+            self._damaged = page.gui.add_html("")
         self._offer(source.history.moments)
-        self._refresher = Refresher("time", self._refresh, _PERIOD_S, stage.failed)
+        self._refresher = Refresher("time", self._refresh, _PERIOD_S, page.failed)
         self._slider.on_update(lambda _: self._want(self._slider.value))
         self._buttons.on_click(lambda _: self._step(-1 if self._buttons.value == _PREVIOUS else 1))
 

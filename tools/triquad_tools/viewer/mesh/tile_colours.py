@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.viewer.legend import Scale, scale_colours
-from triquad_tools.viewer.map_source import Tile
-from triquad_tools.viewer.thinning import Triangles
+from triquad_tools.viewer.page.legend import Scale, scale_colours
+from triquad_tools.viewer.page.unlit_glb import Triangles
+from triquad_tools.viewer.sources.map_source import Tile
 
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 _SUN, _SKY = 0.55, 0.5

@@ -10,19 +10,19 @@ from triquad_format.errors import TriquadError
 from triquad_tools.viewer.asking.click_layer import ClickLayer
 from triquad_tools.viewer.asking.slice_layer import SliceLayer
 from triquad_tools.viewer.asking.unknown_layer import UnknownLayer
-from triquad_tools.viewer.changes_panel import ChangesPanel
-from triquad_tools.viewer.history import History
-from triquad_tools.viewer.history_source import HistorySource, newest_of
-from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.map_source import MapSource
-from triquad_tools.viewer.mesh_layer import MeshLayer
-from triquad_tools.viewer.panel import problem_html, text_html
-from triquad_tools.viewer.screenshot_layer import ScreenshotLayer
-from triquad_tools.viewer.shown_legends import ShownLegends
-from triquad_tools.viewer.stage import SceneOrigin, Stage
-from triquad_tools.viewer.status_layer import StatusLayer
-from triquad_tools.viewer.time_panel import TimePanel
-from triquad_tools.viewer.trail_layer import TrailLayer
+from triquad_tools.viewer.checkpoints.changes_panel import ChangesPanel
+from triquad_tools.viewer.checkpoints.time_panel import TimePanel
+from triquad_tools.viewer.live.status_panel import StatusPanel
+from triquad_tools.viewer.live.trail_layer import TrailLayer
+from triquad_tools.viewer.mesh.mesh_layer import MeshLayer
+from triquad_tools.viewer.page.page import Page, SceneOrigin
+from triquad_tools.viewer.page.panel_html import problem_html, text_html
+from triquad_tools.viewer.page.shown_legends import ShownLegends
+from triquad_tools.viewer.picture.screenshot_button import ScreenshotButton
+from triquad_tools.viewer.sources.history import History
+from triquad_tools.viewer.sources.history_source import HistorySource, newest_of
+from triquad_tools.viewer.sources.live_source import LiveSource
+from triquad_tools.viewer.sources.map_source import MapSource
 
 
 class Layer(Protocol):
@@ -32,18 +32,18 @@ class Layer(Protocol):
         """Draw no more; what was drawn and the folder go."""
 
 
-_LAYERS: tuple[Callable[[Stage], Layer], ...] = (
+_LAYERS: tuple[Callable[[Page], Layer], ...] = (
     MeshLayer,
     SliceLayer,
     UnknownLayer,
     ClickLayer,
-    ScreenshotLayer,
+    ScreenshotButton,
 )
-_HISTORY_LAYERS: tuple[Callable[[HistorySource, Stage], Layer], ...] = (TimePanel, ChangesPanel)
-_LIVE_LAYERS: tuple[Callable[[LiveSource, Stage], Layer], ...] = (StatusLayer, TrailLayer)
+_HISTORY_LAYERS: tuple[Callable[[HistorySource, Page], Layer], ...] = (TimePanel, ChangesPanel)
+_LIVE_LAYERS: tuple[Callable[[LiveSource, Page], Layer], ...] = (StatusPanel, TrailLayer)
 
 
-class Visit:
+class BrowserSession:
     """The scene and the panel of one browser, from when it opens the page until it leaves."""
 
     def __init__(self, client: viser.ClientHandle, shown: MapSource | History) -> None:
@@ -80,8 +80,8 @@ class Visit:
         origin, legends = SceneOrigin(), ShownLegends()
         for number, layer in enumerate(layers):
             failed = partial(self._failed, number)
-            stage = Stage(self._client, source, failed, origin=origin, legends=legends)
-            self._layers.append(layer(stage))
+            page = Page(self._client, source, failed, origin=origin, legends=legends)
+            self._layers.append(layer(page))
 
     def close(self) -> None:
         """The browser has left."""

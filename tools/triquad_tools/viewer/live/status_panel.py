@@ -4,25 +4,25 @@ import time
 
 from triquad_format.wire.messages import ServerStatus
 
-from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.panel import problem_html, table_html
-from triquad_tools.viewer.refresher import Refresher
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.panel_html import problem_html, table_html
+from triquad_tools.viewer.page.refresher import Refresher
+from triquad_tools.viewer.sources.live_source import LiveSource
 
 _PERIOD_S = 1.0
 
 
-class StatusLayer:
+class StatusPanel:
     """Shows what the server is doing, and how far away it is."""
 
-    def __init__(self, source: LiveSource, stage: Stage) -> None:
+    def __init__(self, source: LiveSource, page: Page) -> None:
         self._client = source.client
         self._before: ServerStatus | None = None
-        self._folder = stage.gui.add_folder("Server")
+        self._folder = page.gui.add_folder("Server")
         with self._folder:
-            self._figures = stage.gui.add_html("")
-            self._warnings = stage.gui.add_html("")
-        self._refresher = Refresher("status", self._refresh, _PERIOD_S, stage.failed)
+            self._figures = page.gui.add_html("")
+            self._warnings = page.gui.add_html("")
+        self._refresher = Refresher("status", self._refresh, _PERIOD_S, page.failed)
 
     def close(self) -> None:
         """Show no more."""

@@ -8,10 +8,10 @@ from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import TileIndex
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.file_source import FileSource
-from triquad_tools.viewer.history import DamagedError, History, Moment
-from triquad_tools.viewer.map_source import MapState
-from triquad_tools.viewer.tile_maker import MadeTile
+from triquad_tools.viewer.sources.file_source import FileSource
+from triquad_tools.viewer.sources.history import DamagedError, History, Moment
+from triquad_tools.viewer.sources.map_source import MapState
+from triquad_tools.viewer.sources.tile_maker import MadeTile
 
 _COARSE_S = 5.0  # after so long, a map is shown with what there is of its mesh
 

@@ -15,12 +15,12 @@ from triquad_tools.mapfiles.object_changes import (
     ObjectChanges,
     object_changes,
 )
-from triquad_tools.viewer.history import Moment
-from triquad_tools.viewer.history_source import HistorySource
-from triquad_tools.viewer.panel import text_html
-from triquad_tools.viewer.refresher import Refresher
-from triquad_tools.viewer.shown_legends import LineMeaning, lines_html
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.panel_html import text_html
+from triquad_tools.viewer.page.refresher import Refresher
+from triquad_tools.viewer.page.shown_legends import LineMeaning, lines_html
+from triquad_tools.viewer.sources.history import Moment
+from triquad_tools.viewer.sources.history_source import HistorySource
 
 # Of Okabe and Ito's colours, which all can tell apart, those that stand out on mesh and background.
 APPEARED, VANISHED, MOVED = "#56b4e9", "#d55e00", "#cc79a7"
@@ -60,17 +60,17 @@ class Change(NamedTuple):
 class ChangesPanel:
     """Shows on request what changed up to the checkpoint that a page shows."""
 
-    def __init__(self, source: HistorySource, stage: Stage) -> None:
+    def __init__(self, source: HistorySource, page: Page) -> None:
         self._source = source
-        self._stage = stage
+        self._page = page
         self._compared: Between | None = None
         self._handles: list[viser.SceneNodeHandle] = []
-        self._folder = stage.gui.add_folder("What changed")
+        self._folder = page.gui.add_folder("What changed")
         with self._folder:
-            self._on = stage.gui.add_checkbox("Show changes", False)
-            self._since = stage.gui.add_dropdown("Since", (_BEFORE,))
-            self._text = stage.gui.add_html("")
-        self._refresher = Refresher("changes", self._refresh, _PERIOD_S, stage.failed)
+            self._on = page.gui.add_checkbox("Show changes", False)
+            self._since = page.gui.add_dropdown("Since", (_BEFORE,))
+            self._text = page.gui.add_html("")
+        self._refresher = Refresher("changes", self._refresh, _PERIOD_S, page.failed)
         for control in (self._on, self._since):
             control.on_update(lambda _: self._refresher.wake())
 
@@ -115,7 +115,7 @@ class ChangesPanel:
         for number, move in enumerate(found.moved[:_DRAWN], start=1):
             way = np.array([[move.before.middle_m, move.after.middle_m]])
             self._add_lines(f"/changes/moved_{number}", way, MOVED)
-        lines = self._stage.legends.lines["changes"] = _meanings(between)
+        lines = self._page.legends.lines["changes"] = _meanings(between)
         self._text.content = (
             text_html(_heading(between)) + lines_html(lines) + text_html(_list(found))
         )
@@ -125,17 +125,17 @@ class ChangesPanel:
         name = f"/changes/{change.name}"
         self._add_lines(name, _dashes(lines) if change.dashed else lines, change.colour)
         top = change.cluster.middle_m + [0, 0, change.cluster.size_m[2] / 2 + 2 * _BESIDE_M]
-        place = self._stage.in_scene(top)
+        place = self._page.in_scene(top)
         self._handles.append(
-            self._stage.scene.add_label(f"{name}_name", change.name, position=place)
+            self._page.scene.add_label(f"{name}_name", change.name, position=place)
         )
 
     def _add_lines(self, name: str, lines: Doubles, colour: str) -> None:
         """Draw lines [L, 2, 3], metres, map frame."""
         self._handles.append(
-            self._stage.scene.add_line_segments(
+            self._page.scene.add_line_segments(
                 name,
-                self._stage.in_scene(lines),
+                self._page.in_scene(lines),
                 to_rgb(colour),
                 thickness=_LINE_PX,
                 thickness_units="screen",
@@ -146,7 +146,7 @@ class ChangesPanel:
         for handle in self._handles:
             handle.remove()
         self._handles.clear()
-        self._stage.legends.lines.pop("changes", None)
+        self._page.legends.lines.pop("changes", None)
         content = text_html(text) if text else ""
         if self._text.content != content:
             self._text.content = content

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
-from triquad_tools.viewer.legend import Scale, scale_colours
-from triquad_tools.viewer.map_source import MapState
-from triquad_tools.viewer.shown_legends import LineMeaning, ShownLegends
+from triquad_tools.viewer.page.legend import Scale, scale_colours
+from triquad_tools.viewer.page.shown_legends import LineMeaning, ShownLegends
+from triquad_tools.viewer.sources.map_source import MapState
 
 _TEXT_PX = 28
 _ROW_PX = 40

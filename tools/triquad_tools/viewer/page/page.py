@@ -1,4 +1,4 @@
-"""What the parts of a page draw on."""
+"""A page: one scene and one panel in one browser, and where the scene has its zero."""
 
 import threading
 from collections.abc import Callable
@@ -9,8 +9,8 @@ import viser
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
-from triquad_tools.viewer.map_source import MapSource
-from triquad_tools.viewer.shown_legends import ShownLegends
+from triquad_tools.viewer.page.shown_legends import ShownLegends
+from triquad_tools.viewer.sources.map_source import MapSource
 
 _GRID_M = 100.0
 
@@ -45,8 +45,8 @@ class SceneOrigin:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A scene and a panel in one browser, and the map that they show."""
+class Page:
+    """What each part of a page draws on: a scene, the panel beside it, and the map they show."""
 
     client: viser.ClientHandle
     source: MapSource
@@ -67,6 +67,19 @@ class Stage:
     def in_scene(self, points: NDArray[np.floating]) -> Floats:
         """Points [..., 3] of the map frame as the scene has them."""
         return self.origin.in_scene(points)
+
+    def add_glb(
+        self, name: str, glb: bytes, origin: NDArray[np.floating], scale: float = 1.0
+    ) -> viser.GlbHandle:
+        """Draw a mesh whose zero is ``origin`` [3], metres, map frame; without shadows."""
+        return self.scene.add_glb(
+            name,
+            glb,
+            scale=scale,
+            position=self.in_scene(origin),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
 
     def in_map(self, points: NDArray[np.floating]) -> Doubles:
         """Points [..., 3] of the scene in the map frame."""

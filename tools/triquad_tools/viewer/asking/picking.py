@@ -6,7 +6,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
 
 _REACH_M = 1000.0  # the longest ray that a map answers
 _BEFORE_M = 250.0  # where the eye is far away, a ray starts so far before what it looks at
@@ -18,11 +18,11 @@ _A_LITTLE_ABOVE = np.array([0.0, 0.0, 1.0])  # metres: what it is turned about m
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def surface_along(stage: Stage, origin: NDArray[np.floating], towards: Doubles) -> Doubles | None:
+def surface_along(page: Page, origin: NDArray[np.floating], towards: Doubles) -> Doubles | None:
     """The first surface [3], metres, map frame, whose front a ray meets; ``None``: it meets none.
 
     Args:
-        stage: whose map is looked at.
+        page: whose map is looked at.
         origin: [3] metres, map frame.
         towards: [3] its direction, of any length but 0.
 
@@ -30,25 +30,25 @@ def surface_along(stage: Stage, origin: NDArray[np.floating], towards: Doubles) 
         TriquadError: the map does not answer.
     """
     direction = towards / np.linalg.norm(towards)
-    camera = stage.client.camera
+    camera = page.client.camera
     distance_m = float(np.linalg.norm(camera.look_at - camera.position))
     start = origin + max(distance_m - _BEFORE_M, 0.0) * direction
     for _ in range(_BACKS):
-        met = _first_surface(stage.source.queries, start, direction)
-        if met is None or not _is_back(stage.source.queries, met, direction):
+        met = _first_surface(page.source.queries, start, direction)
+        if met is None or not _is_back(page.source.queries, met, direction):
             return met
         start = met + _BEYOND_BACK_M * direction
     return None
 
 
-def ground_in_view(stage: Stage) -> Doubles:
+def ground_in_view(page: Page) -> Doubles:
     """The ground [3], map frame, below what the camera is turned about; else that itself.
 
     Raises:
         TriquadError: the map does not answer.
     """
-    middle = stage.in_map(stage.client.camera.look_at)
-    below = _first_surface(stage.source.queries, middle + _A_LITTLE_ABOVE, _DOWN)
+    middle = page.in_map(page.client.camera.look_at)
+    below = _first_surface(page.source.queries, middle + _A_LITTLE_ABOVE, _DOWN)
     return middle if below is None else below
 
 

@@ -17,8 +17,8 @@ from triquad_format.mapfile.checkpoint_folder import (
 from triquad_format.mapfile.metadata import utc_time
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.file_source import FileSource
-from triquad_tools.viewer.open_maps import OpenMaps
+from triquad_tools.viewer.sources.file_source import FileSource
+from triquad_tools.viewer.sources.open_maps import OpenMaps
 
 
 @dataclass(frozen=True)

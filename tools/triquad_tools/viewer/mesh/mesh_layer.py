@@ -9,22 +9,22 @@ import viser
 from triquad_client.mesh.followed_mesh import TileIndex
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.viewer.detail import Viewpoint, wanted_levels
-from triquad_tools.viewer.framing import Framing
-from triquad_tools.viewer.legend import legend_html
-from triquad_tools.viewer.map_source import COARSEST, Tile
-from triquad_tools.viewer.near_tiles import NearTiles
-from triquad_tools.viewer.refresher import Refresher
-from triquad_tools.viewer.stage import Stage
-from triquad_tools.viewer.thinning import Triangles, thinned
-from triquad_tools.viewer.tile_colours import (
+from triquad_tools.viewer.mesh.detail import Viewpoint, wanted_levels
+from triquad_tools.viewer.mesh.framing import Framing
+from triquad_tools.viewer.mesh.near_tiles import NearTiles
+from triquad_tools.viewer.mesh.thinning import thinned
+from triquad_tools.viewer.mesh.tile_colours import (
     AgeColours,
     ConfidenceColours,
     HeightColours,
     TileColours,
     lit_colours,
 )
-from triquad_tools.viewer.unlit_glb import unlit_glb
+from triquad_tools.viewer.page.legend import legend_html
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.refresher import Refresher
+from triquad_tools.viewer.page.unlit_glb import Triangles, unlit_glb
+from triquad_tools.viewer.sources.map_source import COARSEST, Tile
 
 _THINNED_LEVELS = 2  # coarser than those that tiles come in
 _PERIOD_S = 0.5
@@ -54,34 +54,34 @@ class DrawnTile(NamedTuple):
 class MeshLayer:
     """Draws the mesh, and keeps it up to date with map and camera."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
-        self._framing = Framing(stage)
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._framing = Framing(page)
         self._framed = False
-        self._whole = stage.source.follow(COARSEST)
-        self._near = [NearTiles(stage.source, level) for level in range(COARSEST)]
+        self._whole = page.source.follow(COARSEST)
+        self._near = [NearTiles(page.source, level) for level in range(COARSEST)]
         self._drawn: dict[Name, DrawnTile] = {}
         self._retired: list[viser.GlbHandle] = []
         self._number = 0
         self._asked_s = -np.inf  # monotonic
         levels = COARSEST + 1 + _THINNED_LEVELS
-        self._cells_m = np.array([stage.source.sizes.cell_of(level) for level in range(levels)])
-        self._folder = stage.gui.add_folder("Mesh")
+        self._cells_m = np.array([page.source.sizes.cell_of(level) for level in range(levels)])
+        self._folder = page.gui.add_folder("Mesh")
         # A file does not tell in which epoch a part of it changed.
-        colours = (_HEIGHT, _AGE, _CONFIDENCE) if stage.source.grows else (_HEIGHT, _CONFIDENCE)
+        colours = (_HEIGHT, _AGE, _CONFIDENCE) if page.source.grows else (_HEIGHT, _CONFIDENCE)
         with self._folder:
-            self._by = stage.gui.add_dropdown("Colour", colours)
-            self._legend = stage.gui.add_html("")
-            self._pixels = stage.gui.add_slider("Pixels per cell", 1, 20, 1, _PIXELS)
-        self._refresher = Refresher("mesh", self._refresh, _PERIOD_S, stage.failed)
+            self._by = page.gui.add_dropdown("Colour", colours)
+            self._legend = page.gui.add_html("")
+            self._pixels = page.gui.add_slider("Pixels per cell", 1, 20, 1, _PIXELS)
+        self._refresher = Refresher("mesh", self._refresh, _PERIOD_S, page.failed)
         for control in (self._by, self._pixels):
             control.on_update(lambda _: self._refresher.wake())
-        stage.client.camera.on_update(lambda _: self._refresher.wake())
+        page.client.camera.on_update(lambda _: self._refresher.wake())
 
     def close(self) -> None:
         """Draw no more; what was drawn and the folder go."""
         self._refresher.close()
-        self._stage.legends.scales.pop("mesh", None)
+        self._page.legends.scales.pop("mesh", None)
         self._whole.close()
         for near in self._near:
             near.close()
@@ -101,7 +101,7 @@ class MeshLayer:
         if not roots:
             return
         points = _some_vertices(roots.values())
-        if self._stage.source.grows or not self._framed:
+        if self._page.source.grows or not self._framed:
             self._framing.follow(points)
             self._framed = self._whole.complete
         levels = self._wanted_levels(roots)
@@ -119,21 +119,21 @@ class MeshLayer:
         if self._by.value == _AGE:
             colours = AgeColours.of_tiles(roots.values())
         elif self._by.value == _CONFIDENCE:
-            colours = ConfidenceColours(self._stage.source.queries)
+            colours = ConfidenceColours(self._page.source.queries)
         else:
             colours = HeightColours.of_heights(points[:, 2])
-        self._stage.legends.scales["mesh"] = colours.scale
+        self._page.legends.scales["mesh"] = colours.scale
         legend = legend_html(colours.scale)
         if self._legend.content != legend:
             self._legend.content = legend
         return colours
 
     def _wanted_levels(self, roots: Mapping[TileIndex, Tile]) -> dict[TileIndex, int]:
-        camera = self._stage.client.camera
+        camera = self._page.client.camera
         viewpoint = Viewpoint(
-            self._stage.in_map(camera.position), camera.fov / max(camera.image_height, 1)
+            self._page.in_map(camera.position), camera.fov / max(camera.image_height, 1)
         )
-        side_m = self._stage.source.sizes.side_of(COARSEST)
+        side_m = self._page.source.sizes.side_of(COARSEST)
         corners = np.array(list(roots), np.float64) * side_m
         levels = wanted_levels(
             corners, side_m, self._cells_m, viewpoint=viewpoint, pixels=self._pixels.value
@@ -166,17 +166,15 @@ class MeshLayer:
         """Draw a tile; what stood for it before goes in the next round."""
         triangles = Triangles(want.tile.vertices, want.tile.faces)
         if want.level > COARSEST:
-            side_m = self._stage.source.sizes.side_of(COARSEST)
+            side_m = self._page.source.sizes.side_of(COARSEST)
             triangles = thinned(triangles, float(self._cells_m[want.level]), side_m)
         handle = None
         if len(triangles.faces):
             self._number += 1
-            handle = self._stage.scene.add_glb(
+            handle = self._page.add_glb(
                 f"/mesh/{self._number}",
-                unlit_glb(*triangles, colours=lit_colours(colours, want.tile, triangles)),
-                position=self._stage.in_scene(want.tile.origin),
-                cast_shadow=False,
-                receive_shadow=False,
+                unlit_glb(triangles, lit_colours(colours, want.tile, triangles)),
+                want.tile.origin,
             )
         self._retire(name)
         self._drawn[name] = DrawnTile(want.look, handle)

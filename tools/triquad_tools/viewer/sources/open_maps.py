@@ -8,8 +8,8 @@ from pathlib import Path
 
 from triquad_client import open_map
 
-from triquad_tools.viewer.file_source import FileSource
-from triquad_tools.viewer.tile_maker import TileMaker
+from triquad_tools.viewer.sources.file_source import FileSource
+from triquad_tools.viewer.sources.tile_maker import TileMaker
 
 _KEPT = 4
 

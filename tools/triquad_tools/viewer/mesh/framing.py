@@ -8,7 +8,7 @@ import viser
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.plots.camera import view_axes
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
 
 _NEAR_M, _FAR_M = 0.1, 20_000.0
 _VIEW_RAD = math.radians(50.0)
@@ -42,10 +42,10 @@ def view_of(points: Doubles, aspect: float) -> View:
 class Framing:
     """Moves the camera of a scene back as the map grows."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
+    def __init__(self, page: Page) -> None:
+        self._page = page
         self._taken = False
-        camera = stage.client.camera
+        camera = page.client.camera
         camera.fov = _VIEW_RAD
         camera.near = _NEAR_M
         camera.far = _FAR_M
@@ -57,13 +57,13 @@ class Framing:
         """Show all of ``points`` [N, 3], metres, map frame, unless a person moved the camera."""
         if self._taken or not len(points):
             return
-        camera = self._stage.client.camera
+        camera = self._page.client.camera
         view = view_of(points, max(camera.aspect, _LEAST_ASPECT))
-        eye, target = self._stage.in_scene(view.eye), self._stage.in_scene(view.target)
+        eye, target = self._page.in_scene(view.eye), self._page.in_scene(view.target)
         away_m = float(np.linalg.norm(eye - target))
         if float(np.linalg.norm(eye - self._eyes[-1])) > _GROWN * away_m:
             self._eyes.append(np.asarray(eye, np.float64))
-            with self._stage.client.atomic():
+            with self._page.client.atomic():
                 camera.position = eye
                 camera.look_at = target
 

@@ -4,10 +4,10 @@ import numpy as np
 import viser
 from triquad_client.calls.sources import ScanSource, SourceReport
 
-from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.panel import text_html
-from triquad_tools.viewer.refresher import Refresher
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.panel_html import text_html
+from triquad_tools.viewer.page.refresher import Refresher
+from triquad_tools.viewer.sources.live_source import LiveSource
 
 _PERIOD_S = 0.5
 _SCAN_POINTS = 4000
@@ -21,18 +21,18 @@ _LINE_PIXELS = 3.0
 class TrailLayer:
     """Draws trails and newest scans, and keeps them up to date."""
 
-    def __init__(self, source: LiveSource, stage: Stage) -> None:
-        self._stage = stage
+    def __init__(self, source: LiveSource, page: Page) -> None:
+        self._page = page
         self._client = source.client
         self._report: SourceReport | None = None
         self._number = 0
         self._drawn: dict[str, list[viser.SceneNodeHandle]] = {}
-        self._folder = stage.gui.add_folder("Robot")
+        self._folder = page.gui.add_folder("Robot")
         with self._folder:
-            self._trails = stage.gui.add_checkbox("Trail", True)
-            self._scans = stage.gui.add_checkbox("Newest scan", True)
-            self._list = stage.gui.add_html(text_html("No scan has come yet."))
-        self._refresher = Refresher("trail", self._refresh, _PERIOD_S, stage.failed)
+            self._trails = page.gui.add_checkbox("Trail", True)
+            self._scans = page.gui.add_checkbox("Newest scan", True)
+            self._list = page.gui.add_html(text_html("No scan has come yet."))
+        self._refresher = Refresher("trail", self._refresh, _PERIOD_S, page.failed)
         for control in (self._trails, self._scans):
             control.on_update(lambda _: self._redraw())
 
@@ -68,18 +68,18 @@ class TrailLayer:
         if lines:
             pieces = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
             handles.append(
-                self._stage.scene.add_line_segments(
+                self._page.scene.add_line_segments(
                     f"{root}/trail",
-                    self._stage.in_scene(pieces),
+                    self._page.in_scene(pieces),
                     colors=colour,
                     thickness=_LINE_PIXELS,
                     thickness_units="screen",
                 )
             )
         if source.newest is not None and self._scans.value:
-            at = self._stage.in_scene(source.newest.points)
+            at = self._page.in_scene(source.newest.points)
             handles.append(
-                self._stage.scene.add_point_cloud(
+                self._page.scene.add_point_cloud(
                     f"{root}/scan", at, colour, point_size=_POINT_M, precision="float32"
                 )
             )

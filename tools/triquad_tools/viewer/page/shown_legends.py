@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from triquad_tools.viewer.legend import Scale
+from triquad_tools.viewer.page.legend import Scale
 
 
 class LineMeaning(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import TileIndex
 
-from triquad_tools.viewer.map_source import COARSEST, MapSource, Tile, TileFollower
+from triquad_tools.viewer.sources.map_source import COARSEST, MapSource, Tile, TileFollower
 
 
 class NearTiles:

@@ -1,18 +1,10 @@
 """Meshes with fewer triangles, for what is far away."""
 
-from typing import NamedTuple
-
 import numpy as np
-from triquad_format.records.arrays import Floats, Ints
+
+from triquad_tools.viewer.page.unlit_glb import Triangles
 
 _ON_SIDE_M = 1e-3
-
-
-class Triangles(NamedTuple):
-    """A mesh within a tile."""
-
-    vertices: Floats  # [V, 3] metres, relative to the tile's origin
-    faces: Ints  # [F, 3]
 
 
 def thinned(triangles: Triangles, cell_m: float, side_m: float) -> Triangles:

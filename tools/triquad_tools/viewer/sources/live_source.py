@@ -9,7 +9,7 @@ from triquad_client.mesh.followed_mesh import KnownTiles, MeshTile, TileIndex
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_format.mapfile.metadata import utc_time
 
-from triquad_tools.viewer.map_source import MapState, TileSizes
+from triquad_tools.viewer.sources.map_source import MapState, TileSizes
 
 _POINT = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 

@@ -5,32 +5,34 @@ Specification: glTF 2.0, and KHR_materials_unlit.
 
 import json
 import struct
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Doubles, Floats, Ints
 
-from triquad_tools.viewer.tone import untoned
+from triquad_tools.viewer.page.tone_mapping import untoned
 
 _FLOAT, _UINT32 = 5126, 5125
 _HEADER = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<I4s")
 
 
-def unlit_glb(
-    vertices: NDArray[np.float32],
-    faces: NDArray[np.int32],
-    colours: Doubles,
-    opacity: float = 1.0,
-) -> bytes:
+class Triangles(NamedTuple):
+    """A mesh."""
+
+    vertices: Floats  # [V, 3] metres, relative to where it is drawn
+    faces: Ints  # [F, 3] rows of vertices, counter-clockwise seen from outside or free space
+
+
+def unlit_glb(triangles: Triangles, colours: Doubles, opacity: float = 1.0) -> bytes:
     """A GLB file.
 
     Args:
-        vertices: [V, 3], at least one.
-        faces: [F, 3] rows of vertices.
+        triangles: the mesh, of one vertex at least.
         colours: [V, 3] of the vertices, linear in [0, 1], as the screen shall show them.
         opacity: below 1, what is behind shines through, and faces are seen from both sides.
     """
+    vertices, faces = triangles
     arrays = (
         np.ascontiguousarray(vertices, "<f4").tobytes(),
         untoned(np.clip(colours, 0.0, 1.0)).astype("<f4").tobytes(),

@@ -12,8 +12,8 @@ from triquad_client.mesh.followed_mesh import TileIndex
 from triquad_client.offline.map_mesh import BLOCK_CELLS, MeshBlocks
 from triquad_format.mapfile.metadata import utc_time
 
-from triquad_tools.viewer.map_source import COARSEST, MapState, TileSizes
-from triquad_tools.viewer.tile_maker import MadeTile, TileMaker
+from triquad_tools.viewer.sources.map_source import COARSEST, MapState, TileSizes
+from triquad_tools.viewer.sources.tile_maker import MadeTile, TileMaker
 
 _CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
 _WAIT_S = 0.1
