@@ -23,6 +23,7 @@ class Viewer:
     def __init__(self, shown: MapSource | History, host: str, port: int) -> None:
         self._shown = shown
         self._sessions: dict[int, BrowserSession] = {}
+        self._closed = False
         self._changing = threading.Lock()
         self._opened = threading.Event()
         for message in _OF_ONE_WHO_LEFT:
@@ -44,6 +45,7 @@ class Viewer:
     def close(self) -> None:
         """Serve no longer."""
         with self._changing:
+            self._closed = True
             sessions = list(self._sessions.values())
             self._sessions.clear()
         for session in sessions:
@@ -54,8 +56,14 @@ class Viewer:
     def _enter(self, client: viser.ClientHandle) -> None:
         session = BrowserSession(client, self._shown)
         with self._changing:
-            self._sessions[client.client_id] = session
-        self._opened.set()
+            # A browser may leave meanwhile: callbacks run at the same time, in any order.
+            left = self._closed or client.client_id not in self._server.get_clients()
+            if not left:
+                self._sessions[client.client_id] = session
+        if left:
+            session.close()
+        else:
+            self._opened.set()
 
     def _leave(self, client: viser.ClientHandle) -> None:
         with self._changing:

@@ -14,10 +14,9 @@ from triquad_tools.viewer.asking.distance_scale import distance_colours, distanc
 from triquad_tools.viewer.asking.path_check import PathAnswer, ask_path
 from triquad_tools.viewer.asking.questions import newest_epoch
 from triquad_tools.viewer.asking.tube import Tube, add_tube
-from triquad_tools.viewer.page.legend import legend_html
+from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import table_html, text_html
-from triquad_tools.viewer.page.shown_legends import LineMeaning, lines_html
 
 _RADIUS_M = 0.3
 _NAME = "path"
@@ -98,15 +97,15 @@ class PathProbe:
     def _check(self) -> None:
         """Ask about the path as it is now, and draw it."""
         self._answer = None
-        self._page.legends.scales.pop(_NAME, None)
-        self._page.legends.lines.pop(_NAME, None)
+        self._page.legends.hide(_NAME)
         if self.unanswered:
             queries = self._page.source.queries
             points = np.array(self._points)
             self._answer = ask_path(queries, points, float(self._radius.value))
             scale = distance_scale("clearance of the robot's middle, m", self._answer.reach_m)
-            self._legend.content = legend_html(scale) + lines_html(_LINES)
-            self._page.legends.scales[_NAME], self._page.legends.lines[_NAME] = scale, _LINES
+            legend = Legend(scale, _LINES)
+            self._legend.content = legend.html
+            self._page.legends.show(_NAME, legend)
         self._text.content = path_html(self._points, self._answer)
         with self._page.client.atomic():
             self._erase()

@@ -9,11 +9,10 @@ from triquad_tools.viewer.asking.picking import ground_in_view
 from triquad_tools.viewer.asking.questions import Pace, newest_epoch
 from triquad_tools.viewer.asking.slice_drawing import SliceDrawing
 from triquad_tools.viewer.asking.slice_plane import HEIGHT_AXIS, SlicePlane, ask_slice
-from triquad_tools.viewer.page.legend import legend_html
+from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import text_html
 from triquad_tools.viewer.page.refresher import Refresher
-from triquad_tools.viewer.page.shown_legends import LineMeaning, lines_html
 
 _PERIOD_S = 0.5
 _AXES = {"level, at some z": HEIGHT_AXIS, "upright, at some x": 0, "upright, at some y": 1}
@@ -83,8 +82,7 @@ class SliceLayer:
     def _erase(self) -> None:
         self._drawing.erase()
         self._drawn = None
-        self._page.legends.scales.pop(_NAME, None)
-        self._page.legends.lines.pop(_NAME, None)
+        self._page.legends.hide(_NAME)
 
     def _place(self) -> None:
         """Put the slice through the middle of the view, with room to move it."""
@@ -104,5 +102,6 @@ class SliceLayer:
             LineMeaning(BEHIND, False, "behind a surface"),
             LineMeaning(UNKNOWN, False, "unknown: not seen"),
         )
-        self._page.legends.scales[_NAME], self._page.legends.lines[_NAME] = scale, lines
-        self._legend.content = legend_html(scale) + lines_html(lines) + text_html(f"epoch {epoch}")
+        legend = Legend(scale, lines)
+        self._page.legends.show(_NAME, legend)
+        self._legend.content = legend.html + text_html(f"epoch {epoch}")

@@ -6,11 +6,11 @@ import numpy as np
 import viser
 from triquad_format.records.arrays import Doubles
 
+from triquad_tools.viewer.page.colour_scale import GAMMA
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.unlit_glb import Triangles, unlit_glb
 
 _SIDES = 8
-_GAMMA = 2.2  # from colours on a screen to light
 _OUTLINE = 1.35  # its radius, as a multiple
 _HEAD_LENGTH, _HEAD_RADIUS, _NECK = 0.3, 2.5, 1e-3  # of an arrow, shares of its length and radius
 
@@ -40,7 +40,7 @@ def add_tube(page: Page, name: str, tube: Tube) -> viser.GlbHandle:
     outer = tube_mesh(points, _OUTLINE * tube.radii_m)
     # Only the far inside of the outline is drawn: a rim that is seen around the tube.
     behind = outer.faces[:, ::-1] + len(inner.vertices)
-    light = np.repeat(tube.colours**_GAMMA, 2 * _SIDES, axis=0)
+    light = np.repeat(tube.colours**GAMMA, 2 * _SIDES, axis=0)
     both = Triangles(
         np.concatenate([inner.vertices, outer.vertices]), np.concatenate([inner.faces, behind])
     )

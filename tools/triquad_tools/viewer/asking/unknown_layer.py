@@ -12,19 +12,19 @@ from triquad_tools.viewer.asking.unknown_boundary import (
     ask_boundary,
     face_triangles,
 )
+from triquad_tools.viewer.page.colour_scale import GAMMA
+from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import text_html
 from triquad_tools.viewer.page.refresher import Refresher
-from triquad_tools.viewer.page.shown_legends import LineMeaning, lines_html
 from triquad_tools.viewer.page.unlit_glb import unlit_glb
 
 _PERIOD_S = 1.0
 _COLOUR_HEX = "#cc79a7"
-_MEANING = (LineMeaning(_COLOUR_HEX, False, "between free and unknown space"),)
+_LEGEND = Legend(lines=(LineMeaning(_COLOUR_HEX, False, "between free and unknown space"),))
 _NAME = "unknown space"
 _COLOUR = np.array(to_rgb(_COLOUR_HEX))
 _SHADES = np.array([0.8, 0.65, 1.0])  # of faces across x, y and z: else no edge would be seen
-_GAMMA = 2.2  # from colours on a screen to light
 _OPACITY = 0.4
 _VOXEL_CELLS = 2  # a cell of the mesh is half a voxel, as fine as what is known is told
 
@@ -68,18 +68,18 @@ class UnknownLayer:
         if len(boundary.faces.cells):
             triangles = face_triangles(boundary.faces)
             shades = _COLOUR * _SHADES[np.abs(boundary.faces.steps).argmax(axis=1), None]
-            glb = unlit_glb(triangles, shades.repeat(4, axis=0) ** _GAMMA, _OPACITY)
+            glb = unlit_glb(triangles, shades.repeat(4, axis=0) ** GAMMA, _OPACITY)
             corner = np.array(box.corner)
             self._surface = self._page.add_glb("/unknown", glb, corner, scale=box.cell_m)
-        self._legend.content = lines_html(_MEANING) + text_html(_extent(box, boundary))
-        self._page.legends.lines[_NAME] = _MEANING
+        self._legend.content = _LEGEND.html + text_html(_extent(box, boundary))
+        self._page.legends.show(_NAME, _LEGEND)
         self._drawn, self._epoch = box, boundary.epoch
 
     def _erase(self) -> None:
         if self._surface is not None:
             self._surface.remove()
         self._surface = self._drawn = None
-        self._page.legends.lines.pop(_NAME, None)
+        self._page.legends.hide(_NAME)
 
 
 def _extent(box: CellBox, boundary: Boundary) -> str:

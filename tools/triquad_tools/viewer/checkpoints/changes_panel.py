@@ -15,10 +15,10 @@ from triquad_tools.mapfiles.object_changes import (
     ObjectChanges,
     object_changes,
 )
+from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import text_html
 from triquad_tools.viewer.page.refresher import Refresher
-from triquad_tools.viewer.page.shown_legends import LineMeaning, lines_html
 from triquad_tools.viewer.sources.history import Moment
 from triquad_tools.viewer.sources.history_source import HistorySource
 
@@ -115,10 +115,9 @@ class ChangesPanel:
         for number, move in enumerate(found.moved[:_DRAWN], start=1):
             way = np.array([[move.before.middle_m, move.after.middle_m]])
             self._add_lines(f"/changes/moved_{number}", way, MOVED)
-        lines = self._page.legends.lines["changes"] = _meanings(between)
-        self._text.content = (
-            text_html(_heading(between)) + lines_html(lines) + text_html(_list(found))
-        )
+        legend = _legend(between)
+        self._page.legends.show("changes", legend)
+        self._text.content = text_html(_heading(between)) + legend.html + text_html(_list(found))
 
     def _outline(self, change: Change) -> None:
         lines = _outline(change.cluster)
@@ -146,7 +145,7 @@ class ChangesPanel:
         for handle in self._handles:
             handle.remove()
         self._handles.clear()
-        self._page.legends.lines.pop("changes", None)
+        self._page.legends.hide("changes")
         content = text_html(text) if text else ""
         if self._text.content != content:
             self._text.content = content
@@ -179,14 +178,14 @@ def _dashes(lines: Doubles) -> Doubles:
     return np.concatenate(dashes)
 
 
-def _meanings(between: Between) -> tuple[LineMeaning, ...]:
-    """What the lines in the scene say."""
+def _legend(between: Between) -> Legend:
     before, after = between.before.epoch, between.after.epoch
-    return (
+    lines = (
         LineMeaning(APPEARED, False, f"appeared (A): free space in epoch {before}"),
         LineMeaning(VANISHED, True, f"vanished (V): free space in epoch {after}"),
         LineMeaning(MOVED, False, "moved (M): dashed before, solid after"),
     )
+    return Legend(lines=lines)
 
 
 def _heading(between: Between) -> str:

@@ -20,13 +20,14 @@ from triquad_tools.viewer.mesh.tile_colours import (
     TileColours,
     lit_colours,
 )
-from triquad_tools.viewer.page.legend import legend_html
+from triquad_tools.viewer.page.legends import Legend
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.refresher import Refresher
 from triquad_tools.viewer.page.unlit_glb import Triangles, unlit_glb
 from triquad_tools.viewer.sources.map_source import COARSEST, Tile
 
 _THINNED_LEVELS = 2  # coarser than those that tiles come in
+_NAME = "mesh"
 _PERIOD_S = 0.5
 _HEIGHT, _AGE, _CONFIDENCE = "height", "age", "confidence"
 _PIXELS = 4  # of a cell
@@ -81,7 +82,7 @@ class MeshLayer:
     def close(self) -> None:
         """Draw no more; what was drawn and the folder go."""
         self._refresher.close()
-        self._page.legends.scales.pop("mesh", None)
+        self._page.legends.hide(_NAME)
         self._whole.close()
         for near in self._near:
             near.close()
@@ -122,10 +123,10 @@ class MeshLayer:
             colours = ConfidenceColours(self._page.source.queries)
         else:
             colours = HeightColours.of_heights(points[:, 2])
-        self._page.legends.scales["mesh"] = colours.scale
-        legend = legend_html(colours.scale)
-        if self._legend.content != legend:
-            self._legend.content = legend
+        legend = Legend(colours.scale)
+        self._page.legends.show(_NAME, legend)
+        if self._legend.content != legend.html:
+            self._legend.content = legend.html
         return colours
 
     def _wanted_levels(self, roots: Mapping[TileIndex, Tile]) -> dict[TileIndex, int]:

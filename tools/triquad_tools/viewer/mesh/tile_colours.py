@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles
+from triquad_map.height_scale import HeightScale
 
-from triquad_tools.viewer.page.legend import Scale, scale_colours
+from triquad_tools.viewer.page.colour_scale import ColourScale, scale_colours
 from triquad_tools.viewer.page.unlit_glb import Triangles
 from triquad_tools.viewer.sources.map_source import Tile
 
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 _SUN, _SKY = 0.55, 0.5
-_STEP_M = 0.5
-_FRAMED = (1.0, 99.0)  # percentiles of heights
+_STEP_M = 0.5  # of the ends of the scale: it stays the same as the map grows a little
 _OLDEST_LOG2 = 10  # of ages, in epochs
 _NEAR_M = 1.0  # around a vertex, where its surface is looked for
 
@@ -26,7 +26,7 @@ class TileColours(Protocol):
     """Colours of mesh tiles."""
 
     @property
-    def scale(self) -> Scale:
+    def scale(self) -> ColourScale:
         """What they mean."""
 
     def key(self, tile: Tile) -> Hashable:
@@ -46,14 +46,14 @@ class HeightColours:
     @classmethod
     def of_heights(cls, heights: NDArray[np.floating]) -> "HeightColours":
         """A scale for nearly all of heights [N], metres, to half a metre."""
-        low, high = np.percentile(heights, _FRAMED) if len(heights) else (0.0, 1.0)
-        low_m = math.floor(low / _STEP_M) * _STEP_M
-        return cls(low_m, max(math.ceil(high / _STEP_M) * _STEP_M, low_m + _STEP_M))
+        scale = HeightScale.around(heights)
+        low_m = math.floor(scale.low_m / _STEP_M) * _STEP_M
+        return cls(low_m, math.ceil(scale.high_m / _STEP_M) * _STEP_M)
 
     @property
-    def scale(self) -> Scale:
+    def scale(self) -> ColourScale:
         """Metres; what is beyond has the colour of the end."""
-        return Scale("height, m", self.low_m, self.high_m, open_below=True, open_above=True)
+        return ColourScale("height, m", self.low_m, self.high_m, open_below=True, open_above=True)
 
     def key(self, tile: Tile) -> Hashable:  # noqa: ARG002
         """The scale, which is that of all tiles."""
@@ -76,10 +76,12 @@ class AgeColours:
         return cls(max((tile.version for tile in tiles), default=0))
 
     @property
-    def scale(self) -> Scale:
+    def scale(self) -> ColourScale:
         """Powers of two, since most changes are recent."""
         ticks = ["1", "4", "16", "64", "256", "1024"]
-        return Scale("epochs since it changed", 0.0, _OLDEST_LOG2, open_above=True, ticks=ticks)
+        return ColourScale(
+            "epochs since it changed", 0.0, _OLDEST_LOG2, open_above=True, ticks=ticks
+        )
 
     def key(self, tile: Tile) -> Hashable:
         """The power of two."""
@@ -100,9 +102,9 @@ class ConfidenceColours:
     queries: MapQueries
 
     @property
-    def scale(self) -> Scale:
+    def scale(self) -> ColourScale:
         """From 0 to 1."""
-        return Scale("confidence", 0.0, 1.0)
+        return ColourScale("confidence", 0.0, 1.0)
 
     def key(self, tile: Tile) -> Hashable:
         """That of the tile's own version."""

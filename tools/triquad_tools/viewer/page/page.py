@@ -9,7 +9,7 @@ import viser
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
-from triquad_tools.viewer.page.shown_legends import ShownLegends
+from triquad_tools.viewer.page.legends import ShownLegends
 from triquad_tools.viewer.sources.map_source import MapSource
 
 _GRID_M = 100.0

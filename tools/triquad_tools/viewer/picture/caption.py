@@ -1,13 +1,13 @@
 """What stands below a picture of a scene: the map, its state, and what colours and lines mean."""
 
-from itertools import chain
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
-from triquad_tools.viewer.page.legend import Scale, scale_colours
-from triquad_tools.viewer.page.shown_legends import LineMeaning, ShownLegends
+from triquad_tools.viewer.page.colour_scale import GAMMA, ColourScale, scale_colours
+from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.sources.map_source import MapState
 
 _TEXT_PX = 28
@@ -19,9 +19,10 @@ _MARGIN_PX = 20
 _INK = "#222222"
 
 
-def captioned(picture: Image.Image, state: MapState, legends: ShownLegends) -> Image.Image:
+def captioned(picture: Image.Image, state: MapState, legends: Sequence[Legend]) -> Image.Image:
     """The picture with a strip below it."""
-    scales, lines = list(legends.scales.values()), list(chain(*legends.lines.values()))
+    scales = [legend.scale for legend in legends if legend.scale is not None]
+    lines = [line for legend in legends for line in legend.lines]
     rows = 1 + 2 * len(scales) + len(lines)
     height = picture.height + rows * _ROW_PX + 2 * _MARGIN_PX
     sheet = Image.new("RGB", (picture.width, height), "white")
@@ -49,10 +50,10 @@ class _Strip:
         self._draw.text((left, self._top), text, _INK, self._font)
         self._top += _ROW_PX
 
-    def draw_scale(self, scale: Scale) -> None:
+    def draw_scale(self, scale: ColourScale) -> None:
         """A bar with its label beside it and its values below."""
         width, height = _BAR_PX
-        colours = scale_colours(scale, np.linspace(scale.low, scale.high, width)) ** (1 / 2.2)
+        colours = scale_colours(scale, np.linspace(scale.low, scale.high, width)) ** (1 / GAMMA)
         row = np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8)
         bar = np.ascontiguousarray(np.broadcast_to(row, (height, width, 3)))
         self._sheet.paste(Image.fromarray(bar), (_MARGIN_PX, self._top + 8))

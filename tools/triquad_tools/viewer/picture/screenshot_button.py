@@ -31,7 +31,7 @@ class ScreenshotButton:
         self._button.disabled = True
         try:
             state = self._page.source.state()
-            picture = captioned(self._picture(), state, self._page.legends)
+            picture = captioned(self._picture(), state, self._page.legends.shown())
             encoded = io.BytesIO()
             picture.save(encoded, "PNG")
             self._page.client.send_file_download(

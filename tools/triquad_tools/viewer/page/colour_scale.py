@@ -1,15 +1,17 @@
-"""Scales of colours, and their legends in the panel."""
+"""Scales of colours."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
-from triquad_map.height_scale import HEIGHT_STOPS
+from triquad_map.height_scale import HEIGHT_STOPS, colours_between
 
 _TICKS = 5
+
+GAMMA = 2.2
+"""From colours as screens take them to linear ones: those to this power."""
 
 Stops = tuple[tuple[float, float, float], ...]
 """Colours, sRGB in [0, 1], evenly spaced from the lower to the upper end of a scale."""
@@ -18,7 +20,7 @@ _HEIGHTS: Stops = tuple((red, green, blue) for red, green, blue in HEIGHT_STOPS.
 
 
 @dataclass(frozen=True)
-class Scale:
+class ColourScale:
     """Colours for values from ``low`` to ``high``; what is beyond has those of the ends."""
 
     label: str  # with its unit
@@ -39,21 +41,7 @@ class Scale:
         return texts
 
 
-def scale_colours(scale: Scale, values: NDArray[np.floating]) -> Doubles:
+def scale_colours(scale: ColourScale, values: NDArray[np.floating]) -> Doubles:
     """Linear colours [N, 3] of values [N]."""
     places = (np.asarray(values, np.float64) - scale.low) / (scale.high - scale.low)
-    stops = np.linspace(0.0, 1.0, len(scale.stops))
-    encoded = [np.interp(places, stops, channel) for channel in np.transpose(scale.stops)]
-    return np.stack(encoded, axis=1) ** 2.2
-
-
-def legend_html(scale: Scale) -> str:
-    """The scale for the panel."""
-    stops = ", ".join(to_hex(stop) for stop in scale.stops)
-    ticks = "".join(f"<span>{text}</span>" for text in scale.tick_texts)
-    return (
-        '<div style="padding: 0.2em 1em; font-size: 0.8em">'
-        f"<div>{scale.label}</div>"
-        f'<div style="height: 0.8em; background: linear-gradient(to right, {stops})"></div>'
-        f'<div style="display: flex; justify-content: space-between">{ticks}</div></div>'
-    )
+    return colours_between(np.array(scale.stops), places) ** GAMMA
