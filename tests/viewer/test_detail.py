@@ -11,8 +11,8 @@ from support.servers import SMALL, learn, running_service
 from triquad_client import connect
 from triquad_tools.plots.camera import view_axes
 from triquad_tools.viewer.mesh.detail import Viewpoint, wanted_levels
-from triquad_tools.viewer.mesh.framing import view_of
 from triquad_tools.viewer.mesh.near_tiles import NearTiles
+from triquad_tools.viewer.mesh.overview_camera import view_of
 from triquad_tools.viewer.mesh.thinning import thinned
 from triquad_tools.viewer.page.tone_mapping import toned, untoned
 from triquad_tools.viewer.page.unlit_glb import Triangles, unlit_glb

@@ -14,7 +14,7 @@ from triquad_tools.viewer.sources.history import DamagedError, History
 from triquad_tools.viewer.sources.history_source import newest_of
 from triquad_tools.viewer.sources.map_source import COARSEST
 from triquad_tools.viewer.sources.open_maps import OpenMaps
-from triquad_tools.viewer.sources.tile_maker import MadeTile, TileCache
+from triquad_tools.viewer.sources.tile_cache import MadeTile, TileCache
 
 ORIGIN = [[0.0, 0.0, 1.0]]
 

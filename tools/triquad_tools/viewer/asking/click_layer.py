@@ -34,7 +34,7 @@ class ClickLayer:
             )
             self._point = PointProbe(page)
             self._path = PathProbe(page, self._do)
-        self._refresher = Refresher("clicks", self._refresh, _PERIOD_S, page.failed)
+        self._refresher = Refresher("clicks", self._refresh, period_s=_PERIOD_S, failed=page.failed)
         self._use.on_update(lambda _: self._refresher.wake())
         page.scene.on_click()(self._clicked)
 

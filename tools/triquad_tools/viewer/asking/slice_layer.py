@@ -44,7 +44,7 @@ class SliceLayer:
                 "Up to (m)", _MAX_DISTANCE_M, min=0.2, max=50.0, step=0.1, visible=False
             )
             self._legend = gui.add_html("", visible=False)
-        self._refresher = Refresher("slice", self._refresh, _PERIOD_S, page.failed)
+        self._refresher = Refresher("slice", self._refresh, period_s=_PERIOD_S, failed=page.failed)
         for control in (self._shown, self._at, self._most):
             control.on_update(lambda _: self._refresher.wake())
         self._kind.on_update(self._place_anew)

@@ -42,7 +42,9 @@ class UnknownLayer:
         with self._folder:
             self._shown = page.gui.add_checkbox("Show border", False)
             self._legend = page.gui.add_html("", visible=False)
-        self._refresher = Refresher("unknown space", self._refresh, _PERIOD_S, page.failed)
+        self._refresher = Refresher(
+            "unknown space", self._refresh, period_s=_PERIOD_S, failed=page.failed
+        )
         self._shown.on_update(lambda _: self._refresher.wake())
 
     def close(self) -> None:

@@ -27,7 +27,7 @@ class TimePanel:
             self._text = page.gui.add_html("")
             self._damaged = page.gui.add_html("")
         self._offer(source.history.moments)
-        self._refresher = Refresher("time", self._refresh, _PERIOD_S, page.failed)
+        self._refresher = Refresher("time", self._refresh, period_s=_PERIOD_S, failed=page.failed)
         self._slider.on_update(lambda _: self._want(self._slider.value))
         self._buttons.on_click(lambda _: self._step(-1 if self._buttons.value == _PREVIOUS else 1))
 

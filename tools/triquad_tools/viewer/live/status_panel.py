@@ -22,7 +22,7 @@ class StatusPanel:
         with self._folder:
             self._figures = page.gui.add_html("")
             self._warnings = page.gui.add_html("")
-        self._refresher = Refresher("status", self._refresh, _PERIOD_S, page.failed)
+        self._refresher = Refresher("status", self._refresh, period_s=_PERIOD_S, failed=page.failed)
 
     def close(self) -> None:
         """Show no more."""

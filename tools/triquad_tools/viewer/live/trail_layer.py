@@ -32,7 +32,7 @@ class TrailLayer:
             self._trails = page.gui.add_checkbox("Trail", True)
             self._scans = page.gui.add_checkbox("Newest scan", True)
             self._list = page.gui.add_html(text_html("No scan has come yet."))
-        self._refresher = Refresher("trail", self._refresh, _PERIOD_S, page.failed)
+        self._refresher = Refresher("trail", self._refresh, period_s=_PERIOD_S, failed=page.failed)
         for control in (self._trails, self._scans):
             control.on_update(lambda _: self._redraw())
 

@@ -19,7 +19,12 @@ class Refresher:
     """
 
     def __init__(
-        self, name: str, refresh: Callable[[], None], period_s: float, failed: Callable[[str], None]
+        self,
+        name: str,
+        refresh: Callable[[], None],
+        *,
+        period_s: float,
+        failed: Callable[[str], None],
     ) -> None:
         self._refresh = refresh
         self._period_s = period_s

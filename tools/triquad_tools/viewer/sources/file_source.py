@@ -13,7 +13,8 @@ from triquad_client.offline.map_mesh import BLOCK_CELLS, MeshBlocks
 from triquad_format.mapfile.metadata import utc_time
 
 from triquad_tools.viewer.sources.map_source import COARSEST, MapState, TileSizes
-from triquad_tools.viewer.sources.tile_maker import MadeTile, TileMaker
+from triquad_tools.viewer.sources.tile_cache import MadeTile
+from triquad_tools.viewer.sources.tile_maker import TileMaker
 
 _CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
 _WAIT_S = 0.1
@@ -147,7 +148,7 @@ class FileFollower:
     def moved(self, bounds: Bounds) -> "FileFollower":
         """Follow another box instead: what was made is still known."""
         self.close()
-        return FileFollower(self._maker, self._level, bounds, self._made)
+        return FileFollower(self._maker, self._level, bounds, made=self._made)
 
     def close(self) -> None:
         """Follow no longer."""

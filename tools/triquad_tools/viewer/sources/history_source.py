@@ -11,7 +11,7 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.sources.file_source import FileSource
 from triquad_tools.viewer.sources.history import DamagedError, History, Moment
 from triquad_tools.viewer.sources.map_source import MapState
-from triquad_tools.viewer.sources.tile_maker import MadeTile
+from triquad_tools.viewer.sources.tile_cache import MadeTile
 
 _COARSE_S = 5.0  # after so long, a map is shown with what there is of its mesh
 

@@ -73,7 +73,7 @@ class LiveFollower:
         """Follow another box instead."""
         known = self._watch.known_tiles()
         self.close()
-        return LiveFollower(self._client, self._watch.level, bounds, known)
+        return LiveFollower(self._client, self._watch.level, bounds, known=known)
 
     def close(self) -> None:
         """Follow no longer."""

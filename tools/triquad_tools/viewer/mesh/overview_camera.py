@@ -39,7 +39,7 @@ def view_of(points: Doubles, aspect: float) -> View:
     return View((middle - [0.0, 0.0, distance_m]) @ axes, middle @ axes)
 
 
-class Framing:
+class OverviewCamera:
     """Moves the camera of a scene back as the map grows."""
 
     def __init__(self, page: Page) -> None:
