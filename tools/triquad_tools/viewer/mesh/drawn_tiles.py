@@ -16,7 +16,7 @@ from triquad_tools.viewer.sources.map_source import COARSEST
 class _DrawnTile(NamedTuple):
     """What is in the scene for a tile."""
 
-    look: Hashable  # what is drawn looks otherwise where this is another one
+    appearance: Hashable  # where this is another one, what is drawn looks otherwise
     handle: viser.GlbHandle | None  # None: no triangle was left
 
 
@@ -32,12 +32,12 @@ class DrawnTiles:
     def show(self, wanted: Mapping[TileName, WantedTile], colours: TileColours) -> None:
         """Draw what is wanted and not there yet; what is wanted no more goes a round later."""
         for name, want in wanted.items():
-            look = (want.tile.version, want.level, type(colours), colours.key(want.tile))
+            appearance = (want.tile.version, want.level, type(colours), colours.key(want.tile))
             drawn = self._drawn.get(name)
-            if drawn is None or drawn.look != look:
+            if drawn is None or drawn.appearance != appearance:
                 handle = self._draw(want, colours)
                 self._replace(name)
-                self._drawn[name] = _DrawnTile(look, handle)
+                self._drawn[name] = _DrawnTile(appearance, handle)
         for name in self._drawn.keys() - wanted.keys():
             self._replace(name)
 

@@ -11,7 +11,7 @@ from triquad_tools.viewer.page.colour_scale import ColourScale
 
 
 class LineMeaning(NamedTuple):
-    """What lines of one look say."""
+    """What lines that look alike say."""
 
     colour: str  # as in #rrggbb
     dashed: bool
