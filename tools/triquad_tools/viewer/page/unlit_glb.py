@@ -5,7 +5,7 @@ Specification: glTF 2.0, and KHR_materials_unlit.
 
 import json
 import struct
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Ints
@@ -38,21 +38,28 @@ def unlit_glb(triangles: Triangles, colours: Doubles, opacity: float = 1.0) -> b
         untoned(np.clip(colours, 0.0, 1.0)).astype("<f4").tobytes(),
         np.ascontiguousarray(faces, "<u4").tobytes(),
     )
-    starts = [0, len(arrays[0]), len(arrays[0]) + len(arrays[1])]
-    document = {
+    document = _document(triangles, [len(array) for array in arrays], opacity)
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    binary = b"".join(arrays)
+    size = _HEADER.size + 2 * _CHUNK.size + len(text) + len(binary)
+    head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text
+    return head + _CHUNK.pack(len(binary), b"BIN\0") + binary
+
+
+def _document(triangles: Triangles, lengths: list[int], opacity: float) -> dict[str, Any]:
+    """What the binary part holds: positions, colours and faces of so many bytes each."""
+    vertices, faces = triangles
+    starts = [sum(lengths[:number]) for number in range(len(lengths))]
+    floats = {"componentType": _FLOAT, "count": len(vertices), "type": "VEC3"}
+    lows, highs = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
+    return {
         "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "extensionsUsed": ["KHR_materials_unlit"],
-        "materials": [
-            {
-                "extensions": {"KHR_materials_unlit": {}},
-                "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, opacity]},
-                "alphaMode": "OPAQUE" if opacity == 1.0 else "BLEND",
-                "doubleSided": opacity != 1.0,
-            }
-        ],
+        "materials": [_material(opacity)],
         "meshes": [
             {
                 "primitives": [
@@ -61,31 +68,22 @@ def unlit_glb(triangles: Triangles, colours: Doubles, opacity: float = 1.0) -> b
             }
         ],
         "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": _FLOAT,
-                "count": len(vertices),
-                "type": "VEC3",
-                "min": vertices.min(axis=0).tolist(),
-                "max": vertices.max(axis=0).tolist(),
-            },
-            {
-                "bufferView": 1,
-                "componentType": _FLOAT,
-                "count": len(vertices),
-                "type": "VEC3",
-            },
+            {"bufferView": 0, **floats, "min": lows, "max": highs},
+            {"bufferView": 1, **floats},
             {"bufferView": 2, "componentType": _UINT32, "count": 3 * len(faces), "type": "SCALAR"},
         ],
         "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": len(array)}
-            for start, array in zip(starts, arrays, strict=True)
+            {"buffer": 0, "byteOffset": start, "byteLength": length}
+            for start, length in zip(starts, lengths, strict=True)
         ],
-        "buffers": [{"byteLength": sum(map(len, arrays))}],
+        "buffers": [{"byteLength": sum(lengths)}],
     }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    binary = b"".join(arrays)
-    size = _HEADER.size + 2 * _CHUNK.size + len(text) + len(binary)
-    head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text
-    return head + _CHUNK.pack(len(binary), b"BIN\0") + binary
+
+
+def _material(opacity: float) -> dict[str, Any]:
+    return {
+        "extensions": {"KHR_materials_unlit": {}},
+        "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, opacity]},
+        "alphaMode": "OPAQUE" if opacity == 1.0 else "BLEND",
+        "doubleSided": opacity != 1.0,
+    }

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
+from typing import NamedTuple
 
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
@@ -16,6 +17,13 @@ from triquad_tools.viewer.sources.tile_cache import MadeTile
 _COARSE_S = 5.0  # after so long, a map is shown with what there is of its mesh
 
 
+class _Shown(NamedTuple):
+    """What is shown: exchanged as a whole, since several threads ask."""
+
+    moment: Moment
+    source: FileSource
+
+
 class HistorySource:
     """A map that changes whenever another moment is chosen; closed by who opened it."""
 
@@ -28,20 +36,25 @@ class HistorySource:
             DamagedError: it cannot be shown.
         """
         self.history = history
-        self.moment = moment
-        self._shown = history.use(moment)
-        self._shown.prepare(_COARSE_S)
-        self.sizes = self._shown.sizes
-        self.title = f"{self._shown.opened.name} in {history.folder}"
+        source = history.use(moment)
+        source.prepare(_COARSE_S)
+        self._shown = _Shown(moment, source)
+        self.sizes = source.sizes
+        self.title = f"{source.opened.name} in {history.folder}"
+
+    @property
+    def moment(self) -> Moment:
+        """Which is shown."""
+        return self._shown.moment
 
     @property
     def queries(self) -> MapQueries:
         """Answers for the moment that is shown."""
-        return self._shown.queries
+        return self._shown.source.queries
 
     def state(self) -> MapState:
         """What is shown."""
-        return self._shown.state()
+        return self._shown.source.state()
 
     def follow(self, level: int, bounds: Bounds | None = None) -> "HistoryFollower":
         """The mesh tiles of a level that meet ``bounds``, of whatever moment is shown."""
@@ -62,8 +75,8 @@ class HistorySource:
         except Exception:
             self.history.release(moment)
             raise
-        before, self.moment, self._shown = self.moment, moment, source
-        self.history.release(before)
+        before, self._shown = self._shown, _Shown(moment, source)
+        self.history.release(before.moment)
 
     def close(self) -> None:
         """Show nothing any longer."""
