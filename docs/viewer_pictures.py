@@ -18,7 +18,7 @@ from triquad_tools.benchmarks.browser import opened_page, running_browser, wait_
 from triquad_tools.demo.server import DemoServer
 from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.simulation.street import street_drive
-from triquad_tools.viewer.live_source import LiveSource
+from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
 
 PICTURES = ("viewer.gif", "viewer.png")

@@ -24,6 +24,7 @@ from triquad_client import RefusedError
 from triquad_server.errors import ListenError
 from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.monitoring.families import FAMILIES
+from triquad_tools.demo.server import free_port
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "metrics.md").read_text(encoding="utf-8")
@@ -60,10 +61,6 @@ def samples(port: int) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
         for family in families
         for sample in family.samples
     }
-
-
-def free_port() -> int:
-    return int(servers.free_endpoint().rpartition(":")[2])
 
 
 @pytest.fixture(scope="module")

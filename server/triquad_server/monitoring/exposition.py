@@ -13,7 +13,8 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 from triquad_format.wire.metrics_messages import Seconds, TimeHistogram
 
-from triquad_server.monitoring.families import FAMILIES, Family, Figures, Kind
+from triquad_server.monitoring.families import FAMILIES
+from triquad_server.monitoring.family import Family, Figures, Kind
 
 
 def exposition(figures: Figures, accept: str) -> tuple[bytes, str]:
