@@ -17,18 +17,28 @@ _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove a
 """Warnings of viser: a browser that leaves takes with it what is being drawn or removed there."""
 
 
+class _OwnServer(viser.ViserServer):
+    """Does not do what a page may ask of it behind the back of whoever started it."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
+        """Refuse to show the page to the internet: whoever reaches it could ask for that."""
+        return None
+
+
 class Viewer:
     """Serves a page that shows a map, to several browsers, until it is closed."""
 
     def __init__(self, shown: MapSource | History, host: str, port: int) -> None:
         self._shown = shown
         self._visits: dict[int, Visit] = {}
+        self._gone: set[int] = set()  # clients that left before their visit was there
+        self._closed = False
         self._changing = threading.Lock()
         self._visited = threading.Event()
         for message in _OF_ONE_WHO_LEFT:
             warnings.filterwarnings("ignore", message, UserWarning)
         with redirect_stdout(io.StringIO()):  # it has announcements of its own
-            self._server = viser.ViserServer(host, port, label="triquad", verbose=False)
+            self._server = _OwnServer(host, port, label="triquad", verbose=False)
         self._server.on_client_connect(self._enter)
         self._server.on_client_disconnect(self._leave)
 
@@ -44,6 +54,7 @@ class Viewer:
     def close(self) -> None:
         """Serve no longer."""
         with self._changing:
+            self._closed = True
             visits = list(self._visits.values())
             self._visits.clear()
         for visit in visits:
@@ -54,11 +65,18 @@ class Viewer:
     def _enter(self, client: viser.ClientHandle) -> None:
         visit = Visit(client, self._shown)
         with self._changing:
-            self._visits[client.client_id] = visit
+            stays = client.client_id not in self._gone and not self._closed
+            self._gone.discard(client.client_id)
+            if stays:
+                self._visits[client.client_id] = visit
         self._visited.set()
+        if not stays:
+            visit.close()
 
     def _leave(self, client: viser.ClientHandle) -> None:
         with self._changing:
             visit = self._visits.pop(client.client_id, None)
+            if visit is None:
+                self._gone.add(client.client_id)
         if visit is not None:
             visit.close()
