@@ -1,12 +1,14 @@
 """The web server that shows a map."""
 
 import io
+import socket
 import threading
 import warnings
 from contextlib import redirect_stdout
 
 import viser
 
+from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.history import History
 from triquad_tools.viewer.map_source import MapSource
 from triquad_tools.viewer.visit import Visit
@@ -29,6 +31,12 @@ class Viewer:
     """Serves a page that shows a map, to several browsers, until it is closed."""
 
     def __init__(self, shown: MapSource | History, host: str, port: int) -> None:
+        """Serve at an address of this machine, at ``port`` or the next one that is free.
+
+        Raises:
+            ToolError: it is no such address.
+        """
+        _check_address(host)
         self._shown = shown
         self._visits: dict[int, Visit] = {}
         self._gone: set[int] = set()  # clients that left before their visit was there
@@ -45,7 +53,8 @@ class Viewer:
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+        host = self._server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
 
     def wait_for_visit(self) -> None:
         """Wait until a browser has opened the page."""
@@ -80,3 +89,15 @@ class Viewer:
                 self._gone.add(client.client_id)
         if visit is not None:
             visit.close()
+
+
+def _check_address(host: str) -> None:
+    """Refuse an address at which nothing can be served: viser would try for ever."""
+    try:
+        family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        socket.create_server(address[:2], family=family).close()
+    except (OSError, ValueError) as error:
+        raise ToolError(
+            f"cannot serve a page at {host!r}: {error}; use an address of this machine, such as "
+            "127.0.0.1, or 0.0.0.0 for all"
+        ) from error
