@@ -81,14 +81,18 @@ class MeshLayer:
     def close(self) -> None:
         """Draw no more; what was drawn and the folder go."""
         self._refresher.close()
-        self._stage.legends.scales.pop("mesh", None)
         self._whole.close()
         for near in self._near:
             near.close()
-        for name in list(self._drawn):
-            self._retire(name)
+        self._erase()
         self._remove_retired()
         self._folder.remove()
+
+    def _erase(self) -> None:
+        """Have nothing drawn from the next round on."""
+        self._stage.legends.scales.pop("mesh", None)
+        for name in list(self._drawn):
+            self._retire(name)
 
     def _refresh(self) -> None:
         """One round: what came since the last one is drawn, and what it replaces goes."""
@@ -99,6 +103,7 @@ class MeshLayer:
             self._whole.refresh()
         roots = self._whole.tiles
         if not roots:
+            self._erase()  # the map may have been reset
             return
         points = _some_vertices(roots.values())
         if self._stage.source.grows or not self._framed:

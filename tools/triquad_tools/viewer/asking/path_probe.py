@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 import viser
 from matplotlib.colors import to_rgb
+from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Bytes, Doubles
 
 from triquad_tools.plots.plan import UNKNOWN
@@ -27,6 +28,7 @@ _LINES = (
 )
 _LEAST_LEG_M = 0.01  # a second click at the same place adds nothing
 _LEAST_WIDTH = 0.002  # radius of what is drawn, as a share of the distance of the eye
+_UNANSWERED = "The map does not answer about this path."
 _SKY = "No surface there: the path stays as it was."
 
 
@@ -103,7 +105,12 @@ class PathProbe:
         if self.unanswered:
             queries = self._stage.source.queries
             points = np.array(self._points)
-            self._answer = ask_path(queries, points, float(self._radius.value))
+            try:
+                self._answer = ask_path(queries, points, float(self._radius.value))
+            except TriquadError:
+                self._erase()  # it was true of another radius, or of another map
+                self._text.content = text_html(_UNANSWERED)
+                raise
             scale = distance_scale("clearance of the robot's middle, m", self._answer.reach_m)
             self._legend.content = legend_html(scale) + lines_html(_LINES)
             self._stage.legends.scales[_NAME], self._stage.legends.lines[_NAME] = scale, _LINES
