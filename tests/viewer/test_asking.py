@@ -147,6 +147,11 @@ def test_a_path_is_blocked_where_the_map_says(ground: OfflineMap) -> None:
     assert len({tuple(colour) for colour in colours[answer.pieces.blocked].tolist()}) == 1
 
 
+def test_large_robots_are_answered_for(ground: OfflineMap) -> None:
+    answer = ask_path(ground, np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]]), radius_m=50.0)
+    assert answer.whole.blocked
+
+
 def test_unknown_space_on_a_path_is_grey_and_named(ground: OfflineMap) -> None:
     points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 4.0]])
     answer = ask_path(ground, points, 0.1)
