@@ -19,7 +19,10 @@ from triquad_server.monitoring.family import Family, Figures, Kind
 
 def exposition(figures: Figures, accept: str) -> tuple[bytes, str]:
     """The metrics as text, and its type; ``accept`` is what the reader's request accepts."""
-    encode, content_type = choose_encoder(accept)
+    try:
+        encode, content_type = choose_encoder(accept)
+    except (TypeError, ValueError):  # such as a version that is no number
+        encode, content_type = choose_encoder("")
     return encode(FiguresCollector(figures)), content_type
 
 
