@@ -12,7 +12,6 @@ from triquad_client import OfflineMap, RefusedError, Status
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.viewer.asking.contours import contour_step, contours, numbers
 from triquad_tools.viewer.asking.distance_scale import distance_colours
-from triquad_tools.viewer.asking.focus import Focus
 from triquad_tools.viewer.asking.path_check import ask_path, in_pieces
 from triquad_tools.viewer.asking.path_drawing import piece_colours
 from triquad_tools.viewer.asking.path_probe import path_html
@@ -26,6 +25,7 @@ from triquad_tools.viewer.asking.unknown_boundary import (
     border_faces,
     face_triangles,
 )
+from triquad_tools.viewer.page.focus import Focus
 
 GROUND_M = 0.1  # in the middle of a voxel
 FOCUS = Focus(np.array([0.3, -0.4, 1.2]), 10.0, 16.0)

@@ -197,16 +197,21 @@ def _part(name: str) -> str:
     return name
 
 
+_DESCRIPTION = (
+    "Measure triquad on this machine, on a simulated street: a server under a "
+    "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
+    "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
+    "opened offline, a server whose metrics are read, open air, things that move, a lidar that "
+    "moves while it turns, clouds of ROS 2, rooms, tables and streets with the presets that "
+    "are for them, and, if asked for, the viewer in a browser and the ablation. Takes over "
+    "half an hour; nothing else should run meanwhile."
+)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
-        description="Measure triquad on this machine, on a simulated street: a server under a "
-        "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
-        "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
-        "opened offline, a server whose metrics are read, open air, things that move, a lidar that "
-        "moves while it turns, clouds of ROS 2, rooms, tables and streets with the presets that "
-        "are for them, and, if asked for, the viewer in a browser and the ablation. Takes over "
-        "half an hour; nothing else should run meanwhile.",
+        description=_DESCRIPTION,
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
     )
     add = parser.add_argument
