@@ -116,7 +116,7 @@ class PathProbe:
 
     def _draw_points(self) -> None:
         for number, point in enumerate(self._points, start=1):
-            self._mark(f"/path/points/{number}", f"{number}", point)
+            self._mark(f"/path/points/{number}", f"{number}", point, "center-right")
 
     def _draw_path(self, answer: PathAnswer) -> None:
         eye = self._stage.in_map(self._stage.client.camera.position)
@@ -127,18 +127,22 @@ class PathProbe:
         whole = answer.whole
         if whole.meets_unknown:
             text = f"unknown from {whole.unknown_contact_m:.2f} m"
-            self._mark("/path/unknown", text, answer.at(whole.unknown_contact_m), "top-center")
+            self._mark("/path/unknown", text, answer.at(whole.unknown_contact_m), "top-left")
         if whole.blocked:
             text = f"✖ blocked at {whole.contact_m:.2f} m"
-            self._mark("/path/blocked", text, answer.at(whole.contact_m))
+            self._mark("/path/blocked", text, answer.at(whole.contact_m), "bottom-left")
 
     def _mark(
         self,
         name: str,
         text: str,
         place: Doubles,
-        anchor: Literal["bottom-center", "top-center"] = "bottom-center",
+        anchor: Literal["center-right", "bottom-left", "top-left"],
     ) -> None:
+        """Write a text beside a place [3]; ``anchor`` is the part of the text that lies there.
+
+        Three of them at one place, as where a path is blocked at its first point, can all be read.
+        """
         label = self._stage.scene.add_label(
             name, text, position=self._stage.in_scene(place), anchor=anchor
         )
