@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Floats, Ints
 
-_ON_SIDE_M = 1e-3
+_ON_SIDE_M = 2e-5  # more than rounding, less than what noise moves a ground that lies in the side
 
 
 class Triangles(NamedTuple):
