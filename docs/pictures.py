@@ -4,15 +4,23 @@ Each is what a command draws, made narrower and of few colours, as it is shown b
 come from ``demo-out``, which ``make demo`` leaves and which is made where it is missing.
 """
 
+import runpy
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import trimesh
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
+from triquad_client import Mesh
 from triquad_server import serve
+from triquad_tools.plots.framing import framed
+from triquad_tools.plots.render import render_mesh
 from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.solids import Solid, box
 from triquad_tools.simulation.street import street_drive
@@ -20,7 +28,7 @@ from triquad_tools.simulation.street import street_drive
 IMAGES = Path(__file__).with_name("images")
 ROOT = IMAGES.parents[1]
 
-_WIDTH, _COLOURS = 1200, 256
+_WIDTH, _HEIGHT, _COLOURS = 1200, 600, 256
 _DEMO, _STREET, _SCANS = "demo-out", 1, 25
 _AROUND_M = ((-1.0, -8.0, -1.0), (24.0, 8.0, 4.0))
 _BOX_HALF_M = (0.6, 0.5, 0.9)
@@ -64,6 +72,24 @@ def difference(out: Path) -> None:
         _run("triquad-inspect", *files, "--diff", "--plot", out, folder=Path(folder))
 
 
+def preview(out: Path) -> None:
+    """What MCAP tools show of a map file."""
+    example = runpy.run_path(str(ROOT / "docs" / "examples" / "map_file_as_mcap.py"))
+    with (ROOT / _DEMO / "map.triquad").open("rb") as file:
+        scene = example["preview"](make_reader(file, decoder_factories=[DecoderFactory()]))
+    shown: Any = trimesh.util.concatenate(list(scene.geometry.values()))
+    colours = shown.visual.vertex_colors[:, :3] / 255.0
+    camera = framed(Mesh(shown.vertices, shown.faces), _WIDTH / _HEIGHT).camera
+    options = {"width": _WIDTH, "height": _HEIGHT}
+    picture = render_mesh(shown.vertices, shown.faces, colours, camera, **options)
+    Image.fromarray(picture).save(out)
+
+
+def tradeoffs(out: Path) -> None:
+    """Accuracy by time, bytes and scan spacing; this one takes ten minutes."""
+    _run("triquad-bench", "tradeoffs", "--plot", out)
+
+
 PICTURES: dict[str, Callable[[Path], None]] = {
     "street.png": street,
     "map.png": map_from_above,
@@ -71,6 +97,8 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "slice.png": height_slice,
     "errors.png": errors,
     "difference.png": difference,
+    "preview.png": preview,
+    "tradeoffs.png": tradeoffs,
 }
 """What makes each: it is given the path to write to."""
 
@@ -95,7 +123,7 @@ def _run(command: str, *arguments: object, folder: Path = ROOT) -> None:
     subprocess.run([program, *map(str, arguments)], cwd=folder, check=True, stdout=sys.stderr)
 
 
-def _for_pages(picture: Image.Image) -> Image.Image:
+def for_pages(picture: Image.Image) -> Image.Image:
     """The picture no wider than a page, and of few colours: a small file."""
     shown = picture.convert("RGB")
     if shown.width > _WIDTH:
@@ -118,7 +146,7 @@ def main(names: list[str]) -> None:
             made = Path(folder) / name
             PICTURES[name](made)
             with Image.open(made) as picture:
-                _for_pages(picture).save(IMAGES / name, optimize=True)
+                for_pages(picture).save(IMAGES / name, optimize=True)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from pictures import IMAGES, for_pages
 from PIL import Image
 from playwright.sync_api import Page
 from triquad_client import Client, connect
@@ -17,10 +18,11 @@ from triquad_tools.benchmarks.browser import opened_page, running_browser, wait_
 from triquad_tools.demo.server import DemoServer
 from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.simulation.street import street_drive
-from triquad_tools.viewer.live_source import LiveSource
+from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
 
-IMAGES = Path(__file__).parent / "images"
+PICTURES = ("viewer.gif", "viewer.png")
+
 _MAP = "street"
 _SCANS = 60
 _SCAN_PERIOD_S = 0.5
@@ -43,7 +45,8 @@ def main() -> None:
         save_film(frames, IMAGES / "viewer.gif")
         wait_until_settled(client, _SETTLE_LIMIT_S)
         page.wait_for_timeout(5000)
-        page.screenshot(path=IMAGES / "viewer.png")
+        settled = Image.open(io.BytesIO(page.screenshot()))
+        for_pages(settled).save(IMAGES / "viewer.png", optimize=True)
 
 
 @contextmanager

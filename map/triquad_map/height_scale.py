@@ -49,5 +49,13 @@ class HeightScale:
     def colours(self, heights_m: NDArray[np.floating]) -> Doubles:
         """Colours ``[N, 3]``, sRGB in [0, 1], of heights ``[N]``."""
         place = (np.asarray(heights_m, np.float64) - self.low_m) / (self.high_m - self.low_m)
-        stops = np.linspace(0.0, 1.0, len(HEIGHT_STOPS))
-        return np.stack([np.interp(place, stops, channel) for channel in HEIGHT_STOPS.T], axis=1)
+        return colours_between(HEIGHT_STOPS, place)
+
+
+def colours_between(stops: Doubles, places: Doubles) -> Doubles:
+    """Colours ``[N, 3]`` of places ``[N]`` from 0 to 1 along ``stops`` ``[S, 3]``, evenly spaced.
+
+    What lies beyond has the colours of the ends.
+    """
+    at = np.linspace(0.0, 1.0, len(stops))
+    return np.stack([np.interp(places, at, channel) for channel in stops.T], axis=1)

@@ -10,7 +10,7 @@ from triquad_format.wire.source_messages import (
     SourceState,
 )
 
-from triquad_server.intake.source_trails import SourceNews, SourceTrails, TakenScan, evenly
+from triquad_server.intake.source_trails import SourceDelta, SourceTrails, TakenScan, evenly
 
 
 class SourceQueries:
@@ -33,24 +33,24 @@ class SourceQueries:
             )
         # What another run of the server told is known no more than nothing.
         known = request.revision if request.server == self._server else 0
-        revision, news = self._trails.since(known)
+        revision, deltas = self._trails.since(known)
         if request.revision < 0 or known > revision:
             raise RefusedError(
                 "bad_request",
                 f"revision = {request.revision} is not one that this server told: use that of the "
                 "reply before, or 0",
             )
-        sources = {name: _state(source, request.max_points) for name, source in news.items()}
+        sources = {name: _state(source, request.max_points) for name, source in deltas.items()}
         return SourcesReply(self._server, revision, sources)
 
 
-def _state(news: SourceNews, max_points: int) -> SourceState:
+def _state(delta: SourceDelta, max_points: int) -> SourceState:
     return SourceState(
-        scans=news.scans,
-        whole=news.whole,
-        trail=news.trail,
-        pieces=news.pieces,
-        newest=None if news.newest is None else _sample(news.newest, max_points),
+        scans=delta.scans,
+        whole=delta.whole,
+        trail=delta.trail,
+        pieces=delta.pieces,
+        newest=None if delta.newest is None else _sample(delta.newest, max_points),
     )
 
 

@@ -24,6 +24,7 @@ from triquad_client import RefusedError
 from triquad_server.errors import ListenError
 from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.monitoring.families import FAMILIES
+from triquad_tools.demo.server import free_port
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "metrics.md").read_text(encoding="utf-8")
@@ -60,10 +61,6 @@ def samples(port: int) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
         for family in families
         for sample in family.samples
     }
-
-
-def free_port() -> int:
-    return int(servers.free_endpoint().rpartition(":")[2])
 
 
 @pytest.fixture(scope="module")
@@ -191,6 +188,37 @@ def test_idle_connections_take_no_more_than_some_threads(port):
         closed = silent[-1].recv(1)  # at once, while the first ones are still waited for
         assert closed == b""
     until(lambda: is_healthy(port))  # once it noticed that they were closed
+
+
+def test_requests_that_trickle_in_are_given_up(port):
+    with ExitStack() as stack:
+        open_ones = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(8)
+        ]
+        for connection in open_ones:
+            connection.settimeout(0.1)
+        while open_ones:  # a byte each second or so: never silent for long
+            open_ones = [connection for connection in open_ones if goes_on(connection)]
+    until(lambda: is_healthy(port))
+
+
+def goes_on(connection: socket.socket) -> bool:
+    """Whether a connection that gets another byte stays open."""
+    try:
+        connection.sendall(b"G")
+        return connection.recv(1) != b""
+    except TimeoutError:
+        return True
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("version", ["x", "1.y", "", "\xff", "-1"])
+def test_versions_of_the_format_that_are_none_get_the_plain_one(port, version):
+    for kind in ("application/openmetrics-text", "text/plain"):
+        answer = get(port, "/metrics", f"{kind}; version={version}")
+        assert answer.code == 200
+        assert "triquad_healthy 1.0" in answer.body
 
 
 def is_healthy(port: int) -> bool:

@@ -251,7 +251,7 @@ def test_a_server_that_does_not_know_the_question_is_told_apart():
     ("state", "words"),
     [
         (SourceState(1, True, np.zeros((2, 3)), np.zeros(1, np.int64), None), "2 positions"),
-        (SourceState(1, False, np.zeros((0, 3)), np.zeros(0, np.int64), None), "only its news"),
+        (SourceState(1, False, np.zeros((0, 3)), np.zeros(0, np.int64), None), "only what is new"),
     ],
 )
 def test_replies_that_do_not_fit_together_are_named(state, words):

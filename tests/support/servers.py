@@ -2,7 +2,6 @@
 
 import json
 import queue
-import socket
 import subprocess
 import sys
 import threading
@@ -28,6 +27,7 @@ from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
+from triquad_tools.demo.server import free_endpoint
 
 MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
@@ -39,12 +39,6 @@ SMALL_TOML = (
     "[field]\ndepth = 7\n[training]\nbatch = 2048\nsamples_per_ray = 6.0\npool_rays = 20000\n"
 )
 RADIUS_M = 4.0
-
-
-def free_endpoint() -> str:
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def sphere(count: int = 4000, radius_m: float = RADIUS_M) -> NDArray[np.float32]:

@@ -14,7 +14,8 @@ from triquad_tools.viewer.asking.contours import contour_step, contours, numbers
 from triquad_tools.viewer.asking.distance_scale import distance_colours
 from triquad_tools.viewer.asking.focus import Focus
 from triquad_tools.viewer.asking.path_check import ask_path, in_pieces
-from triquad_tools.viewer.asking.path_probe import path_html, piece_colours
+from triquad_tools.viewer.asking.path_drawing import piece_colours
+from triquad_tools.viewer.asking.path_probe import path_html
 from triquad_tools.viewer.asking.questions import in_small_parts
 from triquad_tools.viewer.asking.slice_plane import SlicePlane, ask_slice
 from triquad_tools.viewer.asking.tube import arrow, tube_mesh

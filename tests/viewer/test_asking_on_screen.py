@@ -13,7 +13,7 @@ from support.servers import WAIT_S, running_service, sphere
 from triquad_client import Client, Status, connect
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import BEHIND, DISTANCE_COLOURS
-from triquad_tools.viewer.live_source import LiveSource
+from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
 
 PATIENCE_MS = 60_000

@@ -11,14 +11,14 @@ from skimage.measure import marching_cubes
 from support.servers import SMALL, learn, running_service
 from triquad_client import connect
 from triquad_tools.plots.camera import view_axes
-from triquad_tools.viewer.detail import Viewpoint, wanted_levels
-from triquad_tools.viewer.framing import view_of
-from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.map_source import COARSEST
-from triquad_tools.viewer.near_tiles import NearTiles
-from triquad_tools.viewer.thinning import Triangles, thinned
-from triquad_tools.viewer.tone import toned, untoned
-from triquad_tools.viewer.unlit_glb import unlit_glb
+from triquad_tools.viewer.mesh.detail import Viewpoint, wanted_levels
+from triquad_tools.viewer.mesh.near_tiles import NearTiles
+from triquad_tools.viewer.mesh.overview_camera import view_of
+from triquad_tools.viewer.mesh.thinning import thinned
+from triquad_tools.viewer.page.tone_mapping import toned, untoned
+from triquad_tools.viewer.page.unlit_glb import Triangles, unlit_glb
+from triquad_tools.viewer.sources.live_source import LiveSource
+from triquad_tools.viewer.sources.map_source import COARSEST
 
 CELLS_M = np.array([0.1, 0.2, 0.4, 0.8, 1.6])
 SIDE_M = 25.6
@@ -111,7 +111,7 @@ def test_a_glb_holds_the_mesh_and_its_colours() -> None:
     ball = trimesh.creation.icosphere(2, 3.0)
     colours = np.random.default_rng(0).uniform(0.0, 0.95, (len(ball.vertices), 3))
     vertices, faces = ball.vertices.astype(np.float32), ball.faces.astype(np.int32)
-    data = unlit_glb(vertices, faces, colours)
+    data = unlit_glb(Triangles(vertices, faces), colours)
     (read,) = trimesh.load(io.BytesIO(data), file_type="glb", process=False).geometry.values()
     np.testing.assert_array_equal(read.vertices.astype(np.float32), vertices)
     np.testing.assert_array_equal(read.faces, faces)

@@ -9,12 +9,12 @@ import pytest
 from support.changing_store import EMPTY, box_at, write_checkpoint
 from triquad_client import ClosedError
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.file_source import FileSource
-from triquad_tools.viewer.history import DamagedError, History
-from triquad_tools.viewer.history_source import newest_of
-from triquad_tools.viewer.map_source import COARSEST
-from triquad_tools.viewer.open_maps import OpenMaps
-from triquad_tools.viewer.tile_maker import MadeTile, TileCache
+from triquad_tools.viewer.sources.file_source import FileSource
+from triquad_tools.viewer.sources.history import DamagedError, History
+from triquad_tools.viewer.sources.history_source import newest_of
+from triquad_tools.viewer.sources.map_source import COARSEST
+from triquad_tools.viewer.sources.open_maps import OpenMaps
+from triquad_tools.viewer.sources.tile_cache import MadeTile, TileCache
 
 ORIGIN = [[0.0, 0.0, 1.0]]
 

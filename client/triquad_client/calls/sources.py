@@ -63,7 +63,7 @@ class SourceReport:
 
 
 def sources(since: SourceReport | None, max_points: int) -> Call[SourceReport]:
-    """All sources; of what ``since`` told, only the news travels."""
+    """All sources; of what ``since`` told, only what is new travels."""
     if since is not None and not isinstance(since, SourceReport):
         raise InvalidInputError(f"since = {since!r}: give what an earlier call returned")
     limit = checks.count("max_points", max_points, MAX_SAMPLE_POINTS)
@@ -88,7 +88,9 @@ def _source(name: str, state: SourceState, before: Mapping[str, ScanSource]) -> 
     if state.whole:
         return ScanSource(name, state.scans, state.trail, pieces=state.pieces, newest=newest)
     if name not in before:
-        raise BadReplyError(f"source {name!r}: only its news came, and nothing was known of it")
+        raise BadReplyError(
+            f"source {name!r}: only what is new of it came, and nothing was known before"
+        )
     old = before[name]
     return ScanSource(
         name,

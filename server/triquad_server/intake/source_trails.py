@@ -43,8 +43,8 @@ class TakenScan:
 
 
 @dataclass(frozen=True)
-class SourceNews:
-    """What is new of a source."""
+class SourceDelta:
+    """What is new of a source since a revision."""
 
     scans: int
     whole: bool  # what was told before is void
@@ -124,14 +124,14 @@ class _Source:
             trail.keep(~inside)
             self.rewritten = revision
 
-    def news(self, revision: int) -> SourceNews:
+    def delta(self, revision: int) -> SourceDelta:
         """What is new since a revision."""
         whole = self.rewritten > revision
         chosen = slice(0, self.trail.count) if whole else self.trail.after(revision)
         newest = self.newest
         if newest is not None and not whole and newest.revision <= revision:
             newest = None
-        return SourceNews(
+        return SourceDelta(
             self.scans,
             whole,
             trail=self.trail.positions[chosen].copy(),
@@ -180,11 +180,11 @@ class SourceTrails:
                 if source.newest is None and source.trail.count == 0:
                     del self._sources[name]
 
-    def since(self, revision: int) -> tuple[int, dict[str, SourceNews]]:
+    def since(self, revision: int) -> tuple[int, dict[str, SourceDelta]]:
         """The revision now, and what is new of every source since an earlier one."""
         with self._lock:
-            news = {name: source.news(revision) for name, source in self._sources.items()}
-            return self._revision, news
+            deltas = {name: source.delta(revision) for name, source in self._sources.items()}
+            return self._revision, deltas
 
 
 def evenly(points: Doubles, count: int) -> Doubles:

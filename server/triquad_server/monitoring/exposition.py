@@ -13,12 +13,16 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 from triquad_format.wire.metrics_messages import Seconds, TimeHistogram
 
-from triquad_server.monitoring.families import FAMILIES, Family, Figures, Kind
+from triquad_server.monitoring.families import FAMILIES
+from triquad_server.monitoring.family import Family, Figures, Kind
 
 
 def exposition(figures: Figures, accept: str) -> tuple[bytes, str]:
     """The metrics as text, and its type; ``accept`` is what the reader's request accepts."""
-    encode, content_type = choose_encoder(accept)
+    try:
+        encode, content_type = choose_encoder(accept)
+    except (TypeError, ValueError):  # such as a version that is no number
+        encode, content_type = choose_encoder("")
     return encode(FiguresCollector(figures)), content_type
 
 

@@ -1,28 +1,33 @@
 """The port on which programs that watch the server ask over HTTP how it is doing."""
 
+import io
 import json
 import logging
 import socket
 import socketserver
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import ListenError, ServerError
 from triquad_server.metrics_settings import MetricsSettings
-from triquad_server.monitoring.families import Figures
+from triquad_server.monitoring.family import Figures
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.threads import NICENESS
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
 
 _log = logging.getLogger(__name__)
 
 _AT_ONCE = 8  # connections; further ones are closed
-_TIMEOUT_S = 10.0  # of a connection on which nothing comes
+_TIMEOUT_S = 10.0  # until a connection's request is there, and until its answer is taken
 _STARTING = "the server is starting: it restores its map and prepares compiled code"
 _STOPPING = "the server is stopping"
 
@@ -116,6 +121,27 @@ def _where(settings: MetricsSettings) -> str:
     return f"{address}:{settings.port}"
 
 
+class _TimelyInput(socket.SocketIO):
+    """What comes on a connection until a time: byte by byte, nobody holds it for longer."""
+
+    def __init__(self, connection: socket.socket, timeout_s: float) -> None:
+        super().__init__(connection, "r")
+        self._connection = connection
+        self._ends_s = time.monotonic() + timeout_s
+
+    def readinto(self, buffer: "WriteableBuffer") -> int | None:
+        """What is there next.
+
+        Raises:
+            TimeoutError: the time is over.
+        """
+        left_s = self._ends_s - time.monotonic()
+        if left_s <= 0.0:
+            raise TimeoutError("the request took too long")
+        self._connection.settimeout(left_s)
+        return super().readinto(buffer)
+
+
 class _Handler(BaseHTTPRequestHandler):
     """Answers one request."""
 
@@ -126,6 +152,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Leave the cores to queries: nobody waits for a scrape."""
         lower_priority(NICENESS)
         super().setup()
+        self.rfile.close()
+        self.rfile = io.BufferedReader(_TimelyInput(self.connection, _TIMEOUT_S))
 
     def do_GET(self) -> None:  # noqa: N802 - the name that the library looks for
         """Send the page."""
@@ -135,6 +163,7 @@ class _Handler(BaseHTTPRequestHandler):
         except Exception:
             _log.exception("an internal error, while %.200r was asked for", path)
             page = _text(HTTPStatus.INTERNAL_SERVER_ERROR, "internal error: see the log\n")
+        self.connection.settimeout(_TIMEOUT_S)
         self.send_response(page.code)
         self.send_header("Content-Type", page.content_type)
         self.send_header("Content-Length", str(len(page.body)))
@@ -162,10 +191,14 @@ class _Listener(socketserver.ThreadingTCPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answer a connection, unless too many are open."""
-        if self._room.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
+        if not self._room.acquire(blocking=False):
             self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:  # no thread could be started
+            self._room.release()
+            raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Answer a connection, on its own thread."""

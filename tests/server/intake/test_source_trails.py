@@ -18,8 +18,8 @@ def add(trails, position, source="lidar"):
 
 def whole(trails, source="lidar"):
     """All that is known of a source: its trail, and the numbers of its pieces."""
-    _, news = trails.since(0)
-    return news[source].trail, news[source].pieces
+    _, deltas = trails.since(0)
+    return deltas[source].trail, deltas[source].pieces
 
 
 class Follower:
@@ -30,8 +30,8 @@ class Follower:
         self.known = {}
 
     def ask(self, trails):
-        self.revision, news = trails.since(self.revision)
-        self.known = {name: self._after(name, new) for name, new in news.items()}
+        self.revision, deltas = trails.since(self.revision)
+        self.known = {name: self._after(name, new) for name, new in deltas.items()}
 
     def _after(self, name, new):
         if new.whole:
@@ -93,17 +93,17 @@ def test_whenever_one_asks_the_news_make_up_the_whole(steps):
         else:
             follower.ask(trails)
     follower.ask(trails)
-    _, news = trails.since(0)
-    assert news.keys() == follower.known.keys()
+    _, deltas = trails.since(0)
+    assert deltas.keys() == follower.known.keys()
     for name, (trail, pieces) in follower.known.items():
-        np.testing.assert_array_equal(trail, news[name].trail)
-        np.testing.assert_array_equal(pieces, news[name].pieces)
+        np.testing.assert_array_equal(trail, deltas[name].trail)
+        np.testing.assert_array_equal(pieces, deltas[name].pieces)
         apart = np.linalg.norm(np.diff(trail, axis=0), axis=1)
         joined = np.diff(pieces) == 0
         assert (np.diff(pieces) >= 0).all()
         assert (apart[joined] < 50 + LEAF_M).all()
         assert (apart[joined] >= LEAF_M).all()
-    assert sum(new.scans for new in news.values()) <= taken
+    assert sum(new.scans for new in deltas.values()) <= taken
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 99, 100, 101])

@@ -15,7 +15,7 @@ from triquad_client import connect
 
 from triquad_tools.benchmarks.browser import opened_page, running_browser, wait_until_drawn
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.live_source import LiveSource
+from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
 
 

@@ -18,8 +18,8 @@ from triquad_tools.benchmarks.onlooker import Onlooker
 from triquad_tools.benchmarks.served import MAP, Served, served, stream_beside_planner
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.recordings.publishing import wait_until_settled
-from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.map_source import COARSEST, MapState, TileSizes
+from triquad_tools.viewer.sources.live_source import LiveSource
+from triquad_tools.viewer.sources.map_source import COARSEST, MapState, TileSizes
 from triquad_tools.viewer.viewer import Viewer
 
 _ROUNDS = 3

@@ -22,7 +22,7 @@ from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
 from triquad_tools.demo.server import DemoServer, free_endpoint
 from triquad_tools.evaluation.map_scores import driven_street
 from triquad_tools.simulation.street import street_drive
-from triquad_tools.viewer.live_source import LiveSource
+from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-demo"
@@ -83,7 +83,7 @@ def _show(opened: ExitStack, port: int, endpoint: str) -> None:
     viewer = Viewer(LiveSource(client, endpoint), "127.0.0.1", port)
     opened.callback(viewer.close)
     _say(f"open {viewer.url} in a browser: the drive begins as soon as the page is there")
-    viewer.wait_for_visit()
+    viewer.wait_for_browser()
 
 
 def run_demo(

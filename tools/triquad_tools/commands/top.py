@@ -37,7 +37,7 @@ def _top(options: argparse.Namespace) -> int:
         elif options.json:
             while True:
                 time.sleep(watch.due_in_s)
-                print(json_line(target, watch.look_again()), flush=True)
+                print(json_line(target, watch.observe_again()), flush=True)
         else:
             show(target, watch)
     return OK
@@ -45,9 +45,9 @@ def _top(options: argparse.Namespace) -> int:
 
 def _look_once(target: Target, watch: Watch, options: argparse.Namespace) -> None:
     """Look for one interval, and print what was seen."""
-    watch.look()
+    watch.observe()
     time.sleep(watch.due_in_s)
-    seen = watch.look()
+    seen = watch.observe()
     if options.json:
         print(json_line(target, seen))
     else:

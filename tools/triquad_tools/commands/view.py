@@ -13,12 +13,12 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.progress import progress
-from triquad_tools.viewer.file_source import FileSource
-from triquad_tools.viewer.history import History
-from triquad_tools.viewer.history_source import newest_of
-from triquad_tools.viewer.live_source import LiveSource
-from triquad_tools.viewer.map_source import MapSource
-from triquad_tools.viewer.open_maps import OpenMaps
+from triquad_tools.viewer.sources.file_source import FileSource
+from triquad_tools.viewer.sources.history import History
+from triquad_tools.viewer.sources.history_source import newest_of
+from triquad_tools.viewer.sources.live_source import LiveSource
+from triquad_tools.viewer.sources.map_source import MapSource
+from triquad_tools.viewer.sources.open_maps import OpenMaps
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-view"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from triquad_client import Mesh
 from triquad_format.records.arrays import Bytes, Doubles
 from triquad_format.records.status import Status
+from triquad_map.height_scale import colours_between
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.report import percent
@@ -88,7 +89,7 @@ def draw_mesh_errors(heading: Heading, comparison: Comparison, path: Path) -> No
     notes = [DIRECTION_NOTE.format(view.looks_to), *outside_notes(view)]
     if beside:
         notes.append(f"beside the truth, not scored: {100.0 * beside:.2g} %")
-    legend = Legend(heading, bar, [notes[0], "; ".join(notes[1:])], view.camera, named)
+    legend = Legend(heading, bar, [notes[0], "; ".join(notes[1:])], view.camera, named=named)
     image = _rendered(part, colours, lacking, camera=view.camera)
     save_mesh_sheet(path, image, legend)
 
@@ -116,16 +117,14 @@ def draw_withheld(
     points = _Points(np.concatenate([answer.points for answer in answers]), colours)
     view = _framed(_NOTHING, points.places)
     named = [(MISSING, f"UNKNOWN:\n{percent(scores.unknown_ratio)}")]
-    legend = Legend(heading, bar, outside_notes(view), view.camera, named)
+    legend = Legend(heading, bar, outside_notes(view), view.camera, named=named)
     image = _rendered(_NOTHING, np.empty((0, 3)), points, camera=view.camera)
     save_mesh_sheet(path, image, legend)
 
 
 def error_colours(distances_m: NDArray[np.floating], high_m: float) -> Doubles:
     """Colours ``[N, 3]``, sRGB in [0, 1], of distances ``[N]``, the greatest ``high_m``."""
-    stops = np.linspace(0.0, high_m, len(ERROR_STOPS))
-    channels = [np.interp(distances_m, stops, channel) for channel in ERROR_STOPS.T]
-    colours = np.stack(channels, axis=1)
+    colours = colours_between(ERROR_STOPS, np.asarray(distances_m, np.float64) / high_m)
     colours[distances_m > high_m] = to_rgb(BEYOND)
     return colours
 

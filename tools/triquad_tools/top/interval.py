@@ -1,4 +1,4 @@
-"""What happened between two looks at a server: records in, rates and quantiles out."""
+"""What happened between two samples of a server: records in, rates and quantiles out."""
 
 import math
 from collections.abc import Mapping

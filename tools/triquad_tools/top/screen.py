@@ -36,7 +36,7 @@ def show(target: Target, watch: Watch) -> None:
         ) as live,
     ):
         while not keyboard.ends_within(watch.due_in_s):
-            seen = watch.look_again()
+            seen = watch.observe_again()
             page = replace(page, silence=seen) if isinstance(seen, Silence) else Page(target, seen)
             live.refresh()
 

@@ -1,4 +1,4 @@
-"""Looking at a server again and again, also while it is gone."""
+"""Observing a server again and again, also while it is gone."""
 
 import time
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ class Silence:
 
 
 class Watch:
-    """Looks at a server once in a while, and remembers what it saw last."""
+    """Observes a server once in a while, and remembers what it saw last."""
 
     def __init__(self, client: Client, period_s: float) -> None:
-        """Look every ``period_s``, the first time at once."""
+        """It is to be observed every ``period_s``, the first time at once."""
         self._client = client
         self._period_s = period_s
         self._due_s = time.monotonic()
@@ -44,11 +44,11 @@ class Watch:
 
     @property
     def due_in_s(self) -> float:
-        """Time until the next look; 0 where one took longer than a period."""
+        """Time until it is to be observed next; 0 where that took longer than a period."""
         return max(0.0, self._due_s - time.monotonic())
 
-    def look(self) -> Interval:
-        """What happened since the last look that was answered.
+    def observe(self) -> Interval:
+        """What happened since the last time that was answered.
 
         Raises:
             TriquadError: the server does not answer.
@@ -64,10 +64,10 @@ class Watch:
         self._last, self._silent_since_s = sample, None
         return seen
 
-    def look_again(self) -> Interval | Silence:
-        """As :meth:`look`, but a server that does not answer is waited for."""
+    def observe_again(self) -> Interval | Silence:
+        """As :meth:`observe`, but a server that does not answer is waited for."""
         try:
-            return self.look()
+            return self.observe()
         except TriquadError as error:
             return Silence(self._silent_since_s or 0.0, str(error))
 

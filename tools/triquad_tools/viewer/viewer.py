@@ -7,9 +7,9 @@ from contextlib import redirect_stdout
 
 import viser
 
-from triquad_tools.viewer.history import History
-from triquad_tools.viewer.map_source import MapSource
-from triquad_tools.viewer.visit import Visit
+from triquad_tools.viewer.browser_session import BrowserSession
+from triquad_tools.viewer.sources.history import History
+from triquad_tools.viewer.sources.map_source import MapSource
 
 DEFAULT_PORT = 8080
 
@@ -22,9 +22,10 @@ class Viewer:
 
     def __init__(self, shown: MapSource | History, host: str, port: int) -> None:
         self._shown = shown
-        self._visits: dict[int, Visit] = {}
+        self._sessions: dict[int, BrowserSession] = {}
+        self._closed = False
         self._changing = threading.Lock()
-        self._visited = threading.Event()
+        self._opened = threading.Event()
         for message in _OF_ONE_WHO_LEFT:
             warnings.filterwarnings("ignore", message, UserWarning)
         with redirect_stdout(io.StringIO()):  # it has announcements of its own
@@ -37,28 +38,35 @@ class Viewer:
         """Where the page is."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
-    def wait_for_visit(self) -> None:
+    def wait_for_browser(self) -> None:
         """Wait until a browser has opened the page."""
-        self._visited.wait()
+        self._opened.wait()
 
     def close(self) -> None:
         """Serve no longer."""
         with self._changing:
-            visits = list(self._visits.values())
-            self._visits.clear()
-        for visit in visits:
-            visit.close()
+            self._closed = True
+            sessions = list(self._sessions.values())
+            self._sessions.clear()
+        for session in sessions:
+            session.close()
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
     def _enter(self, client: viser.ClientHandle) -> None:
-        visit = Visit(client, self._shown)
+        session = BrowserSession(client, self._shown)
         with self._changing:
-            self._visits[client.client_id] = visit
-        self._visited.set()
+            # A browser may leave meanwhile: callbacks run at the same time, in any order.
+            left = self._closed or client.client_id not in self._server.get_clients()
+            if not left:
+                self._sessions[client.client_id] = session
+        if left:
+            session.close()
+        else:
+            self._opened.set()
 
     def _leave(self, client: viser.ClientHandle) -> None:
         with self._changing:
-            visit = self._visits.pop(client.client_id, None)
-        if visit is not None:
-            visit.close()
+            session = self._sessions.pop(client.client_id, None)
+        if session is not None:
+            session.close()

@@ -8,11 +8,11 @@ import numpy as np
 from viser import SceneClickEvent
 
 from triquad_tools.viewer.asking.path_probe import PathProbe
+from triquad_tools.viewer.asking.picking import surface_along
 from triquad_tools.viewer.asking.point_probe import PointProbe
 from triquad_tools.viewer.asking.questions import Pace
-from triquad_tools.viewer.asking.sight import surface_along
-from triquad_tools.viewer.refresher import Refresher
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.refresher import Refresher
 
 _PERIOD_S = 0.5
 _ASKS, _LAYS, _NOTHING = "asks the map", "adds to the path", "does nothing"
@@ -22,25 +22,25 @@ _RAISED_M = 0.5
 class ClickLayer:
     """Finds the surface that is clicked at, and hands it to what a click is for."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
+    def __init__(self, page: Page) -> None:
+        self._page = page
         self._pace = Pace()
         self._todo: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._folder = stage.gui.add_folder("Clicks")
+        self._folder = page.gui.add_folder("Clicks")
         with self._folder:
-            self._use = stage.gui.add_dropdown("A click", (_ASKS, _LAYS, _NOTHING))
-            self._raised = stage.gui.add_number(
+            self._use = page.gui.add_dropdown("A click", (_ASKS, _LAYS, _NOTHING))
+            self._raised = page.gui.add_number(
                 "Raised by (m)", _RAISED_M, min=0.0, max=100.0, step=0.05
             )
-            self._point = PointProbe(stage)
-            self._path = PathProbe(stage, self._do)
-        self._refresher = Refresher("clicks", self._refresh, _PERIOD_S, stage.failed)
+            self._point = PointProbe(page)
+            self._path = PathProbe(page, self._do)
+        self._refresher = Refresher("clicks", self._refresh, period_s=_PERIOD_S, failed=page.failed)
         self._use.on_update(lambda _: self._refresher.wake())
-        stage.scene.on_click()(self._clicked)
+        page.scene.on_click()(self._clicked)
 
     def close(self) -> None:
         """Listen and draw no more; what was drawn and the folder go."""
-        self._stage.scene.remove_click_callback(self._clicked)
+        self._page.scene.remove_click_callback(self._clicked)
         self._refresher.close()
         self._point.clear()
         self._path.clear()
@@ -68,8 +68,8 @@ class ClickLayer:
                 self._path.refresh()
 
     def _find(self, event: SceneClickEvent) -> None:
-        origin = self._stage.in_map(np.array(event.ray_origin))
-        surface = surface_along(self._stage, origin, np.array(event.ray_direction))
+        origin = self._page.in_map(np.array(event.ray_origin))
+        surface = surface_along(self._page, origin, np.array(event.ray_direction))
         if self._use.value == _LAYS:
             self._path.add(surface, self._raised.value)
         else:

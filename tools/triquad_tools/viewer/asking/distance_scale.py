@@ -7,14 +7,14 @@ from triquad_format.records.arrays import Bools, Bytes
 
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import DISTANCE_COLOURS
-from triquad_tools.viewer.legend import Scale, Stops
+from triquad_tools.viewer.page.colour_scale import ColourScale, Stops
 
 _STOPS: Stops = tuple(to_rgb(DISTANCE_COLOURS(place)) for place in np.linspace(0.0, 1.0, 17))
 
 
-def distance_scale(label: str, max_distance_m: float) -> Scale:
+def distance_scale(label: str, max_distance_m: float) -> ColourScale:
     """From 0 to the largest distance, which stands for all beyond, too."""
-    return Scale(label, 0.0, max_distance_m, open_above=True, stops=_STOPS)
+    return ColourScale(label, 0.0, max_distance_m, open_above=True, stops=_STOPS)
 
 
 def distance_colours(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
 
 _LEAST_SIDE_M, _MOST_SIDE_M = 2.0, 128.0
 
@@ -24,11 +24,11 @@ class Focus:
         return np.asarray(np.round(self.middle / step_m) * step_m, np.float64)
 
 
-def focus_of(stage: Stage) -> Focus:
+def focus_of(page: Page) -> Focus:
     """What the camera of a page is turned about."""
-    camera = stage.client.camera
+    camera = page.client.camera
     distance_m = float(np.linalg.norm(camera.look_at - camera.position))
     aspect = camera.image_width / max(camera.image_height, 1)
     seen_m = 2.0 * distance_m * math.tan(0.5 * camera.fov) * max(aspect, 1.0)
     side_m = 2.0 ** round(math.log2(max(seen_m, _LEAST_SIDE_M)))
-    return Focus(stage.in_map(camera.look_at), distance_m, min(side_m, _MOST_SIDE_M))
+    return Focus(page.in_map(camera.look_at), distance_m, min(side_m, _MOST_SIDE_M))

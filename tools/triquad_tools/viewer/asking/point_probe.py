@@ -9,8 +9,8 @@ from triquad_format.records.arrays import Doubles
 
 from triquad_tools.viewer.asking.questions import newest_epoch
 from triquad_tools.viewer.asking.tube import add_tube, arrow
-from triquad_tools.viewer.panel import table_html, text_html
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.panel_html import table_html, text_html
 
 _MAX_DISTANCE_M = 10.0
 _SKY = text_html("No surface there: sky, or nothing was seen in that direction.")
@@ -36,9 +36,9 @@ class AskedPoint:
 class PointProbe:
     """A point that is asked about, until it is put elsewhere."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
-        self._text = stage.gui.add_html(_HOW)
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._text = page.gui.add_html(_HOW)
         self._point: AskedPoint | None = None
         self._epoch = 0
         self._marks: list[viser.SceneNodeHandle] = []
@@ -58,7 +58,7 @@ class PointProbe:
         if surface is None:
             self._text.content = _SKY
             return
-        eye = self._stage.in_map(self._stage.client.camera.position)
+        eye = self._page.in_map(self._page.client.camera.position)
         self._point = AskedPoint(surface, raised_m, float(np.linalg.norm(surface - eye)))
         self._ask(self._point)
 
@@ -68,7 +68,7 @@ class PointProbe:
         Raises:
             TriquadError: the map does not answer.
         """
-        if self._point is not None and newest_epoch(self._stage.source.queries) != self._epoch:
+        if self._point is not None and newest_epoch(self._page.source.queries) != self._epoch:
             self._ask(self._point)
 
     def clear(self) -> None:
@@ -79,15 +79,15 @@ class PointProbe:
         self._text.content = _HOW
 
     def _ask(self, point: AskedPoint) -> None:
-        answer = self._stage.source.queries.query_distance(point.place[None], _MAX_DISTANCE_M)
+        answer = self._page.source.queries.query_distance(point.place[None], _MAX_DISTANCE_M)
         self._epoch = answer.epoch
         self._text.content = point_html(point, answer)
-        with self._stage.client.atomic():
+        with self._page.client.atomic():
             self._erase()
             self._draw(point, answer)
 
     def _draw(self, point: AskedPoint, answer: Distances) -> None:
-        scene, in_scene = self._stage.scene, self._stage.in_scene
+        scene, in_scene = self._page.scene, self._page.in_scene
         place, radius_m = in_scene(point.place), _BALL * point.eye_m
         stem = np.stack([in_scene(point.surface), place])[None]
         self._marks = [
@@ -99,7 +99,7 @@ class PointProbe:
         if answer.found[0]:
             along = _ARROW * point.eye_m * answer.gradient[0].astype(np.float64)
             tube = arrow(point.place, along, 0.4 * radius_m, np.array(_COLOUR) / 255.0)
-            self._marks.append(add_tube(self._stage, "/point/gradient", tube))
+            self._marks.append(add_tube(self._page, "/point/gradient", tube))
 
     def _erase(self) -> None:
         for mark in self._marks:

@@ -8,7 +8,7 @@ from viser.transforms import SO3
 from triquad_tools.viewer.asking.contours import Contour, contours, numbers
 from triquad_tools.viewer.asking.distance_scale import distance_colours
 from triquad_tools.viewer.asking.slice_plane import Slice, SlicePlane
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.page import Page
 
 _FINER = 4  # pixels along a cell: the browser blurs no more than their borders
 _LIFT = 1 / 800  # of the width: lines lie on both sides, before the picture from both sides
@@ -19,8 +19,8 @@ _WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
 class SliceDrawing:
     """What is drawn for a slice, until it is erased."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
+    def __init__(self, page: Page) -> None:
+        self._page = page
         self._plane: SlicePlane | None = None
         self._picture: viser.ImageHandle | None = None
         self._marks: list[viser.LineSegmentsHandle | viser.LabelHandle] = []
@@ -30,7 +30,7 @@ class SliceDrawing:
         colours = distance_colours(answer.distance_m, answer.known, max_distance_m)
         image = colours.repeat(_FINER, axis=0).repeat(_FINER, axis=1)
         lines = contours(answer, max_distance_m)
-        with self._stage.client.atomic():
+        with self._page.client.atomic():
             self._draw_picture(answer.plane, image)
             self._remove_marks()
             self._draw_lines(answer.plane, lines)
@@ -48,7 +48,7 @@ class SliceDrawing:
         if self._picture is not None and plane == self._plane:
             self._picture.image = image
             return
-        self._picture = self._stage.scene.add_image(
+        self._picture = self._page.scene.add_image(
             "/slice/picture",
             image,
             *plane.size_m,
@@ -56,7 +56,7 @@ class SliceDrawing:
             cast_shadow=False,
             receive_shadow=False,
             wxyz=SO3.from_matrix(plane.axes).wxyz,
-            position=self._stage.in_scene(plane.middle()),
+            position=self._page.in_scene(plane.middle()),
         )
         self._plane = plane
 
@@ -79,9 +79,9 @@ class SliceDrawing:
             return
         across = _LIFT * plane.size_m[0] * plane.axes[:, 2]
         flat = np.concatenate(pieces)
-        handle = self._stage.scene.add_line_segments(
+        handle = self._page.scene.add_line_segments(
             f"/slice/{name}",
-            self._stage.in_scene(np.concatenate([flat - across, flat + across])),
+            self._page.in_scene(np.concatenate([flat - across, flat + across])),
             colour,
             thickness=pixels,
             thickness_units="screen",
@@ -90,10 +90,10 @@ class SliceDrawing:
 
     def _draw_numbers(self, plane: SlicePlane, lines: list[Contour]) -> None:
         for row, number in enumerate(numbers(lines, plane.size_m[0])):
-            label = self._stage.scene.add_label(
+            label = self._page.scene.add_label(
                 f"/slice/numbers/{row}",
                 f"{number.level_m:g} m",
-                position=self._stage.in_scene(number.place),
+                position=self._page.in_scene(number.place),
                 font_screen_scale=0.8,
                 anchor="center-center",
             )

@@ -5,15 +5,14 @@ from triquad_tools.plots.slice_plan import BEHIND
 from triquad_tools.viewer.asking.contours import contour_step
 from triquad_tools.viewer.asking.distance_scale import distance_scale
 from triquad_tools.viewer.asking.focus import focus_of
+from triquad_tools.viewer.asking.picking import ground_in_view
 from triquad_tools.viewer.asking.questions import Pace, newest_epoch
-from triquad_tools.viewer.asking.sight import ground_in_view
 from triquad_tools.viewer.asking.slice_drawing import SliceDrawing
 from triquad_tools.viewer.asking.slice_plane import HEIGHT_AXIS, SlicePlane, ask_slice
-from triquad_tools.viewer.legend import legend_html
-from triquad_tools.viewer.panel import text_html
-from triquad_tools.viewer.refresher import Refresher
-from triquad_tools.viewer.shown_legends import LineMeaning, lines_html
-from triquad_tools.viewer.stage import Stage
+from triquad_tools.viewer.page.legends import Legend, LineMeaning
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.panel_html import text_html
+from triquad_tools.viewer.page.refresher import Refresher
 
 _PERIOD_S = 0.5
 _AXES = {"level, at some z": HEIGHT_AXIS, "upright, at some x": 0, "upright, at some y": 1}
@@ -27,14 +26,14 @@ _NAME = "slice"
 class SliceLayer:
     """Draws a slice around what the camera looks at."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
-        self._drawing = SliceDrawing(stage)
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._drawing = SliceDrawing(page)
         self._pace = Pace()
         self._unplaced = True
         self._drawn: tuple[SlicePlane, float] | None = None
         self._epoch = 0
-        gui = stage.gui
+        gui = page.gui
         self._folder = gui.add_folder("Slice")
         with self._folder:
             self._shown = gui.add_checkbox("Show slice", False)
@@ -45,7 +44,7 @@ class SliceLayer:
                 "Up to (m)", _MAX_DISTANCE_M, min=0.2, max=50.0, step=0.1, visible=False
             )
             self._legend = gui.add_html("", visible=False)
-        self._refresher = Refresher("slice", self._refresh, _PERIOD_S, stage.failed)
+        self._refresher = Refresher("slice", self._refresh, period_s=_PERIOD_S, failed=page.failed)
         for control in (self._shown, self._at, self._most):
             control.on_update(lambda _: self._refresher.wake())
         self._kind.on_update(self._place_anew)
@@ -70,9 +69,9 @@ class SliceLayer:
             return
         if self._unplaced:
             self._place()
-        plane = SlicePlane.around(focus_of(self._stage), _AXES[self._kind.value], self._at.value)
+        plane = SlicePlane.around(focus_of(self._page), _AXES[self._kind.value], self._at.value)
         wanted = (plane, float(self._most.value))
-        queries = self._stage.source.queries
+        queries = self._page.source.queries
         if wanted != self._drawn or (self._pace.due and newest_epoch(queries) != self._epoch):
             with self._pace.asking():
                 answer = ask_slice(queries, *wanted)
@@ -83,14 +82,13 @@ class SliceLayer:
     def _erase(self) -> None:
         self._drawing.erase()
         self._drawn = None
-        self._stage.legends.scales.pop(_NAME, None)
-        self._stage.legends.lines.pop(_NAME, None)
+        self._page.legends.hide(_NAME)
 
     def _place(self) -> None:
         """Put the slice through the middle of the view, with room to move it."""
         axis = _AXES[self._kind.value]
         above_m = _ABOVE_M if axis == HEIGHT_AXIS else 0.0
-        at_m = round(float(ground_in_view(self._stage)[axis]) + above_m, 2)
+        at_m = round(float(ground_in_view(self._page)[axis]) + above_m, 2)
         self._unplaced = False
         self._at.min, self._at.max = at_m - _REACH_M, at_m + _REACH_M
         self._at.value = at_m  # type: ignore[misc]  # mypy takes it for read-only
@@ -104,5 +102,6 @@ class SliceLayer:
             LineMeaning(BEHIND, False, "behind a surface"),
             LineMeaning(UNKNOWN, False, "unknown: not seen"),
         )
-        self._stage.legends.scales[_NAME], self._stage.legends.lines[_NAME] = scale, lines
-        self._legend.content = legend_html(scale) + lines_html(lines) + text_html(f"epoch {epoch}")
+        legend = Legend(scale, lines)
+        self._page.legends.show(_NAME, legend)
+        self._legend.content = legend.html + text_html(f"epoch {epoch}")

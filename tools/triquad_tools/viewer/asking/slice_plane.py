@@ -41,7 +41,7 @@ class SlicePlane:
         rows = _CELLS if axis == HEIGHT_AXIS else round(_FLAT * _CELLS)
         across, up = (float(middle[other]) for other in _others(axis))
         low_m = (across - 0.5 * _CELLS * cell_m, up - 0.5 * rows * cell_m)
-        return cls(axis, at_m, low_m, cell_m, columns=_CELLS, rows=rows)
+        return cls(axis, at_m, low_m, cell_m=cell_m, columns=_CELLS, rows=rows)
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -95,7 +95,7 @@ def ask_slice(queries: MapQueries, plane: SlicePlane, max_distance_m: float) -> 
     shape = (plane.rows, plane.columns)
     status = np.concatenate([part.status for part in parts]).reshape(shape)
     distance_m = np.concatenate([part.distance_m for part in parts]).reshape(shape)
-    return Slice(plane, distance_m, status != Status.UNKNOWN, parts[0].epoch)
+    return Slice(plane, distance_m, status != Status.UNKNOWN, epoch=parts[0].epoch)
 
 
 def _others(axis: int) -> tuple[int, int]:

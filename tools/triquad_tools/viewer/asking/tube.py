@@ -6,12 +6,11 @@ import numpy as np
 import viser
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.viewer.stage import Stage
-from triquad_tools.viewer.thinning import Triangles
-from triquad_tools.viewer.unlit_glb import unlit_glb
+from triquad_tools.viewer.page.colour_scale import GAMMA
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.unlit_glb import Triangles, unlit_glb
 
 _SIDES = 8
-_GAMMA = 2.2  # from colours on a screen to light
 _OUTLINE = 1.35  # its radius, as a multiple
 _HEAD_LENGTH, _HEAD_RADIUS, _NECK = 0.3, 2.5, 1e-3  # of an arrow, shares of its length and radius
 
@@ -33,7 +32,7 @@ def arrow(start: Doubles, along: Doubles, radius_m: float, colour: Doubles) -> T
     return Tube(start + places[:, None] * along, radii_m, np.tile(colour, (3, 1)))
 
 
-def add_tube(stage: Stage, name: str, tube: Tube) -> viser.GlbHandle:
+def add_tube(page: Page, name: str, tube: Tube) -> viser.GlbHandle:
     """Draw a tube."""
     corner = tube.points[0]
     points = tube.points - corner
@@ -41,18 +40,11 @@ def add_tube(stage: Stage, name: str, tube: Tube) -> viser.GlbHandle:
     outer = tube_mesh(points, _OUTLINE * tube.radii_m)
     # Only the far inside of the outline is drawn: a rim that is seen around the tube.
     behind = outer.faces[:, ::-1] + len(inner.vertices)
-    light = np.repeat(tube.colours**_GAMMA, 2 * _SIDES, axis=0)
-    return stage.scene.add_glb(
-        name,
-        unlit_glb(
-            np.concatenate([inner.vertices, outer.vertices]),
-            np.concatenate([inner.faces, behind]),
-            np.concatenate([light, np.ones_like(light)]),
-        ),
-        position=stage.in_scene(corner),
-        cast_shadow=False,
-        receive_shadow=False,
+    light = np.repeat(tube.colours**GAMMA, 2 * _SIDES, axis=0)
+    both = Triangles(
+        np.concatenate([inner.vertices, outer.vertices]), np.concatenate([inner.faces, behind])
     )
+    return page.add_glb(name, unlit_glb(both, np.concatenate([light, np.ones_like(light)])), corner)
 
 
 def tube_mesh(points: Doubles, radii_m: Doubles) -> Triangles:

@@ -12,7 +12,7 @@ from triquad_map.questions.rays import RayRanges
 
 from triquad_tools.viewer.asking.focus import Focus
 from triquad_tools.viewer.asking.questions import in_small_parts
-from triquad_tools.viewer.thinning import Triangles
+from triquad_tools.viewer.page.unlit_glb import Triangles
 
 _COLUMNS, _LAYERS = 64, 24  # cells along x and y, and along z: they bound how much is asked
 _MOST_CELL_M = 0.75

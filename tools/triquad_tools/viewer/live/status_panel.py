@@ -1,0 +1,78 @@
+"""How the server is doing, beside a scene."""
+
+import time
+
+from triquad_format.wire.messages import ServerStatus
+
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.page.panel_html import problem_html, table_html
+from triquad_tools.viewer.page.refresher import Refresher
+from triquad_tools.viewer.sources.live_source import LiveSource
+
+_PERIOD_S = 1.0
+
+
+class StatusPanel:
+    """Shows what the server is doing, and how far away it is."""
+
+    def __init__(self, source: LiveSource, page: Page) -> None:
+        self._client = source.client
+        self._before: ServerStatus | None = None
+        self._folder = page.gui.add_folder("Server")
+        with self._folder:
+            self._figures = page.gui.add_html("")
+            self._warnings = page.gui.add_html("")
+        self._refresher = Refresher("status", self._refresh, period_s=_PERIOD_S, failed=page.failed)
+
+    def close(self) -> None:
+        """Show no more."""
+        self._refresher.close()
+        self._folder.remove()
+
+    def _refresh(self) -> None:
+        asked_s = time.perf_counter()
+        status = self._client.status()
+        answered_ms = 1e3 * (time.perf_counter() - asked_s)
+        before, self._before = self._before, status
+        if before is not None and before.server != status.server:
+            before = None
+        self._figures.content = table_html(_rows(status, before, answered_ms))
+        problems = [text for text in (status.store_error, status.warnings) if text]
+        self._warnings.content = "".join(map(problem_html, problems))
+
+
+def _rows(
+    status: ServerStatus, before: ServerStatus | None, answered_ms: float
+) -> list[tuple[str, str]]:
+    dropped = sum(status.scans_dropped.values())
+    lost = sum(status.scans_lost.values())
+    regions = "1 region" if status.regions == 1 else f"{status.regions} regions"
+    return [
+        ("epoch", f"{status.epoch}"),
+        ("learning", _learning(status, before)),
+        ("scans", f"{status.scans_taken:,} taken, {status.scans_waiting} waiting"),
+        ("not taken", f"{dropped:,} refused, {lost:,} lost"),
+        ("map", f"{regions}, {status.parameters / 1e6:.2f} M parameters"),
+        ("memory", f"{status.memory_bytes / 1e6:,.0f} MB"),
+        ("last checkpoint", _checkpoint(status)),
+        ("link", f"answers in {answered_ms:.1f} ms"),
+    ]
+
+
+def _learning(status: ServerStatus, before: ServerStatus | None) -> str:
+    if status.settled:
+        return "settled: nothing is left to learn"
+    left = f"{status.samples_left / 1e6:.1f} M samples left"
+    if before is None or status.uptime_s <= before.uptime_s:
+        return left
+    trained = status.samples_trained - before.samples_trained
+    rate = trained / (status.uptime_s - before.uptime_s)
+    return f"{rate / 1e6:.2f} M samples/s, {left}"
+
+
+def _checkpoint(status: ServerStatus) -> str:
+    last = status.last_checkpoint
+    if last is None:
+        return "none yet"
+    age_s = max(0.0, time.time() - last.stamp_ns / 1e9)
+    return f"epoch {last.epoch}, {last.bytes / 1e6:.1f} MB, {age_s:.0f} s ago"

@@ -1,0 +1,1 @@
+"""The mesh in a scene: which tiles, how fine, in which colours."""

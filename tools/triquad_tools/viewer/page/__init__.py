@@ -1,0 +1,1 @@
+"""What every part of a page works with: the scene, texts and legends, and threads that refresh."""
