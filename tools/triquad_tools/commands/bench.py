@@ -47,7 +47,7 @@ PARTS = (*USUAL_PARTS, "tradeoffs", "viewer", "ablation")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 done, whatever the figures; 1 a part failed; 2 wrong usage."""
+    """Run the tool: 0 done, whatever the figures; 1 a part failed; 2 wrong usage or input."""
     options = _parser().parse_args(argv)
     if options.drawn_from is not None and (options.plot is None or options.parts):
         message = "--from draws what is in a file: give --plot OUT.png and no parts"
@@ -59,12 +59,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             message = f"{path}: cannot be written: choose another folder"
             return complain(_COMMAND, message, BAD_INPUT)
     with sigterm_interrupts():
+        if options.drawn_from is not None:
+            return run(_COMMAND, partial(_draw_saved, options))
         return run(_COMMAND, partial(_bench, options), failures=(ToolError, OSError))
 
 
 def _bench(options: argparse.Namespace) -> int:
-    if options.drawn_from is not None:
-        return _draw_saved(options)
     parts = options.parts or (("tradeoffs",) if options.plot is not None else USUAL_PARTS)
     if options.plot is not None and "tradeoffs" not in parts:
         parts = (*parts, "tradeoffs")
@@ -212,7 +212,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
         description=_DESCRIPTION,
-        epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
+        epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage or "
+        "a FILE that cannot be used.",
     )
     add = parser.add_argument
     add(
