@@ -80,8 +80,9 @@ def preview(out: Path) -> None:
     shown: Any = trimesh.util.concatenate(list(scene.geometry.values()))
     colours = shown.visual.vertex_colors[:, :3] / 255.0
     camera = framed(Mesh(shown.vertices, shown.faces), _WIDTH / _HEIGHT).camera
-    options = {"width": _WIDTH, "height": _HEIGHT}
-    picture = render_mesh(shown.vertices, shown.faces, colours, camera, **options)
+    picture = render_mesh(
+        shown.vertices, shown.faces, colours, camera=camera, width=_WIDTH, height=_HEIGHT
+    )
     Image.fromarray(picture).save(out)
 
 

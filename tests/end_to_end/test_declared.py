@@ -56,7 +56,7 @@ def imported(folder: str) -> set[str]:
                 modules.add(node.module.split(".")[0])
     foreign = {
         name
-        for name in modules - sys.stdlib_module_names - {"tomllib"}
+        for name in modules - sys.stdlib_module_names - {"tomllib", "_typeshed"}
         if not name.startswith("triquad_")
     }
     return {DISTRIBUTIONS.get(name, name) for name in foreign}

@@ -1,18 +1,17 @@
 """Quantiles of times that were only counted in buckets."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.server_records import METRICS
 from triquad_format.wire import codec
 from triquad_format.wire.metrics_messages import (
-    CheckpointMetrics,
     OperationMetrics,
-    QueueMetrics,
     ServerMetrics,
-    SourceMetrics,
     TimeHistogram,
 )
 
@@ -23,26 +22,8 @@ OPERATION = "query/sdf"
 def metrics(times_s, server="s"):
     counts = np.bincount(np.searchsorted(BOUNDS_S, times_s), minlength=5).astype(np.int64)
     answers = TimeHistogram(counts, float(sum(times_s)))
-    return ServerMetrics(
-        server=server,
-        uptime_s=1.0,
-        problem=None,
-        epoch=1,
-        epoch_age_s=0.5,
-        epochs_kept=2,
-        epochs_pinned=1,
-        bounds_s=BOUNDS_S,
-        operations={OPERATION: OperationMetrics(answers, answers, {"busy": 1}, 1, 10, 20)},
-        queues={"scans": QueueMetrics(1, 32)},
-        sources={"lidar": SourceMetrics(1, 5, 0, 2, age_s=0.1)},
-        scans_received=7,
-        scan_bytes_received=700,
-        memory_bytes={"field": 10},
-        resident_bytes=100,
-        mapper_s={"idle": 0.5},
-        checkpoints=CheckpointMetrics(1, 0, 0.25, None),
-        sessions={"ab": "client"},
-    )
+    operation = OperationMetrics(answers, answers, {"busy": 1}, 1, 10, 20)
+    return replace(METRICS, server=server, bounds_s=BOUNDS_S, operations={OPERATION: operation})
 
 
 @given(st.lists(st.floats(0, 0.99), min_size=1, max_size=50), st.sampled_from([0.0, 0.5, 0.99, 1]))

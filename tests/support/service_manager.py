@@ -18,13 +18,13 @@ class Manager:
 
     address: str  # as the environment has it
     heard: list[list[str]] = field(default_factory=list)
-    _news: "queue.SimpleQueue[list[str]]" = field(default_factory=queue.SimpleQueue)
+    _datagrams: "queue.SimpleQueue[list[str]]" = field(default_factory=queue.SimpleQueue)
 
     def wait_for(self, line: str) -> list[str]:
         """The lines of the next datagram that has a line which begins with ``line``."""
         until = time.monotonic() + WAIT_S
         while True:
-            lines = self._news.get(timeout=max(0.0, until - time.monotonic()))
+            lines = self._datagrams.get(timeout=max(0.0, until - time.monotonic()))
             if any(told.startswith(line) for told in lines):
                 return lines
 
@@ -33,7 +33,7 @@ class Manager:
             if lines == [""]:
                 return
             self.heard.append(lines)
-            self._news.put(lines)
+            self._datagrams.put(lines)
 
 
 @contextmanager

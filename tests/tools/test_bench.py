@@ -128,8 +128,16 @@ def test_files_without_curves_are_refused(
     path.write_text(text)
     with pytest.raises(ToolError, match=r"figures\.json"):
         saved_tradeoffs(path)
-    assert bench.main(["--plot", str(tmp_path / "o.png"), "--from", str(path)]) != bench.OK
+    assert bench.main(["--plot", str(tmp_path / "o.png"), "--from", str(path)]) == bench.BAD_INPUT
     assert str(path) in capsys.readouterr().err
+
+
+def test_figures_that_there_are_not_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "nothing.json"
+    assert bench.main(["--plot", str(tmp_path / "o.png"), "--from", str(path)]) == bench.BAD_INPUT
+    assert capsys.readouterr().err == f"triquad-bench: {path}: no such file or directory\n"
 
 
 def test_saved_figures_are_drawn_without_measuring_or_not_at_all(
@@ -149,6 +157,6 @@ def test_half_of_a_curve_is_not_drawn(tmp_path: Path, capsys: pytest.CaptureFixt
     halved = json.loads(saved.read_text())
     halved["figures"] = halved["figures"][:2]
     saved.write_text(json.dumps(halved))
-    assert bench.main(["--plot", str(picture), "--from", str(saved)]) != bench.OK
+    assert bench.main(["--plot", str(picture), "--from", str(saved)]) == bench.BAD_INPUT
     assert "no curve" in capsys.readouterr().err
     assert not picture.exists()

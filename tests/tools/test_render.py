@@ -23,15 +23,17 @@ def _two_squares(first_z: float, second_z: float) -> tuple[np.ndarray, np.ndarra
 @pytest.mark.parametrize(("heights", "nearest"), [((0.0, 1.0), 1), ((1.0, 0.0), 0)])
 def test_nearer_things_hide_farther_ones(heights: tuple[float, float], nearest: int) -> None:
     vertices, faces, colours = _two_squares(*heights)
-    picture = render_mesh(vertices, faces, colours, FROM_ABOVE, 64, 48)
+    picture = render_mesh(vertices, faces, colours, camera=FROM_ABOVE, width=64, height=48)
     assert np.argmax(picture[24, 32]) == nearest
-    from_below = render_mesh(vertices, faces, colours, FROM_BELOW, 64, 48)
+    from_below = render_mesh(vertices, faces, colours, camera=FROM_BELOW, width=64, height=48)
     assert np.argmax(from_below[24, 32]) == 1 - nearest
 
 
 def test_faces_seen_from_inside_are_darker() -> None:
-    front = render_mesh(SQUARE, SQUARE_FACES, CLAY, FROM_ABOVE, 64, 48)[24, 32]
-    back = render_mesh(SQUARE, SQUARE_FACES[:, ::-1], CLAY, FROM_ABOVE, 64, 48)[24, 32]
+    front, back = (
+        render_mesh(SQUARE, faces, CLAY, camera=FROM_ABOVE, width=64, height=48)[24, 32]
+        for faces in (SQUARE_FACES, SQUARE_FACES[:, ::-1])
+    )
     assert np.all(back < 0.8 * front)
 
 
@@ -40,8 +42,10 @@ def test_a_roof_throws_a_shadow() -> None:
     vertices = np.vstack([floor, SQUARE + np.array([0.0, 0.0, 3.0])])
     faces = np.vstack([SQUARE_FACES, SQUARE_FACES + 4])
     camera = PerspectiveCamera(np.array([0.0, 0.0, 40.0]), np.array([0.0, 0.0, 0.0]))
-    bare = render_mesh(floor, SQUARE_FACES, CLAY, camera, 96, 96).astype(int)
-    shaded = render_mesh(vertices, faces, np.vstack([CLAY, CLAY]), camera, 96, 96).astype(int)
+    bare = render_mesh(floor, SQUARE_FACES, CLAY, camera=camera, width=96, height=96).astype(int)
+    shaded = render_mesh(
+        vertices, faces, np.vstack([CLAY, CLAY]), camera=camera, width=96, height=96
+    ).astype(int)
     darker = np.any(bare - shaded > 40, axis=2)
     square_m2 = 4.0 * (37.0 / 40.0) ** -2
     metres = 2.0 * 40.0 * np.tan(np.radians(0.5 * camera.view_deg)) / 96
@@ -51,7 +55,9 @@ def test_a_roof_throws_a_shadow() -> None:
 def _of_nothing() -> np.ndarray:
     """A picture of no mesh."""
     nothing = np.empty((0, 3))
-    return render_mesh(nothing, nothing.astype(np.int64), nothing, FROM_ABOVE, 32, 16)
+    return render_mesh(
+        nothing, nothing.astype(np.int64), nothing, camera=FROM_ABOVE, width=32, height=16
+    )
 
 
 def test_an_empty_mesh_is_all_background() -> None:
@@ -63,7 +69,7 @@ def test_an_empty_mesh_is_all_background() -> None:
 
 def test_things_behind_the_eye_are_not_drawn() -> None:
     away = PerspectiveCamera(np.array([0.0, 0.0, 10.0]), np.array([0.0, 0.0, 20.0]))
-    seen = render_mesh(SQUARE, SQUARE_FACES, CLAY, away, 32, 16)
+    seen = render_mesh(SQUARE, SQUARE_FACES, CLAY, camera=away, width=32, height=16)
     np.testing.assert_array_equal(seen, _of_nothing())
 
 
@@ -105,7 +111,7 @@ def test_a_metre_is_as_long_everywhere_in_parallel_projection() -> None:
 def test_level_ground_in_the_sun_has_its_own_colour() -> None:
     colours = np.tile([[0.15, 0.6, 0.5]], (4, 1))
     for camera in ASLANT:
-        picture = render_mesh(5 * SQUARE, SQUARE_FACES, colours, camera, 64, 48)
+        picture = render_mesh(5 * SQUARE, SQUARE_FACES, colours, camera=camera, width=64, height=48)
         np.testing.assert_allclose(picture[24, 32], 255 * colours[0], atol=4)
 
 

@@ -12,7 +12,6 @@ from triquad_client import OfflineMap, RefusedError, Status
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.viewer.asking.contours import contour_step, contours, numbers
 from triquad_tools.viewer.asking.distance_scale import distance_colours
-from triquad_tools.viewer.asking.focus import Focus
 from triquad_tools.viewer.asking.path_check import ask_path, in_pieces
 from triquad_tools.viewer.asking.path_drawing import piece_colours
 from triquad_tools.viewer.asking.path_probe import path_html
@@ -26,6 +25,7 @@ from triquad_tools.viewer.asking.unknown_boundary import (
     border_faces,
     face_triangles,
 )
+from triquad_tools.viewer.page.focus import Focus
 
 GROUND_M = 0.1  # in the middle of a voxel
 FOCUS = Focus(np.array([0.3, -0.4, 1.2]), 10.0, 16.0)
@@ -145,6 +145,11 @@ def test_a_path_is_blocked_where_the_map_says(ground: OfflineMap) -> None:
     assert reached[first] == pytest.approx(whole.contact_m, abs=0.3)
     colours = piece_colours(answer)
     assert len({tuple(colour) for colour in colours[answer.pieces.blocked].tolist()}) == 1
+
+
+def test_large_robots_are_answered_for(ground: OfflineMap) -> None:
+    answer = ask_path(ground, np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]]), radius_m=50.0)
+    assert answer.whole.blocked
 
 
 def test_unknown_space_on_a_path_is_grey_and_named(ground: OfflineMap) -> None:

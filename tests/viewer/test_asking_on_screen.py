@@ -16,7 +16,7 @@ from triquad_tools.plots.slice_plan import BEHIND, DISTANCE_COLOURS
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
 
-PATIENCE_MS = 60_000
+TIMEOUT_MS = 60_000
 NUMBER = re.compile(r"-?\d+\.\d+")
 
 
@@ -127,7 +127,7 @@ def test_a_click_asks_the_map(looked: Looked) -> None:
     control(page, "Raised by (m)").fill("0.75")
     click_at(page, 480, 380)
     raised = page.get_by_role("row", name="raised by")
-    expect(raised).to_contain_text("0.75 m", timeout=PATIENCE_MS)
+    expect(raised).to_contain_text("0.75 m", timeout=TIMEOUT_MS)
     place = numbers_in(cell(page, "position"))
     assert np.linalg.norm(np.array(place) - [0, 0, 0.75]) == pytest.approx(4.0, abs=0.1)
     answer = client.query_distance([place], 10.0)
@@ -172,7 +172,7 @@ def test_a_path_is_laid_checked_and_blocked_as_the_map_goes_on(looked: Looked) -
     for _ in range(3):
         client.publish_scan(sphere(30_000, radius_m=1.7), pose)  # a ball around the second point
     assert client.flush(WAIT_S).refused == 0
-    expect(page.get_by_role("row", name="blocked")).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_role("row", name="blocked")).to_be_visible(timeout=TIMEOUT_MS)
 
     def newest() -> bool:
         contact_m = client.query_polyline(points, 0.1, 1.0).contact_m

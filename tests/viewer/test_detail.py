@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from skimage.measure import marching_cubes
 from support.servers import SMALL, learn, running_service
 from triquad_client import connect
 from triquad_tools.plots.camera import view_axes
@@ -38,6 +39,19 @@ def test_cells_are_as_coarse_as_their_pixels_allow(
     pixel_m = 0.002 * np.linalg.norm(outside)
     assert level == 0 or CELLS_M[level] <= pixels * pixel_m * (1 + 1e-9)
     assert level == len(CELLS_M) - 1 or CELLS_M[level + 1] > pixels * pixel_m * (1 - 1e-9)
+
+
+def test_tiles_above_each_other_have_the_finest_of_their_levels() -> None:
+    viewpoint = Viewpoint(np.array([-100.0, 0.0, 20.0]), 0.002)
+    below, above, farther = (0.0, 0.0, -SIDE_M), (0.0, 0.0, 0.0), (2000.0, 0.0, 0.0)
+
+    def levels(*corners: tuple[float, ...]) -> list[int]:
+        found = wanted_levels(np.array(corners), SIDE_M, CELLS_M, viewpoint=viewpoint, pixels=1.99)
+        return found.tolist()
+
+    alone = [levels(corner)[0] for corner in (below, above, farther)]
+    assert alone[0] > alone[1] < alone[2]
+    assert levels(below, farther, above) == [alone[1], alone[2], alone[1]]
 
 
 def test_a_thinned_mesh_is_smaller_and_stays_where_it_was() -> None:
@@ -72,6 +86,20 @@ def test_tiles_that_are_thinned_alike_meet_without_cracks() -> None:
         sides.append(fewer.vertices[np.abs(fewer.vertices[:, 0] - at_m) < 1e-4][:, 1:])
     assert len(sides[0]) > 8
     np.testing.assert_allclose(*(np.sort(side, axis=0) for side in sides), atol=1e-4)
+
+
+def test_a_ground_in_the_side_between_two_tiles_stays_whole() -> None:
+    """Waves of 3 mm around z = 0, where one tile lies on another."""
+    side_m, at_m = 6.4, np.arange(65) * 0.1
+    x, y, z = np.meshgrid(at_m, at_m, at_m, indexing="ij")
+    ground_m = 0.003 * np.sin(5 * x + 0.3) * np.cos(7 * y + 0.2)
+    covered_m2 = 0.0
+    for least_z_m in (0.0, -side_m):
+        vertices, faces, *_ = marching_cubes(z + least_z_m - ground_m, 0.0, spacing=(0.1,) * 3)
+        fewer = thinned(Triangles(vertices, faces), 0.4, side_m)
+        a, b, c = (fewer.vertices[fewer.faces[:, corner], :2] for corner in range(3))
+        covered_m2 += abs(float(np.linalg.det(np.stack([b - a, c - a], axis=1)).sum())) / 2
+    assert covered_m2 == pytest.approx(side_m**2, rel=0.005)
 
 
 def test_nothing_thinned_is_nothing() -> None:

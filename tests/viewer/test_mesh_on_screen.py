@@ -64,6 +64,15 @@ def test_a_server_that_is_gone_is_told_of_until_it_is_back(page_of: PageOf) -> N
         expect(page.get_by_text("0 taken")).to_be_visible(timeout=60_000)
 
 
+def test_nothing_is_left_of_a_map_that_is_reset(page_of: PageOf) -> None:
+    with running_service() as endpoint, connect(endpoint) as client:
+        learn(client)
+        page = page_of(endpoint)
+        wait_until_drawn(page)
+        client.reset()
+        wait_until(page, lambda: drawn_share(page) == 0.0, "nothing is drawn")
+
+
 def _few_left(page: Page, colours: set[tuple[int, ...]]) -> bool:
     """Whether most of some colours are drawn no more."""
     return len(colours & _colours(page)) < 0.5 * len(colours)

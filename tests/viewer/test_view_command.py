@@ -40,3 +40,18 @@ def test_a_file_and_a_server_exclude_each_other(
     option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "for a server, not for a file" in told(["map.triquad", option, "x"], capsys)
+
+
+@pytest.mark.parametrize("host", ["", "nowhere.invalid", "192.0.2.1", "127.0.0.1:80", "a" * 100])
+def test_addresses_that_are_not_ours_are_refused(
+    host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_checkpoint(tmp_path, 1, EMPTY)
+    assert f"cannot serve a page at {host!r}" in told([str(path), "--host", host], capsys)
+
+
+@pytest.mark.parametrize("port", ["-1", "65536", "x", ""])
+def test_ports_that_are_none_are_refused(port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["map.triquad", "--port", port])
+    assert f"{port!r} is not a port: use 0 to 65535" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from triquad_tools.benchmarks.figures import CurvePoint, Figure
 from triquad_tools.console.command import ToolError
@@ -31,20 +31,29 @@ class _Scored:
 
 _NEIGHBOUR_STREET = 1
 _NEIGHBOUR = (
-    _Scored(TIME, 3.6, 98.56, 0.72),
-    _Scored(BYTES, 32_252_355, 98.56, 0.72),
-    _Scored(SPACING, 1, 98.56, 0.72),
-    _Scored(SPACING, 2, 97.18, 0.78),
-    _Scored(SPACING, 5, 92.59, 0.89),
-    _Scored(SPACING, 10, 80.32, 0.98),
+    _Scored(TIME, 3.6, f_score=98.56, accuracy_cm=0.72),
+    _Scored(BYTES, 32_252_355, f_score=98.56, accuracy_cm=0.72),
+    _Scored(SPACING, 1, f_score=98.56, accuracy_cm=0.72),
+    _Scored(SPACING, 2, f_score=97.18, accuracy_cm=0.78),
+    _Scored(SPACING, 5, f_score=92.59, accuracy_cm=0.89),
+    _Scored(SPACING, 10, f_score=80.32, accuracy_cm=0.98),
 )
 """VDBFusion 0.1.6 on the scans of street 1, its meshes scored like all others:
 ``docs/benchmarks.md`` has the program."""
 
+
+class _Axis(NamedTuple):
+    """What a curve is drawn along."""
+
+    label: str
+    ticks: Sequence[float]
+    scale: float = 1.0  # from costs to what is shown
+
+
 _AXES = {
-    TIME: ("processor seconds", (1, 2, 5, 10, 20, 50), 1.0),
-    BYTES: ("file, MB", (0.5, 1, 2, 5, 10, 20, 50), 1e-6),
-    SPACING: ("one scan in so many", (1, 2, 5, 10), 1.0),
+    TIME: _Axis("processor seconds", (1, 2, 5, 10, 20, 50)),
+    BYTES: _Axis("file, MB", (0.5, 1, 2, 5, 10, 20, 50), 1e-6),
+    SPACING: _Axis("one scan in so many", (1, 2, 5, 10)),
 }
 _UPWARDS = {F_SCORE: ("%", (None, 100.5)), ACCURACY: ("cm", (0.0, None))}
 _HEADINGS = {
@@ -97,16 +106,16 @@ def draw_tradeoffs(found: Tradeoffs, path: Path) -> None:
         "against the exact surface: F at 10 cm, errors of what is nearer than 20 cm.",
         "3QFP and SHINE-Mapping published no figures on this street.",
     ]
-    save_panels(path, f"triquad: {found.title}", rows, notes)
+    save_panels(path, f"triquad: {found.title}", rows, notes=notes)
 
 
 def _panel(found: Tradeoffs, curve: str, measure: str) -> Panel:
-    across, ticks, scale = _AXES[curve]
+    axis = _AXES[curve]
     points = _points(found, curve, measure)
-    drawn = [Curve("triquad", STYLES[0], [(cost * scale, value) for cost, value in points])]
+    drawn = [Curve("triquad", STYLES[0], [(cost * axis.scale, value) for cost, value in points])]
     if found.street == _NEIGHBOUR_STREET:
         other = [
-            (one.cost * scale, one.f_score if measure == F_SCORE else one.accuracy_cm)
+            (one.cost * axis.scale, one.f_score if measure == F_SCORE else one.accuracy_cm)
             for one in _NEIGHBOUR
             if one.curve == curve
         ]
@@ -114,9 +123,11 @@ def _panel(found: Tradeoffs, curve: str, measure: str) -> Panel:
     unit, limits = _UPWARDS[measure]
     lowest = min(cost for one in drawn for cost, _ in one.points)
     highest = max(cost for one in drawn for cost, _ in one.points)
-    shown = [tick for tick in ticks if 0.6 * lowest <= tick <= 1.6 * highest]
+    shown = [tick for tick in axis.ticks if 0.6 * lowest <= tick <= 1.6 * highest]
     heading = _HEADINGS[curve] if measure == F_SCORE else ""  # of its column
-    return Panel(heading, across, f"{measure}, {unit}", ticks=shown, limits=limits, curves=drawn)
+    return Panel(
+        heading, axis.label, f"{measure}, {unit}", ticks=shown, limits=limits, curves=drawn
+    )
 
 
 def _points(found: Tradeoffs, curve: str, measure: str) -> list[tuple[float, float]]:

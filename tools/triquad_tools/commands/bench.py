@@ -47,7 +47,7 @@ PARTS = (*USUAL_PARTS, "tradeoffs", "viewer", "ablation")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 done, whatever the figures; 1 a part failed; 2 wrong usage."""
+    """Run the tool: 0 done, whatever the figures; 1 a part failed; 2 wrong usage or input."""
     options = _parser().parse_args(argv)
     if options.drawn_from is not None and (options.plot is None or options.parts):
         message = "--from draws what is in a file: give --plot OUT.png and no parts"
@@ -59,12 +59,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             message = f"{path}: cannot be written: choose another folder"
             return complain(_COMMAND, message, BAD_INPUT)
     with sigterm_interrupts():
+        if options.drawn_from is not None:
+            return run(_COMMAND, partial(_draw_saved, options))
         return run(_COMMAND, partial(_bench, options), failures=(ToolError, OSError))
 
 
 def _bench(options: argparse.Namespace) -> int:
-    if options.drawn_from is not None:
-        return _draw_saved(options)
     parts = options.parts or (("tradeoffs",) if options.plot is not None else USUAL_PARTS)
     if options.plot is not None and "tradeoffs" not in parts:
         parts = (*parts, "tradeoffs")
@@ -197,17 +197,23 @@ def _part(name: str) -> str:
     return name
 
 
+_DESCRIPTION = (
+    "Measure triquad on this machine, on a simulated street: a server under a "
+    "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
+    "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
+    "opened offline, a server whose metrics are read, open air, things that move, a lidar that "
+    "moves while it turns, clouds of ROS 2, rooms, tables and streets with the presets that "
+    "are for them, and, if asked for, the viewer in a browser and the ablation. Takes over "
+    "half an hour; nothing else should run meanwhile."
+)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
-        description="Measure triquad on this machine, on a simulated street: a server under a "
-        "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
-        "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
-        "opened offline, a server whose metrics are read, open air, things that move, a lidar that "
-        "moves while it turns, clouds of ROS 2, rooms, tables and streets with the presets that "
-        "are for them, and, if asked for, the viewer in a browser and the ablation. Takes over "
-        "half an hour; nothing else should run meanwhile.",
-        epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage.",
+        description=_DESCRIPTION,
+        epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage or "
+        "a FILE that cannot be used.",
     )
     add = parser.add_argument
     add(

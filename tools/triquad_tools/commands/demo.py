@@ -13,7 +13,7 @@ from pathlib import Path
 
 from triquad_client import connect
 
-from triquad_tools.console.arguments import add_version, count, seed
+from triquad_tools.console.arguments import add_version, count, port, seed
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, run
 from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.report import json_text, print_rows
@@ -165,7 +165,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--view", action="store_true", help="show in a browser how the street grows")
     add(
         "--port",
-        type=count,
+        type=port,
         default=DEFAULT_PORT,
         metavar="N",
         help=f"of that page ({DEFAULT_PORT})",

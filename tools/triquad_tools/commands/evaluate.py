@@ -89,7 +89,7 @@ def evaluate_mesh(options: argparse.Namespace) -> Results:
     else:
         drive = street_drive(options.street, options.scans, options.step)
         truth = scene_truth(drive.scene, drive.true_hits(settings.voxel_m), settings)
-    return {"mesh": _compared(options, str(options.mesh), mesh, truth, settings)}
+    return {"mesh": _compared(options, str(options.mesh), mesh, truth=truth, settings=settings)}
 
 
 def evaluate_map(options: argparse.Namespace) -> Results:
@@ -105,11 +105,14 @@ def _on_street(options: argparse.Namespace) -> Results:
         street = score_street(opened.query_sdf, probes)
         mesh = opened.mesh(scored_box(truth.points, STREET_SETTINGS))
     name = f"{_map_name(options)}, epoch {mesh.epoch}"
-    return {"street": street, "mesh": _compared(options, name, mesh, truth, STREET_SETTINGS)}
+    return {
+        "street": street,
+        "mesh": _compared(options, name, mesh, truth=truth, settings=STREET_SETTINGS),
+    }
 
 
 def _compared(
-    options: argparse.Namespace, name: str, mesh: Mesh, truth: Truth, settings: ScoreSettings
+    options: argparse.Namespace, name: str, mesh: Mesh, *, truth: Truth, settings: ScoreSettings
 ) -> MeshScores:
     """Scores of a mesh, which ``--plot`` draws."""
     comparison = compare_mesh(mesh, truth, settings)

@@ -33,7 +33,7 @@ def _top(options: argparse.Namespace) -> int:
     with sigterm_interrupts(), reached as client:
         watch = Watch(client, options.interval)
         if options.once or not (options.json or is_screen()):
-            _look_once(target, watch, options)
+            _observe_once(target, watch, options)
         elif options.json:
             while True:
                 time.sleep(watch.due_in_s)
@@ -43,8 +43,8 @@ def _top(options: argparse.Namespace) -> int:
     return OK
 
 
-def _look_once(target: Target, watch: Watch, options: argparse.Namespace) -> None:
-    """Look for one interval, and print what was seen."""
+def _observe_once(target: Target, watch: Watch, options: argparse.Namespace) -> None:
+    """Observe one interval, and print what was seen."""
     watch.observe()
     time.sleep(watch.due_in_s)
     seen = watch.observe()

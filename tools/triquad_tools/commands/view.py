@@ -10,7 +10,7 @@ from pathlib import Path
 import triquad_client
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
-from triquad_tools.console.arguments import add_version
+from triquad_tools.console.arguments import add_version, port
 from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.progress import progress
 from triquad_tools.viewer.sources.file_source import FileSource
@@ -96,6 +96,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--map", metavar="NAME", help="of the server's map (default: default)")
     add("--config", metavar="FILE", help="Zenoh configuration (JSON5), for TLS or credentials")
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="to serve the page at")
-    add("--port", type=int, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
+    add("--port", type=port, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
     add_version(parser)
     return parser

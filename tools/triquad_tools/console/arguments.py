@@ -9,6 +9,7 @@ import triquad_format
 
 _PER_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
 _LEAST_ERROR_M, _LARGEST_ERROR_M = 1e-5, 0.1
+_LAST_PORT = 65_535
 
 
 def add_version(parser: argparse.ArgumentParser) -> None:
@@ -71,4 +72,11 @@ def seed(text: str) -> int:
     """A whole number of at least 0."""
     if not text.isascii() or not text.isdigit():
         raise argparse.ArgumentTypeError(f"{text!r} is not a seed: use 0, 1, ...")
+    return int(text)
+
+
+def port(text: str) -> int:
+    """A port to listen on; 0: any that is free."""
+    if not text.isascii() or not text.isdigit() or int(text) > _LAST_PORT:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port: use 0 to {_LAST_PORT}")
     return int(text)

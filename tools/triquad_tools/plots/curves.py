@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -14,8 +15,17 @@ _HEAD_IN = 1.6  # of the title, the legend and the notes
 _DPI = 110
 _LETTERS_PT = 13  # can be read in half the size, too
 
-STYLES = (("#0072b2", "o", "-"), ("#d55e00", "s", "--"), ("#009e73", "^", ":"))
-"""Colour, marker and line of the first, second and third curve (colours of Okabe and Ito)."""
+
+class Style(NamedTuple):
+    """How a curve is drawn, as matplotlib names it."""
+
+    colour: str
+    marker: str
+    line: str
+
+
+STYLES = (Style("#0072b2", "o", "-"), Style("#d55e00", "s", "--"), Style("#009e73", "^", ":"))
+"""Of the first, second and third curve (colours of Okabe and Ito)."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +33,7 @@ class Curve:
     """Measured points, joined in the order of their abscissae."""
 
     label: str
-    style: tuple[str, str, str]
+    style: Style
     points: Sequence[tuple[float, float]]
 
 
@@ -72,9 +82,12 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set(xlabel=panel.across, ylabel=panel.upwards, xscale="log")
     axes.grid(color="#dddddd")
     for curve in panel.curves:
-        colour, marker, line = curve.style
+        style = curve.style
         across, upwards = zip(*sorted(curve.points), strict=True)
-        axes.plot(across, upwards, line, color=colour, marker=marker, ms=8, label=curve.label)
+        axes.plot(
+            across, upwards, style.line, color=style.colour, marker=style.marker, ms=8,
+            label=curve.label,
+        )  # fmt: skip
     axes.set_xticks(panel.ticks)
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())

@@ -89,7 +89,7 @@ def draw_mesh_errors(heading: Heading, comparison: Comparison, path: Path) -> No
     notes = [DIRECTION_NOTE.format(view.looks_to), *outside_notes(view)]
     if beside:
         notes.append(f"beside the truth, not scored: {100.0 * beside:.2g} %")
-    legend = Legend(heading, bar, [notes[0], "; ".join(notes[1:])], view.camera, named=named)
+    legend = Legend(heading, bar, [notes[0], "; ".join(notes[1:])], camera=view.camera, named=named)
     image = _rendered(part, colours, lacking, camera=view.camera)
     save_mesh_sheet(path, image, legend)
 
@@ -117,7 +117,7 @@ def draw_withheld(
     points = _Points(np.concatenate([answer.points for answer in answers]), colours)
     view = _framed(_NOTHING, points.places)
     named = [(MISSING, f"UNKNOWN:\n{percent(scores.unknown_ratio)}")]
-    legend = Legend(heading, bar, outside_notes(view), view.camera, named=named)
+    legend = Legend(heading, bar, outside_notes(view), camera=view.camera, named=named)
     image = _rendered(_NOTHING, np.empty((0, 3)), points, camera=view.camera)
     save_mesh_sheet(path, image, legend)
 
@@ -130,7 +130,7 @@ def error_colours(distances_m: NDArray[np.floating], high_m: float) -> Doubles:
 
 
 def _bar(label: str, high_m: float) -> ColourBar:
-    return ColourBar(label, ERROR_STOPS, 0.0, 100.0 * high_m, beyond=BEYOND)
+    return ColourBar(label, ERROR_STOPS, low=0.0, high=100.0 * high_m, beyond=BEYOND)
 
 
 def _one_colour(colour: str, count: int) -> Doubles:
@@ -153,7 +153,7 @@ def _rendered(mesh: Mesh, colours: Doubles, points: _Points, camera: ParallelCam
         both.vertices,
         both.faces,
         np.concatenate([colours, points.colours.repeat(len(_SQUARE), axis=0)]),
-        camera,
+        camera=camera,
         width=WIDTH,
         height=HEIGHT,
         plain=len(squares.faces),

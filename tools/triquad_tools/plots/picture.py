@@ -73,17 +73,19 @@ def draw_view(
     heights_m = mesh.vertices[np.unique(mesh.faces), 2]
     scale = HeightScale.around(heights_m)
     colours = scale.colours(mesh.vertices[:, 2])
-    image = render_mesh(mesh.vertices, mesh.faces, colours, camera, width=WIDTH, height=HEIGHT)
+    image = render_mesh(
+        mesh.vertices, mesh.faces, colours, camera=camera, width=WIDTH, height=HEIGHT
+    )
     least_m, most_m = float(heights_m.min()), float(heights_m.max())
     bar = ColourBar(
         "height z in m",
         HEIGHT_STOPS,
-        scale.low_m,
-        scale.high_m,
+        low=scale.low_m,
+        high=scale.high_m,
         above=f"up to {most_m:.2g} m" if most_m > scale.high_m else "",
         below=f"down to {least_m:.2g} m" if least_m < scale.low_m else "",
     )
-    save_mesh_sheet(path, image, Legend(heading, bar, notes, camera))
+    save_mesh_sheet(path, image, Legend(heading, bar, notes, camera=camera))
 
 
 def outside_notes(view: Framing) -> list[str]:

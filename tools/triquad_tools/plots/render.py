@@ -33,6 +33,7 @@ def render_mesh(
     vertices: NDArray[np.floating],
     faces: NDArray[np.integer],
     colours: NDArray[np.floating],
+    *,
     camera: Camera,
     width: int = 1600,
     height: int = 900,

@@ -1,12 +1,14 @@
 """The web server that shows a map."""
 
 import io
+import socket
 import threading
 import warnings
 from contextlib import redirect_stdout
 
 import viser
 
+from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.browser_session import BrowserSession
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.map_source import MapSource
@@ -17,10 +19,24 @@ _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove a
 """Warnings of viser: a browser that leaves takes with it what is being drawn or removed there."""
 
 
+class _OwnServer(viser.ViserServer):
+    """Does not do what a page may ask of it behind the back of whoever started it."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
+        """Refuse to show the page to the internet: whoever reaches it could ask for that."""
+        return None
+
+
 class Viewer:
     """Serves a page that shows a map, to several browsers, until it is closed."""
 
     def __init__(self, shown: MapSource | History, host: str, port: int) -> None:
+        """Serve at an address of this machine, at ``port`` or the next one that is free.
+
+        Raises:
+            ToolError: it is no such address.
+        """
+        _check_address(host)
         self._shown = shown
         self._sessions: dict[int, BrowserSession] = {}
         self._closed = False
@@ -29,14 +45,15 @@ class Viewer:
         for message in _OF_ONE_WHO_LEFT:
             warnings.filterwarnings("ignore", message, UserWarning)
         with redirect_stdout(io.StringIO()):  # it has announcements of its own
-            self._server = viser.ViserServer(host, port, label="triquad", verbose=False)
+            self._server = _OwnServer(host, port, label="triquad", verbose=False)
         self._server.on_client_connect(self._enter)
         self._server.on_client_disconnect(self._leave)
 
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+        host = self._server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
 
     def wait_for_browser(self) -> None:
         """Wait until a browser has opened the page."""
@@ -70,3 +87,15 @@ class Viewer:
             session = self._sessions.pop(client.client_id, None)
         if session is not None:
             session.close()
+
+
+def _check_address(host: str) -> None:
+    """Refuse an address at which nothing can be served: viser would try for ever."""
+    try:
+        family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        socket.create_server(address[:2], family=family).close()
+    except (OSError, ValueError) as error:
+        raise ToolError(
+            f"cannot serve a page at {host!r}: {error}; use an address of this machine, such as "
+            "127.0.0.1, or 0.0.0.0 for all"
+        ) from error

@@ -6,6 +6,7 @@ import numpy as np
 from triquad_client import Polyline, Segments
 from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles
+from triquad_format.wire.limits import MAX_DISTANCE_M
 
 _LEAST_REACH_M, _REACH_RADII = 1.0, 3.0  # how far around surfaces are looked for
 _LEAST_PIECE_M = 0.25
@@ -36,7 +37,7 @@ def ask_path(queries: MapQueries, points: Doubles, radius_m: float) -> PathAnswe
     Raises:
         TriquadError: the map does not answer, or not about so long a path.
     """
-    reach_m = max(_LEAST_REACH_M, _REACH_RADII * radius_m)
+    reach_m = min(max(_LEAST_REACH_M, _REACH_RADII * radius_m), MAX_DISTANCE_M)
     whole = queries.query_polyline(points, radius_m, reach_m)
     cuts = in_pieces(points)
     pieces = queries.query_segments(cuts[:-1], cuts[1:], radius_m, reach_m, at_epoch=whole.epoch)

@@ -31,7 +31,7 @@ class PathDrawing:
                 mark.remove()
             self._marks.clear()
             for number, point in enumerate(points, start=1):
-                self._label(f"points/{number}", f"{number}", point)
+                self._label(f"points/{number}", f"{number}", point, anchor="center-right")
             if answer is not None:
                 self._draw_answer(answer)
 
@@ -45,10 +45,10 @@ class PathDrawing:
         if whole.meets_unknown:
             text = f"unknown from {whole.unknown_contact_m:.2f} m"
             place = answer.at(whole.unknown_contact_m)
-            self._label("unknown", text, place, anchor="top-center")
+            self._label("unknown", text, place, anchor="top-left")
         if whole.blocked:
             text = f"✖ blocked at {whole.contact_m:.2f} m"
-            self._label("blocked", text, answer.at(whole.contact_m))
+            self._label("blocked", text, answer.at(whole.contact_m), anchor="bottom-left")
 
     def _label(
         self,
@@ -56,8 +56,12 @@ class PathDrawing:
         text: str,
         place: Doubles,
         *,
-        anchor: Literal["bottom-center", "top-center"] = "bottom-center",
+        anchor: Literal["center-right", "bottom-left", "top-left"],
     ) -> None:
+        """Write a text beside a place [3]; ``anchor`` is the part of the text that lies there.
+
+        Three of them at one place, as where a path is blocked at its first point, can all be read.
+        """
         label = self._page.scene.add_label(
             f"/path/{name}", text, position=self._page.in_scene(place), anchor=anchor
         )

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.plots.plan import UNKNOWN
@@ -22,6 +23,7 @@ _LINES = (
     LineMeaning(UNKNOWN, False, "the robot is in unknown space"),
 )
 _LEAST_LEG_M = 0.01  # a second click at the same place adds nothing
+_UNANSWERED = "The map does not answer about this path."
 _SKY = "No surface there: the path stays as it was."
 
 
@@ -97,7 +99,13 @@ class PathProbe:
         if self.unanswered:
             queries = self._page.source.queries
             points = np.array(self._points)
-            self._answer = ask_path(queries, points, float(self._radius.value))
+            try:
+                self._answer = ask_path(queries, points, float(self._radius.value))
+            except TriquadError:
+                # What is drawn was true of another radius, or of another map.
+                self._drawing.draw(self._points, None)
+                self._text.content = text_html(_UNANSWERED)
+                raise
             scale = distance_scale("clearance of the robot's middle, m", self._answer.reach_m)
             legend = Legend(scale, _LINES)
             self._legend.content = legend.html

@@ -4,11 +4,11 @@ from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import BEHIND
 from triquad_tools.viewer.asking.contours import contour_step
 from triquad_tools.viewer.asking.distance_scale import distance_scale
-from triquad_tools.viewer.asking.focus import focus_of
 from triquad_tools.viewer.asking.picking import ground_in_view
 from triquad_tools.viewer.asking.questions import Pace, newest_epoch
 from triquad_tools.viewer.asking.slice_drawing import SliceDrawing
 from triquad_tools.viewer.asking.slice_plane import HEIGHT_AXIS, SlicePlane, ask_slice
+from triquad_tools.viewer.page.focus import focus_of
 from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import text_html

@@ -8,8 +8,8 @@ from triquad_format.records.arrays import Bools, Doubles, Floats
 from triquad_format.records.status import Status
 from triquad_map.questions.distance import Distances
 
-from triquad_tools.viewer.asking.focus import Focus
 from triquad_tools.viewer.asking.questions import in_small_parts
+from triquad_tools.viewer.page.focus import Focus
 
 _CELLS = 192  # along the longer side
 _SNAPS = 8  # to a side: a smaller move of the view moves no slice

@@ -10,8 +10,8 @@ from triquad_format.records.status import Status
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.rays import RayRanges
 
-from triquad_tools.viewer.asking.focus import Focus
 from triquad_tools.viewer.asking.questions import in_small_parts
+from triquad_tools.viewer.page.focus import Focus
 from triquad_tools.viewer.page.unlit_glb import Triangles
 
 _COLUMNS, _LAYERS = 64, 24  # cells along x and y, and along z: they bound how much is asked

@@ -4,7 +4,6 @@ import numpy as np
 import viser
 from matplotlib.colors import to_rgb
 
-from triquad_tools.viewer.asking.focus import focus_of
 from triquad_tools.viewer.asking.questions import Pace, newest_epoch
 from triquad_tools.viewer.asking.unknown_boundary import (
     Boundary,
@@ -13,6 +12,7 @@ from triquad_tools.viewer.asking.unknown_boundary import (
     face_triangles,
 )
 from triquad_tools.viewer.page.colour_scale import GAMMA
+from triquad_tools.viewer.page.focus import focus_of
 from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import text_html

@@ -46,12 +46,13 @@ def _rows(
 ) -> list[tuple[str, str]]:
     dropped = sum(status.scans_dropped.values())
     lost = sum(status.scans_lost.values())
+    regions = "1 region" if status.regions == 1 else f"{status.regions} regions"
     return [
         ("epoch", f"{status.epoch}"),
         ("learning", _learning(status, before)),
         ("scans", f"{status.scans_taken:,} taken, {status.scans_waiting} waiting"),
         ("not taken", f"{dropped:,} refused, {lost:,} lost"),
-        ("map", f"{status.regions} regions, {status.parameters / 1e6:.2f} M parameters"),
+        ("map", f"{regions}, {status.parameters / 1e6:.2f} M parameters"),
         ("memory", f"{status.memory_bytes / 1e6:,.0f} MB"),
         ("last checkpoint", _checkpoint(status)),
         ("link", f"answers in {answered_ms:.1f} ms"),

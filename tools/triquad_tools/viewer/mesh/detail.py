@@ -19,6 +19,9 @@ def wanted_levels(
 ) -> Ints:
     """Which level of detail [T] each tile deserves: the coarsest of cells of so many pixels.
 
+    Tiles above each other have one level, the finest of theirs: where the ground lies in the side
+    between two of them, as at z = 0, meshes of two levels would leave holes all over it.
+
     Args:
         corners: [T, 3] least corners of the tiles, metres, map frame.
         side_m: of the tiles.
@@ -30,4 +33,8 @@ def wanted_levels(
     distance_m = np.linalg.norm(nearest - viewpoint.position, axis=1)
     allowed_m = distance_m * viewpoint.radians_per_pixel * pixels
     coarsest = np.searchsorted(cells_m, allowed_m, side="right") - 1
-    return np.asarray(np.maximum(coarsest, 0), np.int32)
+    _, columns = np.unique(corners[:, :2], axis=0, return_inverse=True)
+    columns = columns.reshape(-1)
+    finest = np.full(len(corners), len(cells_m) - 1, np.int32)
+    np.minimum.at(finest, columns, np.maximum(coarsest, 0).astype(np.int32))
+    return np.asarray(finest[columns], np.int32)

@@ -66,7 +66,9 @@ class MeshLayer:
             self._asked_s = time.monotonic()
         self._tiles.refresh_roots(due=due)
         roots = self._tiles.roots
-        if not roots:
+        if not roots:  # there is no map yet, or it was reset
+            self._page.legends.hide(_NAME)
+            self._drawn.clear()
             return
         points = _some_vertices(roots.values())
         if self._page.source.grows or not self._framed:

@@ -4,7 +4,7 @@ import numpy as np
 
 from triquad_tools.viewer.page.unlit_glb import Triangles
 
-_ON_SIDE_M = 1e-3
+_ON_SIDE_M = 2e-5  # more than rounding, less than what noise moves a ground that lies in the side
 
 
 def thinned(triangles: Triangles, cell_m: float, side_m: float) -> Triangles:
