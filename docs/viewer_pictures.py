@@ -44,7 +44,8 @@ def main() -> None:
         driving.join()
         save_film(frames, IMAGES / "viewer.gif")
         wait_until_settled(client, _SETTLE_LIMIT_S)
-        page.wait_for_timeout(5000)
+        page.get_by_label("Show slice").check()
+        page.wait_for_timeout(6000)
         settled = Image.open(io.BytesIO(page.screenshot()))
         for_pages(settled).save(IMAGES / "viewer.png", optimize=True)
 

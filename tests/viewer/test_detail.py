@@ -133,7 +133,7 @@ def test_near_tiles_are_those_of_the_server(level: int) -> None:
         near.move(roots)
         for _ in range(1000):
             near.refresh()
-            if near.complete:
+            if near.loaded:
                 break
         assert set(roots) <= near.ready
         found = dict(near.within((0, 0, 0)))

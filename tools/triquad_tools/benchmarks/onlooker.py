@@ -1,15 +1,19 @@
 """Somebody who looks at the map of a server: a process with the viewer and a browser.
 
-It only takes what the machine has left, as it would run on another one. Commands on its standard
+It would run on another machine: here it only takes what this one has left. Commands on its standard
 input, a line each: ``open`` opens the page, and is answered with the seconds until a mesh is drawn;
-``close`` closes it. It ends with its input.
+``freeze`` stops the browser, which goes on to be sent what changes but takes no processor any
+more, and ``thaw`` lets it go on; ``close`` closes the page. It ends with its input.
 """
 
 import os
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 from triquad_client import connect
 
@@ -17,6 +21,8 @@ from triquad_tools.benchmarks.browser import opened_page, running_browser, wait_
 from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
+
+_SIGNALS = {"freeze": signal.SIGSTOP, "thaw": signal.SIGCONT}
 
 
 class Onlooker:
@@ -39,6 +45,14 @@ class Onlooker:
         """Open the page; seconds until a mesh is drawn."""
         return float(self._ask("open"))
 
+    def freeze(self) -> None:
+        """Stop the browser's processes, as if they ran elsewhere."""
+        self._ask("freeze")
+
+    def thaw(self) -> None:
+        """Let them go on."""
+        self._ask("thaw")
+
     def close(self) -> None:
         """Close the page."""
         self._ask("close")
@@ -54,11 +68,22 @@ class Onlooker:
         return answer
 
 
+def _descendants(parent: int) -> Iterator[int]:
+    """The processes that a process has started, and theirs."""
+    found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(parent)], capture_output=True)
+    for text in found.stdout.split():
+        yield from _descendants(int(text))
+        if Path(f"/proc/{int(text)}").exists():  # not that of ps itself
+            yield int(text)
+
+
 def main() -> None:
     """Obey until the input ends."""
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     endpoint, map_name = sys.argv[1:]
-    with connect(endpoint, map_name) as client, running_browser() as browser, ExitStack() as page:
+    with connect(endpoint, map_name) as client, ExitStack() as page:
+        # From here on, for the threads of the network have to take what the server sends.
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        browser = page.enter_context(running_browser())
         viewer = Viewer(LiveSource(client, endpoint), "127.0.0.1", 0)
         page.callback(viewer.close)
         shown = page.enter_context(ExitStack())
@@ -66,6 +91,9 @@ def main() -> None:
             started = time.monotonic()
             if command.strip() == "open":
                 wait_until_drawn(shown.enter_context(opened_page(browser, viewer.url)))
+            elif command.strip() in _SIGNALS:
+                for process in _descendants(os.getpid()):
+                    os.kill(process, _SIGNALS[command.strip()])
             elif command.strip() == "close":
                 shown.close()
             print(time.monotonic() - started, flush=True)

@@ -22,7 +22,7 @@ from triquad_tools.viewer.page.refresher import Refresher
 from triquad_tools.viewer.sources.map_source import Tile
 
 _NAME = "mesh"
-_PERIOD_S = 0.5
+_PERIOD_S = 1.0  # between questions what changed: more often, and a robot's planner would notice
 _HEIGHT, _AGE, _CONFIDENCE = "height", "age", "confidence"
 _PIXELS = 4  # of a cell
 _ENOUGH = 200  # vertices of a tile, to know where it is
@@ -76,7 +76,7 @@ class MeshLayer:
             self._framed = self._tiles.roots_complete
         wanted = self._tiles.refresh_near(self._viewpoint(), self._pixels.value, due=due)
         self._drawn.show(wanted, self._colours(points))
-        if not self._tiles.complete:
+        if not self._tiles.loaded:
             self._refresher.wake()
 
     def _viewpoint(self) -> Viewpoint:

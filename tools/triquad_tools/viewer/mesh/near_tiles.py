@@ -22,9 +22,9 @@ class NearTiles:
         """Tiles of the coarsest level within which all of this one are there."""
 
     @property
-    def complete(self) -> bool:
-        """Whether the last refresh left nothing waiting."""
-        return self._follower is None or self._follower.complete
+    def loaded(self) -> bool:
+        """Whether all that is followed was there once."""
+        return self._around <= self.ready
 
     def move(self, roots: list[TileIndex]) -> None:
         """Follow the tiles within ``roots``, tiles of the coarsest level; none: as before."""

@@ -35,6 +35,7 @@ class TilesInView:
     def __init__(self, source: MapSource) -> None:
         self._side_m = source.sizes.side_of(COARSEST)
         self._whole = source.follow(COARSEST)
+        self._whole_loaded = False
         self._near = [NearTiles(source, level) for level in range(COARSEST)]
         levels = range(COARSEST + 1 + _THINNED_LEVELS)
         self._cells_m = np.array([source.sizes.cell_of(level) for level in levels])
@@ -50,14 +51,15 @@ class TilesInView:
         return self._whole.complete
 
     @property
-    def complete(self) -> bool:
-        """Whether the last refreshes left nothing waiting."""
-        return self._whole.complete and all(near.complete for near in self._near)
+    def loaded(self) -> bool:
+        """Whether all that is in view was there once; from then on only changes come."""
+        return self._whole_loaded and all(near.loaded for near in self._near)
 
     def refresh_roots(self, *, due: bool) -> None:
-        """Fetch some of what is new; unless it is ``due``, only where more is waiting."""
-        if due or not self._whole.complete:
+        """Fetch some of what is new; unless it is ``due``, only until all was there once."""
+        if due or not self._whole_loaded:
             self._whole.refresh()
+            self._whole_loaded |= self._whole.complete
 
     def refresh_near(
         self, viewpoint: Viewpoint, pixels: float, *, due: bool
@@ -67,7 +69,7 @@ class TilesInView:
         Args:
             viewpoint: of the eye.
             pixels: that a cell may cover on the screen.
-            due: else only what is waiting is fetched.
+            due: else only what was never there is fetched.
         """
         roots = self.roots
         corners = np.array(list(roots), np.float64).reshape(-1, 3) * self._side_m
@@ -77,7 +79,7 @@ class TilesInView:
         levels = dict(zip(roots, wanted.tolist(), strict=True))
         for near in self._near:
             near.move([index for index, level in levels.items() if level <= near.level])
-            if due or not near.complete:
+            if due or not near.loaded:
                 near.refresh()
         return dict(self._wanted(roots, levels))
 
