@@ -27,6 +27,13 @@ CODE = "import sys; from triquad_tools.commands.entry_points import top; sys.exi
 ENTERED, LEFT = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
 
 
+@pytest.fixture(autouse=True)
+def no_width_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests that run side by side are told of a terminal of 80 columns, which is not there."""
+    for name in ("COLUMNS", "LINES"):
+        monkeypatch.delenv(name, raising=False)
+
+
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with servers.running_service(store=tmp_path_factory.mktemp("store")) as endpoint:
