@@ -26,6 +26,9 @@ HEIGHT_STOPS: Doubles = np.array(
 )
 """``[9, 3]`` sRGB in [0, 1], evenly spaced from the bottom of a scale to its top."""
 
+GAMMA = 2.2
+"""From sRGB to linear light: colours to this power, near enough."""
+
 _MOST = (0.01, 0.99)  # a treetop or a hole does not take the colours from all else
 _LEAST_RANGE_M = 0.1  # noise on a floor is no relief
 

@@ -6,27 +6,7 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import Browser
 from triquad_tools.benchmarks import browser
-from triquad_tools.benchmarks.browser import (
-    HEIGHT,
-    WIDTH,
-    drawn_share,
-    opened_page,
-    picture,
-    wait_until,
-    wait_until_drawn,
-)
 from triquad_tools.console.command import ToolError
-
-__all__ = [
-    "HEIGHT",
-    "WIDTH",
-    "drawn_share",
-    "opened_page",
-    "picture",
-    "running_browser",
-    "wait_until",
-    "wait_until_drawn",
-]
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 from triquad_tools.plots.camera import ParallelCamera, PerspectiveCamera
-from triquad_tools.plots.raster import rasterise, vertex_normals
+from triquad_tools.plots.mesh_normals import vertex_normals
+from triquad_tools.plots.raster import rasterise
 from triquad_tools.plots.render import BACKGROUND, render_mesh
 
 SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import triquad_client
 from playwright.sync_api import Browser, Page, expect
-from support.browser import opened_page, running_browser
+from support.browser import running_browser
+from triquad_tools.benchmarks.browser import opened_page
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.open_maps import OpenMaps

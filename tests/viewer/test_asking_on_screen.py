@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from playwright.sync_api import Browser, Locator, Page, expect
-from support.browser import opened_page, picture, wait_until, wait_until_drawn
 from support.servers import WAIT_S, running_service, sphere
 from triquad_client import Client, Status, connect
+from triquad_tools.benchmarks.browser import opened_page, picture, wait_until, wait_until_drawn
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import BEHIND, DISTANCE_COLOURS
 from triquad_tools.viewer.sources.live_source import LiveSource

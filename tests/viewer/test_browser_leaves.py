@@ -5,9 +5,9 @@ from contextlib import closing
 from pathlib import Path
 
 from playwright.sync_api import Browser
-from support.browser import wait_until
 from support.changing_store import EMPTY, write_checkpoint
 from triquad_client.checks import Bounds
+from triquad_tools.benchmarks.browser import wait_until
 from triquad_tools.viewer.sources.file_source import FileFollower, FileSource
 from triquad_tools.viewer.sources.open_maps import OpenMaps
 from triquad_tools.viewer.sources.tile_maker import TileMaker, TileOrder

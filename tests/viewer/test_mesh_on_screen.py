@@ -6,9 +6,9 @@ from functools import partial
 import numpy as np
 from playwright.sync_api import Page, expect
 from support import servers
-from support.browser import drawn_share, picture, wait_until, wait_until_drawn
 from support.servers import learn, running_service, sphere
 from triquad_client import connect
+from triquad_tools.benchmarks.browser import drawn_share, picture, wait_until, wait_until_drawn
 
 PageOf = Callable[[str], Page]
 

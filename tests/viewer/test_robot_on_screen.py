@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 from playwright.sync_api import Page, expect
-from support.browser import picture, wait_until, wait_until_drawn
 from support.servers import running_service, sphere
 from triquad_client import Client, connect
+from triquad_tools.benchmarks.browser import picture, wait_until, wait_until_drawn
 
 
 def test_trail_newest_scan_and_figures(page_of: Callable[[str], Page]) -> None:

@@ -94,24 +94,24 @@ def _first_mesh(client: Client) -> list[Figure]:
 def _long_street(client: Client) -> list[Figure]:
     """How many frames a second there are of 2 km of streets, while the camera turns."""
     source = RepeatedSource.of_street(client)
-    viewer = Viewer(source, "127.0.0.1", 0)
-    try:
-        with running_browser() as browser, opened_page(browser, viewer.url) as page:
-            wait_until_drawn(page)
-            time.sleep(_DRAWN_S)
-            whole = _frames_per_second(page)
-            page.mouse.move(*_MIDDLE)
-            for _ in range(_WHEEL_TURNS):
-                page.mouse.wheel(0, -_WHEEL)
-                page.wait_for_timeout(50)
-            time.sleep(2 * _DRAWN_S)  # the fine tiles come
-            near = _frames_per_second(page)
-        return [
-            Figure("frames of 2 km of street, all in view", whole, "a second", at_least=20),
-            Figure("the same, near the ground", near, "a second", at_least=20),
-        ]
-    finally:
-        viewer.close()
+    with (
+        closing(Viewer(source, "127.0.0.1", 0)) as viewer,
+        running_browser() as browser,
+        opened_page(browser, viewer.url) as page,
+    ):
+        wait_until_drawn(page)
+        time.sleep(_DRAWN_S)
+        whole = _frames_per_second(page)
+        page.mouse.move(*_MIDDLE)
+        for _ in range(_WHEEL_TURNS):
+            page.mouse.wheel(0, -_WHEEL)
+            page.wait_for_timeout(50)
+        time.sleep(2 * _DRAWN_S)  # the fine tiles come
+        near = _frames_per_second(page)
+    return [
+        Figure("frames of 2 km of street, all in view", whole, "a second", at_least=20),
+        Figure("the same, near the ground", near, "a second", at_least=20),
+    ]
 
 
 def _frames_per_second(page: Page) -> float:

@@ -238,6 +238,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--scans", type=count, default=60, metavar="N", help="of the ablation (default: 60)")
     add("--step", type=positive, default=1.0, metavar="M", help="between them (default: 1)")
+    _add_outputs(add)
+    add_version(parser)
+    return parser
+
+
+def _add_outputs(add: Callable[..., argparse.Action]) -> None:
     add(
         "--plot",
         type=Path,
@@ -254,5 +260,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--json", type=Path, metavar="FILE", help="write the figures there, too")
     add("--record", type=Path, metavar="FILE.md", help="add a table to this page")
-    add_version(parser)
-    return parser

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints
+from triquad_map.height_scale import GAMMA
 
 from triquad_tools.plots.camera import Camera, view_axes
-from triquad_tools.plots.raster import Raster, rasterise, vertex_normals
+from triquad_tools.plots.mesh_normals import vertex_normals
+from triquad_tools.plots.raster import Raster, rasterise
 
 _SUPERSAMPLING = 2
 _SHADOW_PIXELS = 3072
@@ -23,7 +25,6 @@ _SUN = 0.85
 _SKY_LIGHT = 0.45
 _GROUND_LIGHT = 0.20
 _BACK = 0.45  # brightness of faces seen from inside
-_GAMMA = 2.2  # of sRGB, near enough
 
 BACKGROUND: Doubles = np.array([0.93, 0.94, 0.95])
 """sRGB of where nothing is."""
@@ -155,11 +156,11 @@ def _contact_shadow(raster: Raster, camera: Camera) -> Doubles:
 
 def _linear(colours: NDArray[np.floating]) -> Doubles:
     """Linear light of sRGB colours."""
-    light: Doubles = np.asarray(colours, np.float64) ** _GAMMA
+    light: Doubles = np.asarray(colours, np.float64) ** GAMMA
     return light
 
 
 def _encode(light: Doubles) -> Bytes:
     """Linear light as 8-bit sRGB."""
-    levels = np.round(255.0 * np.clip(light, 0.0, 1.0) ** (1.0 / _GAMMA))
+    levels = np.round(255.0 * np.clip(light, 0.0, 1.0) ** (1.0 / GAMMA))
     return np.asarray(levels, np.uint8)

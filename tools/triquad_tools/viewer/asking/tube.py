@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 from triquad_format.records.arrays import Doubles
+from triquad_map.height_scale import GAMMA
 
-from triquad_tools.viewer.page.colour_scale import GAMMA
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.unlit_glb import Triangles, unlit_glb
 

@@ -3,6 +3,7 @@
 import numpy as np
 import viser
 from matplotlib.colors import to_rgb
+from triquad_map.height_scale import GAMMA
 
 from triquad_tools.viewer.asking.questions import Pace, newest_epoch
 from triquad_tools.viewer.asking.unknown_boundary import (
@@ -11,7 +12,6 @@ from triquad_tools.viewer.asking.unknown_boundary import (
     ask_boundary,
     face_triangles,
 )
-from triquad_tools.viewer.page.colour_scale import GAMMA
 from triquad_tools.viewer.page.focus import focus_of
 from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.page.page import Page

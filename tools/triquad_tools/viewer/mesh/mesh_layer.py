@@ -1,6 +1,5 @@
 """The mesh in a scene: coarse everywhere, finer where the camera is near."""
 
-import time
 from collections.abc import Iterable
 
 import numpy as np
@@ -22,7 +21,7 @@ from triquad_tools.viewer.page.refresher import Refresher
 from triquad_tools.viewer.sources.map_source import Tile
 
 _NAME = "mesh"
-_PERIOD_S = 1.0  # between questions what changed: more often, and a robot's planner would notice
+_PERIOD_S = 0.5
 _HEIGHT, _AGE, _CONFIDENCE = "height", "age", "confidence"
 _PIXELS = 4  # of a cell
 _ENOUGH = 200  # vertices of a tile, to know where it is
@@ -37,7 +36,6 @@ class MeshLayer:
         self._framed = False
         self._tiles = TilesInView(page.source)
         self._drawn = DrawnTiles(page)
-        self._asked_s = -np.inf  # monotonic
         self._folder = page.gui.add_folder("Mesh")
         # A file does not tell in which epoch a part of it changed.
         colours = (_HEIGHT, _AGE, _CONFIDENCE) if page.source.grows else (_HEIGHT, _CONFIDENCE)
@@ -61,10 +59,7 @@ class MeshLayer:
     def _refresh(self) -> None:
         """One round: what came since the last one is drawn, and what it replaces goes."""
         self._drawn.remove_replaced()
-        due = time.monotonic() - self._asked_s >= _PERIOD_S
-        if due:
-            self._asked_s = time.monotonic()
-        self._tiles.refresh_roots(due=due)
+        self._tiles.refresh_roots()
         roots = self._tiles.roots
         if not roots:  # there is no map yet, or it was reset
             self._page.legends.hide(_NAME)
@@ -74,7 +69,7 @@ class MeshLayer:
         if self._page.source.grows or not self._framed:
             self._camera.follow(points)
             self._framed = self._tiles.roots_complete
-        wanted = self._tiles.refresh_near(self._viewpoint(), self._pixels.value, due=due)
+        wanted = self._tiles.refresh_near(self._viewpoint(), self._pixels.value)
         self._drawn.show(wanted, self._colours(points))
         if not self._tiles.loaded:
             self._refresher.wake()

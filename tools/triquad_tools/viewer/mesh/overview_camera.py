@@ -1,6 +1,7 @@
 """A camera that shows all of a map until a person takes it."""
 
 import math
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ _MARGIN = 1.05
 _LEAST_ASPECT = 0.1
 _GROWN = 0.02  # share of the camera's distance; a smaller step is not worth a jump
 _SAME = 1e-3
+_EYES = 64  # places where it was put last: what a browser tells is not as old as those before
 
 
 class View(NamedTuple):
@@ -50,7 +52,7 @@ class OverviewCamera:
         camera.near = _NEAR_M
         camera.far = _FAR_M
         # The browser tells of each place late: only one where it never was put is a person's.
-        self._eyes = [np.array(camera.position)]  # [3] in the scene
+        self._eyes = deque([np.array(camera.position)], _EYES)  # [3] in the scene
         camera.on_update(self._moved)
 
     def follow(self, points: Doubles) -> None:

@@ -11,6 +11,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles
 from triquad_map.height_scale import HeightScale
 
+from triquad_tools.plots.mesh_normals import vertex_normals
 from triquad_tools.viewer.page.colour_scale import ColourScale, scale_colours
 from triquad_tools.viewer.page.unlit_glb import Triangles
 from triquad_tools.viewer.sources.map_source import Tile
@@ -120,18 +121,6 @@ class ConfidenceColours:
 def lit_colours(colours: TileColours, tile: Tile, triangles: Triangles) -> Doubles:
     """Linear colours [V, 3] of the vertices of a tile, in the light of a sun and a bright sky."""
     plain = scale_colours(colours.scale, colours.values(tile, triangles))
-    up = _normals(triangles)
+    up = vertex_normals(triangles.vertices.astype(np.float64), triangles.faces)
     light = _SUN * np.maximum(up @ _TOWARDS_SUN, 0.0) + _SKY * (0.75 + 0.25 * up[:, 2])
     return np.asarray(plain * light[:, None], np.float64)
-
-
-def _normals(triangles: Triangles) -> Doubles:
-    """Unit normals [V, 3] of vertices, the mean of their faces', larger ones counting more."""
-    vertices, faces = triangles
-    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
-    across = np.cross(second - first, third - first).astype(np.float64)
-    summed = np.zeros((len(vertices), 3))
-    for corner, axis in np.ndindex(3, 3):
-        summed[:, axis] += np.bincount(faces[:, corner], across[:, axis], len(vertices))
-    lengths = np.linalg.norm(summed, axis=1, keepdims=True)
-    return np.asarray(summed / np.maximum(lengths, 1e-12))

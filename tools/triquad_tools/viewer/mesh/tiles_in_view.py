@@ -55,21 +55,17 @@ class TilesInView:
         """Whether all that is in view was there once; from then on only changes come."""
         return self._whole_loaded and all(near.loaded for near in self._near)
 
-    def refresh_roots(self, *, due: bool) -> None:
-        """Fetch some of what is new; unless it is ``due``, only until all was there once."""
-        if due or not self._whole_loaded:
-            self._whole.refresh()
-            self._whole_loaded |= self._whole.complete
+    def refresh_roots(self) -> None:
+        """Fetch some of what is new."""
+        self._whole.refresh()
+        self._whole_loaded |= self._whole.complete
 
-    def refresh_near(
-        self, viewpoint: Viewpoint, pixels: float, *, due: bool
-    ) -> dict[TileName, WantedTile]:
+    def refresh_near(self, viewpoint: Viewpoint, pixels: float) -> dict[TileName, WantedTile]:
         """Fetch some of the finer tiles near an eye; returns what of all tiles is to be drawn.
 
         Args:
             viewpoint: of the eye.
             pixels: that a cell may cover on the screen.
-            due: else only what was never there is fetched.
         """
         roots = self.roots
         corners = np.array(list(roots), np.float64).reshape(-1, 3) * self._side_m
@@ -79,8 +75,7 @@ class TilesInView:
         levels = dict(zip(roots, wanted.tolist(), strict=True))
         for near in self._near:
             near.move([index for index, level in levels.items() if level <= near.level])
-            if due or not near.loaded:
-                near.refresh()
+            near.refresh()
         return dict(self._wanted(roots, levels))
 
     def close(self) -> None:

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
-from triquad_map.height_scale import HEIGHT_STOPS, colours_between
+from triquad_map.height_scale import GAMMA, HEIGHT_STOPS, colours_between
 
 _TICKS = 5
-
-GAMMA = 2.2
-"""From colours as screens take them to linear ones: those to this power."""
 
 Stops = tuple[tuple[float, float, float], ...]
 """Colours, sRGB in [0, 1], evenly spaced from the lower to the upper end of a scale."""

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
+from triquad_map.height_scale import GAMMA
 
-from triquad_tools.viewer.page.colour_scale import GAMMA, ColourScale, scale_colours
+from triquad_tools.viewer.page.colour_scale import ColourScale, scale_colours
 from triquad_tools.viewer.page.legends import Legend, LineMeaning
 from triquad_tools.viewer.sources.map_source import MapState
 

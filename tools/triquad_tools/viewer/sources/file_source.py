@@ -127,14 +127,9 @@ class FileFollower:
         self._maker = maker
         self._level = level
         self._order = maker.order(level, TilesInBox(bounds, level.side_m), made)
-        self._made: Mapping[TileIndex, MadeTile] = self._order.made.copy()
+        self._take_up(self._order.made.copy())
         self.complete = False
         """Whether the last refresh left nothing waiting."""
-
-    @property
-    def tiles(self) -> Mapping[TileIndex, MadeTile]:
-        """The tiles as of the last refresh, by their indices."""
-        return {index: tile for index, tile in self._made.items() if len(tile.faces)}
 
     def refresh(self) -> None:
         """Take up what is made within a short time."""
@@ -142,8 +137,11 @@ class FileFollower:
 
     def wait(self, timeout_s: float) -> None:
         """Take up what is made until all is, or the time is over; errors as of :meth:`refresh`."""
-        self.complete = self._maker.wait(self._order, timeout_s)
-        self._made = self._maker.collect(self._order)
+        if self.complete:  # a file does not change
+            return
+        complete = self._maker.wait(self._order, timeout_s)
+        self._take_up(self._maker.collect(self._order))
+        self.complete = complete
 
     def moved(self, bounds: Bounds) -> "FileFollower":
         """Follow another box instead: what was made is still known."""
@@ -153,3 +151,8 @@ class FileFollower:
     def close(self) -> None:
         """Follow no longer."""
         self._maker.cancel(self._order)
+
+    def _take_up(self, made: Mapping[TileIndex, MadeTile]) -> None:
+        self._made = made
+        self.tiles = {index: tile for index, tile in made.items() if len(tile.faces)}
+        """The tiles as of the last refresh, by their indices."""

@@ -12,6 +12,7 @@ from triquad_format.mapfile.metadata import utc_time
 from triquad_tools.viewer.sources.map_source import MapState, TileSizes
 
 _POINT = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+_PERIOD_S = 1.0  # between questions what changed: more often, and a robot's planner would notice
 
 
 class LiveSource:
@@ -53,6 +54,8 @@ class LiveFollower:
         known: KnownTiles | None = None,
     ) -> None:
         self._client = client
+        self._loaded = False  # all was there once: from then on only changes come
+        self._due_s = 0.0  # monotonic
         self._watch: MeshWatch = client.watch_mesh(bounds, level, known=known)
 
     @property
@@ -66,8 +69,13 @@ class LiveFollower:
         return self._watch.complete
 
     def refresh(self) -> None:
-        """Fetch what one reply brings."""
+        """Fetch what one reply brings; once all was there, no more than one a second."""
+        now_s = time.monotonic()
+        if self._loaded and now_s < self._due_s:
+            return
+        self._due_s = now_s + _PERIOD_S
         self._watch.next(timeout_s=0.0)
+        self._loaded |= self._watch.complete
 
     def moved(self, bounds: Bounds) -> "LiveFollower":
         """Follow another box instead."""
