@@ -1,5 +1,4 @@
-"""The published states of the map: what each answers, which can be asked for, and when training
-gives way to that."""
+"""The published states of the map: what each answers, and which can be asked for."""
 
 import threading
 import time
@@ -18,6 +17,7 @@ from triquad_map.composition.composed_view import ComposedView
 from triquad_map.composition.region import Split
 
 from triquad_server.engine.live_field import FrozenField, region_record
+from triquad_server.query_gate import QueryGate
 from triquad_server.settings import ServiceSettings
 
 
@@ -84,32 +84,6 @@ class KeptEpochs(NamedTuple):
     epochs: tuple[Epoch, ...]  # the newest last
     pinned: int  # of them, which stay because they were asked for by number
     newest_age_s: float
-
-
-class QueryGate:
-    """Counts the queries in flight: training waits a moment between slices while there are any."""
-
-    def __init__(self) -> None:
-        self._idle = threading.Condition()
-        self._in_flight = 0
-
-    @contextmanager
-    def query(self) -> Iterator[None]:
-        """A query is being answered."""
-        with self._idle:
-            self._in_flight += 1
-        try:
-            yield
-        finally:
-            with self._idle:
-                self._in_flight -= 1
-                if self._in_flight == 0:
-                    self._idle.notify_all()
-
-    def give_way(self, limit_s: float) -> None:
-        """Return once no query is in flight, or after ``limit_s``: training never starves."""
-        with self._idle:
-            self._idle.wait_for(lambda: self._in_flight == 0, limit_s)
 
 
 class EpochHistory:

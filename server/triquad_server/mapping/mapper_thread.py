@@ -182,7 +182,8 @@ class MapperThread:
             self.epochs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
             self.time.begin(Activity.TRAINING)
             started = time.monotonic()
-            self._mapper.train()
+            with self.epochs.gate.turn():
+                self._mapper.train()
             self._step_s = time.monotonic() - started
             self._unpublished = True
         if self._publish_soon.is_set() or (

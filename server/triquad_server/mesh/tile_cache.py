@@ -71,8 +71,14 @@ class TileDelta:
 
     ready: list[CachedTile]  # by increasing revision; empty ones are to be removed
     removed: list[TileIndex]  # that the other side has, and that were never here
-    to_make: list[TileIndex]  # those that were never made, then those made longest ago
+    missing: list[TileIndex]  # that were never made
+    outdated: list[TileIndex]  # that have to be made anew, those made longest ago first
     revision: int  # who knows all of this knows everything up to here
+
+    @property
+    def to_make(self) -> list[TileIndex]:
+        """All that have to be made, the most needed first."""
+        return self.missing + self.outdated
 
 
 class _TileLevel:
@@ -88,11 +94,6 @@ class _TileLevel:
         """The tile where it shows what the map has; None where it has to be made."""
         tile = self.tiles.get(index)
         return tile if tile is not None and self.changed.get(index, 0) <= tile.made else None
-
-    def _made(self, index: TileIndex) -> int:
-        """Epoch with which a tile was last made; -1: never."""
-        tile = self.tiles.get(index)
-        return -1 if tile is None else tile.made
 
     def record(self, changes: Changes, half_m: float, epoch: int) -> None:
         """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
@@ -117,21 +118,22 @@ class _TileLevel:
     ) -> TileDelta:
         """As :meth:`TileCache.delta`; ``revision`` is that of the newest tile of any level."""
         ready: list[CachedTile] = []
-        to_make: list[TileIndex] = []
+        missing: list[TileIndex] = []
+        outdated: list[TileIndex] = []
         inside = self._indices[self.lattice.meets(self._indices, low, high)]
         for x, y, z in inside.tolist():
             index = (x, y, z)
             tile = self.clean(index)
             if tile is None:
-                to_make.append(index)
+                (outdated if index in self.tiles else missing).append(index)
                 continue
             unknown = tile.revision > known_to and known.get(index) != tile.version
             if unknown and (not tile.empty or known_to or index in known):
                 ready.append(tile)
         ready.sort(key=lambda tile: tile.revision)
-        to_make.sort(key=lambda index: (self._made(index), index))
+        outdated.sort(key=lambda index: (self.tiles[index].made, index))
         removed = [index for index in known if index not in self.changed]
-        return TileDelta(ready, removed, to_make, revision=revision)
+        return TileDelta(ready, removed, sorted(missing), outdated=outdated, revision=revision)
 
     def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
         """What a tile has to agree with, by the tiles whose it is, in its own lattice.

@@ -33,6 +33,11 @@ _GIVE_WAY_S = 0.1
 _MAX_REFRESH_SHARE = 4
 """Refreshing the cache takes at most one part in so many of the thread's time."""
 
+_PLANNER_S = 1.0  # who asked so short a time ago will ask again
+_MAX_REMAKE_SHARE = 4
+"""While a planner asks, tiles that only changed are made in at most one part in so many of the
+time: each query that meets one takes a third longer."""
+
 _REFRESH_GRACE_S = 10.0
 """So long after its deadline, a request may wait for the epoch that was the newest when it came to
 be refreshed from; that takes a fraction of this."""
@@ -63,6 +68,7 @@ class TileFeed:
         self._pending: list[Follower] = []
         self._stopping = False
         self._next_refresh_s = 0.0
+        self._next_remake_s = 0.0
         self._senders = TileSenders()
         self._thread = threading.Thread(target=self._run, name="meshing")
         self._thread.start()
@@ -128,7 +134,8 @@ class TileFeed:
         if newest.number <= self._cache.epoch or started < self._next_refresh_s:
             return
         try:
-            self._cache.refresh(newest)
+            with self._epochs.gate.turn():
+                self._cache.refresh(newest)
         except Exception:
             _log.exception("an internal error, while changes of the surface were searched for")
         now = time.monotonic()
@@ -158,8 +165,13 @@ class TileFeed:
         if delta.ready or (delta.removed and not delta.to_make):
             self._send(follower, self._filled(follower, delta))
             return True
-        if delta.to_make:
-            self._make(asks.level, delta.to_make)
+        if delta.missing:
+            self._make(asks.level, delta.missing)
+            return True
+        if delta.outdated:
+            if time.monotonic() < self._next_remake_s:
+                return self._answer_if_late(follower, knows_all=False)
+            self._remake(asks.level, delta.outdated)
             return True
         if follower.restart and self._is_current_for(follower):
             self._send(follower, TileReply(complete=True, revision=delta.revision))
@@ -186,9 +198,18 @@ class TileFeed:
         ends_s = time.monotonic() + _SLICE_S
         for index in indices:
             self._epochs.gate.give_way(_GIVE_WAY_S)
-            self._cache.make(level, index)
+            with self._epochs.gate.turn():
+                self._cache.make(level, index)
             if time.monotonic() > ends_s or self._stopping:
                 return
+
+    def _remake(self, level: int, indices: list[TileIndex]) -> None:
+        """Make tiles anew for a moment; while a planner asks, leave it alone for longer then."""
+        started = time.monotonic()
+        self._make(level, indices)
+        ended = time.monotonic()
+        if self._epochs.gate.asked_within(_PLANNER_S):
+            self._next_remake_s = ended + _MAX_REMAKE_SHARE * (ended - started)
 
     def _filled(self, follower: Follower, delta: TileDelta) -> TileReply:
         """As many of the tiles as a reply may have, at least one."""

@@ -48,6 +48,7 @@ class ProbeReport:
     latency_p95_ms: float
     latency_p99_ms: float
     latency_max_ms: float
+    latencies_ms: list[float]
 
 
 class Probe:
@@ -116,6 +117,7 @@ def ask_until(
         latency_p95_ms=p95,
         latency_p99_ms=p99,
         latency_max_ms=longest,
+        latencies_ms=[1e3 * latency_s for latency_s in latencies_s],
     )
 
 
