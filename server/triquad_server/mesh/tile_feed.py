@@ -34,9 +34,9 @@ _MAX_REFRESH_SHARE = 4
 """Refreshing the cache takes at most one part in so many of the thread's time."""
 
 _PLANNER_S = 1.0  # who asked so short a time ago will ask again
-_MAX_REMAKE_SHARE = 4
-"""While a planner asks, tiles that only changed are made in at most one part in so many of the
-time: each query that meets one takes a third longer."""
+_BESIDE_PLANNER_SHARE = 8
+"""While a planner asks, each of refreshing and making tiles that only changed takes at most one
+part in so many of the time: a query that meets it takes a third longer."""
 
 _REFRESH_GRACE_S = 10.0
 """So long after its deadline, a request may wait for the epoch that was the newest when it came to
@@ -139,9 +139,8 @@ class TileFeed:
         except Exception:
             _log.exception("an internal error, while changes of the surface were searched for")
         now = time.monotonic()
-        self._next_refresh_s = now + max(
-            self._settings.update_period_s, _MAX_REFRESH_SHARE * (now - started)
-        )
+        share = _BESIDE_PLANNER_SHARE if self._planner_asks() else _MAX_REFRESH_SHARE
+        self._next_refresh_s = now + max(self._settings.update_period_s, share * (now - started))
 
     def _serve_safely(self, follower: Follower) -> bool:
         """As :meth:`_serve`; an internal error ends this request only."""
@@ -208,8 +207,11 @@ class TileFeed:
         started = time.monotonic()
         self._make(level, indices)
         ended = time.monotonic()
-        if self._epochs.gate.asked_within(_PLANNER_S):
-            self._next_remake_s = ended + _MAX_REMAKE_SHARE * (ended - started)
+        if self._planner_asks():
+            self._next_remake_s = ended + _BESIDE_PLANNER_SHARE * (ended - started)
+
+    def _planner_asks(self) -> bool:
+        return self._epochs.gate.asked_within(_PLANNER_S)
 
     def _filled(self, follower: Follower, delta: TileDelta) -> TileReply:
         """As many of the tiles as a reply may have, at least one."""
