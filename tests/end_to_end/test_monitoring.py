@@ -1,5 +1,6 @@
 """The port for Prometheus and supervisors, of a real server over real HTTP."""
 
+import http.client
 import json
 import re
 import resource
@@ -176,6 +177,16 @@ def test_nothing_else_is_answered_and_nothing_breaks_it(port):
         connection.sendall(b"POST /healthz HTTP/1.0\r\n\r\n")
         assert b"501" in connection.recv(1000)
     assert health(port)[0] == 200
+
+
+def test_a_probe_may_ask_for_the_head_alone(port):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=servers.WAIT_S)
+    with closing(connection):
+        connection.request("HEAD", "/healthz")
+        reply = connection.getresponse()
+        assert reply.status == 200
+        assert int(reply.headers["Content-Length"]) > 0
+        assert reply.read() == b""
 
 
 def test_idle_connections_take_no_more_than_some_threads(port):

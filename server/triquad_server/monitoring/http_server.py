@@ -157,6 +157,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:  # noqa: N802 - the name that the library looks for
         """Send the page."""
+        self.wfile.write(self._send_head())
+
+    def do_HEAD(self) -> None:  # noqa: N802 - the name that the library looks for
+        """Send what stands before the page, as probes of load balancers ask for."""
+        self._send_head()
+
+    def _send_head(self) -> bytes:
+        """Send what stands before a page; returns the page."""
         path = self.path.partition("?")[0]
         try:
             page = self.server.monitoring.page(path, self.headers.get("Accept", ""))
@@ -168,7 +176,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", page.content_type)
         self.send_header("Content-Length", str(len(page.body)))
         self.end_headers()
-        self.wfile.write(page.body)
+        return page.body
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - as in the library
         """Keep requests out of the log, but for debugging."""

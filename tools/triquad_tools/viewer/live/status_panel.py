@@ -4,6 +4,7 @@ import time
 
 from triquad_format.wire.messages import ServerStatus
 
+from triquad_tools.top.amounts import duration
 from triquad_tools.top.interval import Rates, Sample, interval
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import problem_html, table_html
@@ -70,4 +71,4 @@ def _checkpoint(status: ServerStatus) -> str:
     if last is None:
         return "none yet"
     age_s = max(0.0, time.time() - last.stamp_ns / 1e9)
-    return f"epoch {last.epoch}, {last.bytes / 1e6:.1f} MB, {age_s:.0f} s ago"
+    return f"epoch {last.epoch}, {last.bytes / 1e6:.1f} MB, {duration(age_s)} ago"
