@@ -51,6 +51,16 @@ def operation_key(map_name: str, operation: str) -> str:
     return f"triquad/{check_name('map', map_name)}/{operation}"
 
 
+def all_queries_key(map_name: str) -> str:
+    """Key expression of all operations that read a map."""
+    return operation_key(map_name, "query/*")
+
+
+def all_admin_key(map_name: str) -> str:
+    """Key expression of all operations that change a map or the disk."""
+    return operation_key(map_name, "admin/*")
+
+
 def scan_key(map_name: str, source: str) -> str:
     """Key on which a source publishes its scans."""
     return f"triquad/{check_name('map', map_name)}/scan/{check_name('source', source)}"
