@@ -12,6 +12,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.endpoints import full_endpoint
 from triquad_format.wire.messages import ErrorReply
+from triquad_format.wire.reply import check_answers
 
 from triquad_client import checks
 from triquad_client.errors import (
@@ -84,16 +85,18 @@ class Connection:
         return replies
 
     def read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
-        """The message of a reply.
+        """The message of a reply. Nothing of it is used before all of it was checked.
 
         Raises:
             RefusedError: the server refused.
             RequestTimeoutError: there was no reply in time.
-            BadReplyError: it cannot be decoded.
+            BadReplyError: it cannot be decoded, or is no answer to what was asked.
         """
         try:
             if reply.ok is not None:
-                return codec.decode(ask.kind, reply.ok.payload.to_bytes())
+                answer = codec.decode(ask.kind, reply.ok.payload.to_bytes())
+                check_answers(ask.message, answer)
+                return answer
             payload = b"" if reply.err is None else reply.err.payload.to_bytes()
             if payload == b"Timeout":
                 raise RequestTimeoutError(
