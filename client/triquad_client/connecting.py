@@ -6,8 +6,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
-
 from triquad_client.async_client import AsyncClient
 from triquad_client.client import Client
 from triquad_client.net.async_driver import AsyncDriver
@@ -18,7 +16,7 @@ MAX_DOWNLOAD_BYTES = 2**30
 
 
 def connect(
-    endpoint: str = DEFAULT_ENDPOINT,
+    endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
     timeout_s: float = 10.0,
@@ -29,10 +27,11 @@ def connect(
 
     Args:
         endpoint: of the server, or of a router that leads to it: a host such as ``robot`` or
-            ``robot:7447``, or an endpoint of Zenoh.
+            ``robot:7447``, or an endpoint of Zenoh; ``None``: where ``config`` says, and otherwise
+            port 7447 of this machine.
         map: name of the map.
         timeout_s: for connecting and for each request.
-        config: Zenoh configuration file (JSON5), for TLS or credentials; the endpoint is added.
+        config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
         max_download_bytes: the largest map file that is taken from the server, and the most that
             the mesh of a box may take of memory, whatever the server announces.
 
@@ -76,7 +75,7 @@ class Connecting:
 
 
 def connect_async(
-    endpoint: str = DEFAULT_ENDPOINT,
+    endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
     timeout_s: float = 10.0,

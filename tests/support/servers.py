@@ -106,8 +106,11 @@ def raw_session(
     connect: str | None = None,
     listen: str | None = None,
     timestamps: bool = False,
+    access_control: dict[str, Any] | None = None,
 ) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
+    if access_control is not None:
+        config.insert_json5("access_control", json.dumps(access_control))
     config.insert_json5("timestamping/enabled", json.dumps(timestamps))
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")

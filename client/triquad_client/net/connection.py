@@ -26,6 +26,7 @@ from triquad_client.errors import (
 )
 from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
 
+_HERE = "127.0.0.1"
 _LIVELINESS_TIMEOUT_S = 3.0
 _MAX_REASON = 2_000  # characters of why a request was refused
 
@@ -212,7 +213,7 @@ def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
 
 
 def open_connection(
-    endpoint: str,
+    endpoint: str | None,
     map_name: str,
     timeout_s: float,
     config: str | Path | None,
@@ -224,15 +225,14 @@ def open_connection(
     most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
     try:
         keys.check_name("map", map_name)
-        endpoint = full_endpoint(endpoint)
+        session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except FormatError as error:
         raise InvalidInputError(str(error)) from error
-    try:
-        session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except zenoh.ZError as error:
+        where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
         raise ConnectError(
-            f"cannot connect to {endpoint}: {_reason(error)} Start triquad-server there, or check "
-            "the endpoint and its credentials."
+            f"cannot connect {where}: {_reason(error)} Start triquad-server there, or check the "
+            "endpoint and the credentials."
         ) from error
     connection = Connection(session, map_name, timeout_s, max_download_bytes=most)
     try:
@@ -245,7 +245,7 @@ def open_connection(
     return connection
 
 
-def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> zenoh.Config:
+def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | None) -> zenoh.Config:
     if file is not None:
         config = _read_configuration(file)
     else:
@@ -254,7 +254,11 @@ def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> 
         config.insert_json5("connect/timeout_ms", "0")  # one attempt, not retries
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("transport/shared_memory/enabled", "false")
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    if endpoint is not None or not json.loads(config.get_json("connect/endpoints")):
+        only_tls = json.loads(config.get_json("transport/link/protocols")) == ["tls"]
+        protocol = "tls" if only_tls else "tcp"
+        full = full_endpoint(_HERE if endpoint is None else endpoint, protocol)
+        config.insert_json5("connect/endpoints", json.dumps([full]))
     config.insert_json5("transport/unicast/open_timeout", str(int(timeout_s * 1000)))
     return config
 
