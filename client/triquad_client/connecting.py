@@ -6,8 +6,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
-
 from triquad_client.async_client import AsyncClient
 from triquad_client.client import Client
 from triquad_client.net.async_driver import AsyncDriver
@@ -15,7 +13,7 @@ from triquad_client.net.connection import Connection, open_connection
 
 
 def connect(
-    endpoint: str = DEFAULT_ENDPOINT,
+    endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
     timeout_s: float = 10.0,
@@ -25,10 +23,11 @@ def connect(
 
     Args:
         endpoint: of the server, or of a router that leads to it: a host such as ``robot`` or
-            ``robot:7447``, or an endpoint of Zenoh.
+            ``robot:7447``, or an endpoint of Zenoh; ``None``: where ``config`` says, and otherwise
+            port 7447 of this machine.
         map: name of the map.
         timeout_s: for connecting and for each request.
-        config: Zenoh configuration file (JSON5), for TLS or credentials; the endpoint is added.
+        config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
 
     Raises:
         ConnectError: nothing listens at the endpoint, or it does not let us in.
@@ -68,7 +67,7 @@ class Connecting:
 
 
 def connect_async(
-    endpoint: str = DEFAULT_ENDPOINT,
+    endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
     timeout_s: float = 10.0,

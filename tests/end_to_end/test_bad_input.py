@@ -205,7 +205,7 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
         (keys.SDF, SdfRequest(ORIGIN, ONE_POINT, False, -1), "epoch_gone"),
         (
             keys.SDF,
-            SdfRequest(ORIGIN, np.zeros((10_000_000, 3), np.float32), False, 0),
+            SdfRequest(ORIGIN, np.zeros((1_900_000, 3), np.float32), False, 0),
             "too_large",
         ),
         *((operation, bytes(12_010_000), "too_large") for operation in OPERATIONS),

@@ -1,5 +1,6 @@
 """The Zenoh session of a client, requests over it, and the driver that makes them."""
 
+import json
 import weakref
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,6 +12,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.endpoints import full_endpoint
 from triquad_format.wire.messages import ErrorReply
+from triquad_format.wire.reply import check_answers
 from triquad_format.wire.zenoh_config import QUIET, fill, put
 
 from triquad_client import checks
@@ -24,6 +26,7 @@ from triquad_client.errors import (
 )
 from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
 
+_HERE = "127.0.0.1"
 _LIVELINESS_TIMEOUT_S = 3.0
 
 _OF_CLIENTS: Mapping[str, Any] = {
@@ -90,16 +93,18 @@ class Connection:
         return replies
 
     def read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
-        """The message of a reply.
+        """The message of a reply. Nothing of it is used before all of it was checked.
 
         Raises:
             RefusedError: the server refused.
             RequestTimeoutError: there was no reply in time.
-            BadReplyError: it cannot be decoded.
+            BadReplyError: it cannot be decoded, or is no answer to what was asked.
         """
         try:
             if reply.ok is not None:
-                return codec.decode(ask.kind, reply.ok.payload.to_bytes())
+                answer = codec.decode(ask.kind, reply.ok.payload.to_bytes())
+                check_answers(ask.message, answer)
+                return answer
             payload = b"" if reply.err is None else reply.err.payload.to_bytes()
             if payload == b"Timeout":
                 raise RequestTimeoutError(
@@ -220,21 +225,20 @@ def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
 
 
 def open_connection(
-    endpoint: str, map_name: str, timeout_s: float, config: str | Path | None
+    endpoint: str | None, map_name: str, timeout_s: float, config: str | Path | None
 ) -> Connection:
     """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
     timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
     try:
         keys.check_name("map", map_name)
-        endpoint = full_endpoint(endpoint)
+        session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except FormatError as error:
         raise InvalidInputError(str(error)) from error
-    try:
-        session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except zenoh.ZError as error:
+        where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
         raise ConnectError(
-            f"cannot connect to {endpoint}: {_reason(error)} Start triquad-server there, or check "
-            "the endpoint and its credentials."
+            f"cannot connect {where}: {_reason(error)} Start triquad-server there, or check the "
+            "endpoint and the credentials."
         ) from error
     connection = Connection(session, map_name, timeout_s)
     try:
@@ -247,17 +251,15 @@ def open_connection(
     return connection
 
 
-def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> zenoh.Config:
-    unset = zenoh.Config()
+def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | None) -> zenoh.Config:
     config = zenoh.Config() if file is None else _read_configuration(file)
-    put(
-        config,
-        {
-            "connect/endpoints": [endpoint],
-            "transport/unicast/open_timeout": int(timeout_s * 1000),
-        },
-    )
-    fill(config, {**QUIET, **_OF_CLIENTS}, unset)
+    fill(config, {**QUIET, **_OF_CLIENTS}, unset=zenoh.Config())
+    put(config, {"transport/unicast/open_timeout": int(timeout_s * 1000)})
+    if endpoint is not None or not json.loads(config.get_json("connect/endpoints")):
+        only_tls = json.loads(config.get_json("transport/link/protocols")) == ["tls"]
+        protocol = "tls" if only_tls else "tcp"
+        full = full_endpoint(_HERE if endpoint is None else endpoint, protocol)
+        put(config, {"connect/endpoints": [full]})
     return config
 
 

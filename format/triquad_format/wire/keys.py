@@ -10,6 +10,9 @@ from triquad_format.wire.codec import PROTOCOL_VERSION, Message
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
+EVERY_MAP = "*"
+"""In place of a map's name in key expressions of all maps."""
+
 SCHEMA_PREFIX = "application/msgpack;triquad."
 
 # Operations on `triquad/<map>/query/...`: they read the map.
@@ -53,27 +56,27 @@ def operation_key(map_name: str, operation: str) -> str:
 
 def all_queries_key(map_name: str) -> str:
     """Key expression of all operations that read a map."""
-    return operation_key(map_name, "query/*")
+    return f"triquad/{_map_chunk(map_name)}/query/*"
 
 
 def all_admin_key(map_name: str) -> str:
     """Key expression of all operations that change a map or the disk."""
-    return operation_key(map_name, "admin/*")
+    return f"triquad/{_map_chunk(map_name)}/admin/*"
 
 
 def scan_key(map_name: str, source: str) -> str:
     """Key on which a source publishes its scans."""
-    return f"triquad/{check_name('map', map_name)}/scan/{check_name('source', source)}"
+    return f"triquad/{_map_chunk(map_name)}/scan/{check_name('source', source)}"
 
 
 def all_scans_key(map_name: str) -> str:
     """Key expression of the scans of all sources."""
-    return f"triquad/{check_name('map', map_name)}/scan/*"
+    return f"triquad/{_map_chunk(map_name)}/scan/*"
 
 
 def status_key(map_name: str) -> str:
     """Key on which the server publishes its status about once a second."""
-    return f"triquad/{check_name('map', map_name)}/status"
+    return f"triquad/{_map_chunk(map_name)}/status"
 
 
 def alive_key(map_name: str, server: str) -> str:
@@ -84,3 +87,7 @@ def alive_key(map_name: str, server: str) -> str:
 def encoding(message: type[Message]) -> str:
     """Zenoh encoding of a message, such as ``application/msgpack;triquad.SdfRequest.v1``."""
     return f"{SCHEMA_PREFIX}{message.__name__}.v{PROTOCOL_VERSION}"
+
+
+def _map_chunk(map_name: str) -> str:
+    return map_name if map_name == EVERY_MAP else check_name("map", map_name)
