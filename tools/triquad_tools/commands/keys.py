@@ -60,7 +60,7 @@ def _add(options: argparse.Namespace) -> int:
 def _renew(options: argparse.Namespace) -> int:
     folder = KeyFolder(options.folder)
     for name in options.name:
-        print_line(folder.renew(name, options.days))
+        print_line(str(folder.renew(name, options.days)))
     print_line("the old ones are valid until they expire; put the new files in their place")
     return OK
 
