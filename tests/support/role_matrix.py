@@ -156,7 +156,8 @@ def _wait_for_status(observer: zenoh.Session) -> None:
 @contextmanager
 def _subscribed(session: zenoh.Session, key: str) -> Iterator[_Inbox]:
     inbox = _Inbox()
-    subscriber = session.declare_subscriber(key, inbox.take)
+    at_once = zenoh.handlers.Callback(inbox.take, indirect=False)  # before what comes later
+    subscriber = session.declare_subscriber(key, at_once)
     yield inbox
     subscriber.undeclare()
 
