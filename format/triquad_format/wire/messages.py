@@ -224,9 +224,11 @@ class ResetRequest(Message):
 
 @dataclass(frozen=True)
 class ResetReply(Message):
-    """Answer to :class:`ResetRequest`: the first epoch without the box's content."""
+    """Answer to :class:`ResetRequest`: what has happened, and how to go back."""
 
-    epoch: int
+    epoch: int  # the first without the box's content
+    kept_epoch: int | None = None  # the map as it was stays on disk as this one; None: it does not
+    undo: str | None = None  # how to go back to it, or why one cannot, for people
 
 
 @dataclass(frozen=True)
