@@ -13,7 +13,7 @@ import pytest
 import triquad_client
 import zenoh
 from support.role_files import free_tls_endpoint, opened, showing
-from support.role_matrix import ATTEMPTS, OTHERS, OWN, achieved, expected
+from support.role_matrix import ATTEMPTS, OTHERS, OWN, WILD, achieved, expected
 from support.servers import SMALL_TOML, WAIT_S, server_process, sphere
 from triquad_client.errors import ConnectError, NoReplyError, UnknownMapError
 from triquad_format.wire import keys
@@ -144,7 +144,7 @@ def test_without_access_control_everybody_who_is_let_in_may_do_everything(
 ) -> None:
     found = results(unguarded, "server")
     for who in MEMBERS:
-        assert found[who] == set(ATTEMPTS), who
+        assert found[who] == set(ATTEMPTS) - {WILD}, who  # which servers never answer
     for who in STRANGERS:
         assert found[who] == set(), who
 
