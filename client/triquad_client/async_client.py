@@ -4,7 +4,13 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
-from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    MapInfo,
+    ResetReply,
+    ServerStatus,
+    TileList,
+)
 from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
@@ -108,7 +114,7 @@ class AsyncClient(AsyncMapQueries):
         return await self._run(fetch_tile((x, y, z), level))
 
     async def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
-        return await self._run(fetch_mesh(bounds, level))
+        return await self._run(fetch_mesh(bounds, level, self._connection.max_download_bytes))
 
     def watch_mesh(
         self,
@@ -117,7 +123,13 @@ class AsyncClient(AsyncMapQueries):
         max_bytes_per_s: int | None = None,
         known: KnownTiles | None = None,
     ) -> AsyncMeshWatch:
-        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s=max_bytes_per_s, known=known)
+        followed = FollowedMesh.initial(
+            bounds,
+            level,
+            max_bytes_per_s=max_bytes_per_s,
+            known=known,
+            max_bytes=self._connection.max_download_bytes,
+        )
         return AsyncMeshWatch(self._run, followed)
 
     async def status(self) -> ServerStatus:
@@ -129,17 +141,21 @@ class AsyncClient(AsyncMapQueries):
     async def checkpoint(self) -> CheckpointInfo:
         return await self._run(admin.checkpoint())
 
-    async def reset(self, bounds: Bounds | None = None) -> int:
+    async def reset(self, bounds: Bounds | None = None) -> ResetReply:
         return await self._run(admin.reset(bounds))
 
     async def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
-        return await self._run(download.fetch(Path(path), training))
+        return await self._run(
+            download.fetch(Path(path), training, self._connection.max_download_bytes)
+        )
 
     async def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
-        return await self._run(download.fetch_box(Path(path), bounds))
+        return await self._run(
+            download.fetch_box(Path(path), bounds, self._connection.max_download_bytes)
+        )
 
     async def sync(self, bounds: Bounds, path: str | Path) -> AsyncSyncedMap:
-        synced = AsyncSyncedMap(Path(path), bounds, self._run)
+        synced = AsyncSyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
         await synced.refresh()
         return synced
 

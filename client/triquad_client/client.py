@@ -4,7 +4,13 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
-from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    MapInfo,
+    ResetReply,
+    ServerStatus,
+    TileList,
+)
 from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
@@ -191,7 +197,7 @@ class Client(MapQueries):
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
         """
-        return self._run(fetch_mesh(bounds, level))
+        return self._run(fetch_mesh(bounds, level, self._connection.max_download_bytes))
 
     def watch_mesh(
         self,
@@ -211,7 +217,13 @@ class Client(MapQueries):
         Raises:
             InvalidInputError: an argument cannot be used, or ``known`` is of another level.
         """
-        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s=max_bytes_per_s, known=known)
+        followed = FollowedMesh.initial(
+            bounds,
+            level,
+            max_bytes_per_s=max_bytes_per_s,
+            known=known,
+            max_bytes=self._connection.max_download_bytes,
+        )
         return MeshWatch(self._connection, followed)
 
     def status(self) -> ServerStatus:
@@ -233,11 +245,21 @@ class Client(MapQueries):
         """
         return self._run(admin.checkpoint())
 
-    def reset(self, bounds: Bounds | None = None) -> int:
-        """Forget what was learnt within ``bounds``; returns the first epoch without it.
+    def reset(self, bounds: Bounds | None = None) -> ResetReply:
+        """Forget what was learnt within ``bounds``.
+
+        A server with a store first writes the map as it is to a checkpoint, which stays for its
+        setting ``store.protect_h``, whatever else happens.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everything is forgotten.
+
+        Returns:
+            ``epoch``: the first without it. ``kept_epoch``: the checkpoint of the map before;
+            ``None`` where there is none. ``undo``: how to go back to it, or why one cannot.
+
+        Raises:
+            RefusedError: ``store``, where the map as it is cannot be kept: nothing is forgotten.
         """
         return self._run(admin.reset(bounds))
 
@@ -252,7 +274,7 @@ class Client(MapQueries):
             DownloadError: what arrived is not what the server announced.
             OSError: the file cannot be written.
         """
-        return self._run(download.fetch(Path(path), training))
+        return self._run(download.fetch(Path(path), training, self._connection.max_download_bytes))
 
     def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
         """Write to a file what the newest map needs to answer within ``bounds``.
@@ -269,7 +291,9 @@ class Client(MapQueries):
             DownloadError: nothing of the map lies in the box, or what arrived is not valid.
             OSError: the file cannot be written.
         """
-        return self._run(download.fetch_box(Path(path), bounds))
+        return self._run(
+            download.fetch_box(Path(path), bounds, self._connection.max_download_bytes)
+        )
 
     def sync(self, bounds: Bounds, path: str | Path) -> SyncedMap:
         """Keep a copy of what the map needs to answer within ``bounds``, and ask that.
@@ -288,7 +312,7 @@ class Client(MapQueries):
             DownloadError: what arrived is not valid.
             OSError: the file cannot be read or written.
         """
-        synced = SyncedMap(Path(path), bounds, self._run)
+        synced = SyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
         synced.refresh()
         return synced
 

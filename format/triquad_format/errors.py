@@ -1,5 +1,7 @@
 """The errors that all of triquad shares. Each carries the offending value in its text."""
 
+from triquad_format.printable import printable_lines
+
 ERROR_CODES = {
     "bad_request": "the request is malformed or out of range",
     "bad_version": "the request is of another protocol version",
@@ -8,14 +10,22 @@ ERROR_CODES = {
     "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
     "timeout": "the server could not finish in the time that the request allows",
     "busy": "too many requests are waiting",
-    "store": "the checkpoint could not be written",
+    "store": "the checkpoint could not be written, or the map not be kept before a reset",
     "internal": "an error inside the server; its log has the details",
 }
 """Why a request is refused; they travel in :class:`triquad_format.wire.messages.ErrorReply`."""
 
 
 class TriquadError(Exception):
-    """Base of all errors of triquad."""
+    """Base of all errors of triquad.
+
+    A value in its text may come from a file or from the network: it cannot steer the terminal, or
+    the log, in which the text is shown.
+    """
+
+    def __str__(self) -> str:
+        """The text, control characters in it as escapes."""
+        return printable_lines(super().__str__())
 
 
 class RefusedError(TriquadError):
