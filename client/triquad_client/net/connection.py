@@ -8,11 +8,12 @@ from typing import Any, TypeAlias
 
 import zenoh
 from triquad_format.errors import FormatError, InvalidInputError, RefusedError, WireError
+from triquad_format.printable import printable
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.endpoints import full_endpoint
 from triquad_format.wire.messages import ErrorReply
-from triquad_format.wire.reply import check_answers
+from triquad_format.wire.reply import MAX_COUNT, check_answers
 from triquad_format.wire.zenoh_config import QUIET, fill, put
 
 from triquad_client import checks
@@ -28,6 +29,7 @@ from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
 
 _HERE = "127.0.0.1"
 _LIVELINESS_TIMEOUT_S = 3.0
+_MAX_REASON = 2_000  # characters of why a request was refused
 
 _OF_CLIENTS: Mapping[str, Any] = {
     "mode": "client",
@@ -43,13 +45,16 @@ Receiver: TypeAlias = Any
 class Connection:
     """An open session, bound to one map. Safe for use by several threads."""
 
-    def __init__(self, session: zenoh.Session, map_name: str, timeout_s: float) -> None:
+    def __init__(
+        self, session: zenoh.Session, map_name: str, timeout_s: float, *, max_download_bytes: int
+    ) -> None:
         self._session = session
         # A session that a program forgot is closed before Python ends: Zenoh's threads must not
         # come back into an interpreter that is no longer there.
         self._close = weakref.finalize(self, session.close)
         self.map_name = map_name
         self.timeout_s = timeout_s
+        self.max_download_bytes = max_download_bytes  # of a map file, or the mesh of a box
 
     @property
     def is_closed(self) -> bool:
@@ -113,7 +118,9 @@ class Connection:
             reason = codec.decode(ErrorReply, payload)
         except WireError as error:
             raise BadReplyError(f"reply on {self._key(ask)}: {error}") from error
-        raise RefusedError(reason.code, reason.message)
+        raise RefusedError(
+            printable(reason.code, _MAX_REASON), printable(reason.message, _MAX_REASON)
+        )
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
@@ -221,14 +228,21 @@ def closed_error() -> ClosedError:
 
 def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
     """The maps that the replies to :meth:`Connection.look_for_maps` name."""
-    return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok})
+    names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
+    return sorted(filter(keys.is_name, names))
 
 
 def open_connection(
-    endpoint: str | None, map_name: str, timeout_s: float, config: str | Path | None
+    endpoint: str | None,
+    map_name: str,
+    timeout_s: float,
+    config: str | Path | None,
+    *,
+    max_download_bytes: int,
 ) -> Connection:
     """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
     timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
+    most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
     try:
         keys.check_name("map", map_name)
         session = zenoh.open(_configuration(endpoint, timeout_s, config))
@@ -240,7 +254,7 @@ def open_connection(
             f"cannot connect {where}: {_reason(error)} Start triquad-server there, or check the "
             "endpoint and the credentials."
         ) from error
-    connection = Connection(session, map_name, timeout_s)
+    connection = Connection(session, map_name, timeout_s, max_download_bytes=most)
     try:
         # Asked for by name first: there may be any number of others.
         if not map_names(connection.look_for_maps(map_name=map_name)):

@@ -39,9 +39,14 @@ CHECKPOINT = "admin/checkpoint"
 RESET = "admin/reset"
 
 
+def is_name(name: str) -> bool:
+    """Whether a map or source can have this name."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(kind: str, name: str) -> str:
     """``name``, where it can stand in a key."""
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
+    if not isinstance(name, str) or not is_name(name):
         raise FormatError(
             f"{kind} name {name!r} is not allowed: use a text of 1 to 64 letters, digits, "
             "'_', '.', '-', beginning with a letter or digit"

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.wire.codec import ArraySpec, Message
+from triquad_format.wire.codec import MAX_MESSAGE_BYTES, ArraySpec, Message
 from triquad_format.wire.limits import MAX_CELL_M, MAX_CHUNK_BYTES, MAX_TILE_M, MIN_LENGTH_M
 from triquad_format.wire.reply import (
     MAX_COUNT,
@@ -164,7 +164,8 @@ class TileUpdates(Message):
     cell_m: Annotated[float, Within(MIN_LENGTH_M, MAX_CELL_M)]
     tiles: TileIndices  # [T, 3] that changed
     versions: Annotated[Epochs, RowsOf("tiles")]  # [T] epoch of which each is
-    sizes: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("tiles")]  # [T] bytes of each
+    # [T] bytes of each
+    sizes: Annotated[Integers, Within(0, MAX_MESSAGE_BYTES), RowsOf("tiles")]
     data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
     removed: TileIndices  # [R, 3] that have no faces any more
 
