@@ -33,7 +33,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _view(options: argparse.Namespace) -> int:
     _check_usage(options)
-    with _shown(options) as shown, closing(Viewer(shown, options.host, options.port)) as viewer:
+    with (
+        _shown(options) as shown,
+        closing(
+            Viewer(shown, options.host, options.port, allowed_hosts=options.allow_host)
+        ) as viewer,
+    ):
         print_line(f"open {viewer.url} in a browser; Ctrl-C ends it")
         threading.Event().wait()
     return OK
@@ -95,6 +100,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_server(parser)
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="to serve the page at")
+    add(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also answer where the page is asked for under this name, as behind a proxy; repeat "
+        "for more (addresses and the machine's host name are)",
+    )
     add("--port", type=port, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
     add_version(parser)
     return parser
