@@ -4,7 +4,13 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
-from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    MapInfo,
+    ResetReply,
+    ServerStatus,
+    TileList,
+)
 from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
@@ -135,7 +141,7 @@ class AsyncClient(AsyncMapQueries):
     async def checkpoint(self) -> CheckpointInfo:
         return await self._run(admin.checkpoint())
 
-    async def reset(self, bounds: Bounds | None = None) -> int:
+    async def reset(self, bounds: Bounds | None = None) -> ResetReply:
         return await self._run(admin.reset(bounds))
 
     async def download_map(self, path: str | Path, training: bool = False) -> MapInfo:

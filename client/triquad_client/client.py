@@ -4,7 +4,13 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
-from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    MapInfo,
+    ResetReply,
+    ServerStatus,
+    TileList,
+)
 from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
@@ -239,11 +245,21 @@ class Client(MapQueries):
         """
         return self._run(admin.checkpoint())
 
-    def reset(self, bounds: Bounds | None = None) -> int:
-        """Forget what was learnt within ``bounds``; returns the first epoch without it.
+    def reset(self, bounds: Bounds | None = None) -> ResetReply:
+        """Forget what was learnt within ``bounds``.
+
+        A server with a store first writes the map as it is to a checkpoint, which stays for its
+        setting ``store.protect_h``, whatever else happens.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everything is forgotten.
+
+        Returns:
+            ``epoch``: the first without it. ``kept_epoch``: the checkpoint of the map before;
+            ``None`` where there is none. ``undo``: how to go back to it, or why one cannot.
+
+        Raises:
+            RefusedError: ``store``, where the map as it is cannot be kept: nothing is forgotten.
         """
         return self._run(admin.reset(bounds))
 

@@ -19,6 +19,10 @@ class StoreBaseError(StoreError):
     """Files that hold parts of the newest checkpoint are damaged: a complete one is due."""
 
 
+class LastCheckpointError(StoreError):
+    """The server stops, and what was mapped since its last checkpoint is lost."""
+
+
 class MapperStoppedError(ServerError):
     """The mapper thread has ended and takes no more commands."""
 

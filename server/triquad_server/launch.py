@@ -102,6 +102,9 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     if options.store is not None:
         store = Store(options.store, options.map_name, settings.store)
         stack.enter_context(closing(store))
+        if options.restore is not None:
+            phases.starting(f"taking the map back to epoch {options.restore}")
+            store.restore(options.restore)
         phases.starting("restoring the newest checkpoint")
         restored = _restored(store, options)
     if restored is not None:

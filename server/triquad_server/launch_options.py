@@ -16,3 +16,4 @@ class LaunchOptions:
     settings: Settings
     store: Path | None
     device: str  # "cpu", "cuda" or "auto"
+    restore: int | None = None  # the epoch that the map is taken back to; None: the newest

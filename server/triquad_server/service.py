@@ -50,6 +50,7 @@ from triquad_server.settings import Settings
 from triquad_server.source_queries import SourceQueries
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
+from triquad_server.store.resets import Resets
 from triquad_server.store.store import Store
 from triquad_server.threads import Teams
 
@@ -135,12 +136,18 @@ class Service:
         self._serve_status()
         checkpoints.start()
         self._parts.callback(checkpoints.close)
+        resets = Resets(
+            self._mapper,
+            checkpoints,
+            self._served.store,
+            protect_h=self._settings.store.protect_h,
+        )
         # Closed before the last checkpoint is written: it shows every reset that was answered.
         self._serve(
             "admin",
             {
                 keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
-                keys.RESET: answering(ResetRequest, self._mapper.reset),
+                keys.RESET: answering(ResetRequest, resets.answer),
             },
         )
         self._parts.callback(self._mapper.rest)

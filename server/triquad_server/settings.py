@@ -139,6 +139,17 @@ class StoreSettings(BaseModel):
     keep_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
     """The oldest checkpoints are deleted while all take more; 0: no limit."""
 
+    protect_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
+    """Hours for which the map as it was before a reset stays on disk, whatever the limits above
+    say; 0: a reset keeps nothing."""
+
+    protect_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
+    """Bytes of all checkpoints that are kept for that. A reset that would need more is refused: so
+    nothing pushes out what is kept already; 0: no limit."""
+
+    scrub_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
+    """Hours between checks of all checkpoints on disk, which find what rots there; 0: none."""
+
 
 class ServiceSettings(BaseModel):
     """Limits of the network service."""

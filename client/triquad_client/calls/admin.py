@@ -34,8 +34,7 @@ def checkpoint() -> Call[CheckpointInfo]:
     return ask(Ask(keys.CHECKPOINT, CheckpointRequest(), CheckpointInfo, min_timeout_s=_SLOW_S))
 
 
-def reset(bounds: Bounds | None) -> Call[int]:
-    """The first epoch without what was learnt in the bounds."""
+def reset(bounds: Bounds | None) -> Call[ResetReply]:
+    """Forgets what was learnt in the bounds."""
     request = ResetRequest(*checks.box(bounds))
-    done = yield from ask(Ask(keys.RESET, request, ResetReply, min_timeout_s=_SLOW_S))
-    return done.epoch
+    return ask(Ask(keys.RESET, request, ResetReply, min_timeout_s=_SLOW_S))

@@ -252,9 +252,11 @@ class ResetRequest(Message):
 
 @dataclass(frozen=True)
 class ResetReply(Message):
-    """Answer to :class:`ResetRequest`: the first epoch without the box's content."""
+    """Answer to :class:`ResetRequest`: what has happened, and how to go back."""
 
-    epoch: Epoch
+    epoch: Epoch  # the first without the box's content
+    kept_epoch: Epoch | None = None  # as which the map of before stays on disk; None: it does not
+    undo: Annotated[str, Text(4096)] | None = None  # how to go back to it, or why one cannot
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from triquad_server.errors import MapLostError, MapperStoppedError, ScanRefusedE
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
-from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
 from triquad_server.mesh.mesher import check_box
 from triquad_server.settings import ServiceSettings
@@ -44,6 +44,14 @@ class Progress:
     samples_left: int = 0
     rays_kept: int = 0
     loss: float = 0.0
+
+
+@dataclass(frozen=True)
+class Forgotten:
+    """What a reset did."""
+
+    before: MapChanges  # of the map that was
+    epoch: int  # the first that shows it
 
 
 @dataclass(frozen=True)
@@ -144,13 +152,27 @@ class MapperThread:
             RefusedError: it is not a box.
         """
         check_box(request.minimum, request.maximum)
+        return ResetReply(self.call(lambda mapper: self._forget(mapper, request)))
 
-        def reset(mapper: Mapper) -> int:
-            mapper.reset(request.minimum, request.maximum)
-            self.trails.forget(request.minimum, request.maximum)
-            return mapper.publish().number
+    def reset_after(self, request: ResetRequest, base: int | None) -> Forgotten:
+        """As :meth:`reset`, with the map as it was just before: no scan comes in between.
 
-        return ResetReply(self.call(reset))
+        ``base`` is the epoch after which changes are enough; ``None``: all is needed.
+
+        Raises:
+            RefusedError: it is not a box.
+        """
+        check_box(request.minimum, request.maximum)
+
+        def reset(mapper: Mapper) -> Forgotten:
+            return Forgotten(mapper.changes_since(base), self._forget(mapper, request))
+
+        return self.call(reset)
+
+    def _forget(self, mapper: Mapper, request: ResetRequest) -> int:
+        mapper.reset(request.minimum, request.maximum)
+        self.trails.forget(request.minimum, request.maximum)
+        return mapper.publish().number
 
     def _run(self) -> None:
         lower_priority(NICENESS)
