@@ -20,8 +20,8 @@ _LAST_DOMAIN = 232  # of ROS 2
 _ROLES = {
     Role.VIEWER: "may question the map and follow it",
     Role.ROBOT: "may publish scans, as the sources named, and what a viewer may",
-    Role.ADMIN: "may reset, restore and pin the map and have checkpoints written, and what a "
-    "viewer may; with --source, publish scans too",
+    Role.ADMIN: "may reset the map and have checkpoints written, and what a viewer may; with "
+    "--source, publish scans too",
 }
 _RESTART = "start servers and routers anew, for they read their file when they start"
 
