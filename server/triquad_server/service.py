@@ -123,6 +123,7 @@ class Service:
             warnings=self._warnings,
             mapper=self._mapper,
             checkpoints=checkpoints,
+            map_max_bytes=self._settings.memory.map_bytes,
         )
         self._serve_queries()
         self._serve_changes(health.server)
@@ -158,6 +159,7 @@ class Service:
             self._settings.service,
             failed=failed,
             warnings=self._warnings,
+            memory=self._settings.memory,
         )
         mapper.start()
         self._parts.callback(mapper.close)

@@ -186,6 +186,8 @@ class ServerStatus(Message):
     store_error: str | None  # why the map is not durable, None if it is
     warnings: str | None = None  # what goes wrong with scans, and what helps: a line each
     samples_left: int = 0  # training samples until nothing is left to learn
+    map_bytes: int = 0  # memory of the map with its newest epoch
+    map_max_bytes: int = 0  # beyond which scans are refused as map_full; 0: not told
 
 
 @dataclass(frozen=True)
