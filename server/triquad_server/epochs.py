@@ -11,7 +11,7 @@ from typing import NamedTuple
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapRecord, Region
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
 from triquad_map.composition.composed_view import ComposedView
@@ -39,6 +39,10 @@ class FrozenRegion:
     changed: int  # epoch of its last change
     live_bytes: Mapping[str, int]  # what the live region took beside this one, by part
     buffers: Buffers  # memory of this one; other epochs may share it
+
+    def record(self) -> Region:
+        """The region as a map file holds it, without training state."""
+        return region_record(self.index, self.engine, self.evidence, training=None)
 
 
 class Epoch(ComposedView):
@@ -81,10 +85,7 @@ class Epoch(ComposedView):
 
     def record(self) -> MapRecord:
         """The epoch as a map file holds it, without training state."""
-        regions = tuple(
-            region_record(region.index, region.engine, region.evidence, training=None)
-            for region in self.frozen_regions
-        )
+        regions = tuple(region.record() for region in self.frozen_regions)
         return MapRecord(self._name, self.number, settings=self.field_settings, regions=regions)
 
 
@@ -197,9 +198,10 @@ class EpochHistory:
         stay = {self.newest.number}
         for number in self._pinned():
             is_full = len(stay.difference(recent)) >= self._settings.epochs_pinned
-            if number not in stay and (number in recent or not is_full):
-                if room.take(self._epochs[number], share=_PINNED_SHARE):
-                    stay.add(number)
+            if number in stay or (is_full and number not in recent):
+                continue
+            if room.take(self._epochs[number], share=_PINNED_SHARE):
+                stay.add(number)
         for number in reversed(recent):
             if number not in stay and room.take(self._epochs[number]):
                 stay.add(number)

@@ -1,11 +1,12 @@
 """Real servers and raw Zenoh sessions for the tests, on free ports of the loopback."""
 
 import json
+import os
 import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -22,7 +23,9 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, Scan
 from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.net.session import NetworkOptions, open_session
+from triquad_server.net.configuration import NetworkOptions, configuration
+from triquad_server.net.session import open_session
+from triquad_server.protection import protection
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
@@ -72,7 +75,7 @@ def running_service(
     """A service in this process; yields its endpoint, a free one unless it is given."""
     compiled()
     endpoint = endpoint or free_endpoint()
-    network = NetworkOptions((endpoint,), connect, multicast_scouting=False)
+    network = configuration(NetworkOptions((endpoint,), connect), protection(map_name, settings))
     opened = Store(store, map_name, settings.store) if store else None
     restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
@@ -106,8 +109,11 @@ def raw_session(
     connect: str | None = None,
     listen: str | None = None,
     timestamps: bool = False,
+    access_control: dict[str, Any] | None = None,
 ) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
+    if access_control is not None:
+        config.insert_json5("access_control", json.dumps(access_control))
     config.insert_json5("timestamping/enabled", json.dumps(timestamps))
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -234,12 +240,17 @@ def server_process(
     arguments: Sequence[str | Path] = (),
     endpoint: str | None = None,
     ready: bool = True,
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator[ServerProcess]:
-    """A server process; killed at the end if it still runs."""
+    """A server process; killed at the end if it still runs.
+
+    ``environment`` has variables beside those of this process.
+    """
     endpoint = endpoint or free_endpoint()
     command = [sys.executable, "-m", "triquad_server.cli", "--listen", endpoint]
-    command += ["--no-multicast-scouting", "--device", "cpu", *map(str, arguments)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    command += ["--device", "cpu", *map(str, arguments)]
+    variables = {**os.environ, **(environment or {})}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=variables) as process:
         server = ServerProcess(process, endpoint)
         try:
             if ready:

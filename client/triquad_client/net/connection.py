@@ -2,16 +2,19 @@
 
 import json
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import zenoh
 from triquad_format.errors import FormatError, InvalidInputError, RefusedError, WireError
+from triquad_format.printable import printable
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.endpoints import full_endpoint
 from triquad_format.wire.messages import ErrorReply
+from triquad_format.wire.reply import MAX_COUNT, check_answers
+from triquad_format.wire.zenoh_config import QUIET, fill, put
 
 from triquad_client import checks
 from triquad_client.errors import (
@@ -24,7 +27,16 @@ from triquad_client.errors import (
 )
 from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
 
+_HERE = "127.0.0.1"
 _LIVELINESS_TIMEOUT_S = 3.0
+_MAX_REASON = 2_000  # characters of why a request was refused
+
+_OF_CLIENTS: Mapping[str, Any] = {
+    "mode": "client",
+    "connect/timeout_ms": 0,  # one attempt, not retries
+    "transport/link/rx/max_message_size": codec.MAX_MESSAGE_BYTES,
+}
+"""How Zenoh is set up for a client, besides what a file says."""
 
 Receiver: TypeAlias = Any
 """``None``, or a ``zenoh.handlers.Callback[zenoh.Reply]``: the overloads of Zenoh take no union."""
@@ -33,13 +45,16 @@ Receiver: TypeAlias = Any
 class Connection:
     """An open session, bound to one map. Safe for use by several threads."""
 
-    def __init__(self, session: zenoh.Session, map_name: str, timeout_s: float) -> None:
+    def __init__(
+        self, session: zenoh.Session, map_name: str, timeout_s: float, *, max_download_bytes: int
+    ) -> None:
         self._session = session
         # A session that a program forgot is closed before Python ends: Zenoh's threads must not
         # come back into an interpreter that is no longer there.
         self._close = weakref.finalize(self, session.close)
         self.map_name = map_name
         self.timeout_s = timeout_s
+        self.max_download_bytes = max_download_bytes  # of a map file, or the mesh of a box
 
     @property
     def is_closed(self) -> bool:
@@ -83,16 +98,18 @@ class Connection:
         return replies
 
     def read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
-        """The message of a reply.
+        """The message of a reply. Nothing of it is used before all of it was checked.
 
         Raises:
             RefusedError: the server refused.
             RequestTimeoutError: there was no reply in time.
-            BadReplyError: it cannot be decoded.
+            BadReplyError: it cannot be decoded, or is no answer to what was asked.
         """
         try:
             if reply.ok is not None:
-                return codec.decode(ask.kind, reply.ok.payload.to_bytes())
+                answer = codec.decode(ask.kind, reply.ok.payload.to_bytes())
+                check_answers(ask.message, answer)
+                return answer
             payload = b"" if reply.err is None else reply.err.payload.to_bytes()
             if payload == b"Timeout":
                 raise RequestTimeoutError(
@@ -101,7 +118,9 @@ class Connection:
             reason = codec.decode(ErrorReply, payload)
         except WireError as error:
             raise BadReplyError(f"reply on {self._key(ask)}: {error}") from error
-        raise RefusedError(reason.code, reason.message)
+        raise RefusedError(
+            printable(reason.code, _MAX_REASON), printable(reason.message, _MAX_REASON)
+        )
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
@@ -114,6 +133,12 @@ class Connection:
             )
         if self.map_name not in available:
             return UnknownMapError(self.map_name, available)
+        if ask.operation.startswith("admin/"):
+            return NoReplyError(
+                f"no reply on {self._key(ask)} although the map is there: access control forbids "
+                "it (by default to all but programs of the server's machine that connect to "
+                "127.0.0.1), or the server is stopping or older than this operation"
+            )
         return NoReplyError(
             f"no reply on {self._key(ask)} although the map is there: the server is stopping "
             "or older than this question, access control forbids the request, or a message "
@@ -138,12 +163,18 @@ class Connection:
             raise self._broken(error) from error
 
     def look_for_maps(
-        self, receiver: Receiver = None, cancellation: zenoh.CancellationToken | None = None
+        self,
+        receiver: Receiver = None,
+        cancellation: zenoh.CancellationToken | None = None,
+        map_name: str = "*",
     ) -> Iterable[zenoh.Reply]:
-        """Ask all servers in reach for their maps; replies and errors as of :meth:`send`."""
+        """Ask all servers in reach for their maps, or for one of this name.
+
+        Replies and errors are as of :meth:`send`.
+        """
         try:
             replies: Iterable[zenoh.Reply] = self._session.liveliness().get(
-                keys.alive_key("*", "*"),
+                keys.alive_key(map_name, "*"),
                 receiver,
                 timeout=_LIVELINESS_TIMEOUT_S,
                 cancellation_token=cancellation,
@@ -197,48 +228,52 @@ def closed_error() -> ClosedError:
 
 def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
     """The maps that the replies to :meth:`Connection.look_for_maps` name."""
-    return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok})
+    names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
+    return sorted(filter(keys.is_name, names))
 
 
 def open_connection(
-    endpoint: str, map_name: str, timeout_s: float, config: str | Path | None
+    endpoint: str | None,
+    map_name: str,
+    timeout_s: float,
+    config: str | Path | None,
+    *,
+    max_download_bytes: int,
 ) -> Connection:
     """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
     timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
+    most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
     try:
         keys.check_name("map", map_name)
-        endpoint = full_endpoint(endpoint)
+        session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except FormatError as error:
         raise InvalidInputError(str(error)) from error
-    try:
-        session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except zenoh.ZError as error:
+        where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
         raise ConnectError(
-            f"cannot connect to {endpoint}: {_reason(error)} Start triquad-server there, or check "
-            "the endpoint and its credentials."
+            f"cannot connect {where}: {_reason(error)} Start triquad-server there, or check the "
+            "endpoint and the credentials."
         ) from error
-    connection = Connection(session, map_name, timeout_s)
+    connection = Connection(session, map_name, timeout_s, max_download_bytes=most)
     try:
-        available = map_names(connection.look_for_maps())
-        if map_name not in available:
-            raise UnknownMapError(map_name, available)
+        # Asked for by name first: there may be any number of others.
+        if not map_names(connection.look_for_maps(map_name=map_name)):
+            raise UnknownMapError(map_name, map_names(connection.look_for_maps()))
     except BaseException:
         connection.close()
         raise
     return connection
 
 
-def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> zenoh.Config:
-    if file is not None:
-        config = _read_configuration(file)
-    else:
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/timeout_ms", "0")  # one attempt, not retries
-        config.insert_json5("scouting/multicast/enabled", "false")
-        config.insert_json5("transport/shared_memory/enabled", "false")
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    config.insert_json5("transport/unicast/open_timeout", str(int(timeout_s * 1000)))
+def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | None) -> zenoh.Config:
+    config = zenoh.Config() if file is None else _read_configuration(file)
+    fill(config, {**QUIET, **_OF_CLIENTS}, unset=zenoh.Config())
+    put(config, {"transport/unicast/open_timeout": int(timeout_s * 1000)})
+    if endpoint is not None or not json.loads(config.get_json("connect/endpoints")):
+        only_tls = json.loads(config.get_json("transport/link/protocols")) == ["tls"]
+        protocol = "tls" if only_tls else "tcp"
+        full = full_endpoint(_HERE if endpoint is None else endpoint, protocol)
+        put(config, {"connect/endpoints": [full]})
     return config
 
 

@@ -56,13 +56,16 @@ class _State:
 class LocalCopy:
     """The copy; for several threads. It is empty until :meth:`_update` has run."""
 
-    def __init__(self, path: Path, bounds: Bounds) -> None:
+    def __init__(self, path: Path, bounds: Bounds, max_bytes: int) -> None:
         """``path`` is the file, ``bounds`` are the corners of the box.
+
+        ``max_bytes`` may be fetched at a time.
 
         Raises:
             InvalidInputError: the bounds are not a box, or hold nothing.
         """
         self._path = path
+        self._max_bytes = max_bytes
         self._low, self._high = checks.finite_box(bounds)
         self._updating = threading.Lock()
         self._state: _State | None = None
@@ -97,13 +100,13 @@ class LocalCopy:
     def _fetch(self, run: Run) -> SyncReport:
         with self._updating:
             asked_s = time.monotonic()
-            info = run(newest_file(training=False))
+            info = run(newest_file(training=False, max_bytes=self._max_bytes))
             known = self._state
             if known is not None and known.sha256 == info.sha256:
                 report = SyncReport(info.epoch, 0, 0, parts_kept=known.report.parts)
                 self._state = dataclasses.replace(known, checked_s=asked_s, report=report)
                 return report
-            remote = RemoteBytes(run, info)
+            remote = RemoteBytes(run, info, self._max_bytes)
             try:
                 stored = StoredMap(remote)
                 wanted = stored.parts_in(self._low, self._high)
@@ -156,9 +159,9 @@ class SyncedMap(LocalCopy, MapQueries):
     epoch, and ``at_epoch`` may be none but :attr:`epoch`.
     """
 
-    def __init__(self, path: Path, bounds: Bounds, run: Run) -> None:
+    def __init__(self, path: Path, bounds: Bounds, run: Run, max_bytes: int) -> None:
         """Use ``Client.sync``."""
-        LocalCopy.__init__(self, path, bounds)
+        LocalCopy.__init__(self, path, bounds, max_bytes)
         MapQueries.__init__(self, self._answer)
         self._ask_server = run
 
@@ -180,9 +183,9 @@ class AsyncSyncedMap(LocalCopy, AsyncMapQueries):
     It is :class:`SyncedMap` to be awaited: a thread answers the queries.
     """
 
-    def __init__(self, path: Path, bounds: Bounds, run: AsyncRun) -> None:
+    def __init__(self, path: Path, bounds: Bounds, run: AsyncRun, max_bytes: int) -> None:
         """Use ``AsyncClient.sync``."""
-        LocalCopy.__init__(self, path, bounds)
+        LocalCopy.__init__(self, path, bounds, max_bytes)
         AsyncMapQueries.__init__(self, self._answer_in_thread)
         self._ask_server = run
 

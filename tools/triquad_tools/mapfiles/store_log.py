@@ -17,6 +17,7 @@ from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.parts.part import REGION_TOPICS
 from triquad_format.records.field_settings import RegionIndex
 
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 
 
@@ -80,14 +81,14 @@ def read_log(store: Path) -> StoreLog:
 
 def print_log(log: StoreLog) -> None:
     """Print a table of the checkpoints, and what is wrong with those that do not open."""
-    print(f"{log.folder}: {len(log.checkpoints)} checkpoints, {log.bytes:,} bytes")
+    print_line(f"{log.folder}: {len(log.checkpoints)} checkpoints, {log.bytes:,} bytes")
     titles = ("epoch", "time", "kind", "bytes", "parts stored", "of", "regions changed", "opens")
     print_columns(titles, [_row(checkpoint) for checkpoint in log.checkpoints])
     for checkpoint in log.checkpoints:
         if checkpoint.problem is not None:
-            print(f"  {checkpoint.file}: {checkpoint.problem}")
+            print_line(f"  {checkpoint.file}: {checkpoint.problem}")
     for name in log.set_aside:
-        print(f"  {name}: set aside as damaged; triquad-pack --recover saves what is intact")
+        print_line(f"  {name}: set aside as damaged; triquad-pack --recover saves what is intact")
 
 
 def _row(checkpoint: LoggedCheckpoint) -> tuple[str, ...]:
