@@ -17,6 +17,7 @@ from triquad_server.errors import ServerError
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.memory import give_back_early
+from triquad_server.memory_settings import MemorySettings
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.configuration import Configuration, configuration
@@ -244,9 +245,11 @@ def warm_up(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     radius = min(max(_WARM_UP_RADIUS_M, settings.scan.range_min_m), settings.scan.range_max_m)
     teams = teams or Teams()
+    settings = settings.model_copy(update={"memory": MemorySettings()})  # with room for it
     mapper = Mapper("warm-up", settings, device, teams=teams)
     report("taking in scans")
-    mapper.ingest((directions * radius).astype(np.float32), np.eye(4))
+    rays = mapper.ingest((directions * radius).astype(np.float32), np.eye(4))
+    mapper.regions[0].growth_by(rays)
     report("training")
     mapper.train()
     mapper.publish()

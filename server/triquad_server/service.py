@@ -124,6 +124,7 @@ class Service:
             warnings=self._warnings,
             mapper=self._mapper,
             checkpoints=checkpoints,
+            map_max_bytes=self._settings.memory.map_bytes,
         )
         self._serve_queries()
         self._serve_changes(health.server)
@@ -165,6 +166,7 @@ class Service:
             self._settings.service,
             failed=failed,
             warnings=self._warnings,
+            memory=self._settings.memory,
         )
         mapper.start()
         self._parts.callback(mapper.close)

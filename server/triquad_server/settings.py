@@ -11,6 +11,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
 from triquad_server.leaf_lengths import DEFAULT_LEAF_M, at_leaf, follows_leaf, length
+from triquad_server.memory_settings import MemorySettings
 from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.scan_settings import ScanSettings
@@ -179,8 +180,10 @@ class ServiceSettings(BaseModel):
     """Newest epochs that requests can ask for by number."""
 
     epochs_pinned: Annotated[int, Field(ge=0, le=1000)] = 8
-    """Older epochs that stay because they were asked for by number; of more, the one asked for
-    longest ago goes."""
+    """Older epochs that stay because they were asked for by number, of all clients together."""
+
+    client_pins: Annotated[int, Field(ge=1, le=1000)] = 3
+    """Epochs that one client may pin; of more, the one that it asked for longest ago goes."""
 
     pin_s: Annotated[float, Field(ge=0, le=1e6)] = 30.0
     """Time for which an epoch stays after it was last asked for by number."""
@@ -216,6 +219,7 @@ class Settings(BaseModel):
     mesh: MeshSettings = MeshSettings()
     store: StoreSettings = StoreSettings()
     service: ServiceSettings = ServiceSettings()
+    memory: MemorySettings = MemorySettings()
     metrics: MetricsSettings = MetricsSettings()
     ros2: Ros2Settings = Ros2Settings()
     sources: dict[str, SourceSettings] = {}

@@ -214,6 +214,8 @@ class ServerStatus(Message):
     store_error: str | None  # why the map is not durable, None if it is
     warnings: str | None = None  # what goes wrong with scans, and what helps: a line each
     samples_left: Count = 0  # training samples until nothing is left to learn
+    map_bytes: Count = 0  # memory of the map with its newest epoch
+    map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not told
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from triquad_server.epochs import Epoch, FrozenRegion
 from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion
+from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.settings import Settings
@@ -65,6 +66,7 @@ class Mapper:
             sums=GradientSums(),
             team=self._teams.mapping,
         )
+        self._budget = MemoryBudget(settings.memory.map_bytes, self._field_settings)
         self._regions: dict[RegionIndex, LiveRegion] = {}
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
@@ -89,6 +91,11 @@ class Mapper:
     def loss(self) -> float:
         """The loss of the last steps; on a GPU, to read it waits for all of them."""
         return 0.0 if self._loss is None else float(self._loss)
+
+    @property
+    def bytes_used(self) -> int:
+        """Memory of the map with its newest epoch, without the replay pools; an estimate."""
+        return self._budget.bytes_of(region.size for region in self._regions.values())
 
     @property
     def regions(self) -> list[LiveRegion]:
@@ -138,6 +145,7 @@ class Mapper:
         )
         around = self._regions_around(rays)
         self._check_regions(around)
+        self._check_memory(rays, around)
         try:
             self._take_in(rays, around, stamp_s)
         except MemoryError as error:
@@ -301,6 +309,26 @@ class Mapper:
                 f"the scan would make {count} regions of the map, more than "
                 f"training.max_regions = {limit}",
             )
+
+    def _check_memory(self, rays: ScanRays, wanted: list[RegionIndex]) -> None:
+        """Refuse a scan that does not fit; the closer to the limit, the better that is looked at.
+
+        Raises:
+            ScanRefusedError: ``map_full``.
+        """
+        used, budget = self.bytes_used, self._budget
+        if used + budget.most_added(rays, [len(rays.ends)] * len(wanted)) <= budget.limit:
+            return
+        regions = [
+            self._regions.get(index) or LiveRegion.unseen(index, self._setup) for index in wanted
+        ]
+        new_voxels = [len(region.new_ends(rays).voxels) for region in regions]
+        if used + budget.most_added(rays, new_voxels) <= budget.limit:
+            return
+        unseen = budget.bytes_of(NO_SIZE for index in wanted if index not in self._regions)
+        needed = unseen + sum(budget.grown(region.growth_by(rays)) for region in regions)
+        if needed and used + needed > budget.limit:
+            raise budget.refusal(used, needed)
 
     def _region(self, index: RegionIndex) -> LiveRegion:
         if index not in self._regions:

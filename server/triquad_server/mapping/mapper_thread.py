@@ -20,6 +20,7 @@ from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
+from triquad_server.memory_settings import MemorySettings
 from triquad_server.mesh.mesher import check_box
 from triquad_server.settings import ServiceSettings
 from triquad_server.surface_history import SurfaceHistory
@@ -43,6 +44,7 @@ class Progress:
     samples_trained: int = 0
     samples_left: int = 0
     rays_kept: int = 0
+    map_bytes: int = 0  # that the map and its newest epoch take
     loss: float = 0.0
 
 
@@ -72,10 +74,11 @@ class MapperThread:
         settings: ServiceSettings,
         failed: Callable[[], None],
         warnings: ScanWarnings | None = None,
+        memory: MemorySettings | None = None,
     ) -> None:
         """Publish the first epoch; ``failed`` is called where an internal error ends the thread.
 
-        ``warnings`` are told what was used of each scan.
+        ``warnings`` are told what was used of each scan; ``memory`` bounds the epochs that stay.
         """
         self._mapper = mapper
         self._scans = scans
@@ -97,7 +100,8 @@ class MapperThread:
         self._loss = 0.0  # as of the newest epoch
         self._step_s = _GIVE_WAY_S  # what the last step of training took
         first = mapper.publish()
-        self.epochs = EpochHistory(first, settings)
+        older_bytes = (memory or MemorySettings()).epochs_bytes
+        self.epochs = EpochHistory(first, settings, older_bytes=older_bytes)
         self.surface = SurfaceHistory(first, settings.changes_kept)
         self.trails = SourceTrails(first.field_settings.leaf_m)
         self.progress = Progress()
@@ -312,5 +316,6 @@ class MapperThread:
             samples_trained=self._mapper.samples_trained,
             samples_left=self._mapper.samples_left,
             rays_kept=self._mapper.rays_kept,
+            map_bytes=self._mapper.bytes_used,
             loss=self._loss,
         )
