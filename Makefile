@@ -2,16 +2,19 @@
 # make check     the checks alone: style, types, which package may import which
 # make docs      write the tables of docs/settings.md from the settings
 # make pictures  make the pictures of the documentation anew; those of the viewer need Chromium
+# make campaign  try for 5 minutes to break a server and its files; CAMPAIGN_MINUTES=60: for an hour
 # make demo      set up a virtual environment and map a street, end to end
 VENV ?= .venv
 PYTHON ?= python3
 # Extra flags for pip; --extra-index-url https://download.pytorch.org/whl/cpu takes torch's CPU build.
 PIP_FLAGS ?=
+# How long make campaign takes; it goes on with what is in campaign-out/.
+CAMPAIGN_MINUTES ?= 5
 
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 
-.PHONY: check clean demo docs pictures test
+.PHONY: campaign check clean demo docs pictures test
 
 demo: $(INSTALLED)
 	$(BIN)/triquad-demo --out demo-out
@@ -26,6 +29,9 @@ pictures: $(INSTALLED)
 	$(BIN)/python docs/pictures.py
 	$(BIN)/python docs/top_picture.py
 	$(BIN)/python docs/viewer_pictures.py
+
+campaign: $(INSTALLED)
+	PYTHONPATH=tests $(BIN)/python -m campaign --minutes $(CAMPAIGN_MINUTES)
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

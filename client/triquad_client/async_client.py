@@ -114,7 +114,7 @@ class AsyncClient(AsyncMapQueries):
         return await self._run(fetch_tile((x, y, z), level))
 
     async def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
-        return await self._run(fetch_mesh(bounds, level))
+        return await self._run(fetch_mesh(bounds, level, self._connection.max_download_bytes))
 
     def watch_mesh(
         self,
@@ -123,7 +123,13 @@ class AsyncClient(AsyncMapQueries):
         max_bytes_per_s: int | None = None,
         known: KnownTiles | None = None,
     ) -> AsyncMeshWatch:
-        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s=max_bytes_per_s, known=known)
+        followed = FollowedMesh.initial(
+            bounds,
+            level,
+            max_bytes_per_s=max_bytes_per_s,
+            known=known,
+            max_bytes=self._connection.max_download_bytes,
+        )
         return AsyncMeshWatch(self._run, followed)
 
     async def status(self) -> ServerStatus:
@@ -139,14 +145,20 @@ class AsyncClient(AsyncMapQueries):
         return await self._run(admin.reset(bounds))
 
     async def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
-        return await self._run(download.fetch(Path(path), training))
+        return await self._run(
+            download.fetch(Path(path), training, self._connection.max_download_bytes)
+        )
 
     async def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
-        return await self._run(download.fetch_box(Path(path), bounds))
+        return await self._run(
+            download.fetch_box(Path(path), bounds, self._connection.max_download_bytes)
+        )
 
-    async def sync(self, bounds: Bounds, path: str | Path) -> AsyncSyncedMap:
-        synced = AsyncSyncedMap(Path(path), bounds, self._run)
-        await synced.refresh()
+    async def sync(
+        self, bounds: Bounds, path: str | Path, accept_emptier: bool = False
+    ) -> AsyncSyncedMap:
+        synced = AsyncSyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
+        await synced.refresh(accept_emptier)
         return synced
 
     async def maps(self) -> list[str]:

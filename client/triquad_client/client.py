@@ -197,7 +197,7 @@ class Client(MapQueries):
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
         """
-        return self._run(fetch_mesh(bounds, level))
+        return self._run(fetch_mesh(bounds, level, self._connection.max_download_bytes))
 
     def watch_mesh(
         self,
@@ -217,7 +217,13 @@ class Client(MapQueries):
         Raises:
             InvalidInputError: an argument cannot be used, or ``known`` is of another level.
         """
-        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s=max_bytes_per_s, known=known)
+        followed = FollowedMesh.initial(
+            bounds,
+            level,
+            max_bytes_per_s=max_bytes_per_s,
+            known=known,
+            max_bytes=self._connection.max_download_bytes,
+        )
         return MeshWatch(self._connection, followed)
 
     def status(self) -> ServerStatus:
@@ -268,7 +274,7 @@ class Client(MapQueries):
             DownloadError: what arrived is not what the server announced.
             OSError: the file cannot be written.
         """
-        return self._run(download.fetch(Path(path), training))
+        return self._run(download.fetch(Path(path), training, self._connection.max_download_bytes))
 
     def download_box(self, path: str | Path, bounds: Bounds) -> MapFileInfo:
         """Write to a file what the newest map needs to answer within ``bounds``.
@@ -285,9 +291,11 @@ class Client(MapQueries):
             DownloadError: nothing of the map lies in the box, or what arrived is not valid.
             OSError: the file cannot be written.
         """
-        return self._run(download.fetch_box(Path(path), bounds))
+        return self._run(
+            download.fetch_box(Path(path), bounds, self._connection.max_download_bytes)
+        )
 
-    def sync(self, bounds: Bounds, path: str | Path) -> SyncedMap:
+    def sync(self, bounds: Bounds, path: str | Path, accept_emptier: bool = False) -> SyncedMap:
         """Keep a copy of what the map needs to answer within ``bounds``, and ask that.
 
         What is in the file already is taken up: only the parts that changed are sent. The copy
@@ -298,14 +306,17 @@ class Client(MapQueries):
                 make it larger than where you ask by the largest distance that you ask for.
             path: the file; one that is no valid map file is replaced. :func:`open_map` opens it
                 without a server.
+            accept_emptier: replace a copy that is in the file already also by a map that knows less
+                than half as much of the box.
 
         Raises:
             InvalidInputError: the bounds are not a box, or hold nothing.
+            EmptierMapError: the file has a copy that knows far more, and stays as it is.
             DownloadError: what arrived is not valid.
             OSError: the file cannot be read or written.
         """
-        synced = SyncedMap(Path(path), bounds, self._run)
-        synced.refresh()
+        synced = SyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
+        synced.refresh(accept_emptier)
         return synced
 
     def maps(self) -> list[str]:

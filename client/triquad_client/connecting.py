@@ -6,36 +6,43 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
-
 from triquad_client.async_client import AsyncClient
 from triquad_client.client import Client
 from triquad_client.net.async_driver import AsyncDriver
 from triquad_client.net.connection import Connection, open_connection
 
+MAX_DOWNLOAD_BYTES = 2**30
+"""Some hundred times the map of a town; larger ones are taken by who says so."""
+
 
 def connect(
-    endpoint: str = DEFAULT_ENDPOINT,
+    endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
     timeout_s: float = 10.0,
     config: str | Path | None = None,
+    max_download_bytes: int = MAX_DOWNLOAD_BYTES,
 ) -> Client:
     """Connect to a map server.
 
     Args:
         endpoint: of the server, or of a router that leads to it: a host such as ``robot`` or
-            ``robot:7447``, or an endpoint of Zenoh.
+            ``robot:7447``, or an endpoint of Zenoh; ``None``: where ``config`` says, and otherwise
+            port 7447 of this machine.
         map: name of the map.
         timeout_s: for connecting and for each request.
-        config: Zenoh configuration file (JSON5), for TLS or credentials; the endpoint is added.
+        config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
+        max_download_bytes: the largest map file that is taken from the server, and the most that
+            the mesh of a box may take of memory, whatever the server announces.
 
     Raises:
         ConnectError: nothing listens at the endpoint, or it does not let us in.
         UnknownMapError: no server there has this map.
         InvalidInputError: there cannot be an endpoint or a map of this name.
     """
-    return Client(open_connection(endpoint, map, timeout_s, config=config))
+    return Client(
+        open_connection(endpoint, map, timeout_s, config, max_download_bytes=max_download_bytes)
+    )
 
 
 class Connecting:
@@ -68,17 +75,22 @@ class Connecting:
 
 
 def connect_async(
-    endpoint: str = DEFAULT_ENDPOINT,
+    endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
     timeout_s: float = 10.0,
     config: str | Path | None = None,
+    max_download_bytes: int = MAX_DOWNLOAD_BYTES,
 ) -> Connecting:
     """Connect to a map server: ``async with connect_async(...) as client``, or await it and close.
 
     Arguments and errors are those of :func:`connect`.
     """
-    return Connecting(lambda: open_connection(endpoint, map, timeout_s, config=config))
+    return Connecting(
+        lambda: open_connection(
+            endpoint, map, timeout_s, config, max_download_bytes=max_download_bytes
+        )
+    )
 
 
 def _close_late(opening: "Future[Connection]") -> None:

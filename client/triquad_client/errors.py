@@ -2,6 +2,9 @@
 
 from triquad_format.errors import TriquadError
 
+_MAPS_NAMED = 20
+_NO_MAPS = "none (is this a router without a triquad server?)"
+
 
 class ConnectError(TriquadError):
     """No server, or one that does not let us in, at the endpoint."""
@@ -11,7 +14,9 @@ class UnknownMapError(TriquadError):
     """No server has a map of this name; ``available`` lists the maps there are."""
 
     def __init__(self, map_name: str, available: list[str]) -> None:
-        there = ", ".join(available) or "none (is this a router without a triquad server?)"
+        there = ", ".join(available[:_MAPS_NAMED]) or _NO_MAPS
+        if len(available) > _MAPS_NAMED:
+            there += f" and {len(available) - _MAPS_NAMED} more"
         super().__init__(f"no server has a map {map_name!r}; available: {there}")
         self.map_name = map_name
         self.available = available
@@ -26,7 +31,11 @@ class RequestTimeoutError(TriquadError):
 
 
 class BadReplyError(TriquadError):
-    """A reply that this release does not understand."""
+    """A reply that is no answer to the question, or that this release does not understand."""
+
+
+class EmptierMapError(TriquadError):
+    """Another run of the server has a map with far less in it: the older copy stays."""
 
 
 class ClosedError(TriquadError):
@@ -34,4 +43,4 @@ class ClosedError(TriquadError):
 
 
 class DownloadError(TriquadError):
-    """The map file could not be fetched whole."""
+    """A map file or a mesh could not be fetched whole, or is larger than this client takes."""

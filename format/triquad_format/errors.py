@@ -1,5 +1,7 @@
 """The errors that all of triquad shares. Each carries the offending value in its text."""
 
+from triquad_format.printable import printable_lines
+
 ERROR_CODES = {
     "bad_request": "the request is malformed or out of range",
     "bad_version": "the request is of another protocol version",
@@ -15,7 +17,15 @@ ERROR_CODES = {
 
 
 class TriquadError(Exception):
-    """Base of all errors of triquad."""
+    """Base of all errors of triquad.
+
+    A value in its text may come from a file or from the network: it cannot steer the terminal, or
+    the log, in which the text is shown.
+    """
+
+    def __str__(self) -> str:
+        """The text, control characters in it as escapes."""
+        return printable_lines(super().__str__())
 
 
 class RefusedError(TriquadError):

@@ -47,3 +47,8 @@ def test_what_is_neither_is_refused_with_what_to_write(text: str, words: str) ->
         full_endpoint(text)
     assert words in str(raised.value)
     assert "use HOST, HOST:PORT or an endpoint of Zenoh such as tcp/robot:7447" in str(raised.value)
+
+
+def test_a_host_is_reached_by_the_protocol_that_is_asked_for() -> None:
+    assert full_endpoint("robot", "tls") == "tls/robot:7447"
+    assert full_endpoint("tcp/robot:1", "tls") == "tcp/robot:1"

@@ -1,11 +1,12 @@
 """Real servers and raw Zenoh sessions for the tests, on free ports of the loopback."""
 
 import json
+import os
 import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -106,8 +107,11 @@ def raw_session(
     connect: str | None = None,
     listen: str | None = None,
     timestamps: bool = False,
+    access_control: dict[str, Any] | None = None,
 ) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
+    if access_control is not None:
+        config.insert_json5("access_control", json.dumps(access_control))
     config.insert_json5("timestamping/enabled", json.dumps(timestamps))
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -234,12 +238,17 @@ def server_process(
     arguments: Sequence[str | Path] = (),
     endpoint: str | None = None,
     ready: bool = True,
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator[ServerProcess]:
-    """A server process; killed at the end if it still runs."""
+    """A server process; killed at the end if it still runs.
+
+    ``environment`` has variables beside those of this process.
+    """
     endpoint = endpoint or free_endpoint()
     command = [sys.executable, "-m", "triquad_server.cli", "--listen", endpoint]
     command += ["--no-multicast-scouting", "--device", "cpu", *map(str, arguments)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    variables = {**os.environ, **(environment or {})}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=variables) as process:
         server = ServerProcess(process, endpoint)
         try:
             if ready:

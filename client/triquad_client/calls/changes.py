@@ -8,7 +8,6 @@ from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import BadReplyError
 from triquad_client.net.call import Ask, Call, ask
 
 Corner = tuple[float, float, float]
@@ -60,14 +59,8 @@ def changes(since: int | ChangeReport | None, bounds: Bounds | None) -> Call[Cha
 
 
 def _boxes(reply: ChangesReply) -> tuple[ChangedBox, ...]:
-    """The boxes of a reply, those of most voxels first.
-
-    Raises:
-        BadReplyError: its arrays do not fit together.
-    """
+    """The boxes of a reply, those of most voxels first."""
     columns = (reply.appeared, reply.minimum, reply.maximum, reply.epochs, reply.voxels)
-    if len({len(column) for column in columns}) > 1:
-        raise BadReplyError("the changes of the reply are not as many in each of its arrays")
     boxes = [
         ChangedBox(
             ChangeKind.APPEARED if appeared else ChangeKind.VANISHED,

@@ -1,6 +1,7 @@
 """Fetching the map as a file; its chunks go in the background of everything else."""
 
 import hashlib
+import shutil
 from pathlib import Path
 
 from triquad_format.errors import FormatError
@@ -22,21 +23,35 @@ _PREPARE_S = 120.0
 _BLOCK_BYTES = 2**23
 
 
-def newest_file(training: bool) -> Call[MapInfo]:
-    """The file of the newest epoch, which the server keeps for a while."""
-    request = MapInfoRequest(training)
-    return ask(Ask(keys.MAP_INFO, request, MapInfo, background=True, min_timeout_s=_PREPARE_S))
+def newest_file(training: bool, max_bytes: int) -> Call[MapInfo]:
+    """The file of the newest epoch, which the server keeps for a while.
+
+    Raises:
+        DownloadError: it is larger than ``max_bytes``.
+    """
+    request = Ask(
+        keys.MAP_INFO, MapInfoRequest(training), MapInfo, background=True, min_timeout_s=_PREPARE_S
+    )
+    info = yield from ask(request)
+    if info.bytes > max_bytes:
+        raise DownloadError(
+            f"the server announces a map file of {info.bytes} bytes, more than the {max_bytes} "
+            "that this client takes: connect with a larger max_download_bytes if that is right"
+        )
+    return info
 
 
 class RemoteBytes:
     """The bytes of one map file on the server; see :class:`RandomAccess`."""
 
-    def __init__(self, run: Run, info: MapInfo) -> None:
+    def __init__(self, run: Run, info: MapInfo, max_bytes: int) -> None:
+        """``max_bytes`` may be read in all."""
         self.name = f"the map of epoch {info.epoch}"
         self.size = info.bytes
         self.bytes_read = 0
         self._run = run
         self._info = info
+        self._max_bytes = max_bytes
 
     def read(self, offset: int, length: int) -> bytes:
         """Exactly ``length`` bytes from ``offset`` on.
@@ -44,20 +59,19 @@ class RemoteBytes:
         Raises:
             DamagedMapFileError: the file does not have so many.
             RefusedError: ``chunk_gone``, where the server does not keep the file any more.
-            DownloadError: other bytes came than were asked for.
+            DownloadError: other bytes came than were asked for, or it is too much in all.
         """
         check_range(offset, length, self.size)
+        if self.bytes_read + length > self._max_bytes:
+            raise DownloadError(f"{self.name} names more than {self._max_bytes} bytes to be read")
         end = offset + length
-        step = max(1, self._info.chunk_bytes)
-        data = bytearray()
-        for chunk in self._run(ask_each(range(offset, end, step), lambda at: self._ask(at, end))):
-            if chunk.offset != offset + len(data):
-                raise DownloadError(f"chunk at {chunk.offset} came, not {offset + len(data)}")
-            data += chunk.data
-        if len(data) != length:
-            raise DownloadError(f"{len(data)} bytes came from {offset} on, not {length}")
+        starts = range(offset, end, self._info.chunk_bytes)
+        chunks = self._run(ask_each(starts, lambda at: self._ask(at, end)))
+        for chunk, start in zip(chunks, starts, strict=True):
+            if chunk.offset != start:
+                raise DownloadError(f"chunk at {chunk.offset} came, not {start}")
         self.bytes_read += length
-        return bytes(data)
+        return b"".join(chunk.data for chunk in chunks)
 
     def close(self) -> None:
         """Nothing is held but the connection, which is not this object's."""
@@ -68,12 +82,13 @@ class RemoteBytes:
         return Ask(keys.MAP_CHUNK, request, MapChunk, background=True)
 
 
-def fetch(path: Path, training: bool) -> Call[MapInfo]:
+def fetch(path: Path, training: bool, max_bytes: int) -> Call[MapInfo]:
     """Write the newest map to ``path``, as ``Client.download_map``."""
 
     def job(run: Run) -> MapInfo:
-        info = run(newest_file(training))
-        remote = RemoteBytes(run, info)
+        info = run(newest_file(training, max_bytes))
+        _check_space(path, info.bytes)
+        remote = RemoteBytes(run, info, max_bytes)
         digest = hashlib.sha256()
         with replacing(path) as file:
             for offset in range(0, info.bytes, _BLOCK_BYTES):
@@ -89,13 +104,14 @@ def fetch(path: Path, training: bool) -> Call[MapInfo]:
     return retried("chunk_gone", lambda: offload(job))
 
 
-def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
+def fetch_box(path: Path, bounds: Bounds, max_bytes: int) -> Call[MapFileInfo]:
     """Write what answers in the bounds, as ``Client.download_box``."""
     low, high = checks.finite_box(bounds)
 
     def job(run: Run) -> MapFileInfo:
         try:
-            stored = StoredMap(RemoteBytes(run, run(newest_file(training=False))))
+            info = run(newest_file(training=False, max_bytes=max_bytes))
+            stored = StoredMap(RemoteBytes(run, info, max_bytes))
             record = crop_record(stored.box(low, high), low, high)
             if not record.has_evidence:
                 raise DownloadError(
@@ -106,3 +122,15 @@ def fetch_box(path: Path, bounds: Bounds) -> Call[MapFileInfo]:
             raise DownloadError(str(error)) from error
 
     return (yield from retried("chunk_gone", lambda: offload(job)))
+
+
+def _check_space(path: Path, size: int) -> None:
+    """Refuse a file for which the disk has no room, before any of it is sent.
+
+    Raises:
+        DownloadError: there is not as much.
+        OSError: there is no such folder.
+    """
+    free = shutil.disk_usage(path.parent).free
+    if size > free:
+        raise DownloadError(f"{path} would take {size} bytes, and {free} are free on its disk")

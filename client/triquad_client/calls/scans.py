@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.errors import FormatError, InvalidInputError, RefusedError
+from triquad_format.printable import printable
 from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest, Scan, ServerStatus
 from triquad_sensors.errors import InvalidScanError
@@ -144,7 +145,7 @@ class ScanPublisher:
             new = [text for text in warnings if text not in self._warned]
             self._warned.update(new)
         for text in new:
-            _log.warning("%s", text)
+            _log.warning("%s", printable(text))
 
     def _dealt_with_by(self, deadline: float) -> Call[bool]:
         """Whether the scans are, after some waiting: servers bound the time that one may ask."""

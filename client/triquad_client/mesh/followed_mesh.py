@@ -12,12 +12,12 @@ from triquad_format.errors import InvalidInputError, WireError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
-from triquad_format.wire.tile_codec import decode_tile
+from triquad_format.wire.tile_codec import decode_tile, decoded_bytes
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError
-from triquad_client.mesh.mesh import Mesh, joined
+from triquad_client.mesh.mesh import Mesh, joined, too_large_error
 
 _REPLY_BYTES = 1_000_000
 
@@ -35,6 +35,11 @@ class MeshTile:
     origin: NDArray[np.float64]  # [3] metres, map frame: the minimum corner
     vertices: NDArray[np.float32]  # [V, 3] metres, relative to the origin
     faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory that it takes."""
+        return self.vertices.nbytes + self.faces.nbytes
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,7 @@ class FollowedMesh:
     level: int
     max_bytes_per_s: int  # 0: whatever the server allows
     name: str  # on which the server counts these bytes
+    max_bytes: int  # of memory, for all tiles
     server: str = ""  # which told all below
     tile_side_m: float = math.nan
     cell_m: float = math.nan
@@ -87,6 +93,8 @@ class FollowedMesh:
         level: int,
         max_bytes_per_s: int | None,
         known: KnownTiles | None,
+        *,
+        max_bytes: int,
     ) -> "FollowedMesh":
         """Nothing, or the ``known`` tiles; arguments as of :meth:`Client.watch_mesh`.
 
@@ -96,7 +104,7 @@ class FollowedMesh:
         minimum, maximum = checks.box(bounds)
         checks.level_of_detail(level)
         rate = checks.bytes_per_second(max_bytes_per_s)
-        empty = cls(minimum, maximum, level, rate, secrets.token_hex(8))
+        empty = cls(minimum, maximum, level, rate, secrets.token_hex(8), max_bytes)
         if known is None:
             return empty
         if not isinstance(known, KnownTiles):
@@ -132,8 +140,16 @@ class FollowedMesh:
             max_bytes_per_s=self.max_bytes_per_s,
         )
 
-    def after(self, reply: TileUpdates, changed: Mapping[TileIndex, MeshTile]) -> "FollowedMesh":
-        """What is known after the reply to :meth:`request`; ``changed`` are its tiles."""
+    def after(self, reply: TileUpdates) -> "FollowedMesh":
+        """What is known after the reply to :meth:`request`.
+
+        Raises:
+            BadReplyError: its parts do not fit together, or it contradicts the reply before.
+            DownloadError: it holds more than may be kept.
+        """
+        self._check_order(reply)
+        kept = sum(tile.nbytes for tile in self.tiles.values())
+        changed = _unpacked(reply, self.max_bytes - kept)
         old = frozenset(self.tiles) if reply.restart else self.stale
         stale = old - changed.keys()
         removed = {(x, y, z) for x, y, z in reply.removed.tolist()}
@@ -152,6 +168,18 @@ class FollowedMesh:
             complete=reply.complete,
         )
 
+    def _check_order(self, reply: TileUpdates) -> None:
+        """Refuse a reply that turns back, or that is of another server and does not say so."""
+        if reply.restart or not self.server:
+            return
+        if reply.server != self.server:
+            raise BadReplyError(f"server {reply.server!r} answers for server {self.server!r}")
+        if reply.revision < self.revision or reply.epoch < self.epoch:
+            raise BadReplyError(
+                f"revision {reply.revision} of epoch {reply.epoch} comes after revision "
+                f"{self.revision} of epoch {self.epoch}"
+            )
+
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""
         tiles = [Mesh(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values()]
@@ -166,24 +194,26 @@ class FollowedMesh:
         )
 
 
-def unpacked(updates: TileUpdates) -> dict[TileIndex, MeshTile]:
-    """The tiles of a reply.
+def _unpacked(updates: TileUpdates, most_bytes: int) -> dict[TileIndex, MeshTile]:
+    """The tiles of a reply, which together take so many bytes of memory at most.
 
     Raises:
         BadReplyError: they are not valid.
+        DownloadError: they take more.
     """
-    if not (math.isfinite(updates.tile_side_m) and updates.tile_side_m > 0):
-        raise BadReplyError(f"tiles of side {updates.tile_side_m}")
-    count = len(updates.tiles)
-    sizes = updates.sizes
-    lengths = {len(updates.versions), len(sizes)}
-    if lengths != {count} or (sizes < 0).any() or int(sizes.sum()) != len(updates.data):
-        raise BadReplyError(f"a reply of {count} tiles has parts of other lengths")
-    ends = np.cumsum(sizes).tolist()
-    tiles = {}
+    if int(updates.sizes.sum()) != len(updates.data):
+        raise BadReplyError(
+            f"tiles of {updates.sizes.sum()} bytes came in {len(updates.data)} bytes"
+        )
+    ends = np.cumsum(updates.sizes).tolist()
+    tiles: dict[TileIndex, MeshTile] = {}
+    left = most_bytes
     for row, (x, y, z) in enumerate(updates.tiles.tolist()):
-        data = updates.data[ends[row] - int(sizes[row]) : ends[row]]
+        data = updates.data[ends[row] - int(updates.sizes[row]) : ends[row]]
         try:
+            left -= decoded_bytes(data)  # before any of it is made
+            if left < 0:
+                raise too_large_error(most_bytes)
             surface = decode_tile(data)
         except WireError as error:
             raise BadReplyError(f"tile {(x, y, z)}: {error}") from error

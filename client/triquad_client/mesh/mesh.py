@@ -17,10 +17,14 @@ from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRe
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
+from triquad_client.errors import DownloadError
 from triquad_client.net.call import NEWEST, Ask, Call, Run, ask, ask_each, offload, retried
 
 if TYPE_CHECKING:
     import trimesh
+
+_TILES_AT_A_TIME = 32
+"""Are fetched before it is asked whether they are too much."""
 
 WELD_M = 1e-4
 """Vertices closer than about this are one."""
@@ -94,14 +98,23 @@ def fetch_tile(index: Sequence[int], level: int) -> Call[Mesh]:
     return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
 
 
-def fetch_mesh(bounds: Bounds | None, level: int) -> Call[Mesh]:
-    """The faces whose centroids lie in the bounds, from one epoch."""
+def fetch_mesh(bounds: Bounds | None, level: int, max_bytes: int) -> Call[Mesh]:
+    """The faces whose centroids lie in the bounds, from one epoch.
+
+    Raises:
+        DownloadError: its tiles take more than ``max_bytes``.
+    """
     box = checks.box(bounds)
 
     def fetch() -> Call[Mesh]:
         listed = yield from fetch_tiles(bounds, level)
         indices = listed.tiles.tolist()
-        tiles = yield from ask_each(indices, lambda index: _ask_tile(index, listed.epoch, level))
+        tiles: list[Tile] = []
+        for start in range(0, len(indices), _TILES_AT_A_TIME):
+            part = indices[start : start + _TILES_AT_A_TIME]
+            tiles += yield from ask_each(part, lambda at: _ask_tile(at, listed.epoch, level))
+            if sum(tile.vertices.nbytes + tile.faces.nbytes for tile in tiles) > max_bytes:
+                raise too_large_error(max_bytes)
 
         def join(_: Run) -> Mesh:
             parts = [Mesh(tile.origin + tile.vertices, tile.faces, tile.epoch) for tile in tiles]
@@ -110,6 +123,14 @@ def fetch_mesh(bounds: Bounds | None, level: int) -> Call[Mesh]:
         return (yield from offload(join))
 
     return (yield from retried("epoch_gone", fetch))
+
+
+def too_large_error(max_bytes: int) -> DownloadError:
+    """The error for a mesh of more bytes."""
+    return DownloadError(
+        f"the mesh takes more than {max_bytes} bytes: ask for a smaller box or a coarser level, or "
+        "connect with a larger max_download_bytes"
+    )
 
 
 def _ask_tile(index: Sequence[int], epoch: int, level: int) -> Ask[Tile]:

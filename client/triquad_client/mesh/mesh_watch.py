@@ -20,7 +20,6 @@ from triquad_client.mesh.followed_mesh import (
     MeshTile,
     MeshUpdate,
     TileIndex,
-    unpacked,
 )
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.call import Ask, Call, ResultT, ask, offload
@@ -95,8 +94,7 @@ class WatchedMesh:
         reply = yield from ask(
             Ask(keys.TILE_UPDATES, request, TileUpdates, background=True, server_wait_s=wait_s)
         )
-        changed = yield from offload(lambda _: unpacked(reply))
-        after = before.after(reply, changed)
+        after = yield from offload(lambda _: before.after(reply))
         with self._changing:
             now = self._followed
             if now is not before:  # by what is known now, the reply may be old
@@ -104,7 +102,7 @@ class WatchedMesh:
             self._followed = after
         removed = tuple(sorted(before.tiles.keys() - after.tiles.keys()))
         return MeshUpdate(
-            changed=tuple(changed),
+            changed=tuple((x, y, z) for x, y, z in reply.tiles.tolist()),
             removed=removed,
             epoch=after.epoch,
             complete=after.complete,

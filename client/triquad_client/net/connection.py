@@ -8,10 +8,12 @@ from typing import Any, TypeAlias
 
 import zenoh
 from triquad_format.errors import FormatError, InvalidInputError, RefusedError, WireError
+from triquad_format.printable import printable
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.endpoints import full_endpoint
 from triquad_format.wire.messages import ErrorReply
+from triquad_format.wire.reply import MAX_COUNT, check_answers
 
 from triquad_client import checks
 from triquad_client.errors import (
@@ -24,7 +26,9 @@ from triquad_client.errors import (
 )
 from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
 
+_HERE = "127.0.0.1"
 _LIVELINESS_TIMEOUT_S = 3.0
+_MAX_REASON = 2_000  # characters of why a request was refused
 
 Receiver: TypeAlias = Any
 """``None``, or a ``zenoh.handlers.Callback[zenoh.Reply]``: the overloads of Zenoh take no union."""
@@ -33,13 +37,16 @@ Receiver: TypeAlias = Any
 class Connection:
     """An open session, bound to one map. Safe for use by several threads."""
 
-    def __init__(self, session: zenoh.Session, map_name: str, timeout_s: float) -> None:
+    def __init__(
+        self, session: zenoh.Session, map_name: str, timeout_s: float, *, max_download_bytes: int
+    ) -> None:
         self._session = session
         # A session that a program forgot is closed before Python ends: Zenoh's threads must not
         # come back into an interpreter that is no longer there.
         self._close = weakref.finalize(self, session.close)
         self.map_name = map_name
         self.timeout_s = timeout_s
+        self.max_download_bytes = max_download_bytes  # of a map file, or the mesh of a box
 
     @property
     def is_closed(self) -> bool:
@@ -83,16 +90,18 @@ class Connection:
         return replies
 
     def read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
-        """The message of a reply.
+        """The message of a reply. Nothing of it is used before all of it was checked.
 
         Raises:
             RefusedError: the server refused.
             RequestTimeoutError: there was no reply in time.
-            BadReplyError: it cannot be decoded.
+            BadReplyError: it cannot be decoded, or is no answer to what was asked.
         """
         try:
             if reply.ok is not None:
-                return codec.decode(ask.kind, reply.ok.payload.to_bytes())
+                answer = codec.decode(ask.kind, reply.ok.payload.to_bytes())
+                check_answers(ask.message, answer)
+                return answer
             payload = b"" if reply.err is None else reply.err.payload.to_bytes()
             if payload == b"Timeout":
                 raise RequestTimeoutError(
@@ -101,7 +110,9 @@ class Connection:
             reason = codec.decode(ErrorReply, payload)
         except WireError as error:
             raise BadReplyError(f"reply on {self._key(ask)}: {error}") from error
-        raise RefusedError(reason.code, reason.message)
+        raise RefusedError(
+            printable(reason.code, _MAX_REASON), printable(reason.message, _MAX_REASON)
+        )
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
         """The error for a request that got no reply, where there are these maps."""
@@ -197,27 +208,33 @@ def closed_error() -> ClosedError:
 
 def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
     """The maps that the replies to :meth:`Connection.look_for_maps` name."""
-    return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok})
+    names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
+    return sorted(filter(keys.is_name, names))
 
 
 def open_connection(
-    endpoint: str, map_name: str, timeout_s: float, config: str | Path | None
+    endpoint: str | None,
+    map_name: str,
+    timeout_s: float,
+    config: str | Path | None,
+    *,
+    max_download_bytes: int,
 ) -> Connection:
     """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
     timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
+    most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
     try:
         keys.check_name("map", map_name)
-        endpoint = full_endpoint(endpoint)
+        session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except FormatError as error:
         raise InvalidInputError(str(error)) from error
-    try:
-        session = zenoh.open(_configuration(endpoint, timeout_s, config))
     except zenoh.ZError as error:
+        where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
         raise ConnectError(
-            f"cannot connect to {endpoint}: {_reason(error)} Start triquad-server there, or check "
-            "the endpoint and its credentials."
+            f"cannot connect {where}: {_reason(error)} Start triquad-server there, or check the "
+            "endpoint and the credentials."
         ) from error
-    connection = Connection(session, map_name, timeout_s)
+    connection = Connection(session, map_name, timeout_s, max_download_bytes=most)
     try:
         available = map_names(connection.look_for_maps())
         if map_name not in available:
@@ -228,7 +245,7 @@ def open_connection(
     return connection
 
 
-def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> zenoh.Config:
+def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | None) -> zenoh.Config:
     if file is not None:
         config = _read_configuration(file)
     else:
@@ -237,7 +254,11 @@ def _configuration(endpoint: str, timeout_s: float, file: str | Path | None) -> 
         config.insert_json5("connect/timeout_ms", "0")  # one attempt, not retries
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("transport/shared_memory/enabled", "false")
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    if endpoint is not None or not json.loads(config.get_json("connect/endpoints")):
+        only_tls = json.loads(config.get_json("transport/link/protocols")) == ["tls"]
+        protocol = "tls" if only_tls else "tcp"
+        full = full_endpoint(_HERE if endpoint is None else endpoint, protocol)
+        config.insert_json5("connect/endpoints", json.dumps([full]))
     config.insert_json5("transport/unicast/open_timeout", str(int(timeout_s * 1000)))
     return config
 

@@ -174,7 +174,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """A stream whose bytes replace the file at ``path``, durably, where nothing is raised.
 
     Raises:
-        OSError: the file cannot be written; the one that was there stays.
+        OSError: the file cannot be written; it is named, and the one that was there stays.
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
@@ -183,8 +183,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and error.filename is None:
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
         raise
     _sync_folder(path.parent)
 

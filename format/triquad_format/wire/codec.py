@@ -266,6 +266,7 @@ def _converted(
     name: str, annotation: Any, value: object, by: Callable[[str, Any, object], object]
 ) -> object:
     """What ``by`` makes of a value that may be ``None``, or of a map's entries; else a scalar."""
+    annotation = _plain(annotation)
     origin = get_origin(annotation)
     if origin in (types.UnionType, typing.Union):
         (inner,) = (arg for arg in get_args(annotation) if arg is not type(None))
@@ -273,7 +274,7 @@ def _converted(
     if origin is dict and isinstance(value, dict):
         key_type, item = get_args(annotation)
         return {
-            _scalar(f"{name} key", key_type, key): by(f"{name}[{key!r}]", item, entry)
+            _scalar(f"{name} key", _plain(key_type), key): by(f"{name}[{key!r}]", item, entry)
             for key, entry in value.items()
         }
     return _scalar(name, annotation, value)
@@ -284,6 +285,11 @@ def _array_spec(annotation: Any) -> ArraySpec | None:
         if isinstance(extra, ArraySpec):
             return extra
     return None
+
+
+def _plain(annotation: Any) -> Any:
+    """The type in an annotation, without what is noted beside it."""
+    return annotation.__origin__ if hasattr(annotation, "__metadata__") else annotation
 
 
 def _scalar(name: str, annotation: Any, value: object) -> Any:

@@ -8,11 +8,12 @@ DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 _FORMS = "use HOST, HOST:PORT or an endpoint of Zenoh such as tcp/robot:7447"
 
 
-def full_endpoint(text: str) -> str:
+def full_endpoint(text: str, protocol: str = "tcp") -> str:
     """The endpoint of Zenoh that ``text`` stands for.
 
-    A host, such as ``robot``, ``192.168.0.7:7448`` or ``[::1]:7447``, is reached by TCP, on port
-    7447 unless it names one. What has a ``/`` is an endpoint already and comes back as it is.
+    A host, such as ``robot``, ``192.168.0.7:7448`` or ``[::1]:7447``, is reached by ``protocol``,
+    on port 7447 unless it names one. What has a ``/`` is an endpoint already and comes back as it
+    is.
 
     Raises:
         FormatError: it is neither.
@@ -26,7 +27,7 @@ def full_endpoint(text: str) -> str:
         raise FormatError(f"endpoint {text!r}: {host!r} is not a host; {_FORMS}")
     if not (port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):
         raise FormatError(f"endpoint {text!r}: {port!r} is not a port from 1 to 65535; {_FORMS}")
-    return f"tcp/{host}:{port}"
+    return f"{protocol}/{host}:{port}"
 
 
 def _host_and_port(text: str) -> tuple[str, str]:

@@ -10,6 +10,9 @@ from triquad_format.wire.codec import PROTOCOL_VERSION, Message
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
+EVERY_MAP = "*"
+"""In place of a map's name in key expressions of all maps."""
+
 SCHEMA_PREFIX = "application/msgpack;triquad."
 
 # Operations on `triquad/<map>/query/...`: they read the map.
@@ -36,9 +39,14 @@ CHECKPOINT = "admin/checkpoint"
 RESET = "admin/reset"
 
 
+def is_name(name: str) -> bool:
+    """Whether a map or source can have this name."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(kind: str, name: str) -> str:
     """``name``, where it can stand in a key."""
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
+    if not isinstance(name, str) or not is_name(name):
         raise FormatError(
             f"{kind} name {name!r} is not allowed: use a text of 1 to 64 letters, digits, "
             "'_', '.', '-', beginning with a letter or digit"
@@ -51,19 +59,29 @@ def operation_key(map_name: str, operation: str) -> str:
     return f"triquad/{check_name('map', map_name)}/{operation}"
 
 
+def all_queries_key(map_name: str) -> str:
+    """Key expression of all operations that read a map."""
+    return f"triquad/{_map_chunk(map_name)}/query/*"
+
+
+def all_admin_key(map_name: str) -> str:
+    """Key expression of all operations that change a map or the disk."""
+    return f"triquad/{_map_chunk(map_name)}/admin/*"
+
+
 def scan_key(map_name: str, source: str) -> str:
     """Key on which a source publishes its scans."""
-    return f"triquad/{check_name('map', map_name)}/scan/{check_name('source', source)}"
+    return f"triquad/{_map_chunk(map_name)}/scan/{check_name('source', source)}"
 
 
 def all_scans_key(map_name: str) -> str:
     """Key expression of the scans of all sources."""
-    return f"triquad/{check_name('map', map_name)}/scan/*"
+    return f"triquad/{_map_chunk(map_name)}/scan/*"
 
 
 def status_key(map_name: str) -> str:
     """Key on which the server publishes its status about once a second."""
-    return f"triquad/{check_name('map', map_name)}/status"
+    return f"triquad/{_map_chunk(map_name)}/status"
 
 
 def alive_key(map_name: str, server: str) -> str:
@@ -74,3 +92,7 @@ def alive_key(map_name: str, server: str) -> str:
 def encoding(message: type[Message]) -> str:
     """Zenoh encoding of a message, such as ``application/msgpack;triquad.SdfRequest.v1``."""
     return f"{SCHEMA_PREFIX}{message.__name__}.v{PROTOCOL_VERSION}"
+
+
+def _map_chunk(map_name: str) -> str:
+    return map_name if map_name == EVERY_MAP else check_name("map", map_name)

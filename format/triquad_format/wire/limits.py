@@ -20,3 +20,12 @@ MAX_SAMPLE_POINTS = 10_000
 
 MAX_KNOWN_TILES = 100_000
 """Mesh tiles that a client may name as known when it asks what changed."""
+
+MAX_CELL_M = 1e3
+"""Side of the cells of a mesh: no server makes them nearly as large."""
+
+MAX_TILE_M = 1e5
+"""Side of a mesh tile."""
+
+MAX_CHUNK_BYTES = 64 * 2**20
+"""Of a map file, in one reply."""

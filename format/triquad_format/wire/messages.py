@@ -11,7 +11,17 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.wire.codec import ArraySpec, Message
+from triquad_format.wire.codec import MAX_MESSAGE_BYTES, ArraySpec, Message
+from triquad_format.wire.limits import MAX_CELL_M, MAX_CHUNK_BYTES, MAX_TILE_M, MIN_LENGTH_M
+from triquad_format.wire.reply import (
+    MAX_COUNT,
+    AskedBy,
+    IndicesOf,
+    RowsOf,
+    SameAsAsked,
+    Text,
+    Within,
+)
 
 Positions = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, 3))]
 Values = Annotated[NDArray[np.float32], ArraySpec("<f4", (None,))]
@@ -21,6 +31,18 @@ Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Integers = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 Faces = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
+
+# What replies hold, within its bounds: triquad_format.wire.reply.
+Count = Annotated[int, Within(0, MAX_COUNT)]
+Epoch = Annotated[int, Within(0, MAX_COUNT)]
+Epochs = Annotated[Integers, Within(0, MAX_COUNT)]
+Duration = Annotated[float, Within(0)]  # seconds
+Length = Annotated[float, Within(0)]  # metres
+Statuses = Annotated[StatusCodes, Within(0, 2)]  # triquad_format.records.status.Status
+FinitePoint = Annotated[Point, Within()]
+FinitePositions = Annotated[Positions, Within()]
+Name = Annotated[str, Text(256)]
+Digest = Annotated[str, Text(64, form="[0-9a-f]{64}")]  # SHA-256
 
 
 @dataclass(frozen=True)
@@ -45,7 +67,8 @@ class Scan(Message):
 class MapReply(Message):
     """What a question about the map is answered with, all of it from one epoch."""
 
-    epoch: int  # number of the published, immutable state of the map that answered
+    # number of the published, immutable state of the map that answered
+    epoch: Annotated[Epoch, SameAsAsked("epoch")]
 
 
 @dataclass(frozen=True)
@@ -62,9 +85,11 @@ class SdfRequest(Message):
 class SdfReply(MapReply):
     """Answer to :class:`SdfRequest`."""
 
-    sdf: Values  # [N] metres, positive in free space; NaN where no region is
-    status: StatusCodes  # [N] triquad_format.records.status.Status
-    gradient: Positions | None  # [N, 3] d(sdf)/dx, map frame
+    # [N] metres, positive in free space; NaN where no region is
+    sdf: Annotated[Values, Within(nan=True), AskedBy("points")]
+    status: Annotated[Statuses, AskedBy("points")]  # [N]
+    # [N, 3] d(sdf)/dx, map frame
+    gradient: Annotated[Positions, Within(nan=True), AskedBy("points")] | None
 
 
 @dataclass(frozen=True)
@@ -81,9 +106,10 @@ class TileListRequest(Message):
 class TileList(MapReply):
     """Answer to :class:`TileListRequest`."""
 
-    tile_side_m: float
+    tile_side_m: Annotated[float, Within(MIN_LENGTH_M, MAX_TILE_M)]
     tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
-    changed: Integers  # [T] the surface of each tile last changed in this epoch
+    # [T] the surface of each tile last changed in this epoch
+    changed: Annotated[Epochs, RowsOf("tiles")]
 
 
 @dataclass(frozen=True)
@@ -101,10 +127,11 @@ class TileRequest(Message):
 class Tile(MapReply):
     """Answer to :class:`TileRequest`."""
 
-    changed: int  # as in TileList
-    origin: Point  # metres, map frame: the tile's minimum corner
-    vertices: Positions  # [V, 3] metres, relative to origin
-    faces: Faces  # [F, 3], counter-clockwise seen from free space
+    changed: Epoch  # as in TileList
+    origin: FinitePoint  # metres, map frame: the tile's minimum corner
+    vertices: FinitePositions  # [V, 3] metres, relative to origin
+    # [F, 3], counter-clockwise seen from free space
+    faces: Annotated[Faces, IndicesOf("vertices")]
 
 
 @dataclass(frozen=True)
@@ -128,16 +155,17 @@ class TileUpdatesRequest(Message):
 class TileUpdates(Message):
     """Answer to :class:`TileUpdatesRequest`."""
 
-    server: str
-    revision: int  # for the next request
-    epoch: int  # the tiles show this epoch, where complete
+    server: Name
+    revision: Count  # for the next request
+    epoch: Epoch  # the tiles show this epoch, where complete
     complete: bool  # nothing more waits
     restart: bool  # the request spoke of another server: what was known of it is void
-    tile_side_m: float
-    cell_m: float
+    tile_side_m: Annotated[float, Within(MIN_LENGTH_M, MAX_TILE_M)]
+    cell_m: Annotated[float, Within(MIN_LENGTH_M, MAX_CELL_M)]
     tiles: TileIndices  # [T, 3] that changed
-    versions: Integers  # [T] epoch of which each is
-    sizes: Integers  # [T] bytes of each
+    versions: Annotated[Epochs, RowsOf("tiles")]  # [T] epoch of which each is
+    # [T] bytes of each
+    sizes: Annotated[Integers, Within(0, MAX_MESSAGE_BYTES), RowsOf("tiles")]
     data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
     removed: TileIndices  # [R, 3] that have no faces any more
 
@@ -151,10 +179,10 @@ class StatusRequest(Message):
 class CheckpointInfo(Message):
     """A checkpoint on the server's disk; also the answer to :class:`CheckpointRequest`."""
 
-    path: str
-    bytes: int
-    epoch: int
-    sha256: str
+    path: Annotated[str, Text(4096)]
+    bytes: Count
+    epoch: Epoch
+    sha256: Digest
     stamp_ns: int
 
 
@@ -162,30 +190,30 @@ class CheckpointInfo(Message):
 class ServerStatus(Message):
     """Answer to :class:`StatusRequest`; also put on ``triquad/<map>/status``."""
 
-    map_name: str
-    server: str  # a name of this server process
-    version: str
-    device: str
-    epoch: int
+    map_name: Name
+    server: Name  # a name of this server process
+    version: Name
+    device: Name
+    epoch: Epoch
     settled: bool  # True: nothing is left to learn from the scans so far
-    scans_taken: int
-    scans_dropped: dict[str, int]  # by reason
-    scans_lost: dict[str, int]  # by source: never arrived, or pushed out of the full queue
-    scans_waiting: int
-    points_dropped: dict[str, int]  # by reason, points and rays of scans that were taken
-    requests_refused: dict[str, int]  # by error code
-    samples_trained: int
-    rays_kept: int  # rays whose lessons are in the replay pools
-    loss: float  # recent training loss, 0 before any training
-    regions: int
-    vertices: int
-    parameters: int
-    memory_bytes: int  # resident memory of the server process
-    uptime_s: float
+    scans_taken: Count
+    scans_dropped: dict[Name, Count]  # by reason
+    scans_lost: dict[Name, Count]  # by source: never arrived, or pushed out of the full queue
+    scans_waiting: Count
+    points_dropped: dict[Name, Count]  # by reason, points and rays of scans that were taken
+    requests_refused: dict[Name, Count]  # by error code
+    samples_trained: Count
+    rays_kept: Count  # rays whose lessons are in the replay pools
+    loss: Annotated[float, Within()]  # recent training loss, 0 before any training
+    regions: Count
+    vertices: Count
+    parameters: Count
+    memory_bytes: Count  # resident memory of the server process
+    uptime_s: Duration
     last_checkpoint: CheckpointInfo | None
     store_error: str | None  # why the map is not durable, None if it is
     warnings: str | None = None  # what goes wrong with scans, and what helps: a line each
-    samples_left: int = 0  # training samples until nothing is left to learn
+    samples_left: Count = 0  # training samples until nothing is left to learn
 
 
 @dataclass(frozen=True)
@@ -202,9 +230,9 @@ class FlushRequest(Message):
 class FlushReply(Message):
     """Answer to :class:`FlushRequest`, with the counts of this source and session."""
 
-    taken: int
-    refused: int
-    lost: int
+    taken: Count
+    refused: Count
+    lost: Count
     last_refusal: str | None
     warnings: str | None = None  # about this source, as in the status
 
@@ -226,8 +254,8 @@ class ResetRequest(Message):
 class ResetReply(Message):
     """Answer to :class:`ResetRequest`: what has happened, and how to go back."""
 
-    epoch: int  # the first without the box's content
-    kept_epoch: int | None = None  # the map as it was stays on disk as this one; None: it does not
+    epoch: Epoch  # the first without the box's content
+    kept_epoch: Epoch | None = None  # the map as it was stays on disk as this; None: it does not
     undo: str | None = None  # how to go back to it, or why one cannot, for people
 
 
@@ -242,10 +270,11 @@ class MapInfoRequest(Message):
 class MapInfo(Message):
     """Answer to :class:`MapInfoRequest`; the file is then fetched in chunks."""
 
-    epoch: int
-    bytes: int
-    sha256: str
-    chunk_bytes: int
+    epoch: Epoch
+    bytes: Count
+    sha256: Digest
+    chunk_bytes: Annotated[int, Within(1, MAX_CHUNK_BYTES)]
+    server: Name = ""  # a name of this server process; empty where it does not tell
 
 
 @dataclass(frozen=True)
@@ -261,8 +290,8 @@ class MapChunkRequest(Message):
 class MapChunk(Message):
     """Answer to :class:`MapChunkRequest`."""
 
-    offset: int
-    data: bytes
+    offset: Annotated[int, SameAsAsked("offset")]
+    data: Annotated[bytes, AskedBy("length")]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.wire.codec import ArraySpec, Message
-from triquad_format.wire.messages import Integers
+from triquad_format.wire.messages import Count, Duration, Epoch, Integers, Name
+from triquad_format.wire.reply import MAX_COUNT, RowsOf, Within
 
 Seconds = Annotated[NDArray[np.float64], ArraySpec("<f8", (None,))]
 
@@ -26,8 +27,9 @@ class MetricsRequest(Message):
 class TimeHistogram(Message):
     """How long things took, as counts in the buckets of ``ServerMetrics.bounds_s``."""
 
-    counts: Integers  # [B + 1] of each bucket; the last one is of what took longer than all bounds
-    sum_s: float
+    # [B + 1] of each bucket; the last one is of what took longer than all bounds
+    counts: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("bounds_s", more=1)]
+    sum_s: Duration
 
     @property
     def count(self) -> int:
@@ -41,10 +43,10 @@ class OperationMetrics(Message):
 
     answers: TimeHistogram  # what was answered: from arrival until the reply was sent
     waits: TimeHistogram  # what was begun with: from arrival until a worker took it
-    refused: dict[str, int]  # by error code
-    pending: int  # that arrived and are not replied to yet
-    received_bytes: int  # of requests
-    sent_bytes: int  # of answers
+    refused: dict[Name, Count]  # by error code
+    pending: Count  # that arrived and are not replied to yet
+    received_bytes: Count  # of requests
+    sent_bytes: Count  # of answers
 
     @property
     def answered(self) -> int:
@@ -56,53 +58,54 @@ class OperationMetrics(Message):
 class QueueMetrics(Message):
     """What waits in a queue now."""
 
-    waiting: int
-    limit: int
+    waiting: Count
+    limit: Count
 
 
 @dataclass(frozen=True)
 class SourceMetrics(Message):
     """The scans of one source, of all its sessions that are remembered."""
 
-    sessions: int
-    taken: int
-    refused: int
-    lost: int  # never arrived, or pushed out of the full queue
-    age_s: float  # since anything was heard of it
+    sessions: Count
+    taken: Count
+    refused: Count
+    lost: Count  # never arrived, or pushed out of the full queue
+    age_s: Duration  # since anything was heard of it
 
 
 @dataclass(frozen=True)
 class CheckpointMetrics(Message):
     """Checkpoints since the server started."""
 
-    written: int
-    failed: int
-    last_duration_s: float | None  # None before any was written
-    age_s: float | None  # since the last one was written, by this server
+    written: Count
+    failed: Count
+    last_duration_s: Duration | None  # None before any was written
+    age_s: Duration | None  # since the last one was written, by this server
 
 
 @dataclass(frozen=True)
 class ServerMetrics(Message):
     """Answer to :class:`MetricsRequest`."""
 
-    server: str  # a name of this server process: all counts begin anew with it
-    uptime_s: float
+    server: Name  # a name of this server process: all counts begin anew with it
+    uptime_s: Duration
     problem: str | None  # why the server does not do what it should; None: it does
-    epoch: int
-    epoch_age_s: float  # since the newest epoch was published
-    epochs_kept: int  # that can be asked for by number, pinned ones included
-    epochs_pinned: int  # older ones that stay because they were asked for by number
-    bounds_s: Seconds  # [B] upper bounds of the buckets of all histograms, increasing
-    operations: dict[str, OperationMetrics]  # by name, such as "query/sdf"
-    queues: dict[str, QueueMetrics]
-    sources: dict[str, SourceMetrics]  # by name; "*" is of those there are too many of
-    scans_received: int
-    scan_bytes_received: int
-    memory_bytes: dict[str, int]  # by part
-    resident_bytes: int  # memory of the whole process
-    mapper_s: dict[str, float]  # how the mapper's thread spent its time, by activity
+    epoch: Epoch
+    epoch_age_s: Duration  # since the newest epoch was published
+    epochs_kept: Count  # that can be asked for by number, pinned ones included
+    epochs_pinned: Count  # older ones that stay because they were asked for by number
+    # [B] upper bounds of the buckets of all histograms, increasing
+    bounds_s: Annotated[Seconds, Within(0)]
+    operations: dict[Name, OperationMetrics]  # by name, such as "query/sdf"
+    queues: dict[Name, QueueMetrics]
+    sources: dict[Name, SourceMetrics]  # by name; "*" is of those there are too many of
+    scans_received: Count
+    scan_bytes_received: Count
+    memory_bytes: dict[Name, Count]  # by part
+    resident_bytes: Count  # memory of the whole process
+    mapper_s: dict[Name, Duration]  # how the mapper's thread spent its time, by activity
     checkpoints: CheckpointMetrics
-    sessions: dict[str, str]  # Zenoh sessions that are connected, by id: client, peer or router
+    sessions: dict[Name, Name]  # Zenoh sessions that are connected, by id: client, peer or router
 
     def answer_time_s(
         self, operation: str, quantile: float, since: "ServerMetrics | None" = None

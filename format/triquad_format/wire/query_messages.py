@@ -11,14 +11,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.wire.codec import ArraySpec, Message
+from triquad_format.wire.limits import MAX_RANGE_M
 from triquad_format.wire.messages import (
+    Count,
+    Epoch,
+    Epochs,
+    FinitePositions,
     Integers,
+    Length,
     MapReply,
+    Name,
     Point,
     Pose,
     Positions,
-    StatusCodes,
+    Statuses,
     Values,
+)
+from triquad_format.wire.reply import (
+    MAX_COUNT,
+    AskedBy,
+    RigidPose,
+    RowsOf,
+    SameAsAsked,
+    ShapeAskedBy,
+    Within,
 )
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
@@ -27,6 +43,12 @@ StatusVolume = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None, None, None))
 Counts = Annotated[NDArray[np.int32], ArraySpec("<i4", (3,))]
 Corners = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3))]
 Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
+
+UnitVectors = Annotated[Positions, Within(-1.001, 1.001)]  # or zero
+Shares = Annotated[Values, Within(0, 1)]
+TruthValues = Annotated[Flags, Within(0, 1)]
+FiniteCorners = Annotated[Corners, Within()]
+PlacesAlong = Annotated[Values, Within(0, 1.001 * MAX_RANGE_M), AskedBy("starts")]
 
 
 @dataclass(frozen=True)
@@ -45,14 +67,20 @@ class DistanceRequest(Message):
 class DistanceReply(MapReply):
     """Answer to :class:`DistanceRequest`."""
 
-    distance_m: Values  # [N] metres, negative behind a surface; at most max_distance_m
-    gradient: Positions  # [N, 3] its unit gradient, map frame; zero where nothing was found
-    found: Flags  # [N] whether there is a surface within max_distance_m
-    status: StatusCodes  # [N] of the points themselves
-    confidence: Values  # [N] in [0, 1]
-    surface_point: Positions | None  # [N, 3] relative to origin; the point where nothing was found
-    unknown_distance_m: Values | None  # [N] metres, at most max_distance_m
-    unknown_point: Positions | None  # [N, 3] relative to origin; the point where there is none
+    # [N] metres, negative behind a surface; at most max_distance_m
+    distance_m: Annotated[Values, Within("-max_distance_m", "max_distance_m"), AskedBy("points")]
+    # [N, 3] its unit gradient, map frame; zero where nothing was found
+    gradient: Annotated[UnitVectors, AskedBy("points")]
+    # [N] whether there is a surface within max_distance_m
+    found: Annotated[TruthValues, AskedBy("points")]
+    status: Annotated[Statuses, AskedBy("points")]  # [N] of the points themselves
+    confidence: Annotated[Shares, AskedBy("points")]  # [N] in [0, 1]
+    # [N, 3] relative to origin; the point where nothing was found
+    surface_point: Annotated[FinitePositions, AskedBy("points")] | None
+    # [N] metres, at most max_distance_m
+    unknown_distance_m: Annotated[Values, Within(0, "max_distance_m"), AskedBy("points")] | None
+    # [N, 3] relative to origin; the point where there is none
+    unknown_point: Annotated[FinitePositions, AskedBy("points")] | None
 
 
 @dataclass(frozen=True)
@@ -69,7 +97,7 @@ class SpheresRequest(Message):
 class SpheresReply(MapReply):
     """Answer to :class:`SpheresRequest`."""
 
-    status: StatusCodes  # [N]
+    status: Annotated[Statuses, AskedBy("centres")]  # [N]
 
 
 @dataclass(frozen=True)
@@ -88,13 +116,15 @@ class SegmentsRequest(Message):
 class SegmentsReply(MapReply):
     """Answer to :class:`SegmentsRequest`; places are metres along the segment."""
 
-    length_m: Values  # [N]
-    blocked: Flags  # [N] the ball touches a seen surface
-    contact_m: Values  # [N] where it first does; the length where it does not
-    clearance_m: Values  # [N] least distance of the centre to a surface, up to the contact
-    clearance_at_m: Values  # [N] where
-    meets_unknown: Flags  # [N] the ball enters unknown space, before any contact
-    unknown_contact_m: Values  # [N] where it first does; the length where it does not
+    length_m: PlacesAlong  # [N]
+    blocked: Annotated[TruthValues, AskedBy("starts")]  # [N] the ball touches a seen surface
+    contact_m: PlacesAlong  # [N] where it first does; the length where it does not
+    # [N] least distance of the centre to a surface, up to the contact
+    clearance_m: Annotated[Values, Within("-max_distance_m", "max_distance_m"), AskedBy("starts")]
+    clearance_at_m: PlacesAlong  # [N] where
+    # [N] the ball enters unknown space, before any contact
+    meets_unknown: Annotated[TruthValues, AskedBy("starts")]
+    unknown_contact_m: PlacesAlong  # [N] where it first does; the length where it does not
 
 
 @dataclass(frozen=True)
@@ -113,8 +143,9 @@ class RaysRequest(Message):
 class RaysReply(MapReply):
     """Answer to :class:`RaysRequest`."""
 
-    range_m: Values  # [N] metres
-    status: StatusCodes  # [N] what it ends at: surface, unknown space, or the largest range (free)
+    range_m: Annotated[Values, Within(0, "max_range_m"), AskedBy("starts")]  # [N] metres
+    # [N] what it ends at: surface, unknown space, or the largest range (free)
+    status: Annotated[Statuses, AskedBy("starts")]
 
 
 @dataclass(frozen=True)
@@ -131,10 +162,13 @@ class GroundRequest(Message):
 class GroundReply(MapReply):
     """Answer to :class:`GroundRequest`."""
 
-    status: StatusCodes  # [N] surface: there is ground; free: there is none; else unknown
-    drop_m: Values  # [N] metres down to the ground; else as far as all was seen to be free
-    normal: Positions  # [N, 3] of the ground, unit vectors, map frame; zero where there is none
-    confidence: Values  # [N] in [0, 1]; 0 where there is no ground
+    # [N] surface: there is ground; free: there is none; else unknown
+    status: Annotated[Statuses, AskedBy("points")]
+    # [N] metres down to the ground; else as far as all was seen to be free
+    drop_m: Annotated[Values, Within("-max_drop_m", "max_drop_m"), AskedBy("points")]
+    # [N, 3] of the ground, unit vectors, map frame; zero where there is none
+    normal: Annotated[UnitVectors, AskedBy("points")]
+    confidence: Annotated[Shares, AskedBy("points")]  # [N] in [0, 1]; 0 where there is no ground
 
 
 @dataclass(frozen=True)
@@ -152,8 +186,11 @@ class GridRequest(Message):
 class GridReply(MapReply):
     """Answer to :class:`GridRequest`."""
 
-    distance_m: Volume  # [x, y, z] metres, as in DistanceReply
-    status: StatusVolume  # [x, y, z]
+    # [x, y, z] metres, as in DistanceReply
+    distance_m: Annotated[
+        Volume, Within("-max_distance_m", "max_distance_m"), ShapeAskedBy("counts")
+    ]
+    status: Annotated[StatusVolume, Within(0, 2), ShapeAskedBy("counts")]  # [x, y, z]
 
 
 @dataclass(frozen=True)
@@ -171,13 +208,14 @@ class AlignRequest(Message):
 class AlignReply(MapReply):
     """Answer to :class:`AlignRequest`."""
 
-    world_from_sensor: Pose
-    covariance: Covariance  # of translation (metres) and rotation vector (radians), map frame
-    inlier_share: float
-    rms_m: float  # of the inliers' distances
+    world_from_sensor: Annotated[Pose, RigidPose()]
+    # of translation (metres) and rotation vector (radians), map frame
+    covariance: Annotated[Covariance, Within()]
+    inlier_share: Annotated[float, Within(0, 1)]
+    rms_m: Length  # of the inliers' distances
     converged: bool
-    iterations: int
-    points: int  # that were used
+    iterations: Annotated[int, Within(0, "max_iterations")]
+    points: Count  # that were used
 
 
 @dataclass(frozen=True)
@@ -194,10 +232,12 @@ class ChangesRequest(Message):
 class ChangesReply(MapReply):
     """Answer to :class:`ChangesRequest`: boxes around voxels that changed."""
 
-    server: str
-    since: int
-    minimum: Corners  # [N, 3] metres, map frame
-    maximum: Corners  # [N, 3]
-    appeared: Flags  # [N] 1: surface appeared, 0: it vanished
-    epochs: Integers  # [N] of the newest change in each
-    voxels: Integers  # [N] that changed in each
+    server: Name
+    since: Annotated[Epoch, SameAsAsked("since")]
+    minimum: FiniteCorners  # [N, 3] metres, map frame
+    maximum: Annotated[FiniteCorners, RowsOf("minimum")]  # [N, 3]
+    # [N] 1: surface appeared, 0: it vanished
+    appeared: Annotated[TruthValues, RowsOf("minimum")]
+    epochs: Annotated[Epochs, RowsOf("minimum")]  # [N] of the newest change in each
+    # [N] that changed in each
+    voxels: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("minimum")]

@@ -1,10 +1,12 @@
 """The wire messages about sources of scans; see :mod:`triquad_format.wire.messages`."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from triquad_format.wire.codec import Message
-from triquad_format.wire.messages import Integers, Pose, Positions
-from triquad_format.wire.query_messages import Corners
+from triquad_format.wire.messages import Count, FinitePositions, Integers, Name, Pose
+from triquad_format.wire.query_messages import FiniteCorners
+from triquad_format.wire.reply import MAX_COUNT, AtMostAsked, RigidPose, RowsOf, Within
 
 
 @dataclass(frozen=True)
@@ -21,19 +23,21 @@ class ScanSample(Message):
     """Some of the points of a scan that is in the map."""
 
     stamp_ns: int  # nanoseconds since 1970, as its publisher said
-    world_from_sensor: Pose
-    points: Positions  # [N, 3] metres, map frame, relative to the sensor's position
-    points_used: int  # of the scan, by the map: N or more
+    world_from_sensor: Annotated[Pose, RigidPose()]
+    # [N, 3] metres, map frame, relative to the sensor's position
+    points: Annotated[FinitePositions, AtMostAsked("max_points")]
+    points_used: Count  # of the scan, by the map: N or more
 
 
 @dataclass(frozen=True)
 class SourceState(Message):
     """What is new of one source of scans."""
 
-    scans: int  # that were taken into the map since the server heard of the source
+    scans: Count  # that were taken into the map since the server heard of the source
     whole: bool  # what was told of this source before is void
-    trail: Corners  # [N, 3] metres, map frame: positions of the sensor, oldest first
-    pieces: Integers  # [N] the piece of the trail each is part of: rises where the sensor jumped
+    trail: FiniteCorners  # [N, 3] metres, map frame: positions of the sensor, oldest first
+    # [N] the piece of the trail each is part of: rises where the sensor jumped
+    pieces: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("trail")]
     newest: ScanSample | None  # where it is new
 
 
@@ -41,6 +45,6 @@ class SourceState(Message):
 class SourcesReply(Message):
     """Answer to :class:`SourcesRequest`: all sources that there are, by name."""
 
-    server: str
-    revision: int  # for the next request
-    sources: dict[str, SourceState]
+    server: Name
+    revision: Count  # for the next request
+    sources: dict[Name, SourceState]

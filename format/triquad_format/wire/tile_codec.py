@@ -58,17 +58,22 @@ def encode_tile(surface: TileSurface) -> bytes:
     return header + zstandard.ZstdCompressor(level=_LEVEL).compress(body)
 
 
+def decoded_bytes(data: bytes) -> int:
+    """Bytes that a tile's positions and faces will take, from its header alone.
+
+    Raises:
+        WireError: these are not the bytes of a tile.
+    """
+    return sum(_counts(data)) * 12
+
+
 def decode_tile(data: bytes) -> TileSurface:
     """The inverse of :func:`encode_tile`.
 
     Raises:
         WireError: these are not the bytes of a tile.
     """
-    if len(data) < _HEADER.size:
-        raise WireError(f"a tile of {len(data)} bytes has no header")
-    vertices, faces = _HEADER.unpack_from(data)
-    if max(vertices, faces) > _MAX_COUNT:
-        raise WireError(f"a tile of {vertices} vertices and {faces} faces is too large")
+    vertices, faces = _counts(data)
     size = vertices * _VERTEX_BYTES + faces * 12
     body = np.frombuffer(_decompressed(data[_HEADER.size :], size), np.uint8)
     planes, rest = np.split(body, [vertices * 6])
@@ -86,6 +91,16 @@ def decode_tile(data: bytes) -> TileSurface:
     ):
         raise WireError("a tile's vertices and faces do not fit together")
     return TileSurface(points, axes, steps, faces=flat.astype(np.int32).reshape(-1, 3))
+
+
+def _counts(data: bytes) -> tuple[int, int]:
+    """Vertices and faces, as the header has them."""
+    if len(data) < _HEADER.size:
+        raise WireError(f"a tile of {len(data)} bytes has no header")
+    vertices, faces = _HEADER.unpack_from(data)
+    if max(vertices, faces) > _MAX_COUNT:
+        raise WireError(f"a tile of {vertices} vertices and {faces} faces is too large")
+    return vertices, faces
 
 
 def _decompressed(data: bytes, size: int) -> bytes:

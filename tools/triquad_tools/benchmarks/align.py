@@ -1,6 +1,5 @@
 """``triquad-bench`` of localisation: unseen scans are put back where they were taken."""
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
+from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.folders.kitti import read_kitti_folder
 
@@ -102,7 +102,7 @@ def check_recorded(part: str, folder: Path | None) -> None:
         ToolError: it cannot be read.
     """
     if folder is None:
-        print(f"{part}: recorded scans are left out: give --recorded FOLDER", file=sys.stderr)
+        print_remark(f"{part}: recorded scans are left out: give --recorded FOLDER")
     else:
         read_kitti_folder(folder)
 

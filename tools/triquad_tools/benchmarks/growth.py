@@ -16,6 +16,7 @@ from triquad_server.memory import resident_bytes
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.figures import Figure, seconds
+from triquad_tools.console.lines import print_line
 from triquad_tools.simulation.street import street_drive
 
 _REGIONS = 16
@@ -69,4 +70,4 @@ def measure_growth(seed: int) -> list[Figure]:
 
 
 if __name__ == "__main__":
-    print(json.dumps([asdict(figure) for figure in measure_growth(int(sys.argv[1]))]))
+    print_line(json.dumps([asdict(figure) for figure in measure_growth(int(sys.argv[1]))]))

@@ -19,6 +19,7 @@ from triquad_client import connect
 
 from triquad_tools.benchmarks.browser import opened_page, running_browser, wait_until_drawn
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.lines import print_line
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
 
@@ -96,7 +97,7 @@ def main() -> None:
                     os.kill(process, _SIGNALS[command.strip()])
             elif command.strip() == "close":
                 shown.close()
-            print(time.monotonic() - started, flush=True)
+            print_line(str(time.monotonic() - started))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from triquad_client import connect
 from triquad_tools.console.arguments import add_version, count, port, seed
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, run
 from triquad_tools.console.interrupts import sigterm_interrupts
+from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo import steps
 from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
@@ -62,8 +63,8 @@ def _demo(options: argparse.Namespace) -> int:
 def _report(out: Path, results: DemoResults) -> int:
     print_rows(f"Street {results.seed}, {results.intake.scans} scans", table_rows(results))
     files = "map.triquad, street.glb, street.ply, street.png, results.json, server.log"
-    print(f"In {out}: {files}")
-    print(
+    print_line(f"In {out}: {files}")
+    print_line(
         f"To look at the map in a browser: {_beside_python('triquad-view')} {out / 'map.triquad'}"
     )
     broken = broken_promises(results)
@@ -148,7 +149,7 @@ class _Laps:
 
 
 def _say(message: str) -> None:
-    print(message, file=sys.stderr, flush=True)
+    print_remark(message)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -19,6 +19,7 @@ from triquad_tools.console.arguments import (
     seed,
 )
 from triquad_tools.console.command import OK, ToolError, run
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import Row, json_text, print_rows
 from triquad_tools.evaluation.map_scores import (
@@ -64,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _evaluate(options: argparse.Namespace) -> int:
     results: Results = options.evaluate(options)
     if options.json:
-        print(json_text(results))
+        print_line(json_text(results))
         return OK
     for name, scores in results.items():
         title, rows = _TABLES[name]

@@ -12,6 +12,7 @@ from triquad_format.mapfile.reader import MapFile
 
 from triquad_tools.console.arguments import add_version, count, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
 from triquad_tools.mapfiles.checks import FailedCheckError, verify
@@ -157,7 +158,7 @@ def _show(options: argparse.Namespace) -> int:
 
         draw_map(_title(name, file), file, options.plot)
     if options.json:
-        print(json_text(summary))
+        print_line(json_text(summary))
     else:
         print_summary(name, summary)
     return OK
@@ -182,7 +183,7 @@ def _log(options: argparse.Namespace) -> int:
         raise ToolError(f"{path} is a file: --log lists the checkpoints in a folder")
     log = read_log(path)
     if options.json:
-        print(json_text(log))
+        print_line(json_text(log))
     else:
         print_log(log)
     if log.damaged:
@@ -211,9 +212,9 @@ def _diff(options: argparse.Namespace) -> int:
 
         draw_diff("\n".join(titles), comparison, objects, path=options.plot)
     if options.json:
-        print(json_text({**vars(diff), "objects": objects}))
+        print_line(json_text({**vars(diff), "objects": objects}))
     else:
-        print("\n".join(titles))
+        print_line("\n".join(titles))
         print_diff(diff, options.limit or _ROWS)
         print_objects(objects, options.limit or _ROWS)
     return OK

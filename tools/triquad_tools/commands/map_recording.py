@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
@@ -19,6 +18,7 @@ from triquad_server.threads import Teams
 
 from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, ToolError, run
+from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.mapping.mapping_run import MappingRun, resumed_mapper, stop_requests
 from triquad_tools.mapping.output import SUFFIXES, write_output
@@ -51,7 +51,7 @@ def _map(options: argparse.Namespace) -> int:
         _prepare(settings, device, teams, stop=stop.is_set)
         at = unfinished.position()
         if at.scans_taken:
-            print(f"going on after scan {at.scans_taken}, from {unfinished.folder}")
+            print_line(f"going on after scan {at.scans_taken}, from {unfinished.folder}")
         mapper = resumed_mapper(at.record, settings, device, teams=teams)
         warnings = ScanWarnings(ScanQueue(1), settings)
         mapping = MappingRun(mapper, unfinished, warnings, stop=stop.is_set)
@@ -70,7 +70,7 @@ def _map(options: argparse.Namespace) -> int:
                 "command writes it once there is room"
             ) from error
     unfinished.remove()
-    print(f"{output}: {written}")
+    print_line(f"{output}: {written}")
     return OK
 
 
@@ -103,7 +103,7 @@ def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> 
         told += f"; the last: {mapping.last_refusal}"
         if not mapper.regions:
             raise ToolError(f"nothing was mapped: {told}")
-        print(f"{_COMMAND}: {told}", file=sys.stderr)
+        print_remark(f"{_COMMAND}: {told}")
 
 
 def _check_output(path: Path, force: bool) -> None:

@@ -15,6 +15,7 @@ from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 
 from triquad_tools.console.arguments import add_version, error_limit, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
+from triquad_tools.console.lines import print_line
 from triquad_tools.mapfiles.grid import export_grid
 from triquad_tools.mapfiles.packing import chosen_precision, pack_map
 from triquad_tools.mapfiles.source import (
@@ -107,7 +108,7 @@ def _pack(options: argparse.Namespace) -> int:
     _check_target(path, options.output, options.force)
     if path != options.input:
         checkpoint = checkpoint_file(path)
-        print(f"epoch {checkpoint and checkpoint.epoch}, from {path}")
+        print_line(f"epoch {checkpoint and checkpoint.epoch}, from {path}")
         if options.at is None:
             _tell_set_aside(path)
     write = _pack_map if options.output.suffix == _MAP else _export
@@ -120,7 +121,9 @@ def _pack(options: argparse.Namespace) -> int:
 def _tell_set_aside(path: Path) -> None:
     """Name the newer checkpoints beside the newest valid one, which were damaged."""
     for newer in (aside for aside in set_aside(path.parent) if aside.name > path.name):
-        print(f"{_COMMAND}: {newer} is newer, but damaged: --recover saves what is intact of it")
+        print_line(
+            f"{_COMMAND}: {newer} is newer, but damaged: --recover saves what is intact of it"
+        )
 
 
 def _check_usage(options: argparse.Namespace) -> None:
@@ -165,7 +168,7 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
     training = not options.no_training and precision.max_error_m is None
     source, complete = _source(options, path, box=_box(options.crop), training=training)
     written = pack_map(source, precision, options.output, bytes_before=path.stat().st_size)
-    print(f"{options.output}: {written}")
+    print_line(f"{options.output}: {written}")
     return OK if complete else FAILED
 
 
@@ -187,7 +190,7 @@ def _export(options: argparse.Namespace, path: Path) -> int:
         from triquad_tools.mapfiles.meshfile import export_mesh  # slow to import
 
         written = export_mesh(source.record, box, options.cell, path=output)
-    print(f"{output}: {written}")
+    print_line(f"{output}: {written}")
     return OK if complete else FAILED
 
 
@@ -210,16 +213,16 @@ def _source(
 def _print_recovery(recovery: RecoveredMap) -> None:
     """Print a line for each loss, and how much was saved."""
     for loss in recovery.losses:
-        print(f"lost: {_what(loss)}{_where(loss)}")
+        print_line(f"lost: {_what(loss)}{_where(loss)}")
     if recovery.parts_listed is None:
         saved = f"saved {recovery.parts_intact} parts"
-        print(f"{saved}; the list of parts is lost: there may have been more")
+        print_line(f"{saved}; the list of parts is lost: there may have been more")
     elif recovery.complete:
-        print(f"saved all {recovery.parts_listed} parts: nothing is lost")
+        print_line(f"saved all {recovery.parts_listed} parts: nothing is lost")
     else:
-        print(f"saved {recovery.parts_intact} of {recovery.parts_listed} parts")
+        print_line(f"saved {recovery.parts_intact} of {recovery.parts_listed} parts")
     if not recovery.record.has_evidence:
-        print("no evidence is left: the map gives distances, but says UNKNOWN everywhere")
+        print_line("no evidence is left: the map gives distances, but says UNKNOWN everywhere")
 
 
 def _what(loss: Loss) -> str:

@@ -13,6 +13,7 @@ from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import Speed, progress
 from triquad_tools.recordings.arguments import add_recording, flags_of, options_of
 from triquad_tools.recordings.listing import print_contents
@@ -79,11 +80,11 @@ def _replay(options: argparse.Namespace) -> int:
     selection = open_selected(options)
     with connect(options.connect, options.map) as client:
         report = _publish_all(client, selection, options)
-        print(_summary(report))
+        print_line(_summary(report))
         if options.settle:
             status = wait_until_settled(client)
             trained = f"{status.samples_trained / 1e6:.1f} M samples trained"
-            print(f"settled: epoch {status.epoch}, {trained}")
+            print_line(f"settled: epoch {status.epoch}, {trained}")
     return OK if report.complete else FAILED
 
 

@@ -12,6 +12,7 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import OK, run
 from triquad_tools.console.interrupts import sigterm_interrupts
+from triquad_tools.console.lines import print_line
 from triquad_tools.top.page import Page
 from triquad_tools.top.report import json_line
 from triquad_tools.top.screen import is_screen, print_page, show
@@ -37,7 +38,7 @@ def _top(options: argparse.Namespace) -> int:
         elif options.json:
             while True:
                 time.sleep(watch.due_in_s)
-                print(json_line(target, watch.observe_again()), flush=True)
+                print_line(json_line(target, watch.observe_again()))
         else:
             show(target, watch)
     return OK
@@ -49,7 +50,7 @@ def _observe_once(target: Target, watch: Watch, options: argparse.Namespace) -> 
     time.sleep(watch.due_in_s)
     seen = watch.observe()
     if options.json:
-        print(json_line(target, seen))
+        print_line(json_line(target, seen))
     else:
         print_page(Page(target, seen))
 

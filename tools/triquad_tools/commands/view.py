@@ -12,6 +12,7 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 from triquad_tools.console.arguments import add_version, port
 from triquad_tools.console.command import OK, complain, refuse, run
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.viewer.sources.file_source import FileSource
 from triquad_tools.viewer.sources.history import History
@@ -33,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _view(options: argparse.Namespace) -> int:
     _check_usage(options)
     with _shown(options) as shown, closing(Viewer(shown, options.host, options.port)) as viewer:
-        print(f"open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
+        print_line(f"open {viewer.url} in a browser; Ctrl-C ends it")
         threading.Event().wait()
     return OK
 
@@ -75,7 +76,7 @@ def _store(path: Path, maps: OpenMaps) -> History:
     for problem in history.damaged:
         complain(_COMMAND, problem, OK)
     moments = history.moments
-    print(f"{len(moments)} checkpoints: {moments[0]} to {moments[-1]}")
+    print_line(f"{len(moments)} checkpoints: {moments[0]} to {moments[-1]}")
     return history
 
 

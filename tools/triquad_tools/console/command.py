@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from triquad_format.errors import FormatError, TriquadError
 
 from triquad_tools.console.interrupts import no_interrupt_lost
-from triquad_tools.console.printable import printable
+from triquad_tools.console.lines import print_remark
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED, NOBODY_READS = 130, 141
@@ -69,8 +69,7 @@ def _in_words(error: OSError) -> str:
 
 def complain(command: str, message: object, status: int) -> int:
     """Print a line on standard error; returns ``status``."""
-    text = "\n".join(map(printable, str(message).splitlines()))
-    print(f"{command}: {text}", file=sys.stderr, flush=True)
+    print_remark(f"{command}: {message}")
     return status
 
 

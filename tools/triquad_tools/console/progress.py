@@ -6,6 +6,10 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
+from triquad_format.printable import printable
+
+from triquad_tools.console.lines import print_remark
+
 Report = Callable[[float, str], None]
 """Takes how much is done, in the units of the total, and a note."""
 
@@ -40,16 +44,16 @@ def _bar(title: str, total: float | None) -> Iterator[Report]:
 
     columns = (
         SpinnerColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True)) as bars:
-        task = bars.add_task(title, total=total, note="")
+        task = bars.add_task(printable(title), total=total, note="")
 
         def report(done: float, note: str) -> None:
-            bars.update(task, completed=done, note=note)
+            bars.update(task, completed=done, note=printable(note))
 
         yield report
         if total is None:
@@ -61,7 +65,7 @@ def _lines(title: str, total: float | None) -> Iterator[Report]:
     started = time.monotonic()
     next_line = started + _LINE_PERIOD_S
     latest = ""
-    print(f"{title} ...", file=sys.stderr, flush=True)
+    print_remark(f"{title} ...")
 
     def report(done: float, note: str) -> None:
         nonlocal next_line, latest
@@ -69,8 +73,8 @@ def _lines(title: str, total: float | None) -> Iterator[Report]:
         latest = f"{share}{note}".strip()
         if time.monotonic() >= next_line:
             next_line = time.monotonic() + _LINE_PERIOD_S
-            print(f"  {title}: {latest}", file=sys.stderr, flush=True)
+            print_remark(f"  {title}: {latest}")
 
     yield report
     end = f"  {title}: done in {time.monotonic() - started:.1f} s"
-    print(f"{end}, {latest}" if latest else end, file=sys.stderr, flush=True)
+    print_remark(f"{end}, {latest}" if latest else end)

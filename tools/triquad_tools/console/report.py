@@ -12,9 +12,13 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from triquad_format.printable import printable
+
+from triquad_tools.console.lines import print_line
 
 _GAP = 2  # spaces before each column
 _PIPE_WIDTH = 10_000  # characters: nothing is broken where a program reads
+_CELL_WIDTH = 2_000  # of a text that somebody else chose
 
 
 @dataclass(frozen=True)
@@ -33,8 +37,8 @@ def print_rows(title: str, rows: Sequence[Row], align: Literal["left", "right"] 
     table.add_column(justify=align)
     table.add_column()
     for row in rows:
-        table.add_row(row.name, row.value, row.note)
-    print(title)
+        table.add_row(*_cells([row.name, row.value, row.note]))
+    print_line(printable(title, _CELL_WIDTH))
     _print(table)
 
 
@@ -46,6 +50,7 @@ def print_columns(
 
     Where the terminal is too narrow, titles are broken, but no cell is.
     """
+    rows = [_cells(row) for row in rows]
     table = _table(show_header=True)
     columns = list(zip(titles, *rows, strict=True))
     narrow = sum(_GAP + max(map(len, column)) for column in columns) > _console().width
@@ -57,6 +62,11 @@ def print_columns(
     for row in rows:
         table.add_row(*row)
     _print(table)
+
+
+def _cells(texts: Sequence[str]) -> list[str]:
+    """Texts that each stay in their cell, whatever is in them."""
+    return [printable(text, _CELL_WIDTH) for text in texts]
 
 
 def _table(show_header: bool = False) -> Table:
@@ -78,7 +88,7 @@ def _print(table: Table) -> None:
     with console.capture() as captured:
         console.print(table)
     for line in captured.get().splitlines():
-        print(line.rstrip())
+        print_line(line.rstrip())
 
 
 def json_text(value: object, indent: int | None = 2) -> str:

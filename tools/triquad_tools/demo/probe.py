@@ -20,6 +20,7 @@ from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.lines import print_line
 
 PERIOD_S = 0.05
 _STOP_TIMEOUT_S = 60.0
@@ -135,7 +136,7 @@ def main(argv: Sequence[str]) -> int:
     threading.Thread(target=wait_for_end, daemon=True).start()
     with connect(endpoint, map_name) as client:
         report = ask_until(stop, client, points, question=question)
-    print(json.dumps(asdict(report)))
+    print_line(json.dumps(asdict(report)))
     return 0
 
 

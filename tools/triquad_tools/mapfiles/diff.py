@@ -11,6 +11,7 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.cells import rows_by_cell
 from triquad_format.records.status import Status
 
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 
 if TYPE_CHECKING:  # slow to import
@@ -139,7 +140,7 @@ def surface_points(opened: "OfflineMap") -> Doubles:
 def print_diff(diff: MapDiff, limit: int) -> None:
     """Print the totals, and a table of the ``limit`` tiles that changed most."""
     if not diff.tiles:
-        print(f"  no difference at {diff.total.points_a:,} surface points")
+        print_line(f"  no difference at {diff.total.points_a:,} surface points")
         return
     titles = ("from x m", "y m", "z m", "points A", "in B", "appeared %", "newly seen %",
               "vanished %", "no longer known %", "moved cm", "95 % cm")  # fmt: skip
@@ -149,7 +150,7 @@ def print_diff(diff: MapDiff, limit: int) -> None:
     print_columns(titles, [*rows, ("all", "", "", *_cells(diff.total))])
     left = len(diff.tiles) - len(rows)
     if left > 0:
-        print(f"  and {left} more: --limit {len(diff.tiles)} shows all")
+        print_line(f"  and {left} more: --limit {len(diff.tiles)} shows all")
 
 
 def _sighting(of: "OfflineMap", by: "OfflineMap") -> Sighting:

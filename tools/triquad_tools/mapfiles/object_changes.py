@@ -9,6 +9,7 @@ from triquad_format.records.cells import rows_by_cell
 from triquad_format.records.status import Status
 from triquad_map.clusters import clusters
 
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 from triquad_tools.mapfiles.diff import Comparison, Sighting
 
@@ -117,11 +118,11 @@ def print_objects(changes: ObjectChanges, limit: int) -> None:
                   "moved m", "by x m", "y m", "z m")  # fmt: skip
         print_columns(titles, rows[:limit])
     else:
-        print("  nothing appeared, vanished or moved as a whole")
+        print_line("  nothing appeared, vanished or moved as a whole")
     if len(rows) > limit:
-        print(f"  and {len(rows) - limit} more: --limit {len(rows)} shows all")
+        print_line(f"  and {len(rows) - limit} more: --limit {len(rows)} shows all")
     small = changes.small
-    print(
+    print_line(
         f"  and clusters of fewer than {LEAST_POINTS} points: {small.vanished} vanished, "
         f"{small.appeared} appeared, {small.newly_seen} newly seen, "
         f"{small.no_longer_known} no longer known"

@@ -1,12 +1,12 @@
 """A map as a smaller map file."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.mapfile.writer import Previews, write_map
 from triquad_format.records.region import MapRecord
 
+from triquad_tools.console.lines import print_remark
 from triquad_tools.mapfiles.quantise import dequantised, quantise
 from triquad_tools.mapfiles.source import SourceMap
 
@@ -73,10 +73,9 @@ def _previews(record: MapRecord, stamp_ns: int | None) -> Previews | None:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("triquad"):
             raise
-        print(
+        print_remark(
             f"triquad-pack: without a preview for MCAP viewers, as {error.name} is missing: "
             "install triquad[preview]",
-            file=sys.stderr,
         )
         return None
     return previews_of(record, stamp_ns=stamp_ns)
@@ -84,7 +83,7 @@ def _previews(record: MapRecord, stamp_ns: int | None) -> Previews | None:
 
 def _warn_of_integers(record: MapRecord) -> None:
     if any(table.scale is not None for region in record.regions for table in region.tables):
-        print("triquad-pack: features are integers already: both errors add up", file=sys.stderr)
+        print_remark("triquad-pack: features are integers already: both errors add up")
 
 
 def _dtype(record: MapRecord) -> str:

@@ -1,5 +1,6 @@
 """The history of a map: the checkpoints of a folder, as their manifests tell of them."""
 
+import dataclasses
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,10 @@ from triquad_format.mapfile.index import FileBytes, MapIndex
 from triquad_format.mapfile.manifest import FileRef, Manifest
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.parts.part import REGION_TOPICS
+from triquad_format.mapfile.protections import read_protections
 from triquad_format.records.field_settings import RegionIndex
 
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 
 
@@ -41,6 +44,7 @@ class LoggedCheckpoint:
     bytes: int
     parts: LoggedParts | None  # None: it has no index, or does not open
     problem: str | None  # why it does not open
+    protected: str | None = None  # why retention keeps it for a while, whatever its limits
 
 
 @dataclass(frozen=True)
@@ -64,12 +68,17 @@ def read_log(store: Path) -> StoreLog:
     Parts are not read: only indices and manifests are, of the checkpoints and of what they need.
 
     Raises:
-        MapFileError: there are no checkpoints, or those of several maps.
+        MapFileError: there are no checkpoints, or those of several maps; or the list of those that
+            are protected is damaged.
         OSError: the folder cannot be read.
     """
     folder = map_folder(store)
     indices = _Indices(folder)
-    checkpoints = tuple(_logged(file, indices) for file in checkpoint_files(folder))
+    protected = {one.epoch: one.why for one in read_protections(folder).checkpoints}
+    checkpoints = tuple(
+        dataclasses.replace(_logged(file, indices), protected=protected.get(file.epoch))
+        for file in checkpoint_files(folder)
+    )
     return StoreLog(
         str(folder),
         bytes=sum(checkpoint.bytes for checkpoint in checkpoints),
@@ -80,14 +89,16 @@ def read_log(store: Path) -> StoreLog:
 
 def print_log(log: StoreLog) -> None:
     """Print a table of the checkpoints, and what is wrong with those that do not open."""
-    print(f"{log.folder}: {len(log.checkpoints)} checkpoints, {log.bytes:,} bytes")
+    print_line(f"{log.folder}: {len(log.checkpoints)} checkpoints, {log.bytes:,} bytes")
     titles = ("epoch", "time", "kind", "bytes", "parts stored", "of", "regions changed", "opens")
     print_columns(titles, [_row(checkpoint) for checkpoint in log.checkpoints])
     for checkpoint in log.checkpoints:
         if checkpoint.problem is not None:
-            print(f"  {checkpoint.file}: {checkpoint.problem}")
+            print_line(f"  {checkpoint.file}: {checkpoint.problem}")
+        if checkpoint.protected is not None:
+            print_line(f"  {checkpoint.file}: protected, {checkpoint.protected}")
     for name in log.set_aside:
-        print(f"  {name}: set aside as damaged; triquad-pack --recover saves what is intact")
+        print_line(f"  {name}: set aside as damaged; triquad-pack --recover saves what is intact")
 
 
 def _row(checkpoint: LoggedCheckpoint) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MAX_LEVEL, MapRecord, Region
 from triquad_format.records.seen_space import evidence_box, owned_evidence
 
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import Row, print_columns, print_rows
 
 
@@ -105,7 +106,7 @@ def print_summary(name: str, summary: MapSummary) -> None:
     ]
     print_columns(("part", "count", "bytes", "in this file", "bytes stored"), rows)
     for check in summary.checks:
-        print(f"  ok: {check}")
+        print_line(f"  ok: {check}")
 
 
 def _facts(summary: MapSummary) -> Iterator[Row]:

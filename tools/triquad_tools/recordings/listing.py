@@ -6,6 +6,7 @@ from pathlib import Path
 
 from triquad_sensors.ros.type_store import IMAGE
 
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 from triquad_tools.recordings.recording import Recording
 
@@ -24,17 +25,17 @@ def print_contents(path: Path, recording: Recording, flags: Sequence[str]) -> bo
     titles = ("stream", "type", "count", "frame", "use")
     print_columns(titles, rows, words=("type", "frame", "use"))
     for remark in recording.remarks:
-        print(remark)
+        print_line(remark)
     entries = recording.entries
     if not entries:
-        print(f"{path}: nothing of it can be mapped as it is")
+        print_line(f"{path}: nothing of it can be mapped as it is")
         return False
     stamps = [entry.stamp_ns for entry in entries]
     seconds = (max(stamps) - min(stamps)) / 1e9
     rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
-    print(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
+    print_line(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
     if any(stream.kind in _OF_DEPTH and "scans" in stream.use for stream in recording.streams):
         flags = ["--preset", "indoor", *flags]
     command = ["triquad-map", str(path), f"{path.resolve().stem}.triquad", *flags]
-    print(f"to map it: {shlex.join(command)}")
+    print_line(f"to map it: {shlex.join(command)}")
     return True

@@ -1,7 +1,6 @@
 """What of a recording is to be mapped."""
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -9,6 +8,7 @@ import numpy as np
 from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.arguments import options_of
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.opening import open_recording
@@ -49,7 +49,7 @@ def open_selected(options: argparse.Namespace) -> Selection:
     reading = options_of(options)
     recording = open_recording(options.recording, reading)
     for remark in recording.remarks:
-        print(f"{options.recording}: {remark}", file=sys.stderr)
+        print_remark(f"{options.recording}: {remark}")
     if not recording.entries:
         raise ToolError(f"{options.recording}: nothing of it can be mapped")
     indices = _chosen(recording.entries, options)

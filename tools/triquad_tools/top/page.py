@@ -8,8 +8,8 @@ from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderR
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
+from triquad_format.printable import printable
 
-from triquad_tools.console.printable import printable
 from triquad_tools.top.amounts import duration
 from triquad_tools.top.asked import asked
 from triquad_tools.top.incoming import incoming

@@ -8,6 +8,7 @@ from dataclasses import replace
 from rich.console import Console
 from rich.live import Live
 
+from triquad_tools.console.lines import print_line
 from triquad_tools.top.keyboard import Keyboard
 from triquad_tools.top.page import Page
 from triquad_tools.top.watch import Silence, Target, Watch
@@ -47,7 +48,7 @@ def print_page(page: Page) -> None:
     if not (sys.stdout.isatty() or "COLUMNS" in os.environ):
         console.width = _PLAIN_WIDTH
     for line in console.render_lines(page):
-        print("".join(segment.text for segment in line).rstrip())
+        print_line("".join(segment.text for segment in line).rstrip())
 
 
 def _console() -> Console:

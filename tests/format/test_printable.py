@@ -3,8 +3,8 @@
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from triquad_format.printable import printable
 from triquad_tools.console.command import complain
-from triquad_tools.console.printable import printable
 
 
 @pytest.mark.parametrize(

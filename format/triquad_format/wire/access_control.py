@@ -1,0 +1,190 @@
+"""Who may do what: Zenoh's ``access_control``, from rules that name what is done on which keys.
+
+All is denied but what a rule allows. Zenoh lets a message pass where the key expression of a rule
+*includes* that of the message. A list of what is forbidden would not do: the selector
+``triquad/**`` is not included in ``triquad/*/admin/**``, and reaches what is below it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from triquad_format.wire import keys
+
+LOOPBACK = "lo"
+"""The network interface by which programs of the same machine come, on Linux."""
+
+_EVERY_MESSAGE = (
+    "put",
+    "delete",
+    "query",
+    "reply",
+    "declare_subscriber",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
+
+
+class Verb(Enum):
+    """What is done on a key: messages of Zenoh from who does it, and messages to him."""
+
+    ASK = (("query",), ("reply", "declare_queryable"))
+    ANSWER = (("reply", "declare_queryable"), ("query",))
+    PUBLISH = (("put",), ("declare_subscriber",))
+    RECEIVE = (("declare_subscriber",), ("put", "delete"))
+    FIND = (("liveliness_query", "declare_liveliness_subscriber"), ("liveliness_token",))
+    BE_FOUND = (("liveliness_token",), ("liveliness_query", "declare_liveliness_subscriber"))
+    ALL = (_EVERY_MESSAGE, _EVERY_MESSAGE)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Something that is allowed; or forbidden, whatever else allows it."""
+
+    verb: Verb
+    keys: tuple[str, ...]  # key expressions; a wildcard does not include chunks that begin with @
+    forbidden: bool = False
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Who is at the other end of a link: all that is given has to hold, one of each.
+
+    Where nothing is given, it is everybody.
+    """
+
+    name: str
+    interfaces: tuple[str, ...] = ()  # of this machine, by which the link comes
+    cert_common_names: tuple[str, ...] = ()  # of the certificate shown, with mTLS
+    usernames: tuple[str, ...] = ()
+
+
+THIS_MACHINE = Subject("this-machine", interfaces=(LOOPBACK,))
+EVERYBODY = Subject("everybody")
+
+
+@dataclass(frozen=True)
+class Grant:
+    """What a subject may do. What fits several subjects may do what any of them may."""
+
+    subject: Subject
+    rules: tuple[Rule, ...]
+
+
+def access_control(grants: Sequence[Grant]) -> dict[str, Any]:
+    """The section ``access_control`` of a Zenoh configuration, of who keeps the gate.
+
+    The names of subjects have to differ.
+    """
+    rules, policies = [], []
+    for grant in grants:
+        entries = [
+            entry
+            for number, rule in enumerate(grant.rules)
+            for entry in _entries(f"{grant.subject.name} {number} {rule.verb.name.lower()}", rule)
+        ]
+        rules += entries
+        policies.append(
+            {"subjects": [grant.subject.name], "rules": [entry["id"] for entry in entries]}
+        )
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [_subject(grant.subject) for grant in grants],
+        "policies": policies,
+    }
+
+
+def without_credentials(map_name: str, *, ros2: Sequence[Rule] = ()) -> tuple[Grant, ...]:
+    """Who may do what with a map server that tells people apart only by where they come from.
+
+    Programs of this machine may do everything. What comes from beyond may question the map, follow
+    it and publish scans, and what ``ros2`` allows besides.
+    """
+    beyond = (*view(map_name), *publish(map_name), *ros2)
+    return Grant(THIS_MACHINE, everything()), Grant(EVERYBODY, beyond)
+
+
+def view(map_name: str) -> tuple[Rule, ...]:
+    """To question a map and to follow it."""
+    return (
+        Rule(Verb.ASK, (keys.all_queries_key(map_name),)),
+        Rule(Verb.RECEIVE, (keys.status_key(map_name),)),
+        Rule(Verb.FIND, (keys.alive_key("*", "*"),)),
+    )
+
+
+def publish(map_name: str, sources: Sequence[str] | None = None) -> tuple[Rule, ...]:
+    """To publish the scans of these sources, or of all; nobody reads the scans of others."""
+    if sources is None:
+        return (Rule(Verb.PUBLISH, (keys.all_scans_key(map_name),)),)
+    return (Rule(Verb.PUBLISH, tuple(keys.scan_key(map_name, source) for source in sources)),)
+
+
+def administer(map_name: str) -> tuple[Rule, ...]:
+    """To change a map otherwise than by scans, and what its server keeps on disk."""
+    return (Rule(Verb.ASK, (keys.all_admin_key(map_name),)),)
+
+
+def serve(map_name: str) -> tuple[Rule, ...]:
+    """To be the server of a map, behind a router."""
+    return (
+        Rule(Verb.ANSWER, (keys.all_queries_key(map_name), keys.all_admin_key(map_name))),
+        Rule(Verb.RECEIVE, (keys.all_scans_key(map_name),)),
+        Rule(Verb.PUBLISH, (keys.status_key(map_name),)),
+        Rule(Verb.BE_FOUND, (keys.alive_key(map_name, "*"),)),
+    )
+
+
+def take_part_in_ros2(
+    map_name: str, domain: int, published: Sequence[str] = ()
+) -> tuple[Rule, ...]:
+    """To be nodes of rmw_zenoh in a domain, or bridges that publish topics of any name.
+
+    ``published`` are the keys on which bridges receive what the server publishes. Since a topic may
+    have any name, bridges may publish on all keys, but not on those of the server of the map.
+    """
+    return (
+        Rule(Verb.ALL, (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**")),
+        Rule(Verb.FIND, ("@/*/@ros2_lv/**",)),
+        Rule(Verb.BE_FOUND, ("@/*/@ros2_lv/**",)),
+        Rule(Verb.ANSWER, ("@/*/@ros2_pub_cache/**", "**/@adv/**")),
+        Rule(Verb.BE_FOUND, ("**/@adv/**",)),
+        Rule(Verb.PUBLISH, ("**",)),
+        Rule(Verb.PUBLISH, (keys.status_key(map_name),), forbidden=True),
+        *((Rule(Verb.RECEIVE, tuple(published)),) if published else ()),
+    )
+
+
+def everything() -> tuple[Rule, ...]:
+    """To do what one likes; Zenoh has no wildcard for chunks of keys that begin with ``@``."""
+    own = ("**/@alive/**", "**/@adv/**", "@/**")
+    of_ros2 = ("@ros2_lv/**", "@/*/@ros2_lv/**", "@/*/@ros2_pub_cache/**")
+    return (Rule(Verb.ALL, ("**", *own, *of_ros2)),)
+
+
+def _entries(name: str, rule: Rule) -> list[dict[str, Any]]:
+    """A rule as Zenoh writes it: an entry for each direction."""
+    return [
+        {
+            "id": f"{name} {flow}",
+            "permission": "deny" if rule.forbidden else "allow",
+            "flows": [flow],
+            "messages": list(messages),
+            "key_exprs": list(rule.keys),
+        }
+        for flow, messages in zip(("ingress", "egress"), rule.verb.value, strict=True)
+    ]
+
+
+def _subject(subject: Subject) -> dict[str, Any]:
+    given = {
+        "interfaces": subject.interfaces,
+        "cert_common_names": subject.cert_common_names,
+        "usernames": subject.usernames,
+    }
+    return {"id": subject.name} | {kind: list(names) for kind, names in given.items() if names}

@@ -1,0 +1,228 @@
+"""What the fields of replies keep to, and the check that a reply does, by whoever asked.
+
+A field's annotation names its bounds beside its type, so that a message says all of it in one
+place. A server may be wrong or hostile: what does not answer the question is refused whole.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol, get_args, get_origin
+
+import numpy as np
+
+from triquad_format.errors import WireError
+from triquad_format.wire.codec import Message
+
+MAX_COUNT = 2**53
+"""Of epochs and of anything that is counted: doubles hold all whole numbers up to here."""
+
+_ROUNDING = 1e-4
+"""By how much of it a number may exceed what was asked for: single precision rounds."""
+
+_RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a field's value is compared with."""
+
+    question: Message
+    around: tuple[Message, ...]  # the messages that the field is in, innermost first
+
+    def number(self, bound: float | str) -> float:
+        """A bound, which may be a number of the question, or the negative of one."""
+        if not isinstance(bound, str):
+            return bound
+        asked = float(getattr(self.question, bound.removeprefix("-"))) * (1 + _ROUNDING)
+        return -asked if bound.startswith("-") else asked
+
+    def rows(self, field: str) -> int:
+        """The rows of an array that stands beside the field, or around it."""
+        holder = next(message for message in self.around if field in message.annotations())
+        return len(getattr(holder, field))
+
+
+class Check(Protocol):
+    """A bound of a field; an annotation may have several."""
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """What is wrong with a value, or ``None``."""
+
+
+@dataclass(frozen=True)
+class Within:
+    """A finite number, or an array of such, from ``least`` to ``most``.
+
+    A bound is a number, or the name of a positive number of the question, maybe after ``-``.
+    """
+
+    least: float | str = -math.inf
+    most: float | str = math.inf
+    nan: bool = False  # some may be no numbers
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """What is out of bounds, or not finite."""
+        array = np.asarray(value)
+        if array.size == 0:
+            return None
+        low, high = (np.fmin, np.fmax) if self.nan else (np.minimum, np.maximum)
+        ends = [float(end.reduce(array, axis=None)) for end in (low, high)]
+        if self.nan and math.isnan(ends[0]):
+            return None
+        least, most = said.number(self.least), said.number(self.most)
+        for end in ends:
+            if not math.isfinite(end):
+                return f"{end} is not finite"
+            if not least <= end <= most:
+                return f"{end:g} is not in [{least:g}, {most:g}]"
+        return None
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text of at most so many characters, which may have to be of some form."""
+
+    most: int
+    form: str = ""  # a regular expression
+
+    def problem(self, value: Any, said: Said) -> str | None:  # noqa: ARG002
+        """What is too long, or of another form."""
+        if len(value) > self.most:
+            return f"{len(value)} characters are more than {self.most}"
+        if self.form and not re.fullmatch(self.form, value):
+            return f"{value[:80]!r} is not of the form {self.form}"
+        return None
+
+
+@dataclass(frozen=True)
+class AskedBy:
+    """As many rows as an array of the question has, or bytes as one of its numbers says."""
+
+    field: str
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """Where the numbers differ."""
+        asked = getattr(said.question, self.field)
+        count = asked if isinstance(asked, int) else len(asked)
+        return None if len(value) == count else f"{len(value)} came for {count}"
+
+
+@dataclass(frozen=True)
+class AtMostAsked:
+    """At most as many rows as a number of the question says."""
+
+    field: str
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """Where there are more."""
+        most: int = getattr(said.question, self.field)
+        return None if len(value) <= most else f"{len(value)} came, and {most} were asked for"
+
+
+@dataclass(frozen=True)
+class ShapeAskedBy:
+    """An array whose sizes are those that an array of the question has as values."""
+
+    field: str
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """Where the sizes differ."""
+        shape, asked = list(value.shape), getattr(said.question, self.field).tolist()
+        return None if shape == asked else f"{shape} came for {asked}"
+
+
+@dataclass(frozen=True)
+class SameAsAsked:
+    """The same as in the question, which may leave it to the server with 0."""
+
+    field: str
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """Where it is another one."""
+        asked = getattr(said.question, self.field, 0)
+        return f"{value} came for {asked}" if asked and value != asked else None
+
+
+@dataclass(frozen=True)
+class RowsOf:
+    """As many rows as another array of the reply, and ``more``."""
+
+    field: str
+    more: int = 0
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """Where the numbers differ."""
+        count = said.rows(self.field) + self.more
+        return None if len(value) == count else f"{len(value)} rows do not go with {count}"
+
+
+@dataclass(frozen=True)
+class IndicesOf:
+    """Indices of the rows of another array of the reply."""
+
+    field: str
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """What has no such row."""
+        return Within(0, said.rows(self.field) - 1).problem(value, said)
+
+
+@dataclass(frozen=True)
+class RigidPose:
+    """A rotation and a translation."""
+
+    def problem(self, value: Any, said: Said) -> str | None:
+        """Where it is neither."""
+        if problem := Within(-1e12, 1e12).problem(value, said):
+            return problem
+        rotation = np.clip(value[:3, :3], -2, 2)
+        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        is_proper = np.linalg.det(rotation) > 0 and (value[3] == (0, 0, 0, 1)).all()
+        return None if is_proper and off <= _RIGID_TOLERANCE else "it is no rigid pose"
+
+
+def check_answers(question: Message, reply: Message) -> None:
+    """Raise :class:`WireError` where a reply is no answer to the question.
+
+    The text names the field and what is wrong with it.
+    """
+    for name, problem in _problems(reply, question, ()):
+        raise WireError(f"{name}: {problem}")
+
+
+def _problems(
+    message: Message, question: Message, outer: tuple[Message, ...]
+) -> Iterator[tuple[str, str]]:
+    said = Said(question, (message, *outer))
+    for field, annotation in message.annotations().items():
+        name = f"{type(message).__name__}.{field}"
+        yield from _of_field(name, annotation, getattr(message, field), said)
+
+
+def _of_field(name: str, annotation: Any, value: Any, said: Said) -> Iterator[tuple[str, str]]:
+    if value is None:
+        return
+    if isinstance(value, Message):
+        yield from _problems(value, said.question, said.around)
+    elif get_origin(annotation) is dict:
+        key_type, item = get_args(annotation)
+        for key, entry in value.items():
+            yield from _of_field(f"{name} key", key_type, key, said)
+            yield from _of_field(f"{name}[{key!r}]", item, entry, said)
+    else:
+        for check in _checks(annotation):
+            problem = check.problem(value, said)
+            if problem is not None:
+                yield name, problem
+
+
+def _checks(annotation: Any) -> Iterator[Check]:
+    """The checks in an annotation, that of a field which may be ``None`` included."""
+    for extra in getattr(annotation, "__metadata__", ()):
+        if hasattr(extra, "problem"):
+            yield extra
+    if not hasattr(annotation, "__metadata__"):
+        for choice in get_args(annotation):
+            yield from _checks(choice)

@@ -1,0 +1,92 @@
+"""What each role may do on a network where certificates tell everybody apart.
+
+Servers and routers keep the gate: they allow a client what his role may do, on all maps, and the
+rest is denied. Clients keep one of their own: they take nothing but from a server or a router.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from triquad_format.wire import keys
+from triquad_format.wire.access_control import (
+    Grant,
+    Rule,
+    Subject,
+    Verb,
+    administer,
+    everything,
+    publish,
+    serve,
+    view,
+)
+
+SERVER = "server"
+ROUTER = "router"
+"""Common names of the certificates of those who listen."""
+
+
+class Role(Enum):
+    """What a client is for; each role may do what those before it may."""
+
+    VIEWER = "viewer"  # questions the map, and follows it
+    ROBOT = "robot"  # publishes scans as its own sources
+    ADMIN = "admin"  # resets, restores, pins, has checkpoints written
+
+
+@dataclass(frozen=True)
+class Holder:
+    """A client with a role. Names that cannot stand in a key are refused with a FormatError."""
+
+    name: str
+    role: Role
+    sources: tuple[str, ...] = ()  # of scans that he publishes, and nobody else
+    ros2_domain: int | None = None  # of ROS 2, in which his nodes take part
+    issue: str = ""  # tells him from who had this name before, and may still have a certificate
+
+    def __post_init__(self) -> None:
+        keys.check_name("role", self.name)
+        for source in self.sources:
+            keys.check_name("source", source)
+
+    @property
+    def common_name(self) -> str:
+        """Of his certificate, by which Zenoh knows him."""
+        return f"{self.role.value}:{self.name}:{self.issue}"
+
+
+def server_grants(holders: Sequence[Holder]) -> tuple[Grant, ...]:
+    """What a server or a router lets others do; those who are none of these may do nothing."""
+    domains = sorted({h.ros2_domain for h in holders if h.ros2_domain is not None})
+    topics = tuple(_take_part(domain) for domain in domains)
+    return (
+        Grant(_known_as(SERVER), (*serve(keys.EVERY_MAP), *topics)),
+        # Who comes through a router was told apart there, and beyond it may be servers, too.
+        Grant(_known_as(ROUTER), everything()),
+        *(Grant(_known_as(holder.common_name), _allowed(holder)) for holder in holders),
+    )
+
+
+def client_grants() -> tuple[Grant, ...]:
+    """What a client lets others do: servers and routers all, and nobody else anything."""
+    return tuple(Grant(_known_as(name), everything()) for name in (SERVER, ROUTER))
+
+
+def _allowed(holder: Holder) -> tuple[Rule, ...]:
+    rules = view(keys.EVERY_MAP)
+    if holder.role is Role.ADMIN:
+        rules += administer(keys.EVERY_MAP)
+    if holder.sources:
+        rules += publish(keys.EVERY_MAP, holder.sources)
+    if holder.ros2_domain is not None:
+        rules += (_take_part(holder.ros2_domain),)
+    return rules
+
+
+def _take_part(domain: int) -> Rule:
+    """In a domain of ROS 2, by rmw_zenoh: its topics, their history, and the graph of nodes."""
+    return Rule(Verb.ALL, (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**"))
+
+
+def _known_as(common_name: str) -> Subject:
+    return Subject(common_name, cert_common_names=(common_name,))

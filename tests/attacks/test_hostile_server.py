@@ -1,0 +1,154 @@
+"""A client takes nothing from a server but answers to what it asked."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import triquad_client
+from support.honest_replies import FILE, TILE
+from support.hostile_server import HostileServer, hostile_server, packed, told
+from support.lies import LIES, QUESTIONS, Ask, Lie
+from triquad_client import Client
+from triquad_client.errors import BadReplyError, DownloadError
+from triquad_format.errors import TriquadError
+from triquad_format.wire import codec, keys
+
+TIMEOUT_S = 3.0
+MOST_BYTES = 2**20
+
+
+@pytest.fixture(scope="module")
+def connected() -> Iterator[tuple[HostileServer, Client]]:
+    with (
+        hostile_server() as server,
+        triquad_client.connect(server.endpoint, timeout_s=TIMEOUT_S) as client,
+    ):
+        yield server, client
+
+
+@pytest.fixture
+def server(connected: tuple[HostileServer, Client]) -> HostileServer:
+    server, _ = connected
+    server.lie, server.refusal, server.sent_bytes = lambda _, honest: honest, None, 0
+    return server
+
+
+@pytest.fixture
+def client(connected: tuple[HostileServer, Client]) -> Client:
+    return connected[1]
+
+
+@pytest.mark.parametrize("ask", [ask for _, ask in QUESTIONS.values()], ids=QUESTIONS)
+def test_the_honest_answer_is_taken(
+    server: HostileServer, client: Client, ask: Ask, tmp_path: Path
+) -> None:
+    assert server.endpoint
+    ask(client, tmp_path / "map.triquad")
+
+
+@pytest.mark.parametrize("lie", LIES, ids=lambda lie: lie.name)
+def test_a_lie_is_refused_whole(
+    server: HostileServer, client: Client, lie: Lie, tmp_path: Path
+) -> None:
+    change = told(lie.operation, lie.change)
+    server.lie = lambda asked, honest: b"" if server.sent_bytes > MOST_BYTES else change(
+        asked, honest
+    )  # fmt: skip
+    with pytest.raises(TriquadError) as refusal:
+        lie.ask(client, tmp_path / "map.triquad")
+    assert isinstance(refusal.value, BadReplyError | DownloadError)
+    assert str(refusal.value).isprintable()
+    assert server.sent_bytes < MOST_BYTES
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_download_stays_below_what_the_client_takes(
+    server: HostileServer, tmp_path: Path
+) -> None:
+    with triquad_client.connect(server.endpoint, max_download_bytes=len(FILE) - 1) as client:
+        with pytest.raises(DownloadError, match="max_download_bytes"):
+            client.download_map(tmp_path / "map.triquad")
+        with pytest.raises(DownloadError, match="max_download_bytes"):
+            client.sync(((0, 0, 0), (1, 1, 1)), tmp_path / "map.triquad")
+    assert list(tmp_path.iterdir()) == []
+    with triquad_client.connect(server.endpoint, max_download_bytes=len(FILE)) as client:
+        client.download_map(tmp_path / "map.triquad")
+    assert (tmp_path / "map.triquad").read_bytes() == FILE
+
+
+def test_a_watch_holds_no_more_than_the_client_takes(server: HostileServer) -> None:
+    count = 1000
+    tiles = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], axis=1)
+    server.lie = told(
+        keys.TILE_UPDATES,
+        lambda body: body.update(
+            tiles=packed(tiles, "<i4"),
+            versions=packed(np.ones(count), "<i8"),
+            sizes=packed(np.full(count, len(TILE)), "<i8"),
+            data=TILE * count,
+        ),
+    )
+    with (
+        triquad_client.connect(server.endpoint, max_download_bytes=count * 48) as client,
+        client.watch_mesh() as watch,
+    ):
+        assert watch.next(1.0) is not None
+    with (
+        triquad_client.connect(server.endpoint, max_download_bytes=count * 48 - 1) as client,
+        client.watch_mesh() as watch,
+    ):
+        with pytest.raises(DownloadError, match="max_download_bytes"):
+            watch.next(1.0)
+        assert not watch.tiles
+
+
+def test_a_tile_of_a_few_bytes_that_would_fill_the_memory_is_not_made(
+    server: HostileServer,
+) -> None:
+    bomb = (2**25).to_bytes(4, "little") * 2 + TILE[8:]
+    server.lie = told(
+        keys.TILE_UPDATES,
+        lambda body: body.update(data=bomb, sizes=packed([len(bomb)], "<i8")),
+    )
+    with (
+        triquad_client.connect(server.endpoint, max_download_bytes=MOST_BYTES) as client,
+        client.watch_mesh() as watch,
+        pytest.raises(DownloadError, match="max_download_bytes"),
+    ):
+        watch.next(1.0)
+
+
+def test_a_mesh_of_more_bytes_than_the_client_takes_is_refused(server: HostileServer) -> None:
+    with (
+        triquad_client.connect(server.endpoint, max_download_bytes=40) as client,
+        pytest.raises(DownloadError, match="max_download_bytes"),
+    ):
+        client.mesh()
+
+
+@pytest.mark.parametrize(
+    "refusal",
+    [
+        {"code": "busy\x1b[2J", "message": "wait"},
+        {"code": "busy", "message": "\x1b]0;owned\x07\u202e\nERROR disk is gone"},
+        {"code": "busy", "message": "x" * 60_000},
+        {"code": "busy"},
+    ],
+)
+def test_the_words_of_a_refusal_are_shown_as_what_they_are(
+    server: HostileServer, client: Client, refusal: dict[str, str]
+) -> None:
+    body = {"triquad": codec.PROTOCOL_VERSION, "kind": "ErrorReply", **refusal}
+    server.refusal = codec.msgpack.packb(body)
+    with pytest.raises(TriquadError) as caught:
+        client.status()
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 5_000
+
+
+def test_bytes_that_are_no_message_are_refused(server: HostileServer, client: Client) -> None:
+    for data in (b"", b"\x1b[2J", b"\xc1" * 100, b"\xdf\xff\xff\xff\xff", b"\x91" * 5000):
+        server.lie = lambda _asked, _honest, data=data: data
+        with pytest.raises(BadReplyError):
+            client.status()

@@ -1,0 +1,228 @@
+"""Every role tries every operation, over real mTLS: at the server itself, and through a router."""
+
+import json
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import triquad_client
+import zenoh
+from support.role_files import free_tls_endpoint, opened, showing
+from support.role_matrix import ATTEMPTS, OTHERS, OWN, achieved, expected
+from support.servers import SMALL_TOML, WAIT_S, server_process, sphere
+from triquad_client.errors import ConnectError, NoReplyError, UnknownMapError
+from triquad_format.wire import keys
+from triquad_format.wire.roles import ROUTER, SERVER, Holder, Role
+from triquad_tools.credentials.authority import Authority
+from triquad_tools.credentials.key_folder import KeyFolder
+
+DAYS = 1.0
+PATHS = ("server", "router")
+MEMBERS = {"viewer": (), "robot": (OWN,), "admin": (), "removed": (OTHERS,)}  # and their sources
+STRANGERS = ("forged authority", "no certificate", "expired")
+EVERYBODY = (*MEMBERS, *STRANGERS)
+
+Results = dict[str, set[str]]  # of each, what he achieved
+
+
+@dataclass(frozen=True)
+class Network:
+    """A server, and a router that leads to it, which go by the files in a folder."""
+
+    folder: KeyFolder
+    endpoints: dict[str, str]  # by path
+
+    def file(self, name: str) -> Path:
+        return self.folder.path / f"{name}.json5"
+
+    @contextmanager
+    def session(self, who: str, path: str) -> Iterator[zenoh.Session]:
+        """Of a member; a stranger comes with the file of the robot, and his own certificate."""
+        name = self.folder.register.holder("robot").common_name
+        changes = {
+            "forged authority": showing(Authority.create("forged").client(name, DAYS)),
+            "no certificate": {"transport__link__tls__enable_mtls": False},
+            "expired": showing(self.folder.authority.client(name, -0.01)),
+        }
+        file = self.file(who if who in MEMBERS else "robot")
+        with opened(file, self.endpoints[path], **changes.get(who, {})) as session:
+            yield session
+
+    @contextmanager
+    def observer(self, path: str) -> Iterator[zenoh.Session]:
+        """A session that sees all that passes; routers may."""
+        as_client = {"mode": "client", "listen__endpoints": []}
+        with opened(self.file(ROUTER), self.endpoints[path], **as_client) as session:
+            yield session
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> KeyFolder:
+    folder = KeyFolder.create(tmp_path_factory.mktemp("roles") / "keys", [], DAYS)
+    for role in Role:
+        folder.add(Holder(role.value, role, MEMBERS[role.value]), DAYS)
+    file = folder.add(Holder("removed", Role.ROBOT, MEMBERS["removed"]), DAYS)
+    copied = file.read_bytes()
+    folder.remove("removed")
+    file.write_bytes(copied)
+    return folder
+
+
+@contextmanager
+def served(folder: KeyFolder, server: Path) -> Iterator[Network]:
+    """The network with this file for the server and for the router."""
+    endpoints = {path: free_tls_endpoint() for path in PATHS}
+    settings = folder.path / "settings.toml"
+    settings.write_text(SMALL_TOML)
+    router = zenoh.Config.from_file(str(server))
+    router.insert_json5("listen/endpoints", json.dumps([endpoints["router"]]))
+    own = showing(folder.certificate(ROUTER), "connect", "listen")
+    for name, value in own.items():
+        router.insert_json5(name.replace("__", "/"), json.dumps(value))
+    arguments = ["--config", server, "--settings", settings, "--connect", endpoints["router"]]
+    with (
+        zenoh.open(router),
+        server_process(arguments, endpoints["server"]),
+    ):
+        yield Network(folder, endpoints)
+
+
+@pytest.fixture(scope="module")
+def network(folder: KeyFolder) -> Iterator[Network]:
+    with served(folder, folder.path / "server.json5") as network:
+        yield network
+
+
+@pytest.fixture(scope="module")
+def unguarded(folder: KeyFolder) -> Iterator[Network]:
+    """With the same certificates, and without access control."""
+    text = (folder.path / "server.json5").read_text()
+    section = '"access_control": {\n    "enabled": '
+    assert f"{section}true" in text
+    file = folder.path / "unguarded.json5"
+    file.write_text(text.replace(f"{section}true", f"{section}false"))
+    with served(folder, file) as network:
+        yield network
+
+
+def results(network: Network, path: str) -> Results:
+    """What everybody achieves, all at the same time."""
+
+    def attempt(who: str) -> set[str]:
+        try:
+            with network.session(who, path) as session:
+                return achieved(who, session, observer)
+        except zenoh.ZError:  # not let in
+            return set()
+
+    with network.observer(path) as observer, ThreadPoolExecutor(len(EVERYBODY)) as threads:
+        return dict(zip(EVERYBODY, threads.map(attempt, EVERYBODY), strict=True))
+
+
+@pytest.fixture(scope="module")
+def matrix(network: Network) -> dict[str, Results]:
+    return {path: results(network, path) for path in PATHS}
+
+
+@pytest.mark.parametrize("operation", ATTEMPTS)
+@pytest.mark.parametrize("who", EVERYBODY)
+@pytest.mark.parametrize("path", PATHS)
+def test_each_may_do_what_the_role_says_and_nothing_else(
+    matrix: dict[str, Results], path: str, who: str, operation: str
+) -> None:
+    allowed = operation in expected(who, MEMBERS.get(who, ()))
+    assert (operation in matrix[path][who]) == allowed
+
+
+def test_without_access_control_everybody_who_is_let_in_may_do_everything(
+    unguarded: Network,
+) -> None:
+    found = results(unguarded, "server")
+    for who in MEMBERS:
+        assert found[who] == set(ATTEMPTS), who
+    for who in STRANGERS:
+        assert found[who] == set(), who
+
+
+def test_roles_work_together(network: Network) -> None:
+    with ExitStack() as clients:
+        robot, viewer, admin = (
+            clients.enter_context(connected(network, "server", who))
+            for who in ("robot", "viewer", "admin")
+        )
+        for _ in range(2):
+            robot.publish_scan(sphere(), np.eye(4), source=OWN)
+        assert robot.flush(WAIT_S).taken == 2
+        assert viewer.query_distance([[3.0, 0.0, 0.0]]).epoch > 0
+        for outsider in (viewer, robot):
+            with pytest.raises(NoReplyError, match="access control"):
+                outsider.reset()
+        assert admin.reset() > 0
+
+
+def connected(network: Network, path: str, who: str) -> triquad_client.Client:
+    return triquad_client.connect(network.endpoints[path], config=network.file(who))
+
+
+IMPOSTORS = {
+    "with the certificate of a robot": lambda own: own.client("robot:x", DAYS),
+    "of a forged authority": lambda _: Authority.create("forged").server(SERVER, [], DAYS),
+    "that is let in, but is no server": lambda own: own.server("viewer:x", [], DAYS),
+}
+
+
+@pytest.mark.parametrize("kind", IMPOSTORS)
+def test_clients_believe_no_server_but_those_they_know(folder: KeyFolder, kind: str) -> None:
+    endpoint = free_tls_endpoint()
+    certificate = IMPOSTORS[kind](folder.authority)
+    listens = {"mode": "router", "listen__endpoints": [endpoint]}
+    with (
+        impostor(folder, endpoint, {**listens, **showing(certificate, "listen")}),
+        pytest.raises((ConnectError, UnknownMapError)),
+    ):
+        triquad_client.connect(endpoint, config=folder.path / "viewer.json5")
+
+
+def test_clients_do_believe_the_server(folder: KeyFolder) -> None:
+    """Else the impostors would fail for another reason."""
+    endpoint = free_tls_endpoint()
+    with impostor(folder, endpoint, {"listen__endpoints": [endpoint]}):
+        triquad_client.connect(endpoint, config=folder.path / "viewer.json5").close()
+
+
+@contextmanager
+def impostor(folder: KeyFolder, endpoint: str, changes: dict[str, Any]) -> Iterator[None]:
+    """Somebody who listens and says that he has the map."""
+    with opened(folder.path / "server.json5", None, **changes) as session:
+        token = session.liveliness().declare_token(keys.alive_key("default", "x"))
+        yield
+        token.undeclare()
+
+
+def test_nodes_of_ros_take_part_in_their_domain_alone(folder: KeyFolder) -> None:
+    holder = Holder("nodes", Role.ROBOT, ros2_domain=3)
+    file = folder.add(holder, DAYS)
+    endpoint = free_tls_endpoint()
+    received: list[str] = []
+    listens = {"listen__endpoints": [endpoint], "access_control__enabled": True}
+    with (
+        opened(folder.path / "server.json5", None, **listens) as server,
+        opened(file, endpoint) as nodes,
+    ):
+        server.declare_subscriber("*/**", lambda sample: received.append(str(sample.key_expr)))
+        answer = server.declare_queryable("3/add/**", lambda query: query.reply("3/add", b""))
+        for key in ("4/lidar", "triquad/default/scan/roof", "3/lidar"):
+            nodes.put(key, b"")
+        tokens = [nodes.liveliness().declare_token(f"@ros2_lv/{n}/node") for n in (3, 4)]
+        assert list(nodes.get("3/add", timeout=WAIT_S))
+        found = server.liveliness().get("@ros2_lv/**", timeout=WAIT_S)
+        assert [str(reply.ok.key_expr) for reply in found] == ["@ros2_lv/3/node"]
+        assert received == ["3/lidar"]
+        answer.undeclare()
+        for token in tokens:
+            token.undeclare()

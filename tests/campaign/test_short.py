@@ -1,0 +1,49 @@
+"""Each part of the campaign for a moment, and the campaign itself: it counts and goes on."""
+
+import time
+from pathlib import Path
+
+import pytest
+from campaign.campaign import Campaign
+from campaign.parts import BY_NAME, PARTS
+from campaign.turn import Part, Turn
+
+_FEW = {
+    "messages": 300,
+    "files": 40,
+    "kills": 1,
+    "disk": 4,
+    "clock": 2,
+    "cuts": 3,
+    "stops": 1,
+    "memory": 1,
+    "driving": 2,
+}
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
+def test_nothing_breaks_in_a_short_turn(part: Part, tmp_path: Path) -> None:
+    if why := part.missing():
+        pytest.skip(why)
+    turn = Turn(seed=1, folder=tmp_path, most=_FEW[part.name], seconds=20.0)
+    part.run(turn)
+    assert turn.broken == []
+    assert turn.counts["done"] >= 1
+
+
+def test_a_campaign_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
+    counts = []
+    for _ in range(2):
+        campaign = Campaign(tmp_path, [BY_NAME["files"]])
+        campaign.run(seconds=3.0, lanes=1)
+        assert campaign.broken == 0
+        counts.append(int(campaign.table().splitlines()[2].split()[3].replace(",", "")))
+    assert 0 < counts[0] < counts[1]
+
+
+def test_a_part_whose_process_ends_is_told_as_broken(tmp_path: Path) -> None:
+    unknown = Part("unknown", "things", 1, 1, run=time.sleep, promise="none")  # type: ignore[arg-type]
+    campaign = Campaign(tmp_path, [unknown])
+    campaign.run(seconds=1.0, lanes=1)
+    assert campaign.broken >= 1
+    assert "ended with 2" in (tmp_path / "campaign.json").read_text()

@@ -1,0 +1,215 @@
+"""Lies of a server, each with the question that it is the answer to."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from support.honest_replies import CHUNK_BYTES, EPOCH
+from support.hostile_server import Body, packed
+from triquad_client import Client
+from triquad_format.wire import keys
+
+COUNT = 100
+POINTS = np.random.default_rng(1).normal(size=(COUNT, 3))
+BOX = ((0, 0, 0), (1, 1, 1))
+NAN, INF = float("nan"), float("inf")
+
+Ask = Callable[[Client, Path], object]
+
+
+@dataclass(frozen=True)
+class Lie:
+    """What a server changes of its replies to an operation."""
+
+    name: str
+    operation: str
+    change: Callable[[Body], object]
+    ask: Ask
+
+
+def all_values(value: float, dtype: str = "<f4", shape: tuple[int, ...] = (COUNT,)) -> Body:
+    return packed(np.full(shape, value), dtype)
+
+
+def _sets(**fields: object) -> Callable[[Body], object]:
+    return lambda body: body.update(fields)
+
+
+def _within(path: str, **fields: object) -> Callable[[Body], object]:
+    """The fields of a message inside a message; ``path`` is of names with slashes between."""
+
+    def change(body: Body) -> None:
+        for name in path.split("/"):
+            body = body[name] if name != "*" else next(iter(body.values()))
+        body.update(fields)
+
+    return change
+
+
+def _flush(client: Client, _: Path) -> object:
+    client.publish_scan(POINTS, np.eye(4))
+    return client.flush(1.0)
+
+
+def _watch(client: Client, _: Path) -> object:
+    with client.watch_mesh() as watch:
+        return watch.next(1.0)
+
+
+def _watch_on(client: Client, _: Path) -> object:
+    """A second update, after an honest first one of revision 3."""
+    with client.watch_mesh() as watch:
+        watch.next(1.0)
+        return watch.next(1.0)
+
+
+def _sources_on(client: Client, _: Path) -> object:
+    return client.sources(client.sources())
+
+
+def _second(change: Callable[[Body], object]) -> Callable[[Body], object]:
+    """Honest at first."""
+    answered: list[bool] = []
+
+    def lie(body: Body) -> None:
+        if answered:
+            change(body)
+        answered.append(True)
+
+    return lie
+
+
+def _questions() -> dict[str, tuple[str, Ask]]:
+    return {
+        "sdf": (keys.SDF, lambda client, _: client.query_sdf(POINTS)),
+        "gradient": (keys.SDF, lambda client, _: client.query_sdf(POINTS, gradient=True)),
+        "sdf of epoch": (keys.SDF, lambda client, _: client.query_sdf(POINTS, at_epoch=EPOCH)),
+        "distance": (
+            keys.DISTANCE,
+            lambda client, _: client.query_distance(
+                POINTS, surface_point=True, unknown_distance=True
+            ),
+        ),
+        "spheres": (keys.SPHERES, lambda client, _: client.query_spheres(POINTS, 0.5)),
+        "segments": (keys.SEGMENTS, lambda client, _: client.query_segments(POINTS, -POINTS)),
+        "rays": (keys.RAYS, lambda client, _: client.query_rays((0, 0, 0), POINTS)),
+        "ground": (keys.GROUND, lambda client, _: client.query_ground(POINTS)),
+        "grid": (keys.GRID, lambda client, _: client.query_grid(BOX, 0.25)),
+        "align": (keys.ALIGN, lambda client, _: client.align(POINTS, np.eye(4))),
+        "changes": (keys.CHANGES, lambda client, _: client.changes(EPOCH)),
+        "sources": (keys.SOURCES, lambda client, _: client.sources(max_points=10)),
+        "sources again": (keys.SOURCES, _sources_on),
+        "tiles": (keys.TILE_LIST, lambda client, _: client.tiles()),
+        "tile": (keys.TILE, lambda client, _: client.mesh_tile(0, 0, 0)),
+        "mesh": (keys.TILE, lambda client, _: client.mesh()),
+        "watch": (keys.TILE_UPDATES, _watch),
+        "watch again": (keys.TILE_UPDATES, _watch_on),
+        "status": (keys.STATUS, lambda client, _: client.status()),
+        "metrics": (keys.METRICS, lambda client, _: client.metrics()),
+        "flush": (keys.FLUSH, _flush),
+        "checkpoint": (keys.CHECKPOINT, lambda client, _: client.checkpoint()),
+        "reset": (keys.RESET, lambda client, _: client.reset()),
+        "download": (keys.MAP_INFO, lambda client, path: client.download_map(path)),
+        "chunk": (keys.MAP_CHUNK, lambda client, path: client.download_map(path)),
+    }
+
+
+QUESTIONS = _questions()
+
+_LIES: list[tuple[str, str, Callable[[Body], object]]] = [
+    ("sdf", "one value for 100 points", _sets(sdf=packed([1.0]), status=packed([1], "|u1"))),
+    ("sdf", "fewer statuses", _sets(status=packed([1] * 50, "|u1"))),
+    ("sdf", "more values", _sets(sdf=all_values(1, shape=(200,)))),
+    ("sdf", "status 9", _sets(status=all_values(9, "|u1"))),
+    ("sdf", "infinite", _sets(sdf=all_values(INF))),
+    ("sdf", "epoch -1", _sets(epoch=-1)),
+    ("sdf", "epoch 2^62", _sets(epoch=2**62)),
+    ("sdf", "no status", lambda body: body.pop("status")),
+    ("sdf", "double precision", _sets(sdf=all_values(1, "<f8"))),
+    ("sdf", "two dimensions", _sets(sdf=all_values(1, shape=(COUNT, 1)))),
+    ("sdf", "2^39 values declared", lambda body: body["sdf"].update(shape=[2**39])),
+    ("sdf", "another kind", _sets(kind="DistanceReply")),
+    ("sdf of epoch", "another epoch", _sets(epoch=EPOCH + 1)),
+    ("gradient", "no gradient", _sets(gradient=None)),
+    ("gradient", "one gradient", _sets(gradient=packed([[0, 0, 1]]))),
+    ("gradient", "infinite gradient", _sets(gradient=all_values(INF, shape=(COUNT, 3)))),
+    ("distance", "no number", _sets(distance_m=all_values(NAN))),
+    ("distance", "beyond what was asked", _sets(distance_m=all_values(80))),
+    ("distance", "confidence 2", _sets(confidence=all_values(2))),
+    ("distance", "long gradient", _sets(gradient=all_values(100, shape=(COUNT, 3)))),
+    ("distance", "found 7", _sets(found=all_values(7, "|u1"))),
+    ("distance", "surface nowhere", _sets(surface_point=all_values(NAN, shape=(COUNT, 3)))),
+    ("distance", "negative to unknown", _sets(unknown_distance_m=all_values(-1))),
+    ("spheres", "one status", _sets(status=packed([1], "|u1"))),
+    ("spheres", "status 200", _sets(status=all_values(200, "|u1"))),
+    ("segments", "too many", lambda body: body.update({
+        name: packed([0.5] * 200) if name.endswith("_m") else packed([0] * 200, "|u1")
+        for name in body if name not in ("triquad", "kind", "epoch")})),
+    ("segments", "contact behind the start", _sets(contact_m=all_values(-5))),
+    ("segments", "clearance no number", _sets(clearance_m=all_values(NAN))),
+    ("segments", "blocked 7", _sets(blocked=all_values(7, "|u1"))),
+    ("rays", "beyond what was asked", _sets(range_m=all_values(900))),
+    ("rays", "no number", _sets(range_m=all_values(NAN))),
+    ("rays", "one ray", _sets(range_m=packed([1.0]), status=packed([1], "|u1"))),
+    ("ground", "infinite drop", _sets(drop_m=all_values(INF))),
+    ("ground", "confidence -1", _sets(confidence=all_values(-1))),
+    ("ground", "normal no number", _sets(normal=all_values(NAN, shape=(COUNT, 3)))),
+    ("grid", "another shape", _sets(distance_m=all_values(1, shape=(1, 1, 1)),
+                                    status=all_values(1, "|u1", (1, 1, 1)))),
+    ("grid", "status 9", _sets(status=all_values(9, "|u1", (4, 4, 4)))),
+    ("grid", "no number", _sets(distance_m=all_values(NAN, shape=(4, 4, 4)))),
+    ("align", "no pose", _sets(world_from_sensor=packed(np.ones((4, 4)), "<f8"))),
+    ("align", "pose no number", _sets(world_from_sensor=all_values(NAN, "<f8", (4, 4)))),
+    ("align", "inlier share 7", _sets(inlier_share=7.0)),
+    ("align", "covariance infinite", _sets(covariance=all_values(INF, "<f8", (6, 6)))),
+    ("align", "a thousand million steps", _sets(iterations=10**9)),
+    ("changes", "since another epoch", _sets(since=3)),
+    ("changes", "negative epochs", _sets(epochs=packed([-1, -2], "<i8"))),
+    ("changes", "corner no number", _sets(minimum=all_values(NAN, "<f8", (2, 3)))),
+    ("changes", "fewer voxels", _sets(voxels=packed([3], "<i8"))),
+    ("sources", "too many points", _within("sources/lidar/newest",
+                                           points=all_values(0, shape=(5000, 3)))),
+    ("sources", "no pose", _within("sources/lidar/newest",
+                                   world_from_sensor=all_values(0, "<f8", (4, 4)))),
+    ("sources", "trail no number", _within("sources/lidar", trail=all_values(NAN, "<f8", (2, 3)))),
+    ("sources", "fewer pieces", _within("sources/lidar", pieces=packed([0], "<i8"))),
+    ("sources again", "turns back", _second(_sets(revision=1))),
+    ("tiles", "one epoch too few", _sets(changed=packed([], "<i8"))),
+    ("tiles", "side no number", _sets(tile_side_m=NAN)),
+    ("tiles", "no side", _sets(tile_side_m=0.0)),
+    ("tile", "corner that is not there", _sets(faces=packed([[0, 1, 99]], "<i4"))),
+    ("tile", "negative corner", _sets(faces=packed([[0, 1, -1]], "<i4"))),
+    ("tile", "vertices no number", _sets(vertices=all_values(NAN, shape=(3, 3)))),
+    ("mesh", "corner that is not there", _sets(faces=packed([[0, 1, 99]], "<i4"))),
+    ("mesh", "another epoch", _sets(epoch=EPOCH + 1)),
+    ("watch", "cells no number", _sets(cell_m=NAN)),
+    ("watch", "side 1e30 m", _sets(tile_side_m=1e30)),
+    ("watch", "epoch -5", _sets(epoch=-5)),
+    ("watch", "sizes that are too large", _sets(sizes=packed([2**40], "<i8"))),
+    ("watch", "version -1", _sets(versions=packed([-1], "<i8"))),
+    ("watch again", "turns back", _second(_sets(revision=1))),
+    ("watch again", "another server", _second(_sets(server="y"))),
+    ("status", "negative counts", _sets(scans_taken=-4)),
+    ("status", "no time", _sets(uptime_s=NAN)),
+    ("status", "long names", _sets(device="x" * 60_000)),
+    ("status", "epoch 2^62", _sets(epoch=2**62)),
+    ("metrics", "too few buckets", _within("operations/*/answers", counts=packed([1], "<i8"))),
+    ("metrics", "negative buckets",
+     _within("operations/*/answers", counts=packed([1, -1, 0], "<i8"))),
+    ("metrics", "bounds no number", _sets(bounds_s=packed([NAN, NAN], "<f8"))),
+    ("flush", "negative counts", _sets(taken=-1)),
+    ("checkpoint", "no digest", _sets(sha256="../../etc/passwd")),
+    ("reset", "epoch -1", _sets(epoch=-1)),
+    ("download", "2^62 bytes", _sets(bytes=2**62)),
+    ("download", "chunks of 0 bytes", _sets(chunk_bytes=0)),
+    ("download", "another digest", _sets(sha256="0" * 64)),
+    ("chunk", "more than was asked", lambda body: body.update(data=body["data"] * 2)),
+    ("chunk", "less than was asked", lambda body: body.update(data=body["data"][:-1])),
+    ("chunk", "from elsewhere", lambda body: body.update(offset=body["offset"] + CHUNK_BYTES)),
+]  # fmt: skip
+
+LIES = [
+    Lie(f"{asked}: {name}", QUESTIONS[asked][0], change, QUESTIONS[asked][1])
+    for asked, name, change in _LIES
+]

@@ -1,0 +1,183 @@
+"""``triquad-keys``: who may do what on a server, by certificates."""
+
+import argparse
+import datetime
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from triquad_format.wire.roles import Holder, Role
+
+from triquad_tools.console.arguments import add_version, positive
+from triquad_tools.console.command import OK, run
+from triquad_tools.console.report import print_columns
+from triquad_tools.credentials.key_folder import LISTENING, KeyFolder
+
+_COMMAND = "triquad-keys"
+_DAYS = 365.0
+_LAST_DOMAIN = 232  # of ROS 2
+_ROLES = {
+    Role.VIEWER: "may question the map and follow it",
+    Role.ROBOT: "may publish scans, as the sources named, and what a viewer may",
+    Role.ADMIN: "may reset, restore and pin the map and have checkpoints written, and what a "
+    "viewer may; with --source, publish scans too",
+}
+_RESTART = "start servers and routers anew, for they read their file when they start"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool: 0 done, 2 wrong usage, or a folder that cannot be used."""
+    options = _parser().parse_args(argv)
+    return run(_COMMAND, partial(options.work, options))
+
+
+def _init(options: argparse.Namespace) -> int:
+    first = (
+        Holder("viewer", Role.VIEWER),
+        Holder("robot", Role.ROBOT, tuple(options.source or ["default"]), options.ros2_domain),
+        Holder("admin", Role.ADMIN),
+    )
+    folder = KeyFolder.create(options.folder, options.host, options.days)
+    for holder in first:
+        folder.add(holder, options.days)
+    print(
+        f"{options.folder} is ready; keep it to yourself, {options.folder / 'authority'} above all."
+        f"\n  triquad-server --config {options.folder / 'server.json5'}\n"
+        f"  triquad-top --config {options.folder / 'viewer.json5'}"
+    )
+    return OK
+
+
+def _add(options: argparse.Namespace) -> int:
+    sources = tuple(dict.fromkeys(options.source or ()))
+    holder = Holder(options.name, options.role, sources, options.ros2_domain)
+    file = KeyFolder(options.folder).add(holder, options.days)
+    print(f"{file}: move it to where {options.name} runs; {_RESTART}")
+    return OK
+
+
+def _renew(options: argparse.Namespace) -> int:
+    folder = KeyFolder(options.folder)
+    for name in options.name:
+        print(folder.renew(name, options.days))
+    print("the old ones are valid until they expire; put the new files in their place")
+    return OK
+
+
+def _remove(options: argparse.Namespace) -> int:
+    KeyFolder(options.folder).remove(options.name)
+    print(f"{options.name} has no role any more; {_RESTART}")
+    return OK
+
+
+def _list(options: argparse.Namespace) -> int:
+    folder = KeyFolder(options.folder)
+    hosts = ", ".join(folder.register.hosts) or "this machine"
+    rows = [(name, name, hosts, "", _day(folder.certificate(name).expires)) for name in LISTENING]
+    for entry in folder.register.entries:
+        holder = entry.holder
+        domain = "" if holder.ros2_domain is None else str(holder.ros2_domain)
+        sources = ", ".join(holder.sources)
+        rows.append((holder.name, holder.role.value, sources, domain, _day(entry.expires)))
+    print_columns(
+        ("name", "role", "hosts or sources", "ROS 2 domain", "expires"),
+        rows,
+        words=("role", "hosts or sources", "expires"),
+    )
+    return OK
+
+
+def _day(expires: datetime.datetime) -> str:
+    """The day, and whether it has passed."""
+    over = expires < datetime.datetime.now(datetime.timezone.utc)
+    return f"{expires:%Y-%m-%d}{' EXPIRED' if over else ''}"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=_COMMAND,
+        description="Give roles to those who use a map server: a certificate authority in a "
+        "folder, and a Zenoh configuration for the server, routers and each client, who may do "
+        "what their roles say, and nothing else. docs/security.md tells more.",
+        epilog="Exit status: 0 done, 2 wrong usage, or a folder that cannot be used.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_init(commands)
+    for role, may in _ROLES.items():
+        add = _command(commands, role.value, f"add one who {may}", _add)
+        add.set_defaults(role=role, source=None, ros2_domain=None)
+        add.add_argument("name", metavar="NAME", help="of the client")
+        if role is not Role.VIEWER:
+            _add_sources(add, required=role is Role.ROBOT)
+        _add_days(add)
+    renew = _command(commands, "renew", "issue new certificates before the old ones expire", _renew)
+    renew.add_argument("name", nargs="+", metavar="NAME", help="of a client, server or router")
+    _add_days(renew)
+    remove = _command(commands, "remove", "take a role away", _remove)
+    remove.add_argument("name", metavar="NAME", help="of a client")
+    _command(commands, "list", "tell who has which role, and until when", _list)
+    add_version(parser)
+    return parser
+
+
+def _add_init(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    init = _command(
+        commands, "init", "make a new folder, with the clients viewer, robot and admin", _init
+    )
+    init.add_argument(
+        "--host",
+        action="append",
+        default=[],
+        metavar="HOST",
+        help="name or address by which others find the server, or a router, repeatable; the "
+        "machine itself finds it without",
+    )
+    _add_sources(init, required=False)
+    _add_days(init)
+
+
+def _command(
+    commands: "argparse._SubParsersAction[argparse.ArgumentParser]",
+    name: str,
+    what: str,
+    work: object,
+) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = commands.add_parser(name, help=what, description=what)
+    command.set_defaults(work=work)
+    command.add_argument("folder", type=Path, metavar="DIR", help="the folder of keys")
+    return command
+
+
+def _add_sources(command: argparse.ArgumentParser, *, required: bool) -> None:
+    command.add_argument(
+        "--source",
+        action="append",
+        required=required,
+        metavar="NAME",
+        help="of scans that the robot publishes, and nobody else, repeatable"
+        + ("" if required else " (default: default)" if command.prog.endswith("init") else ""),
+    )
+    command.add_argument(
+        "--ros2-domain",
+        type=_domain,
+        metavar="N",
+        help="let nodes of ROS 2 with this certificate take part in this domain",
+    )
+
+
+def _add_days(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--days",
+        type=positive,
+        default=_DAYS,
+        metavar="N",
+        help=f"until the certificate expires (default: {_DAYS:g})",
+    )
+
+
+def _domain(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) > _LAST_DOMAIN:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a domain of ROS 2: use 0 to {_LAST_DOMAIN}"
+        )
+    return int(text)
