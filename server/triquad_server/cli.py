@@ -89,7 +89,7 @@ def _run(options: argparse.Namespace) -> int:
     from triquad_format.wire.keys import check_name
 
     from triquad_server.launch_options import LaunchOptions
-    from triquad_server.net.session import NetworkOptions
+    from triquad_server.net.configuration import NetworkOptions
     from triquad_server.settings_loading import load_settings, settings_toml
     from triquad_server.stop import Stop, Stops
 
@@ -111,7 +111,7 @@ def _run(options: argparse.Namespace) -> int:
         connect=tuple(map(full_endpoint, options.connect)),
         mode=options.mode,
         config_file=options.config,
-        multicast_scouting=False if options.no_multicast_scouting else None,
+        multicast_scouting=options.multicast_scouting,
     )
     why = run_server(
         LaunchOptions(
@@ -249,14 +249,25 @@ def _add_network(group: argparse._ArgumentGroup) -> None:
         help="another Zenoh router to connect to, repeatable",
     )
     add("-m", "--mode", choices=("router", "peer", "client"), help="default: router")
-    add("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration, JSON5")
+    add(
+        "-c",
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="Zenoh configuration, JSON5; what it leaves out is as without it: docs/server.md",
+    )
     add(
         "--metrics-port",
         metavar="PORT",
         help="answer /metrics (Prometheus) and /healthz there, on this machine alone unless "
         "metrics.address says otherwise: docs/metrics.md",
     )
-    add("--no-multicast-scouting", action="store_true", help="do not look for others by multicast")
+    add(
+        "--multicast-scouting",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="look for others by multicast, and be found (default: no)",
+    )
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapRecord, Region
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
 from triquad_map.composition.composed_view import ComposedView
@@ -34,6 +34,10 @@ class FrozenRegion:
     parameters: int
     changed: int  # epoch of its last change
     live_bytes: Mapping[str, int]  # what the live region took beside this one, by part
+
+    def record(self) -> Region:
+        """The region as a map file holds it, without training state."""
+        return region_record(self.index, self.engine, self.evidence, training=None)
 
 
 class Epoch(ComposedView):
@@ -71,10 +75,7 @@ class Epoch(ComposedView):
 
     def record(self) -> MapRecord:
         """The epoch as a map file holds it, without training state."""
-        regions = tuple(
-            region_record(region.index, region.engine, region.evidence, training=None)
-            for region in self.frozen_regions
-        )
+        regions = tuple(region.record() for region in self.frozen_regions)
         return MapRecord(self._name, self.number, settings=self.field_settings, regions=regions)
 
 

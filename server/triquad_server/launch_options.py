@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_server.net.session import NetworkOptions
+from triquad_server.net.configuration import NetworkOptions
 from triquad_server.settings import Settings
 
 

@@ -255,8 +255,8 @@ class ResetReply(Message):
     """Answer to :class:`ResetRequest`: what has happened, and how to go back."""
 
     epoch: Epoch  # the first without the box's content
-    kept_epoch: Epoch | None = None  # the map as it was stays on disk as this; None: it does not
-    undo: str | None = None  # how to go back to it, or why one cannot, for people
+    kept_epoch: Epoch | None = None  # as which the map of before stays on disk; None: it does not
+    undo: Annotated[str, Text(4096)] | None = None  # how to go back to it, or why one cannot
 
 
 @dataclass(frozen=True)

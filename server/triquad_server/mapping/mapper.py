@@ -13,7 +13,7 @@ from triquad_format.records.region import MapRecord
 
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.epochs import Epoch, FrozenRegion
-from triquad_server.errors import ScanRefusedError
+from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.normals import SurfaceNormals
@@ -122,7 +122,11 @@ class Mapper:
             What of it is used, and how many points and rays without a return are not.
 
         Raises:
-            ScanRefusedError: the scan cannot be used; the map is unchanged.
+            ScanRefusedError: the scan cannot be used; the map is unchanged. Where memory ran out
+                amid it, the reason is ``out_of_memory``, and the map as after any other exception.
+            MapLostError: the scan is half in the map, and what was published cannot be restored.
+            Exception: the scan failed midway. Of it nothing is in the map: regions that it touched
+                are as in the newest epoch.
         """
         of_source = self._settings.sources.get(source, ANY_SOURCE)
         rays = usable_rays(
@@ -134,6 +138,19 @@ class Mapper:
         )
         around = self._regions_around(rays)
         self._check_regions(around)
+        try:
+            self._take_in(rays, around, stamp_s)
+        except MemoryError as error:
+            self._go_back(rays, around)
+            raise ScanRefusedError(
+                "out_of_memory", "the system gives the server no more memory"
+            ) from error
+        except Exception:
+            self._go_back(rays, around)
+            raise
+        return rays
+
+    def _take_in(self, rays: ScanRays, around: list[RegionIndex], stamp_s: int) -> None:
         regions = [self._region(index) for index in around]
         with self._teams.mapping.beside() as beside:
             for region in regions:
@@ -144,7 +161,29 @@ class Mapper:
             self._share_pool()
         for region in regions:
             region.set_normals(normals)
-        return rays
+
+    def _go_back(self, rays: ScanRays, touched: list[RegionIndex]) -> None:
+        """Undo a scan that failed midway: what it touched is again as it was published last.
+
+        What those regions had learnt since, and what training needs beyond the field, goes too.
+
+        Raises:
+            MapLostError: that fails as well.
+        """
+        published = {old.index: old for old in self._epoch.frozen_regions} if self._epoch else {}
+        for index in touched:
+            self._regions.pop(index, None)  # first: memory may be what is short
+        self._structure_changed = True
+        try:
+            for index in published.keys() & set(touched):
+                region = LiveRegion.restore(published[index].record(), self._setup)
+                self._regions[index] = region
+            if len(rays.ends):
+                self._normals.forget(rays.ends.min(axis=0), rays.ends.max(axis=0))
+            self._share_pool()
+        except Exception as error:
+            text = f"a scan failed, and the map before it is lost: {error!r}"
+            raise MapLostError(text) from error
 
     def train(self) -> None:
         """One optimiser step where the training budget is largest; nothing once all is settled."""

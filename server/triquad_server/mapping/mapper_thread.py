@@ -14,7 +14,7 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
 from triquad_server.epochs import EpochHistory
-from triquad_server.errors import MapperStoppedError, ScanRefusedError
+from triquad_server.errors import MapLostError, MapperStoppedError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
@@ -256,13 +256,19 @@ class MapperThread:
                 source=scan.source,
                 no_return=scan.no_return,
             )
+        except MapLostError:
+            raise
         except ScanRefusedError as error:
             self._scans.dropped.add(error.reason)
             self._scans.ledger.refuse(scan, str(error))
+            if error.reason == "out_of_memory":
+                self._take_back(str(error))
             _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
         except Exception as error:  # bad input, whatever it is, must not stop the server
             self._scans.dropped.add("internal")
-            self._scans.ledger.refuse(scan, f"internal error of the server: {error!r}")
+            text = f"internal error of the server: {error!r}"
+            self._scans.ledger.refuse(scan, text)
+            self._take_back(text)
             _log.exception("scan %d of %s could not be taken in", scan.sequence, scan.source)
         else:
             for reason, count in rays.points_dropped.items():
@@ -274,6 +280,13 @@ class MapperThread:
             self._unpublished = True
             self._scans.ledger.take(scan)
         return True
+
+    def _take_back(self, why: str) -> None:
+        """Count as refused what no epoch shows yet: a scan failed, and the map went back."""
+        count = self._scans.ledger.take_back(why)
+        self._scans_taken -= count
+        if count:
+            _log.warning("%d scans were taken back with one that failed: %s", count, why)
 
     def _publish(self) -> None:
         self.time.begin(Activity.PUBLISHING)

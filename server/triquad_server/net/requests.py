@@ -168,6 +168,9 @@ class RequestHandlers:
     def _receive(self, queryable: zenoh.Queryable[Any], key: str) -> None:
         """Empty the channel at once: a full one would stall the network's threads."""
         for query in queryable:
+            if str(query.key_expr) != key:
+                query.drop()  # unanswered: who means it names it
+                continue
             request = Request(query, key, self._operations[key].counts)
             if request.size > self._max_bytes:
                 text = f"{request.size} bytes exceed the limit of {self._max_bytes}: split it"
