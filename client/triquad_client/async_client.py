@@ -154,9 +154,11 @@ class AsyncClient(AsyncMapQueries):
             download.fetch_box(Path(path), bounds, self._connection.max_download_bytes)
         )
 
-    async def sync(self, bounds: Bounds, path: str | Path) -> AsyncSyncedMap:
+    async def sync(
+        self, bounds: Bounds, path: str | Path, accept_emptier: bool = False
+    ) -> AsyncSyncedMap:
         synced = AsyncSyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
-        await synced.refresh()
+        await synced.refresh(accept_emptier)
         return synced
 
     async def maps(self) -> list[str]:

@@ -295,7 +295,7 @@ class Client(MapQueries):
             download.fetch_box(Path(path), bounds, self._connection.max_download_bytes)
         )
 
-    def sync(self, bounds: Bounds, path: str | Path) -> SyncedMap:
+    def sync(self, bounds: Bounds, path: str | Path, accept_emptier: bool = False) -> SyncedMap:
         """Keep a copy of what the map needs to answer within ``bounds``, and ask that.
 
         What is in the file already is taken up: only the parts that changed are sent. The copy
@@ -306,14 +306,17 @@ class Client(MapQueries):
                 make it larger than where you ask by the largest distance that you ask for.
             path: the file; one that is no valid map file is replaced. :func:`open_map` opens it
                 without a server.
+            accept_emptier: replace a copy that is in the file already also by a map that knows less
+                than half as much of the box.
 
         Raises:
             InvalidInputError: the bounds are not a box, or hold nothing.
+            EmptierMapError: the file has a copy that knows far more, and stays as it is.
             DownloadError: what arrived is not valid.
             OSError: the file cannot be read or written.
         """
         synced = SyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
-        synced.refresh()
+        synced.refresh(accept_emptier)
         return synced
 
     def maps(self) -> list[str]:

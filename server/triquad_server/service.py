@@ -51,6 +51,7 @@ from triquad_server.source_queries import SourceQueries
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.resets import Resets
+from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
 from triquad_server.threads import Teams
 
@@ -130,13 +131,17 @@ class Service:
         self._serve_changes(health.server)
         self._serve_sources(health.server)
         feed, tiles = self._serve_mesh(health.server)
-        downloads = self._serve_downloads()
+        downloads = self._serve_downloads(health.server)
         self.metrics = Metrics(
             health, self._session, tiles=tiles, downloads=downloads, queues=self._operations.queues
         )
         self._serve_status()
         checkpoints.start()
         self._parts.callback(checkpoints.close)
+        store, scrub_h = self._served.store, self._settings.store.scrub_h
+        if store is not None and scrub_h > 0:
+            scrubber = Scrubber(store.folder, scrub_h, damaged=checkpoints.found_damaged)
+            self._parts.callback(scrubber.close)
         resets = Resets(
             self._mapper,
             checkpoints,
@@ -276,8 +281,8 @@ class Service:
             },
         )
 
-    def _serve_downloads(self) -> MapDownloads:
-        downloads = MapDownloads(self._mapper)
+    def _serve_downloads(self, server: str) -> MapDownloads:
+        downloads = MapDownloads(self._mapper, server)
         self._serve(
             "downloads",
             {

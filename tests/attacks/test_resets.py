@@ -72,6 +72,7 @@ def test_what_was_learnt_while_the_map_is_being_kept_is_kept_too(tmp_path: Path)
     """Scans stream in all the while: each is in the kept map, or in the new one."""
     with served(tmp_path) as (server, client):
         for _ in range(3):
+            servers.learn(client, scans=1)
             for _ in range(10):
                 client.publish_scan(servers.sphere(3000), np.eye(4))
             reply = client.reset()

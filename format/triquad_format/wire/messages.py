@@ -276,6 +276,7 @@ class MapInfo(Message):
     bytes: Count
     sha256: Digest
     chunk_bytes: Annotated[int, Within(1, MAX_CHUNK_BYTES)]
+    server: Name = ""  # a name of this server process; empty where it does not tell
 
 
 @dataclass(frozen=True)

@@ -135,6 +135,18 @@ class CheckpointThread:
         self._wake.set()
         return result.result()
 
+    def found_damaged(self, name: str) -> None:
+        """Have all of the map written anew, if the newest checkpoint needs the file ``name``."""
+        self._asked.put(_Job(lambda: self._write_anew(name), Future()))
+        self._wake.set()
+
+    def _write_anew(self, name: str) -> None:
+        assert self._store is not None
+        if self._store.forget_base(name):
+            _log.warning("the newest checkpoint needs %s: all of the map is written anew", name)
+            self.last = None
+            self._write_if_changed()
+
     def _run(self) -> None:
         lower_priority(2 * NICENESS)  # mapping comes first, too
         due = time.monotonic() + self._period_s

@@ -139,17 +139,16 @@ class KeptCheckpoints:
     def protect(self, epoch: int, why: str, instead_of: int | None = None) -> None:
         """Have a checkpoint stay for ``protect_h``, whatever else retention says.
 
-        Where it stays in any case, nothing changes. ``instead_of`` is one that may go for it.
+        The time of one that is protected already begins anew. ``instead_of`` is one that may go
+        for it.
 
         Raises:
             StoreError: too much is protected already.
             OSError: this cannot be recorded, and does not count.
         """
         already = self._protected.epochs
-        if epoch in already:
-            return
-        others = already - {instead_of}
-        self._check_protected(epoch, others)
+        if epoch not in already:
+            self._check_protected(epoch, already - {instead_of})
         self._protected.add(epoch, why)
         if instead_of in already:
             self._protected.remove(instead_of)

@@ -24,9 +24,9 @@ _log = logging.getLogger(__name__)
 
 _READ_BYTES = 2**20
 
-MAX_EPOCH = 2**53
-"""A map goes on from epochs below this: at a million a second, that is enough for 280 years. What
-is above was not counted by any server, and would end in numbers that no message can hold."""
+MAX_EPOCH = 2**52
+"""A map goes on from epochs below this: at a million a second, that is enough for 140 years. What
+is above was not counted by any server, and would end where no client takes numbers any more."""
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,13 @@ class Store:
         self._set_newest(path, written, {} if known is None else known.stored)
         return info
 
+    def forget_base(self, name: str) -> bool:
+        """Write all of the map next time, if the newest checkpoint needs the file ``name``."""
+        if self._known is None or name not in self._known.files:
+            return False
+        self._known = None
+        return True
+
     def fold(self, stopping: Callable[[], bool]) -> CheckpointInfo | None:
         """Put the newest checkpoint into one file, where that pays; the answer tells of it.
 
