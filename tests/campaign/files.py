@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import multiprocessing
 import os
 import resource
@@ -75,10 +76,10 @@ def _read_mutants(turn: Turn, part: int, tell: Connection) -> None:
     folder.mkdir()
     maps = valid_maps(folder)
 
-    chunk = 0
-    while not turn.over:
+    for chunk in itertools.count():
         _read_chunk(turn, maps, (turn.seed, part, chunk), tell)
-        chunk += 1
+        if turn.over:
+            break
     tell.send((_ENDED, ""))
 
 
