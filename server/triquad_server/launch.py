@@ -21,6 +21,7 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.configuration import Configuration, configuration
 from triquad_server.net.session import open_session
+from triquad_server.open_files import allow_open_files
 from triquad_server.phases import Phases
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.protection import protection
@@ -59,6 +60,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     give_back_early()
+    allow_open_files()
     if options.store is None:
         _log.warning("no --store: the map is not kept when the server stops")
     with closing(Supervision(ServiceManager())) as supervision:

@@ -39,7 +39,7 @@ class Campaign:
         self._running: set[str] = set()
         self._children: set[subprocess.Popen[bytes]] = set()
         self._stopped = threading.Event()
-        self._ends_s = 0.0
+        self._began_s = self._ends_s = 0.0
 
     @property
     def broken(self) -> int:
@@ -52,8 +52,8 @@ class Campaign:
 
     def run(self, seconds: float, lanes: int) -> None:
         """Run turns until the time is up; the part that is farthest from its goal comes next."""
-        started = time.monotonic()
-        self._ends_s = started + seconds
+        self._began_s = time.monotonic() - self._record.seconds
+        self._ends_s = time.monotonic() + seconds
         try:
             with ThreadPoolExecutor(lanes) as pool:
                 running = [pool.submit(self._lane) for _ in range(lanes)]
@@ -64,9 +64,12 @@ class Campaign:
                     self._stop()
                     raise
         finally:
-            with self._lock:
-                self._record.seconds += time.monotonic() - started
-                self._record.write()
+            self._save()
+
+    def _save(self) -> None:
+        with self._lock:
+            self._record.seconds = time.monotonic() - self._began_s
+            self._record.write()
 
     def _stop(self) -> None:
         """End the turns that run; they do not count."""
@@ -84,7 +87,7 @@ class Campaign:
                 if self._stopped.is_set():
                     return
                 self._record.of(part.name).add(seed, result)
-                self._record.write()
+            self._save()
             self._tell(part, seed, result)
 
     def _next_part(self) -> Part | None:

@@ -31,7 +31,7 @@ _LIMIT_BYTES = 64 * 2**20
 
 _MUTATIONS = (*DAMAGE * 3, *FORGERY * 3, add_bombs, forge_bombs)
 _READ, _ENDED = "read", "ended"
-_CHUNK = 25  # mutants between two looks at the time
+_CHUNK = 50  # mutants between two looks at the time
 
 
 def run(turn: Turn) -> None:

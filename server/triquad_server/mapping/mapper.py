@@ -203,7 +203,12 @@ class Mapper:
         if self._epoch is not None or not self._number:
             self._number += 1
         before = {old.index: old for old in self._epoch.frozen_regions} if self._epoch else {}
-        regions = tuple(self._freeze(region, before) for region in self._regions.values())
+        try:
+            regions = tuple(self._freeze(region, before) for region in self._regions.values())
+        except BaseException:
+            for region in self._regions.values():  # the next epoch is to show what this did not
+                region.changed = True
+            raise
         self._epoch = Epoch(
             name=self._name,
             number=self._number,

@@ -172,7 +172,7 @@ class CheckpointThread:
         """
         assert self._store is not None
         base = self._store.base_epoch
-        return self.write_changes(self._mapper.call(lambda mapper: mapper.changes_since(base)))
+        return self.write_changes(self._changes_since(base))
 
     def write_changes(self, changes: MapChanges) -> CheckpointInfo:
         """Write what changed since the last checkpoint; only for what runs on this thread.
@@ -211,7 +211,18 @@ class CheckpointThread:
             return store.write(changes)
         except StoreBaseError as error:
             _log.warning("%s; all of the map is written instead", error)
-            return store.write(self._mapper.call(lambda mapper: mapper.changes_since(None)))
+            return store.write(self._changes_since(None))
+
+    def _changes_since(self, base: int | None) -> MapChanges:
+        """What a checkpoint needs that follows the epoch ``base``.
+
+        Raises:
+            StoreError: memory does not suffice for a copy of it.
+        """
+        try:
+            return self._mapper.call(lambda mapper: mapper.changes_since(base))
+        except MemoryError as error:
+            raise StoreError("the map cannot be copied for a checkpoint: out of memory") from error
 
     def _fold(self) -> None:
         """Put old checkpoints together, where there are many."""

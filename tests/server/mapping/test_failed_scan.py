@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.servers import SMALL, scan, sphere
+from triquad_format.records.status import Status
 from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.live_region import LiveRegion
@@ -71,6 +72,18 @@ def test_a_map_that_cannot_be_restored_is_told_as_lost(
     monkeypatch.setattr(LiveRegion, "restore", lambda *_: 1 / 0)
     with pytest.raises(MapLostError):
         mapper.ingest(sphere(), THERE)
+
+
+def test_an_epoch_that_fails_midway_is_made_up_for_by_the_next(
+    mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper.ingest(sphere(), THERE)
+    with monkeypatch.context() as patched:
+        patched.setattr(LiveRegion, "_forget_gone", lambda *_: bytes(2**60))
+        with pytest.raises(MemoryError):
+            mapper.publish()
+    statuses = mapper.publish().query(PROBES, gradient=False).status
+    assert (statuses == Status.SURFACE).all()
 
 
 def test_scans_that_no_epoch_shows_are_counted_as_refused_with_it() -> None:
