@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +86,7 @@ def _scans(plain: Client, guarded: Client, scans: Sequence[PosedScan]) -> list[F
     for number in range(_TURNS):
         for client in took_s:
             part = scans[number * len(scans) // _TURNS : (number + 1) * len(scans) // _TURNS]
-            took_s[client] += seconds(lambda c=client, p=part: publish_all(c, p))  # type: ignore[misc]
+            took_s[client] += seconds(partial(publish_all, client, part))
     rates = {client: len(scans) / total for client, total in took_s.items()}
     return [
         Figure("scans taken in, plain TCP", rates[plain], "/s"),
@@ -100,7 +101,7 @@ def _queries(plain: _Server, guarded: _Server, made: BenchStreet) -> list[Figure
     times_ms: dict[str, list[float]] = {"plain TCP": [], "with roles": []}
     for _ in range(_QUERIES):
         for name, server in zip(times_ms, (plain, guarded), strict=True):
-            asking_s = seconds(lambda s=server: s.client.query_distance(points))  # type: ignore[misc]
+            asking_s = seconds(partial(server.client.query_distance, points))
             times_ms[name].append(1e3 * asking_s)
     quantiles = {name: np.quantile(times, [0.5, 0.99]) for name, times in times_ms.items()}
     figures = []
