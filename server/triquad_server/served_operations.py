@@ -6,8 +6,15 @@ import zenoh
 from triquad_format.wire import keys
 from triquad_format.wire.metrics_messages import QueueMetrics
 
+from triquad_server.net.askers import Askers
 from triquad_server.net.operation_counts import OperationCounts
-from triquad_server.net.requests import Handler, Operation, RequestHandlers, payload_limit
+from triquad_server.net.requests import (
+    Handler,
+    Operation,
+    RequestHandlers,
+    RequestLimits,
+    payload_limit,
+)
 from triquad_server.settings import ServiceSettings
 
 ReadQueue = Callable[[], QueueMetrics]
@@ -20,7 +27,14 @@ class ServedOperations:
     def __init__(self, session: zenoh.Session, map_name: str, limits: ServiceSettings) -> None:
         self._session = session
         self._map_name = map_name
-        self._limits = limits
+        self._askers = Askers(session)
+        self._groups: list[RequestHandlers] = []
+        self._limits = RequestLimits(
+            waiting=limits.request_queue,
+            waiting_bytes=limits.request_queue_bytes,
+            max_bytes=payload_limit(limits.max_query_points),
+            longest_s=limits.request_timeout_max_s,
+        )
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
         self.queues: dict[str, ReadQueue] = {}  # by name
 
@@ -36,11 +50,17 @@ class ServedOperations:
             counts = self.counts[name] = OperationCounts()
             operations[keys.operation_key(self._map_name, name)] = Operation(handler, counts)
         group = RequestHandlers(
-            self._session,
-            operations,
-            workers=workers,
-            waiting=self._limits.request_queue,
-            max_bytes=payload_limit(self._limits.max_query_points),
+            self._session, operations, self._askers, workers=workers, limits=self._limits
         )
+        self._groups.append(group)
         self.queues[queue] = lambda: group.queue
         return group
+
+    def stop(self) -> None:
+        """Refuse what waits and what comes in all groups; the end of none waits for another."""
+        for group in self._groups:
+            group.stop()
+
+    def close(self) -> None:
+        """End; all groups are closed by who asked for them, before."""
+        self._askers.close()

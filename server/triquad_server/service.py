@@ -30,7 +30,7 @@ from triquad_format.wire.query_messages import (
     SpheresRequest,
 )
 from triquad_format.wire.source_messages import SourcesRequest
-from triquad_map.questions.answers import Answers, QuestionLimits
+from triquad_map.questions.answers import QuestionLimits
 
 from triquad_server.change_queries import ChangeQueries
 from triquad_server.health import Health, Heartbeat
@@ -45,6 +45,7 @@ from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.net.requests import Handler, answering
+from triquad_server.questions import Questions
 from triquad_server.served_operations import ServedOperations
 from triquad_server.settings import Settings
 from triquad_server.source_queries import SourceQueries
@@ -85,7 +86,7 @@ class Service:
         self._served = served
         self._settings = settings
         self._operations = ServedOperations(session, served.name, settings.service)
-        self._scans = ScanQueue(settings.service.scan_queue)
+        self._scans = ScanQueue(settings.service.scan_queue, settings.service.scan_queue_bytes)
         self._warnings = ScanWarnings(self._scans, settings)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
@@ -100,7 +101,7 @@ class Service:
         return self._mapper.epochs.newest.number
 
     def close(self) -> None:
-        """Stop mapping, write a last checkpoint, and answer what still waits.
+        """Refuse what still waits, stop mapping, and write a last checkpoint.
 
         Raises:
             StoreError: the checkpoint cannot be written; all else is closed.
@@ -109,6 +110,7 @@ class Service:
 
     def _open(self, failed: Callable[[], None]) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
+        self._parts.callback(self._operations.close)
         self._mapper = self._open_mapper(failed)
         checkpoints = CheckpointThread(
             self._mapper,
@@ -163,6 +165,7 @@ class Service:
         self._parts.callback(Heartbeat(self._session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
+        self._parts.callback(self._operations.stop)  # of all groups, before any is waited for
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
         mapper = MapperThread(
@@ -204,30 +207,30 @@ class Service:
 
     def _serve_queries(self) -> None:
         limits = self._settings.service
-        answers = Answers(
+        questions = Questions(
             self._mapper.epochs.view,
             QuestionLimits(limits.max_query_points, limits.max_search_points),
         )
-        self._serve("field", {keys.SDF: answering(SdfRequest, answers.sdf)}, limits.query_workers)
+        self._serve("field", {keys.SDF: questions.of(SdfRequest)}, limits.query_workers)
         self._serve(
             "distances",
             {
-                keys.DISTANCE: answering(DistanceRequest, answers.distance),
-                keys.SPHERES: answering(SpheresRequest, answers.spheres),
+                keys.DISTANCE: questions.of(DistanceRequest),
+                keys.SPHERES: questions.of(SpheresRequest),
             },
             limits.query_workers,
         )
         self._serve(
             "places",
             {
-                keys.SEGMENTS: answering(SegmentsRequest, answers.segments),
-                keys.RAYS: answering(RaysRequest, answers.rays),
-                keys.GROUND: answering(GroundRequest, answers.ground),
-                keys.GRID: answering(GridRequest, answers.grid),
+                keys.SEGMENTS: questions.of(SegmentsRequest),
+                keys.RAYS: questions.of(RaysRequest),
+                keys.GROUND: questions.of(GroundRequest),
+                keys.GRID: questions.of(GridRequest),
             },
             limits.query_workers,
         )
-        self._serve("poses", {keys.ALIGN: answering(AlignRequest, answers.align)})
+        self._serve("poses", {keys.ALIGN: questions.of(AlignRequest)})
 
     def _serve_changes(self, server: str) -> None:
         queries = ChangeQueries(self._mapper.epochs, self._mapper.surface, server)

@@ -158,10 +158,22 @@ class ServiceSettings(BaseModel):
     model_config = SECTION
 
     scan_queue: Annotated[int, Field(ge=1, le=10_000)] = 32
-    """Scans that wait; the oldest is pushed out, and counted."""
+    """Scans of each source that wait; the oldest is pushed out, and counted. Sources take turns."""
+
+    scan_queue_bytes: Annotated[int, Field(ge=1_000_000, le=2**40)] = 100_000_000
+    """Bytes of the scans of all sources that wait; the oldest of the source that has most of them
+    is pushed out."""
 
     request_queue: Annotated[int, Field(ge=1, le=10_000)] = 64
-    """Requests that wait, per group of operations."""
+    """Requests that wait, per group of operations; of more, the newest of the client that has most
+    of them is refused."""
+
+    request_queue_bytes: Annotated[int, Field(ge=0, le=2**40)] = 64_000_000
+    """Bytes of the requests that wait, per group of operations, likewise."""
+
+    request_timeout_max_s: Annotated[float, Field(ge=0.1, le=1e6)] = 60.0
+    """A request is given up after this time, or after the shorter one for which its client
+    waits."""
 
     query_workers: Annotated[int, Field(ge=1, le=64)] = 2
     """Threads that answer queries of the field, as many for distances and spheres, and as many for

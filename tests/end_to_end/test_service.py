@@ -207,14 +207,14 @@ def test_the_status_is_published(endpoint):
 
 def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
     begun, go_on = threading.Event(), threading.Event()
-    answer = Answers.sdf
+    answer = Answers.answer
 
     def answer_later(queries, request):
         begun.set()
         assert go_on.wait(servers.WAIT_S)
         return answer(queries, request)
 
-    monkeypatch.setattr(Answers, "sdf", answer_later)
+    monkeypatch.setattr(Answers, "answer", answer_later)
     limits = ServiceSettings(request_queue=1, query_workers=1)
     settings = servers.SMALL.model_copy(update={"service": limits})
     key = keys.operation_key(servers.MAP, keys.SDF)

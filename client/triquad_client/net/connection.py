@@ -13,6 +13,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.endpoints import full_endpoint
 from triquad_format.wire.messages import ErrorReply
+from triquad_format.wire.origin import RequestOrigin
 from triquad_format.wire.reply import MAX_COUNT, check_answers
 from triquad_format.wire.zenoh_config import QUIET, fill, put
 
@@ -49,6 +50,7 @@ class Connection:
         self, session: zenoh.Session, map_name: str, timeout_s: float, *, max_download_bytes: int
     ) -> None:
         self._session = session
+        self._id = str(session.info.zid())
         # A session that a program forgot is closed before Python ends: Zenoh's threads must not
         # come back into an interpreter that is no longer there.
         self._close = weakref.finalize(self, session.close)
@@ -81,13 +83,15 @@ class Connection:
             ClosedError: the session was closed.
             ConnectError: it is broken.
         """
+        timeout_s = self._timeout_s(ask)
         try:
             replies: Iterable[zenoh.Reply] = self._session.get(
                 self._key(ask),
                 receiver,
                 payload=codec.encode(ask.message),
                 encoding=keys.encoding(type(ask.message)),
-                timeout=self._timeout_s(ask),
+                attachment=codec.encode(RequestOrigin(self._id, timeout_s)),
+                timeout=timeout_s,
                 priority=zenoh.Priority.BACKGROUND if ask.background else zenoh.Priority.DATA,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 consolidation=zenoh.ConsolidationMode.NONE,

@@ -3,6 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 
 import zenoh
 from triquad_format.errors import FormatError, ProtocolVersionError, WireError
@@ -10,11 +11,15 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import Scan
 
 from triquad_server.errors import ScanRefusedError
+from triquad_server.fair_queue import FairQueue, Owner
 from triquad_server.intake.rays import check_count
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.net.requests import payload_limit
 
 _log = logging.getLogger(__name__)
+
+_INBOX = 1024
+"""Messages of scans that wait to be decoded."""
 
 
 class ScanIntake:
@@ -31,15 +36,16 @@ class ScanIntake:
     ) -> None:
         """Begin to receive; ``arrived`` is called after each scan that was queued.
 
-        Scans of more than ``max_points`` points are refused here, so that the queue, whose limit
-        is a number of scans, is bounded in bytes too.
+        Scans of more than ``max_points`` points are refused here, before they wait.
         """
         self._max_points = max_points
         self._queue = queue
         self._arrived = arrived
+        # Scans as they came, by key: to decode them, too, takes time that a source may take up.
+        self._inbox: FairQueue[zenoh.Sample] = FairQueue(_INBOX, queue.limit_bytes)
         # A ring, since a full channel of another kind would stall the network's threads.
         self._subscriber = session.declare_subscriber(
-            keys.all_scans_key(map_name), zenoh.handlers.RingChannel(queue.limit)
+            keys.all_scans_key(map_name), zenoh.handlers.RingChannel(_INBOX)
         )
         self._thread = threading.Thread(target=self._run, name="scan-intake")
         self._thread.start()
@@ -51,14 +57,34 @@ class ScanIntake:
 
     def _run(self) -> None:
         for sample in self._subscriber:
-            self._queue.received += 1
-            self._queue.received_bytes += len(sample.payload)
-            try:
-                self._receive(str(sample.key_expr), sample.payload)
-            except Exception:  # an internal error must not stop the intake of other scans
-                self._queue.dropped.add("internal")
-                _log.exception("a scan on %s could not be received", sample.key_expr)
-            self._arrived()
+            self._keep(sample)
+            while (oldest := self._inbox.take()) is not None:
+                self._receive_safely(oldest)
+                self._empty_ring()
+
+    def _empty_ring(self) -> None:
+        """Keep what has come meanwhile: in a full ring, one source pushes out what is others'."""
+        with suppress(zenoh.ZError):  # it is closing
+            for _ in range(_INBOX):
+                sample = self._subscriber.try_recv()
+                if sample is None:
+                    return
+                self._keep(sample)
+
+    def _keep(self, sample: zenoh.Sample) -> None:
+        self._queue.received += 1
+        self._queue.received_bytes += len(sample.payload)
+        self._inbox.put(Owner(str(sample.key_expr)), sample, len(sample.payload))
+        self._inbox.excess(newest=False)  # which is a gap in the sequence, and counted as that
+
+    def _receive_safely(self, sample: zenoh.Sample) -> None:
+        """As :meth:`_receive`; an internal error must not stop the intake of other scans."""
+        try:
+            self._receive(str(sample.key_expr), sample.payload)
+        except Exception:
+            self._queue.dropped.add("internal")
+            _log.exception("a scan on %s could not be received", sample.key_expr)
+        self._arrived()
 
     def _receive(self, key: str, payload: zenoh.ZBytes) -> None:
         max_bytes = payload_limit(self._max_points)

@@ -2,7 +2,8 @@
 
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -10,11 +11,17 @@ from triquad_format.wire.messages import FlushReply, Scan
 from triquad_format.wire.metrics_messages import SourceMetrics
 
 from triquad_server.counter import Counter
+from triquad_server.fair_queue import FairQueue, Owner
 
 MAX_SESSIONS = 1024
 """Sessions of publishers that are remembered; the one heard of longest ago is forgotten."""
 
 MAX_SOURCES_LISTED = 64
+
+MAX_SOURCES_WAITING = 64
+"""Sources that may each have as many scans wait as one may; more share that."""
+
+_SCAN_BYTES = 2_000  # that a scan takes beside its points
 
 MAX_SEQUENCE = 2**48
 
@@ -262,16 +269,21 @@ def _with_track(before: SourceMetrics | None, track: _Track, age_s: float) -> So
 
 
 class ScanQueue:
-    """The newest scans that wait; where it is full, the oldest is pushed out and counted."""
+    """The newest scans of each source that wait; sources take turns.
 
-    def __init__(self, limit: int) -> None:
-        """At most ``limit`` scans wait."""
+    Where there are too many, the oldest is pushed out and counted: of a source that has too many,
+    or of the one that has most.
+    """
+
+    def __init__(self, limit: int, limit_bytes: int = 2**40) -> None:
+        """At most ``limit`` scans of each source wait, and ``limit_bytes`` of all together."""
         self.limit = limit
+        self.limit_bytes = limit_bytes
         self.ledger = SourceLedger()
         self.dropped = Counter()  # scans that are not in the map, by reason
         self.received = self.received_bytes = 0  # messages of scans, whatever became of them
         self._lock = threading.Lock()
-        self._scans: deque[Scan] = deque()
+        self._scans: FairQueue[Scan] = FairQueue(limit * MAX_SOURCES_WAITING, limit_bytes)
         self._in_hand = False
 
     def __len__(self) -> int:
@@ -280,12 +292,7 @@ class ScanQueue:
     @property
     def bytes_waiting(self) -> int:
         """Bytes of the scans that wait."""
-        with self._lock:
-            waiting = list(self._scans)
-        return sum(
-            scan.points.nbytes + (0 if scan.no_return is None else scan.no_return.nbytes)
-            for scan in waiting
-        )
+        return self._scans.nbytes
 
     def put(self, scan: Scan) -> None:
         """Add a scan, unless its sequence or stamp refuses it."""
@@ -294,9 +301,12 @@ class ScanQueue:
             if reason is not None:
                 self.dropped.add(reason)
                 return
-            self._scans.append(scan)
-            if len(self._scans) > self.limit:
-                self.ledger.push_out(self._scans.popleft())
+            owner = Owner(scan.source)
+            self._scans.put(owner, scan, _bytes_of(scan))
+            if self._scans.count(owner) > self.limit:
+                self.ledger.push_out(self._scans.drop_oldest(owner))
+            for pushed_out in self._scans.excess(newest=False):
+                self.ledger.push_out(pushed_out)
 
     def refuse(self, scan: Scan, reason: str, text: str) -> None:
         """Account for a scan that arrived but is not let in."""
@@ -306,8 +316,18 @@ class ScanQueue:
                 self.ledger.turn_away(scan, text)
             self.dropped.add(backwards or reason)
 
-    def take(self) -> Scan | None:
-        """The oldest waiting scan; it counts as waiting until the next one is asked for."""
+    def take(self, but: Collection[str] = ()) -> Scan | None:
+        """The oldest scan of the next source, not one of ``but``.
+
+        It counts as waiting until another is asked for.
+        """
         with self._lock:
-            self._in_hand = bool(self._scans)
-            return self._scans.popleft() if self._scans else None
+            scan = self._scans.take(lambda scan: scan.source not in but)
+            self._in_hand = scan is not None
+            return scan
+
+
+def _bytes_of(scan: Scan) -> int:
+    return (
+        _SCAN_BYTES + scan.points.nbytes + (0 if scan.no_return is None else scan.no_return.nbytes)
+    )

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from triquad_format.wire.messages import ResetReply, ResetRequest
+from triquad_format.wire.messages import ResetReply, ResetRequest, Scan
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
@@ -29,6 +29,9 @@ from triquad_server.threads import NICENESS
 _log = logging.getLogger(__name__)
 
 _GIVE_WAY_S = 0.1
+_SCANS_S = 0.05
+"""Scans of several sources are taken in for so long before training goes on."""
+
 _MIN_PUBLISH_SHARE = 5
 """Publishing takes at most one part in so many of the thread's time."""
 
@@ -194,14 +197,14 @@ class MapperThread:
             self._refuse_commands(ended)
 
     def _turn(self) -> None:
-        """One round: commands, a scan, a slice of training, an epoch where one is due."""
+        """One round: commands, scans, a slice of training, an epoch where one is due."""
         self._wake.clear()
         self._run_commands()
         if self._resting.is_set():
             self.time.begin(Activity.IDLE)
             self._wake.wait()
             return
-        took_scan = self._ingest_next()
+        took_scans = self._ingest_scans()
         if not self._mapper.settled:
             self.time.begin(Activity.GIVING_WAY)
             # However many ask, training waits a third of its time at most.
@@ -218,7 +221,7 @@ class MapperThread:
             self._publish_soon.clear()
             self._publish()
         self._record_progress()
-        if self._mapper.settled and not took_scan:
+        if self._mapper.settled and not took_scans:
             self.time.begin(Activity.IDLE)
             self._wake.wait(self._rest_s())
 
@@ -246,11 +249,18 @@ class MapperThread:
         for command in pending:
             command.result.set_exception(MapperStoppedError(why))
 
-    def _ingest_next(self) -> bool:
-        """Take in the oldest waiting scan; False where none waits."""
-        scan = self._scans.take()
-        if scan is None:
-            return False
+    def _ingest_scans(self) -> bool:
+        """Take in the oldest scan of each source, for a moment; False where none waits."""
+        ends_s = time.monotonic() + _SCANS_S
+        sources: set[str] = set()
+        while (scan := self._scans.take(sources)) is not None:
+            sources.add(scan.source)
+            self._ingest(scan)
+            if time.monotonic() > ends_s:
+                break
+        return bool(sources)
+
+    def _ingest(self, scan: Scan) -> None:
         self.time.begin(Activity.SCANS)
         try:
             rays = self._mapper.ingest(
@@ -283,7 +293,6 @@ class MapperThread:
             self._scans_taken += 1
             self._unpublished = True
             self._scans.ledger.take(scan)
-        return True
 
     def _take_back(self, why: str) -> None:
         """Count as refused what no epoch shows yet: a scan failed, and the map went back."""

@@ -1,9 +1,11 @@
 """Requests: received, kept in a bounded queue, handled by workers, and answered exactly once."""
 
 import logging
-import queue
 import threading
+import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
 import zenoh
@@ -13,7 +15,10 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 from triquad_format.wire.metrics_messages import QueueMetrics
 
+from triquad_server.asking_client import asking_client
+from triquad_server.net.askers import Asker, Askers
 from triquad_server.net.operation_counts import OperationCounts
+from triquad_server.net.request_queue import MOST_BEGUN, MOST_SENDING, Job, RequestQueue
 
 _log = logging.getLogger(__name__)
 
@@ -23,19 +28,44 @@ _POINT_BYTES = 12
 _OTHER_BYTES = 4096  # the largest message takes less without its points
 
 
+_SLICE_POINTS = 2048
+"""Points of a slice of a long request while others ask as well: some milliseconds."""
+
+_SLICE_ALONE_POINTS = 65_536
+
+_REFUSALS = 2  # threads that send them
+
+
 def payload_limit(points: int) -> int:
     """Most bytes that a message of so many points may have: what is larger is not decoded."""
     return points * _POINT_BYTES + _OTHER_BYTES
 
 
+@dataclass(frozen=True)
+class Turns:
+    """When a request is worked at, as its group has it."""
+
+    pause: Callable[[], None]  # returns when it is the request's turn again
+    send: Callable[[], None]  # its reply is on its way
+    problem: Callable[[], str | None]  # why nobody is answered any more
+
+
 class Request:
     """A query that waits for its answer."""
 
-    def __init__(self, query: zenoh.Query, key: str, counts: OperationCounts) -> None:
-        """``key`` is the key of the operation, whose ``counts`` tell what becomes of it."""
+    def __init__(
+        self, query: zenoh.Query, key: str, counts: OperationCounts, asker: Asker, askers: Askers
+    ) -> None:
+        """``key`` is the key of the operation, whose ``counts`` tell what becomes of it.
+
+        ``asker`` is whose it is, of all ``askers``.
+        """
         self.key = key
+        self.asker = asker
         self._query = query
         self._counts = counts
+        self._askers = askers
+        self._turns: Turns | None = None
         self._arrived_s = counts.arrive(self.size)
 
     @property
@@ -44,9 +74,34 @@ class Request:
         payload = self._query.payload
         return 0 if payload is None else len(payload)
 
-    def begin(self) -> None:
-        """It is its turn."""
+    def begin(self, turns: Turns) -> None:
+        """It is its turn.
+
+        Raises:
+            RefusedError: nobody waits for the answer any more, or the server is stopping.
+        """
+        self._turns = turns
         self._counts.begin(self._arrived_s)
+        self._check()
+
+    def turn(self) -> int:
+        """Return when it is its turn again; how many points may be searched around then.
+
+        Raises:
+            RefusedError: nobody waits for the answer any more, or the server is stopping.
+        """
+        if self._turns is not None:
+            self._turns.pause()
+        self._check()
+        return _SLICE_POINTS if self._askers.are_several else _SLICE_ALONE_POINTS
+
+    def _check(self) -> None:
+        if self._turns is not None and (problem := self._turns.problem()) is not None:
+            raise RefusedError("busy", problem)
+        if self._askers.has_left(self.asker):
+            raise RefusedError("timeout", "the client has left")
+        if time.monotonic() > self.asker.deadline_s:
+            raise RefusedError("timeout", "there was no time to finish: ask for less at once")
 
     def read(self, kind: type[RequestT]) -> RequestT:
         """The request's message.
@@ -92,6 +147,8 @@ class Request:
 
     def _finish(self, reply: Callable[[], None]) -> None:
         """Send the reply and end the query, also where the one who asked is gone."""
+        if self._turns is not None:
+            self._turns.send()
         try:
             with self._query:
                 reply()
@@ -119,6 +176,19 @@ def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Ha
     return handle
 
 
+_STOPPING = "the server is stopping"
+
+
+@dataclass(frozen=True)
+class RequestLimits:
+    """Bounds of what waits for the workers of a group."""
+
+    waiting: int  # requests
+    waiting_bytes: int  # of their payloads
+    max_bytes: int  # of a single payload
+    longest_s: float  # for which any client is believed to wait
+
+
 class RequestHandlers:
     """A group of operations that share a queue and workers, so that no other waits for them."""
 
@@ -126,50 +196,59 @@ class RequestHandlers:
         self,
         session: zenoh.Session,
         operations: Mapping[str, Operation],
+        askers: Askers,
         *,
         workers: int,
-        waiting: int,
-        max_bytes: int,
+        limits: RequestLimits,
     ) -> None:
-        """Begin to serve ``operations``, by key.
-
-        At most ``waiting`` requests, of ``max_bytes`` each, wait for one of the ``workers``.
-        """
+        """Begin to serve ``operations``, by key, with so many ``workers``."""
         self._operations = operations
-        self._max_bytes = max_bytes
-        self._waiting: queue.Queue[Request | None] = queue.Queue(waiting)
+        self._askers = askers
+        self._limits = limits
+        self._queue: RequestQueue[Request] = RequestQueue(
+            self._begin,
+            lambda: askers.are_several,
+            workers=workers,
+            limit=limits.waiting,
+            limit_bytes=limits.waiting_bytes,
+        )
+        self._stopping = False
+        # As many as ever work or send at a time; they are started when they are needed.
+        self._workers = ThreadPoolExecutor(max(MOST_BEGUN, workers) + MOST_SENDING, "worker")
+        self._refusals = ThreadPoolExecutor(_REFUSALS, "refusals")
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._receivers: list[threading.Thread] = []
-        self._workers = [
-            threading.Thread(target=self._work, name=f"worker-{number}")
-            for number in range(workers)
-        ]
         for key in operations:
-            channel = zenoh.handlers.FifoChannel(waiting)
+            channel = zenoh.handlers.FifoChannel(limits.waiting)
             queryable = session.declare_queryable(key, channel, complete=True)
             receive = threading.Thread(
                 target=self._receive, args=(queryable, key), name=f"receiver-{key}"
             )
             self._queryables.append(queryable)
             self._receivers.append(receive)
-        for thread in self._receivers + self._workers:
+        for thread in self._receivers:
             thread.start()
 
     @property
     def queue(self) -> QueueMetrics:
         """What waits for a worker."""
-        return QueueMetrics(self._waiting.qsize(), self._waiting.maxsize)
+        return self._queue.metrics
+
+    def stop(self) -> None:
+        """Refuse what waits and what comes, and end what is worked at as soon as it pauses."""
+        self._stopping = True
+        for request in self._queue.clear():
+            self._refuse_aside(request, "busy", _STOPPING)
 
     def close(self) -> None:
-        """Take no more requests, and handle those that wait."""
+        """As :meth:`stop`, and take no more requests."""
         for queryable in self._queryables:
             queryable.undeclare()
         for thread in self._receivers:
             thread.join()
-        for _ in self._workers:
-            self._waiting.put(None)
-        for thread in self._workers:
-            thread.join()
+        self.stop()
+        self._workers.shutdown()
+        self._refusals.shutdown()
 
     def _receive(self, queryable: zenoh.Queryable[Any], key: str) -> None:
         """Empty the channel at once: a full one would stall the network's threads."""
@@ -177,22 +256,40 @@ class RequestHandlers:
             if str(query.key_expr) != key:
                 query.drop()  # unanswered: who means it names it
                 continue
-            request = Request(query, key, self._operations[key].counts)
-            if request.size > self._max_bytes:
-                text = f"{request.size} bytes exceed the limit of {self._max_bytes}: split it"
-                request.refuse("too_large", text)
-                continue
-            try:
-                self._waiting.put_nowait(request)
-            except queue.Full:
-                request.refuse("busy", f"{self._waiting.maxsize} requests wait already; try later")
+            asker = self._askers.asker(query, self._limits.longest_s)
+            request = Request(query, key, self._operations[key].counts, asker, self._askers)
+            if request.size > self._limits.max_bytes:
+                limit = self._limits.max_bytes
+                text = f"{request.size} bytes exceed the limit of {limit}: split it"
+                self._refuse_aside(request, "too_large", text)
+            elif self._stopping:
+                self._refuse_aside(request, "busy", _STOPPING)
+            else:
+                for excess in self._queue.put(asker.owner, request, request.size):
+                    text = f"{self._limits.waiting} requests wait already; try later"
+                    self._refuse_aside(excess, "busy", text)
 
-    def _work(self) -> None:
-        while (request := self._waiting.get()) is not None:
-            request.begin()
-            try:
-                self._operations[request.key].handle(request)
-            except RefusedError as error:
-                request.refuse(error.code, error.message)
-            except Exception as error:
-                request.fail(error)
+    def _refuse_aside(self, request: Request, code: str, text: str) -> None:
+        """Refuse a request in another thread: its client may not take the reply."""
+        self._refusals.submit(request.refuse, code, text)
+
+    def _begin(self, job: Job[Request]) -> None:
+        self._workers.submit(self._work, job)
+
+    def _work(self, job: Job[Request]) -> None:
+        request = job.request
+        turns = Turns(
+            pause=lambda: self._queue.pause(job),
+            send=lambda: self._queue.send(job),
+            problem=lambda: _STOPPING if self._stopping else None,
+        )
+        asking_client.set(request.asker.owner.group)
+        try:
+            request.begin(turns)
+            self._operations[request.key].handle(request)
+        except RefusedError as error:
+            request.refuse(error.code, error.message)
+        except Exception as error:
+            request.fail(error)
+        finally:
+            self._queue.finish(job)

@@ -185,3 +185,35 @@ def test_a_scan_turned_away_says_nothing_of_those_that_wait():
     outcome = ledger.outcome(*asked)
     assert outcome is not None
     assert (outcome.taken, outcome.refused, outcome.lost) == (1, 1, 0)
+
+
+def test_sources_take_turns_and_the_busiest_loses_alone():
+    queue = ScanQueue(2)
+    for sequence in range(9):
+        queue.put(servers.scan(sequence, source="busy"))
+    queue.put(servers.scan(0))
+    queue.put(servers.scan(1))
+    order = [(scan.source, scan.sequence) for scan in iter(queue.take, None)]
+    assert order == [("busy", 7), ("lidar", 0), ("busy", 8), ("lidar", 1)]
+    assert queue.ledger.lost() == {"busy": 7}
+
+
+def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():
+    nbytes = servers.scan().points.nbytes
+    queue = ScanQueue(100, 10 * nbytes)
+    queue.put(servers.scan(0))
+    for sequence in range(50):
+        queue.put(servers.scan(sequence, source="busy"))
+    assert queue.bytes_waiting <= 10 * nbytes
+    assert queue.ledger.lost().keys() == {"busy"}
+    assert queue.take().source == "lidar"
+
+
+def test_invented_sources_push_out_each_other_first(monkeypatch):
+    monkeypatch.setattr(scan_queue, "MAX_SOURCES_WAITING", 2)
+    queue = ScanQueue(2)
+    queue.put(servers.scan(0))
+    for number in range(20):
+        queue.put(servers.scan(0, source=f"invented-{number}"))
+    assert len(queue) == 4
+    assert "lidar" not in queue.ledger.lost()

@@ -1,0 +1,28 @@
+"""Who asks, and for how long: the attachment of a request."""
+
+from dataclasses import dataclass
+
+from triquad_format.errors import WireError
+from triquad_format.wire import codec
+from triquad_format.wire.codec import Message
+
+MAX_ORIGIN_BYTES = 1024
+"""A longer attachment is not read."""
+
+
+@dataclass(frozen=True)
+class RequestOrigin(Message):
+    """Attached to a request, so that clients are answered in turn and nobody works for nothing."""
+
+    client: str  # Zenoh id of the session that asks, hexadecimal
+    timeout_s: float  # nobody waits for the reply for longer
+
+
+def read_origin(attachment: bytes | None) -> RequestOrigin | None:
+    """The origin that an attachment names; ``None`` where it names none."""
+    if attachment is None or len(attachment) > MAX_ORIGIN_BYTES:
+        return None
+    try:
+        return codec.decode(RequestOrigin, attachment)
+    except WireError:
+        return None

@@ -1,0 +1,98 @@
+"""Who asks: of which of the linked sessions a request is, and whether others ask as well."""
+
+import math
+import threading
+import time
+from dataclasses import dataclass
+
+import zenoh
+from triquad_format.wire.origin import MAX_ORIGIN_BYTES, RequestOrigin, read_origin
+
+from triquad_server.fair_queue import Owner
+
+_UNLINKED = ""
+"""The group of all who are not linked to the server itself: they take one turn together, since
+anybody may call himself as he likes."""
+
+
+_LATELY_S = 1.0
+_GRACE_S = 0.5  # a client's own time-out comes first
+_EVENTS = 1024  # that wait to be heard of
+
+
+@dataclass(frozen=True)
+class Asker:
+    """Who asked, and until when he waits for the answer."""
+
+    owner: Owner  # of the request
+    linked: bool  # whether it is the session at the other end of a link
+    deadline_s: float  # monotonic
+
+
+class Askers:
+    """Tells who asks; safe for any thread.
+
+    A client that is linked and says who it is has a turn of its own. One that comes through a
+    router, or says nothing, shares one with all such: Zenoh does not tell from which link a request
+    came, but invented names are no links.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        """Begin to watch who is linked to ``session``."""
+        self._lock = threading.Lock()
+        self._latest = Owner(_UNLINKED)  # of all requests
+        self._others_s = -math.inf  # when it last was another one, monotonic
+        self._links: dict[str, int] = {}  # transports by the Zenoh id at their other end
+        self._listener = session.info.declare_transport_events_listener(
+            zenoh.handlers.FifoChannel(_EVENTS), history=True
+        )
+        self._thread = threading.Thread(target=self._watch, name="links")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Watch no more."""
+        self._listener.undeclare()
+        self._thread.join()
+
+    @property
+    def are_several(self) -> bool:
+        """Whether more than one asked lately: whoever asks much then leaves time to others."""
+        return time.monotonic() - self._others_s < _LATELY_S
+
+    def asker(self, query: zenoh.Query, longest_s: float) -> Asker:
+        """Who asks; he is not believed to wait for more than ``longest_s``."""
+        asker = self._identify(_origin(query), longest_s)
+        with self._lock:
+            if asker.owner != self._latest:
+                self._latest, self._others_s = asker.owner, time.monotonic()
+        return asker
+
+    def has_left(self, asker: Asker) -> bool:
+        """Whether the link to one who asked is gone."""
+        return asker.linked and asker.owner.group not in self._links
+
+    def _identify(self, origin: RequestOrigin | None, longest_s: float) -> Asker:
+        now = time.monotonic()
+        if origin is None:
+            return Asker(Owner(_UNLINKED), linked=False, deadline_s=now + longest_s)
+        # Written so that NaN counts as not given.
+        wait_s = origin.timeout_s if 0 <= origin.timeout_s <= longest_s else longest_s
+        linked = origin.client in self._links
+        group = origin.client if linked else _UNLINKED
+        return Asker(Owner(group, origin.client), linked, deadline_s=now + wait_s + _GRACE_S)
+
+    def _watch(self) -> None:
+        for event in self._listener:
+            client = str(event.transport.zid)
+            count = self._links.get(client, 0) + (1 if event.kind == zenoh.SampleKind.PUT else -1)
+            if count > 0:
+                self._links[client] = count
+            else:
+                self._links.pop(client, None)
+
+
+def _origin(query: zenoh.Query) -> RequestOrigin | None:
+    attachment = query.attachment
+    if attachment is None or len(attachment) > MAX_ORIGIN_BYTES:
+        return None
+    return read_origin(attachment.to_bytes())
