@@ -28,8 +28,16 @@ _POINT_BYTES = 12
 _OTHER_BYTES = 4096  # the largest message takes less without its points
 
 
-_SLICE_POINTS = 2048
-"""Points of a slice of a long request while others ask as well: some milliseconds."""
+_SLICE_POINTS = 1024
+"""Points of a slice of a long request while others ask as well: some milliseconds of one core."""
+
+_QUICK_SLICES = 16
+"""So many slices of a request follow each other; then it rests, while others ask as well."""
+
+_REST = 2.0
+"""How many times as long as a slice took: mapping and the network need the cores, too."""
+
+_LONGEST_REST_S = 0.1
 
 _SLICE_ALONE_POINTS = 65_536
 
@@ -66,6 +74,8 @@ class Request:
         self._counts = counts
         self._askers = askers
         self._turns: Turns | None = None
+        self._slices = 0  # that have begun
+        self._slice_began_s = 0.0  # monotonic
         self._arrived_s = counts.arrive(self.size)
 
     @property
@@ -90,10 +100,16 @@ class Request:
         Raises:
             RefusedError: nobody waits for the answer any more, or the server is stopping.
         """
+        several = self._askers.are_several
+        if several and self._slices > _QUICK_SLICES:
+            took_s = time.monotonic() - self._slice_began_s
+            time.sleep(min(_REST * took_s, _LONGEST_REST_S))
         if self._turns is not None:
             self._turns.pause()
         self._check()
-        return _SLICE_POINTS if self._askers.are_several else _SLICE_ALONE_POINTS
+        self._slices += 1
+        self._slice_began_s = time.monotonic()
+        return _SLICE_POINTS if several else _SLICE_ALONE_POINTS
 
     def _check(self) -> None:
         if self._turns is not None and (problem := self._turns.problem()) is not None:
