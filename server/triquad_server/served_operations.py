@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 
 import zenoh
 from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.net.operation_counts import OperationCounts
@@ -12,6 +13,22 @@ from triquad_server.settings import ServiceSettings
 
 ReadQueue = Callable[[], QueueMetrics]
 """What waits in a queue now."""
+
+
+_OF_POINTS = frozenset({"field", "distances", "places", "poses"})
+"""The groups of operations that ask about points."""
+
+_KNOWN_TILE_BYTES = 20
+_PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
+
+
+def _largest_request(queue: str, limits: ServiceSettings) -> int:
+    """Most bytes of a request of a group: what is larger is refused before it is held."""
+    if queue in _OF_POINTS:
+        return payload_limit(limits.max_query_points)
+    if queue == "tile_updates":
+        return MAX_KNOWN_TILES * _KNOWN_TILE_BYTES + _PLAIN_BYTES
+    return _PLAIN_BYTES
 
 
 class ServedOperations:
@@ -40,7 +57,7 @@ class ServedOperations:
             operations,
             workers=workers,
             waiting=self._limits.request_queue,
-            max_bytes=payload_limit(self._limits.max_query_points),
+            max_bytes=_largest_request(queue, self._limits),
         )
         self.queues[queue] = lambda: group.queue
         return group
