@@ -12,7 +12,7 @@ class MemorySettings(BaseModel):
 
     model_config = SECTION
 
-    map_bytes: Annotated[int, Field(ge=1_000_000, le=2**50)] = 2_000_000_000
+    max_bytes: Annotated[int, Field(ge=1_000_000, le=2**50)] = 2_000_000_000
     """Of the live map with its newest epoch. A scan that would make it larger is refused as
     `map_full`; one that shows nothing new is taken on, and all else goes on too."""
 

@@ -127,7 +127,7 @@ class Service:
             warnings=self._warnings,
             mapper=self._mapper,
             checkpoints=checkpoints,
-            map_max_bytes=self._settings.memory.map_bytes,
+            map_max_bytes=self._settings.memory.max_bytes,
         )
         self._serve_queries()
         self._serve_changes(health.server)

@@ -25,7 +25,7 @@ def resident(server: ServerProcess) -> int:
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[ServerProcess]:
-    limits = [f"memory.map_bytes={MAP_BYTES}", f"memory.epochs_bytes={EPOCHS_BYTES}"]
+    limits = [f"memory.max_bytes={MAP_BYTES}", f"memory.epochs_bytes={EPOCHS_BYTES}"]
     arguments = [text for limit in limits for text in ("--set", limit)]
     with servers.server_process(arguments) as process:
         yield process
@@ -48,7 +48,7 @@ def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> N
         status = client.status()
         assert status.scans_dropped["map_full"] == report.refused > 0
         assert "map_full" not in str(status.warnings)
-        assert "memory.map_bytes" in str(report.last_refusal)
+        assert "memory.max_bytes" in str(report.last_refusal)
         assert 0 < status.map_bytes <= status.map_max_bytes == MAP_BYTES
         assert client.query_distance(np.zeros((10, 3)), max_distance_m=1.0).epoch > 0
         client.publish_scan(servers.sphere(500, 10.0), np.eye(4), source="honest")

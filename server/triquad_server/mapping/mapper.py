@@ -66,7 +66,7 @@ class Mapper:
             sums=GradientSums(),
             team=self._teams.mapping,
         )
-        self._budget = MemoryBudget(settings.memory.map_bytes, self._field_settings)
+        self._budget = MemoryBudget(settings.memory.max_bytes, self._field_settings)
         self._regions: dict[RegionIndex, LiveRegion] = {}
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None

@@ -81,6 +81,6 @@ class MemoryBudget:
         return ScanRefusedError(
             "map_full",
             f"the map takes {used / 1e6:.0f} MB and the scan would add some {needed / 1e6:.1f} MB, "
-            f"more than memory.map_bytes = {self.limit} allows: raise it, reset what is no longer "
+            f"more than memory.max_bytes = {self.limit} allows: raise it, reset what is no longer "
             "needed, or use a larger field.leaf_m for a new map",
         )

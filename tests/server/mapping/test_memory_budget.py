@@ -13,7 +13,7 @@ LIMIT = 8_000_000
 
 
 def mapper(limit: int = LIMIT) -> Mapper:
-    chosen = settings().model_copy(update={"memory": MemorySettings(map_bytes=limit)})
+    chosen = settings().model_copy(update={"memory": MemorySettings(max_bytes=limit)})
     return Mapper("test", chosen, "cpu")
 
 
@@ -38,7 +38,7 @@ def test_a_scan_that_does_not_fit_is_refused_and_changes_nothing() -> None:
     full, x = filled()
     used, epoch = full.bytes_used, full.publish()
     assert 0.5 * LIMIT < used <= LIMIT
-    with pytest.raises(ScanRefusedError, match=r"memory\.map_bytes = 8000000") as refusal:
+    with pytest.raises(ScanRefusedError, match=r"memory\.max_bytes = 8000000") as refusal:
         full.ingest(sphere(), at(x))
     assert refusal.value.reason == "map_full"
     assert full.bytes_used == used
@@ -62,7 +62,7 @@ def take_open_rays(full: Mapper) -> None:
 
 def test_free_space_counts_too() -> None:
     full = mapper()
-    with pytest.raises(ScanRefusedError, match="map_bytes") as refusal:
+    with pytest.raises(ScanRefusedError, match="max_bytes") as refusal:
         take_open_rays(full)
     assert refusal.value.reason == "map_full"
     assert full.bytes_used <= LIMIT
