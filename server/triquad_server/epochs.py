@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections import ChainMap
+from collections import ChainMap, Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -140,6 +140,7 @@ class EpochHistory:
         self._published_s = clock()  # when the newest was
         self._epochs = {first.number: first}  # oldest first
         self._pins: list[_Pin] = []  # in the order in which they were first asked for
+        self._viewed: Counter[int] = Counter()  # requests that are at work on an epoch, by number
 
     def add(self, epoch: Epoch) -> None:
         """Make ``epoch`` the newest; older ones may go."""
@@ -166,21 +167,39 @@ class EpochHistory:
             RefusedError: ``epoch_gone``.
         """
         with self._lock:
-            epoch = self._epochs.get(number) if number else self.newest
-            if epoch is None:
-                raise RefusedError(
-                    "epoch_gone", f"epoch {number} is not kept; kept are {sorted(self._epochs)}"
-                )
-            if number:
-                self._pin(asking_client.get(), number)
+            epoch = self._get(number)
             self._tidy()
             return epoch
 
     @contextmanager
     def view(self, number: int) -> Iterator[Epoch]:
-        """As :meth:`get`; training gives way while the epoch is asked."""
+        """As :meth:`get`; training gives way while the epoch is asked.
+
+        An epoch that grows old meanwhile is pinned: the request may be the first of many parts, of
+        which the next asks for it by number.
+        """
         with self.gate.query():
-            yield self.get(number)
+            with self._lock:
+                epoch = self._get(number)
+                self._viewed[epoch.number] += 1
+                self._tidy()
+            try:
+                yield epoch
+            finally:
+                with self._lock:
+                    self._viewed -= Counter([epoch.number])
+                    if epoch is not self.newest:
+                        self._pin(asking_client.get(), epoch.number)
+
+    def _get(self, number: int) -> Epoch:
+        epoch = self._epochs.get(number) if number else self.newest
+        if epoch is None:
+            raise RefusedError(
+                "epoch_gone", f"epoch {number} is not kept; kept are {sorted(self._epochs)}"
+            )
+        if number:
+            self._pin(asking_client.get(), number)
+        return epoch
 
     def _pin(self, client: str, number: int) -> None:
         """Note that a client asked for an epoch."""
@@ -195,9 +214,10 @@ class EpochHistory:
         """Let go of older epochs whose time is over, or that exceed a limit."""
         recent = list(self._epochs)[-self._settings.epochs_kept :]
         room = _Room(self.newest, self._older_bytes)
-        stay = {self.newest.number}
+        stay = {self.newest.number, *self._viewed}
         for number in self._pinned():
-            is_full = len(stay.difference(recent)) >= self._settings.epochs_pinned
+            pinned = stay.difference(recent, self._viewed)
+            is_full = len(pinned) >= self._settings.epochs_pinned
             if number in stay or (is_full and number not in recent):
                 continue
             if room.take(self._epochs[number], share=_PINNED_SHARE):

@@ -54,7 +54,9 @@ def test_work_for_a_client_that_has_left_stops(server, client):
 def test_work_for_a_client_that_waits_no_more_stops(server, client):
     many = points(4_000)
     with triquad_client.connect(server.endpoint, timeout_s=0.2) as impatient:
-        with pytest.raises(triquad_client.RequestTimeoutError):
+        # Its own time may end a moment after that of the network in between.
+        given_up = triquad_client.RequestTimeoutError, triquad_client.NoReplyError
+        with pytest.raises(given_up):
             ask_until_it_fails(lambda: impatient.query_segments(many[:2000], many[2000:], 0.3))
         until_none_is_pending(client, keys.SEGMENTS)
     assert operation(client, keys.SEGMENTS).refused.get("timeout", 0) > 0

@@ -116,7 +116,7 @@ def test_bad_requests_are_refused_by_the_server_too(endpoint):
         for change, code in (
             ({"since": -1}, "bad_request"),
             ({"since": 2**62}, "epoch_gone"),
-            ({"server": "x" * 60_000}, "epoch_gone"),
+            ({"server": "x" * 10_000}, "epoch_gone"),
             ({"minimum": np.full(3, np.nan)}, "bad_request"),
             ({"minimum": anywhere[1], "maximum": anywhere[0]}, "bad_request"),
         ):

@@ -22,6 +22,7 @@ from prometheus_client.openmetrics import parser as openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 from support import servers
 from triquad_client import RefusedError
+from triquad_format.printable import printable
 from triquad_server.errors import ListenError
 from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.monitoring.families import FAMILIES
@@ -314,7 +315,7 @@ def test_an_address_that_is_not_ours_is_named(address):
     settings = servers.SMALL.model_copy(
         update={"metrics": MetricsSettings(port=free_port(), address=address)}
     )
-    with pytest.raises(ListenError, match=address):
+    with pytest.raises(ListenError, match=re.escape(printable(address))):
         triquad_server.serve(settings=settings)
 
 

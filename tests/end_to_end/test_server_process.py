@@ -200,14 +200,14 @@ def test_a_store_that_cannot_be_written_is_exit_code_4(tmp_path):
     assert "cannot be written" in server.log
 
 
-def test_a_last_checkpoint_that_is_not_written_is_exit_code_4(tmp_path, arguments):
+def test_a_last_checkpoint_that_is_not_written_is_exit_code_5(tmp_path, arguments):
     with servers.server_process(arguments) as server:
         with triquad_client.connect(server.endpoint) as client:
             servers.learn(client)
         shutil.rmtree(tmp_path / "store" / servers.MAP)
         (tmp_path / "store" / servers.MAP).write_text("in the way")
         server.process.send_signal(signal.SIGTERM)
-        assert server.wait() == 4
+        assert server.wait() == 5
     assert "cannot be written" in server.log
     assert "Traceback" not in server.log
 

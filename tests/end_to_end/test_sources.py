@@ -250,7 +250,10 @@ def test_a_server_that_does_not_know_the_question_is_told_apart():
 @pytest.mark.parametrize(
     ("state", "words"),
     [
-        (SourceState(1, True, np.zeros((2, 3)), np.zeros(1, np.int64), None), "2 positions"),
+        (
+            SourceState(1, True, np.zeros((2, 3)), np.zeros(1, np.int64), None),
+            "1 rows do not go with 2",
+        ),
         (SourceState(1, False, np.zeros((0, 3)), np.zeros(0, np.int64), None), "only what is new"),
     ],
 )
@@ -262,7 +265,7 @@ def test_replies_that_do_not_fit_together_are_named(state, words):
     with (
         servers.answering({keys.SOURCES: answer}) as endpoint,
         triquad_client.connect(endpoint) as client,
-        pytest.raises(BadReplyError, match=f"'lidar'.*{words}"),
+        pytest.raises(BadReplyError, match=words),
     ):
         client.sources()
 

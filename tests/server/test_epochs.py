@@ -46,6 +46,17 @@ def test_zero_asks_for_the_newest():
     assert epochs.get(1).number == 1
 
 
+def test_an_epoch_stays_while_it_is_worked_on_and_for_the_parts_that_follow():
+    epochs = history(kept=1, pinned=1)
+    with epochs.view(0) as worked_on:
+        for number in range(2, 6):
+            epochs.add(epoch(number))
+    epochs.add(epoch(6))
+    assert epochs.get(1) is worked_on
+    with pytest.raises(RefusedError, match="epoch_gone"):
+        epochs.get(5)
+
+
 def test_older_epochs_that_nobody_asked_for_go():
     epochs = history(kept=2, pinned=8)
     for number in (2, 3):

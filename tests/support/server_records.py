@@ -20,7 +20,11 @@ from triquad_tools.top.interval import Sample
 BOUNDS_S = np.array([0.001, 0.01, 0.1, 1.0, 10.0])
 
 CHECKPOINT = CheckpointInfo(
-    path="/maps/default/1200.triquad", bytes=2_500_000, epoch=1200, sha256="ab", stamp_ns=10**18
+    path="/maps/default/1200.triquad",
+    bytes=2_500_000,
+    epoch=1200,
+    sha256="ab" * 32,
+    stamp_ns=10**18,
 )
 
 STATUS = ServerStatus(

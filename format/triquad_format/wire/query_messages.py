@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.wire.codec import ArraySpec, Message
-from triquad_format.wire.limits import MAX_RANGE_M
+from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_RANGE_M
 from triquad_format.wire.messages import (
     Count,
     Epoch,
@@ -164,8 +164,9 @@ class GroundReply(MapReply):
 
     # [N] surface: there is ground; free: there is none; else unknown
     status: Annotated[Statuses, AskedBy("points")]
-    # [N] metres down to the ground; else as far as all was seen to be free
-    drop_m: Annotated[Values, Within("-max_drop_m", "max_drop_m"), AskedBy("points")]
+    # [N] metres down to the ground, a little up where the point lies in it; else as far as all was
+    # seen to be free
+    drop_m: Annotated[Values, Within(-MAX_DISTANCE_M, "max_drop_m"), AskedBy("points")]
     # [N, 3] of the ground, unit vectors, map frame; zero where there is none
     normal: Annotated[UnitVectors, AskedBy("points")]
     confidence: Annotated[Shares, AskedBy("points")]  # [N] in [0, 1]; 0 where there is no ground

@@ -111,6 +111,8 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
     learnt, unlearnt = np.flatnonzero(near & nearest.learnt), np.flatnonzero(near & ~nearest.learnt)
     _join_field(view, points, learnt, distance=distance, gradient=gradient)
     _join_rays(view, points, unlearnt, nearest=nearest, distance=distance, gradient=gradient)
+    # What the field or the rays say may lie beyond a limit that is close by.
+    np.clip(distance, -options.max_distance_m, options.max_distance_m, out=distance)
     unknown = None
     if options.unknown_distance:
         unknown = view.nearest_unknown(points, options.max_distance_m)

@@ -163,7 +163,8 @@ _REQUESTS = (
     ),
     gauge(
         "triquad_queue_limit",
-        "What may wait in each queue: of scans, the oldest is lost beyond; requests are refused",
+        "What may wait in each queue: of scans those of one source, of which the oldest is lost "
+        "beyond; requests are refused",
         each(lambda f: {name: queue.limit for name, queue in f.metrics.queues.items()}),
         "queue",
     ),
