@@ -90,7 +90,7 @@ def _run(options: argparse.Namespace) -> int:
 
     from triquad_server.launch_options import LaunchOptions
     from triquad_server.net.configuration import NetworkOptions
-    from triquad_server.settings_loading import load_settings, settings_toml
+    from triquad_server.settings.loading import load_settings, settings_toml
     from triquad_server.stop import Stop, Stops
 
     check_name("map", options.map)

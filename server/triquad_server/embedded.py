@@ -203,7 +203,7 @@ def serve(
 
 def _loaded(settings: "Settings | str | Path | None") -> "Settings":
     from triquad_server.settings import Settings
-    from triquad_server.settings_loading import load_settings
+    from triquad_server.settings.loading import load_settings
 
     if isinstance(settings, Settings):
         return settings

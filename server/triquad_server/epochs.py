@@ -20,9 +20,8 @@ from triquad_map.composition.region import Split
 from triquad_server.array_memory import Buffers
 from triquad_server.asking_client import asking_client
 from triquad_server.engine.live_field import FrozenField, region_record
-from triquad_server.memory_settings import MemorySettings
 from triquad_server.query_gate import QueryGate
-from triquad_server.settings import ServiceSettings
+from triquad_server.settings import MemorySettings, ServiceSettings
 
 
 @dataclass(frozen=True)

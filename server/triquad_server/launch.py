@@ -17,7 +17,6 @@ from triquad_server.errors import ServerError
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.memory import give_back_early
-from triquad_server.memory_settings import MemorySettings
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.configuration import Configuration, configuration
@@ -28,7 +27,7 @@ from triquad_server.process.service_manager import ServiceManager
 from triquad_server.protection import protection
 from triquad_server.self_question import SelfQuestion
 from triquad_server.service import ServedMap, Service
-from triquad_server.settings import Settings
+from triquad_server.settings import MemorySettings, Settings
 from triquad_server.stop import Stop, Stops, wait_for_stop
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store

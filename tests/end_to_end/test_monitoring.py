@@ -23,8 +23,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from support import servers
 from triquad_client import RefusedError
 from triquad_server.errors import ListenError
-from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.monitoring.families import FAMILIES
+from triquad_server.settings import MetricsSettings
 from triquad_tools.demo.server import free_port
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -10,8 +10,7 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_server.errors import ServerError
 from triquad_server.net.configuration import Configuration, NetworkOptions
 from triquad_server.protection import protection
-from triquad_server.ros2_settings import Ros2Settings
-from triquad_server.settings import Settings
+from triquad_server.settings import Ros2Settings, Settings
 
 SAFE = {
     "mode": "router",

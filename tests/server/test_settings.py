@@ -11,10 +11,9 @@ from support import servers
 from triquad_format.errors import SettingsError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server import cli
-from triquad_server.setting_schemas import setting_schemas
-from triquad_server.settings import MeshSettings, Settings
-from triquad_server.settings_loading import PRESETS, load_settings, settings_toml
-from triquad_server.source_settings import SourceSettings
+from triquad_server.settings import MeshSettings, Settings, SourceSettings
+from triquad_server.settings.loading import PRESETS, load_settings, settings_toml
+from triquad_server.settings.schemas import setting_schemas
 
 ROOT = Path(__file__).parents[2]
 
@@ -78,7 +77,7 @@ def test_the_street_is_what_there_is_without_a_preset() -> None:
 
 
 def test_presets_are_all_that_lie_in_their_folder_and_each_is_valid() -> None:
-    folder = ROOT / "server" / "triquad_server" / "presets"
+    folder = ROOT / "server" / "triquad_server" / "settings" / "presets"
     assert {path.stem for path in folder.iterdir()} == set(PRESETS)
     leaves = {name: load_settings(preset=name).field.leaf_m for name in PRESETS}
     assert leaves["tabletop"] < leaves["indoor"] < leaves["street"] < leaves["long-range"]

@@ -19,8 +19,7 @@ from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mapping.region_setup import RegionSetup
-from triquad_server.settings import Settings
-from triquad_server.source_settings import ANY_SOURCE
+from triquad_server.settings import ANY_SOURCE, Settings
 from triquad_server.threads import Teams
 
 _LOSS_MEMORY = 0.95

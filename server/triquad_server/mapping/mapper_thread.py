@@ -20,9 +20,8 @@ from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
-from triquad_server.memory_settings import MemorySettings
 from triquad_server.mesh.mesher import check_box
-from triquad_server.settings import ServiceSettings
+from triquad_server.settings import MemorySettings, ServiceSettings
 from triquad_server.surface_history import SurfaceHistory
 from triquad_server.threads import NICENESS
 

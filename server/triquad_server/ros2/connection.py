@@ -20,7 +20,7 @@ from triquad_server.ros2.output.grid_outlet import GridOutlet, SliceShape
 from triquad_server.ros2.output.mesh_outlet import MeshOutlet
 from triquad_server.ros2.output.outlet import Outlet
 from triquad_server.ros2.topics import Delivery, Topic
-from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.settings import Ros2Settings
 
 _log = logging.getLogger("triquad_server.ros2")
 

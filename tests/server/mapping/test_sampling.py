@@ -9,7 +9,7 @@ from triquad_server.mapping.ray_intervals import (
     draw_samples,
     ray_intervals,
 )
-from triquad_server.scan_settings import ScanSettings
+from triquad_server.settings import ScanSettings
 from triquad_server.threads import Teams
 
 HALF_SIDE_M = 400.0

@@ -18,7 +18,7 @@ from triquad_sensors.ros.type_store import OCCUPANCY_GRID, encode_cdr, type_stor
 from triquad_server.epochs import Epoch, EpochHistory
 from triquad_server.ros2.intake.scans import Place
 from triquad_server.ros2.output.outlet import Outlet
-from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.settings import Ros2Settings
 from triquad_server.threads import NICENESS
 
 _log = logging.getLogger("triquad_server.ros2")

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field
 
-from triquad_server.settings_section import SECTION
+from triquad_server.settings.section import SECTION
 
 
 class MetricsSettings(BaseModel):

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field
 
-from triquad_server.settings_section import SECTION
+from triquad_server.settings.section import SECTION
 
 _Coordinate = Annotated[float, Field(ge=-20, le=20)]
 # A file has lists, not tuples.

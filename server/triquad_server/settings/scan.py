@@ -4,8 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
-from triquad_server.leaf_lengths import length
-from triquad_server.settings_section import SECTION
+from triquad_server.settings.leaf_lengths import length
+from triquad_server.settings.section import SECTION
 
 
 class ScanSettings(BaseModel):

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 from triquad_sensors.ros.header import frame_name
 
-from triquad_server.settings_section import SECTION
+from triquad_server.settings.section import SECTION
 
 _NAME = r"[A-Za-z_][A-Za-z0-9_]*"
 _TOPIC = rf"(/?{_NAME})+"

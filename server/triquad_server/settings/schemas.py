@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from triquad_server.settings import Settings
+from triquad_server.settings.settings import Settings
 
 SOURCE_SECTION = "sources.NAME"
 
