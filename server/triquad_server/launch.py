@@ -16,23 +16,23 @@ from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_server.errors import ServerError
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.memory import give_back_early
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.configuration import Configuration, configuration
 from triquad_server.net.session import open_session
-from triquad_server.open_files import allow_open_files
 from triquad_server.phases import Phases
+from triquad_server.process.memory import give_back_early
+from triquad_server.process.open_files import allow_open_files
 from triquad_server.process.service_manager import ServiceManager
+from triquad_server.process.stop import Stop, Stops, wait_for_stop
+from triquad_server.process.threads import Teams
 from triquad_server.protection import protection
 from triquad_server.self_question import SelfQuestion
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import MemorySettings, Settings
-from triquad_server.stop import Stop, Stops, wait_for_stop
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.supervision import Supervision
-from triquad_server.threads import Teams
 
 _log = logging.getLogger("triquad_server")
 

@@ -12,15 +12,15 @@ from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord
 
 from triquad_server.engine.compiled_trainer import GradientSums
-from triquad_server.epochs import Epoch, FrozenRegion
+from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mapping.region_setup import RegionSetup
+from triquad_server.process.threads import Teams
 from triquad_server.settings import ANY_SOURCE, Settings
-from triquad_server.threads import Teams
 
 _LOSS_MEMORY = 0.95
 _POOL_STEP = 1.1

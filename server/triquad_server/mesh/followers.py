@@ -22,8 +22,8 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.mesh.mesher import TileIndex, TileLattice, check_box, check_level
 from triquad_server.mesh.tile_cache import CachedTile
+from triquad_server.process.threads import NICENESS
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 

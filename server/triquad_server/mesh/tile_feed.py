@@ -10,7 +10,7 @@ from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.epochs import EpochHistory
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.followers import (
     BURST_S,
     MAX_HELD_BYTES,
@@ -23,8 +23,8 @@ from triquad_server.mesh.followers import (
 )
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
+from triquad_server.process.threads import NICENESS
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 

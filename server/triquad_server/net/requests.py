@@ -15,8 +15,8 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 from triquad_format.wire.metrics_messages import QueueMetrics
 
-from triquad_server.asking_client import asking_client
 from triquad_server.net.askers import Asker, Askers
+from triquad_server.net.asking_client import asking_client
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.request_queue import MOST_BEGUN, MOST_SENDING, Job, RequestQueue
 

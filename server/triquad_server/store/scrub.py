@@ -13,7 +13,7 @@ from triquad_format.mapfile.index import FileBytes, MapIndex, named
 from triquad_format.mapfile.reader import read_map_file
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.threads import NICENESS
+from triquad_server.process.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 

@@ -6,8 +6,9 @@ from hypothesis import strategies as st
 from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.composition.field_view import in_one
-from triquad_server.asking_client import asking_client
-from triquad_server.epochs import Epoch, EpochHistory
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs.history import EpochHistory
+from triquad_server.net.asking_client import asking_client
 from triquad_server.settings import ServiceSettings
 
 

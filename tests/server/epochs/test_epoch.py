@@ -3,7 +3,7 @@ import pytest
 from support.small_world import settings, settled_mapper, world
 from triquad_format.records.status import Status
 from triquad_map.reference.evaluator import MapEvaluator
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 
 RNG = np.random.default_rng(0)

@@ -15,7 +15,7 @@ from triquad_format.records.region import BLOCK_BYTES
 from triquad_map.clusters import same_cells
 from triquad_map.compiled.voxel_index import cells_of
 
-from triquad_server.epochs import Epoch, FrozenRegion
+from triquad_server.epochs.epoch import Epoch, FrozenRegion
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ import pytest
 from support.servers import sphere
 from triquad_format.errors import RefusedError
 from triquad_format.records.seen_space import surface_voxels
+from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
-from triquad_server.surface_history import SurfaceHistory
 
 SETTINGS = Settings.model_validate(
     {"field": {"depth": 6}, "training": {"batch": 64, "samples_per_ray": 1.0, "pool_rays": 1000}}

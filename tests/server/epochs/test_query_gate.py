@@ -4,7 +4,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from triquad_server.query_gate import QueryGate
+from triquad_server.epochs.query_gate import QueryGate
 
 _LONG_S = 60.0
 

@@ -15,7 +15,7 @@ from triquad_server.settings import MeshSettings, Settings, SourceSettings
 from triquad_server.settings.loading import PRESETS, load_settings, settings_toml
 from triquad_server.settings.schemas import setting_schemas
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def test_the_defaults_of_the_field_are_the_published_ones() -> None:
