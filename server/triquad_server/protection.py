@@ -3,7 +3,7 @@
 from triquad_format.wire.access_control import Rule, without_credentials
 
 from triquad_server.net.configuration import Protection
-from triquad_server.net.requests import payload_limit
+from triquad_server.net.payload_limit import payload_limit
 from triquad_server.settings import Settings
 
 _ROS_POINT_BYTES = 64

@@ -43,7 +43,7 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.monitoring.metrics import Metrics
-from triquad_server.net.requests import Handler, answering
+from triquad_server.net.request_handlers import Handler, answering
 from triquad_server.process.threads import Teams
 from triquad_server.queries.change_queries import ChangeQueries
 from triquad_server.queries.questions import Questions

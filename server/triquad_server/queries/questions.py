@@ -8,7 +8,8 @@ from triquad_map.questions.answers import Answers, QuestionLimits, Views
 from triquad_map.questions.slices import SlicedView
 from triquad_map.view import MapView
 
-from triquad_server.net.requests import Handler, Request
+from triquad_server.net.request import Request
+from triquad_server.net.request_handlers import Handler
 
 
 class Questions:

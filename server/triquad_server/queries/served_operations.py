@@ -9,12 +9,12 @@ from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.net.askers import Askers
 from triquad_server.net.operation_counts import OperationCounts
-from triquad_server.net.requests import (
+from triquad_server.net.payload_limit import payload_limit
+from triquad_server.net.request_handlers import (
     Handler,
     Operation,
     RequestHandlers,
     RequestLimits,
-    payload_limit,
 )
 from triquad_server.settings import ServiceSettings
 
