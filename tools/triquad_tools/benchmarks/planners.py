@@ -33,7 +33,7 @@ _FREEZE_AFTER_S = 0.5
 _FROZEN = """
 import sys, triquad_client
 with triquad_client.connect(sys.argv[1], sys.argv[2], timeout_s=60.0) as client:
-    print_line("asking")
+    print("asking", flush=True)
     while True:
         client.mesh()
 """
