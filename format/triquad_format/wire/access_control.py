@@ -29,7 +29,7 @@ _EVERY_MESSAGE = (
 
 
 class Verb(Enum):
-    """What is done on a key: messages of Zenoh from who does it, and messages to him."""
+    """What is done on a key: messages of Zenoh from who does it, and messages to them."""
 
     ASK = (("query",), ("reply", "declare_queryable"))
     ANSWER = (("reply", "declare_queryable"), ("query",))

@@ -14,8 +14,8 @@ from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.followers import (
     BURST_S,
     MAX_HELD_BYTES,
-    Asker,
     Follower,
+    PendingRequest,
     TileReply,
     TileSenders,
     check_updates,
@@ -97,7 +97,7 @@ class TileFeed:
         self._thread.join()
         self._senders.close()
 
-    def add(self, request: Asker) -> None:
+    def add(self, request: PendingRequest) -> None:
         """Take over a request for updates; it is answered once there are some, or in time.
 
         Raises:

@@ -9,7 +9,7 @@ import triquad_server.net.configuration as network
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_server.errors import ServerError
 from triquad_server.net.configuration import Configuration, NetworkOptions
-from triquad_server.protection import protection
+from triquad_server.network_defaults import network_defaults
 from triquad_server.settings import Ros2Settings, Settings
 
 SAFE = {
@@ -31,7 +31,7 @@ def of_file(folder: Path, text: str, **options: Any) -> Configuration:
     file = folder / "zenoh.json5"
     file.write_text(text)
     return network.configuration(
-        NetworkOptions(config_file=file, **options), protection("lab", Settings())
+        NetworkOptions(config_file=file, **options), network_defaults("lab", Settings())
     )
 
 
@@ -40,7 +40,7 @@ def values(config: Configuration) -> dict[str, Any]:
 
 
 def test_what_is_not_set_is_safe(tmp_path):
-    plain = network.configuration(NetworkOptions(), protection("lab", Settings()))
+    plain = network.configuration(NetworkOptions(), network_defaults("lab", Settings()))
     assert values(plain) == SAFE
     assert not plain.listens_beyond
     assert values(of_file(tmp_path, "{ timestamping: { enabled: true } }")) == SAFE
@@ -85,7 +85,7 @@ def test_options_go_before_the_file(tmp_path):
 
 def test_access_control_of_a_file_is_taken_as_it_is(tmp_path):
     config = of_file(tmp_path, '{ access_control: { enabled: true, default_permission: "allow" } }')
-    assert not config.protection_is_own
+    assert not config.own_access_control
     assert json.loads(config.zenoh.get_json("access_control/default_permission")) == "allow"
 
 
@@ -96,7 +96,7 @@ def test_a_client_listens_nowhere(tmp_path):
 
 def test_nodes_of_ros_find_each_other_and_their_clouds_get_in():
     settings = Settings(ros2=Ros2Settings(enabled=True))
-    found = values(network.configuration(NetworkOptions(), protection("lab", settings)))
+    found = values(network.configuration(NetworkOptions(), network_defaults("lab", settings)))
     assert found["scouting/gossip/enabled"] is True
     assert found["transport/link/rx/max_message_size"] > 500_000 * 64
 

@@ -4,7 +4,6 @@ Each is on the network until its ``with`` statement ends. They speak the wire pr
 do what the client never would.
 """
 
-import json
 import secrets
 import signal
 import subprocess
@@ -20,6 +19,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import Scan
 from triquad_format.wire.origin import RequestOrigin
 from triquad_format.wire.query_messages import DistanceRequest, SegmentsRequest
+from triquad_format.wire.zenoh_config import QUIET, put
 
 MOST_POINTS = 250_000  # of one request, as servers are set by default
 FLOOD_HZ = 650.0
@@ -155,10 +155,7 @@ def main(argv: Sequence[str]) -> None:
     """Be a neighbour; ``argv`` is its kind, the endpoint and the map."""
     kind, endpoint, map_name = argv
     config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("transport/shared_memory/enabled", "false")
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    put(config, {**QUIET, "mode": "client", "connect/endpoints": [endpoint]})
     with zenoh.open(config) as session:
         KINDS[kind](session, map_name)
 

@@ -1,8 +1,8 @@
-"""What a server lets in without a configuration that says so: no more than the protocol needs."""
+"""What a server lets in where no configuration says otherwise: no more than the protocol needs."""
 
 from triquad_format.wire.access_control import Rule, without_credentials
 
-from triquad_server.net.configuration import Protection
+from triquad_server.net.configuration import NetworkDefaults
 from triquad_server.net.payload_limit import payload_limit
 from triquad_server.settings import Settings
 
@@ -10,10 +10,10 @@ _ROS_POINT_BYTES = 64
 """Of a point with all that drivers of lidars tell of it."""
 
 
-def protection(map_name: str, settings: Settings) -> Protection:
-    """The protection of the server of a map."""
+def network_defaults(map_name: str, settings: Settings) -> NetworkDefaults:
+    """The defaults of the server of a map."""
     rules = _of_ros2(map_name, settings) if settings.ros2.enabled else ()
-    return Protection(
+    return NetworkDefaults(
         without_credentials(map_name, ros2=rules),
         _max_message_bytes(settings),
         # Nodes of rmw_zenoh find each other by their router.
