@@ -75,7 +75,7 @@ class Grant:
 
 
 def access_control(grants: Sequence[Grant]) -> dict[str, Any]:
-    """The section ``access_control`` of a Zenoh configuration, of who keeps the gate.
+    """The section ``access_control`` of the configuration of a server or a router.
 
     The names of subjects have to differ.
     """

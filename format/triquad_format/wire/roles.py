@@ -1,6 +1,6 @@
 """What each role may do on a network where certificates tell everybody apart.
 
-Servers and routers keep the gate: they allow a client what its role may do, on all maps, and the
+Servers and routers enforce it: they allow a client what its role may do, on all maps, and the
 rest is denied. Clients keep one of their own: they take nothing but from a server or a router.
 """
 
