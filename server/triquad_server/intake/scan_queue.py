@@ -63,13 +63,13 @@ class ScanQueue:
                 self.ledger.turn_away(scan, text)
             self.dropped.add(backwards or reason)
 
-    def take(self, but: Collection[str] = ()) -> Scan | None:
-        """The oldest scan of the next source, not one of ``but``.
+    def take(self, passed_over: Collection[str] = ()) -> Scan | None:
+        """The oldest scan of the next source, not one that is ``passed_over``.
 
         It counts as waiting until another is asked for.
         """
         with self._lock:
-            scan = self._scans.take(lambda scan: scan.source not in but)
+            scan = self._scans.take(lambda scan: scan.source not in passed_over)
             self._in_hand = scan is not None
             return scan
 

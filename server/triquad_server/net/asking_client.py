@@ -1,4 +1,7 @@
-"""Which client the request is of that a thread is answering."""
+"""Which client the request is of that a thread is answering.
+
+It goes beside the calls, and not through all of them, for only the pins of epochs go by it.
+"""
 
 from contextvars import ContextVar
 
