@@ -1,4 +1,4 @@
-"""A slow look at all that lies in a store: what rots there is found while the map is in memory."""
+"""A slow check of all that lies in a store: what rots there is found while the map is in memory."""
 
 import logging
 import threading
@@ -28,7 +28,7 @@ class Scrubber:
     def __init__(self, folder: Path, period_h: float, damaged: Callable[[str], None]) -> None:
         """Begin; ``damaged`` is called with the name of each file that is found damaged.
 
-        ``period_h`` goes by between the end of one look and the next, and before the first.
+        ``period_h`` goes by between the end of one check and the next, and before the first.
         """
         self._folder = folder
         self._period_s = period_h * _HOUR_S

@@ -1,4 +1,4 @@
-"""Who may reach the page: those who opened it, and no page of somebody else in their browser.
+"""Which requests the page answers: of those who opened it, and of no other page in their browser.
 
 A browser lets any page send requests to this machine. It says in ``Origin`` whose page asks, and in
 ``Host`` under which name: a name that is not ours was made to point here.
@@ -22,7 +22,7 @@ _Answer = Callable[[Any, Request], Any]
 _patching = threading.Lock()
 
 
-class Visitors:
+class AllowedOrigins:
     """Tells which requests are answered."""
 
     def __init__(self, allowed_hosts: Sequence[str] = ()) -> None:
@@ -51,15 +51,15 @@ class Visitors:
 
 
 @contextmanager
-def serving_only(visitors: Visitors) -> Iterator[None]:
-    """Servers of websockets that are started meanwhile answer these visitors alone.
+def serving_only(allowed: AllowedOrigins) -> Iterator[None]:
+    """Servers of websockets that are started meanwhile answer what is allowed, and nothing else.
 
     The viewer's library starts its server where no option reaches it.
     """
     serve = websockets.asyncio.server.serve
 
     def guarded(*arguments: Any, process_request: _Answer, **options: Any) -> Any:
-        return serve(*arguments, process_request=_guard(visitors, process_request), **options)
+        return serve(*arguments, process_request=_guard(allowed, process_request), **options)
 
     with _patching:
         websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
@@ -69,9 +69,9 @@ def serving_only(visitors: Visitors) -> Iterator[None]:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-def _guard(visitors: Visitors, answer: _Answer) -> _Answer:
-    def answer_visitor(connection: Any, request: Request) -> Any:
-        reason = visitors.refusal(request.headers)
+def _guard(allowed: AllowedOrigins, answer: _Answer) -> _Answer:
+    def answer_allowed(connection: Any, request: Request) -> Any:
+        reason = allowed.refusal(request.headers)
         if reason is not None:
             forbidden = http.HTTPStatus.FORBIDDEN
             body = f"{reason}\n".encode()
@@ -79,7 +79,7 @@ def _guard(visitors: Visitors, answer: _Answer) -> _Answer:
             return Response(forbidden, forbidden.phrase, headers, body)
         return answer(connection, request)
 
-    return answer_visitor
+    return answer_allowed
 
 
 def _name(host: str) -> str:
