@@ -19,7 +19,7 @@ from triquad_server.errors import (
     ServerError,
     StoreError,
 )
-from triquad_server.installed import require_libraries
+from triquad_server.process.installed import require_libraries
 from triquad_server.process.log_output import LOG_FORMATS, TEXT, start_log
 
 _PROGRAM = "triquad-server"
@@ -90,8 +90,8 @@ def _run(options: argparse.Namespace) -> int:
 
     from triquad_server.launch_options import LaunchOptions
     from triquad_server.net.configuration import NetworkOptions
-    from triquad_server.settings_loading import load_settings, settings_toml
-    from triquad_server.stop import Stop, Stops
+    from triquad_server.process.stop import Stop, Stops
+    from triquad_server.settings.loading import load_settings, settings_toml
 
     check_name("map", options.map)
     assignments = [*options.set, *_implied(options)]

@@ -14,9 +14,9 @@ from triquad_format.errors import SettingsError
 from triquad_format.wire.endpoints import full_endpoint
 
 from triquad_server.errors import ServerError
-from triquad_server.installed import require_libraries
 from triquad_server.phases import Phases
-from triquad_server.stop import Stop, Stops
+from triquad_server.process.installed import require_libraries
+from triquad_server.process.stop import Stop, Stops
 
 if TYPE_CHECKING:
     from triquad_client import Client
@@ -203,7 +203,7 @@ def serve(
 
 def _loaded(settings: "Settings | str | Path | None") -> "Settings":
     from triquad_server.settings import Settings
-    from triquad_server.settings_loading import load_settings
+    from triquad_server.settings.loading import load_settings
 
     if isinstance(settings, Settings):
         return settings

@@ -16,24 +16,23 @@ from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_server.errors import ServerError
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.memory import give_back_early
-from triquad_server.memory_settings import MemorySettings
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.configuration import Configuration, configuration
 from triquad_server.net.session import open_session
-from triquad_server.open_files import allow_open_files
+from triquad_server.network_defaults import network_defaults
 from triquad_server.phases import Phases
+from triquad_server.process.memory import give_back_early
+from triquad_server.process.open_files import allow_open_files
 from triquad_server.process.service_manager import ServiceManager
-from triquad_server.protection import protection
+from triquad_server.process.stop import Stop, Stops, wait_for_stop
+from triquad_server.process.threads import Teams
 from triquad_server.self_question import SelfQuestion
 from triquad_server.service import ServedMap, Service
-from triquad_server.settings import Settings
-from triquad_server.stop import Stop, Stops, wait_for_stop
+from triquad_server.settings import MemorySettings, Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.supervision import Supervision
-from triquad_server.threads import Teams
 
 _log = logging.getLogger("triquad_server")
 
@@ -98,7 +97,7 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     """Open all parts of a server, to be closed by ``stack``."""
     device = choose_device(options.device)
     settings = options.settings
-    network = configuration(options.network, protection(options.map_name, settings))
+    network = configuration(options.network, network_defaults(options.map_name, settings))
     monitoring = _open_monitoring(settings, stack)
     store = None
     restored = None
@@ -269,7 +268,7 @@ def warm_up(
 
 def _log_who_gets_in(network: Configuration) -> None:
     """Say whom the network lets in, and what they may do."""
-    if not network.protection_is_own:
+    if not network.own_access_control:
         _log.info("access: as the Zenoh configuration says")
     elif network.listens_beyond or network.connect:
         _log.info(

@@ -32,7 +32,6 @@ from triquad_format.wire.query_messages import (
 from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import QuestionLimits
 
-from triquad_server.change_queries import ChangeQueries
 from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan import ScanIntake
@@ -44,17 +43,18 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.monitoring.metrics import Metrics
-from triquad_server.net.requests import Handler, answering
-from triquad_server.questions import Questions
-from triquad_server.served_operations import ServedOperations
+from triquad_server.net.request_handlers import Handler, answering
+from triquad_server.process.threads import Teams
+from triquad_server.queries.change_queries import ChangeQueries
+from triquad_server.queries.questions import Questions
+from triquad_server.queries.served_operations import ServedOperations
+from triquad_server.queries.source_queries import SourceQueries
 from triquad_server.settings import Settings
-from triquad_server.source_queries import SourceQueries
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.resets import Resets
 from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
-from triquad_server.threads import Teams
 
 _TILE_WORKERS = 2  # one computes while another packs
 

@@ -4,8 +4,8 @@ import logging
 import threading
 
 from triquad_server.health import STUCK_S, Health
-from triquad_server.memory import spare_from_collection
 from triquad_server.phases import Phases
+from triquad_server.process.memory import spare_from_collection
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.self_question import SelfQuestion
 

@@ -8,7 +8,7 @@ import triquad_client
 from support import servers
 from support.attacked import attacked_server, operation, points
 from triquad_format.wire import keys
-from triquad_tools.benchmarks.bad_neighbours import frozen_neighbours, neighbour
+from triquad_tools.benchmarks.noisy_neighbours import frozen_neighbours, neighbour
 from triquad_tools.demo.probe import Probe
 
 SCANS = 40
@@ -37,7 +37,7 @@ def told(name, met, fate):
     )
 
 
-def test_a_planner_and_a_lidar_do_as_well_beside_bad_neighbours(server):
+def test_a_planner_and_a_lidar_do_as_well_beside_noisy_neighbours(server):
     with (
         triquad_client.connect(server.endpoint) as lidar,
         neighbour("greedy", server.endpoint, servers.MAP),

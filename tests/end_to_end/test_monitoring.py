@@ -24,8 +24,8 @@ from support import servers
 from triquad_client import RefusedError
 from triquad_format.printable import printable
 from triquad_server.errors import ListenError
-from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.monitoring.families import FAMILIES
+from triquad_server.settings import MetricsSettings
 from triquad_tools.demo.server import free_port
 
 DOCS = Path(__file__).parents[2] / "docs"

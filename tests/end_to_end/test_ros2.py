@@ -10,7 +10,7 @@ from support.ros_robot import T0, robot, shifted
 from support.ros_server import AT, MAST, accounted, serving, stand, until
 from triquad_client import Client, ServerStatus, Status
 from triquad_server.ros2.intake import silence
-from triquad_server.source_settings import SourceSettings
+from triquad_server.settings import SourceSettings
 
 WAYS = ["rmw", "bridge"]
 

@@ -12,8 +12,7 @@ from support.ros_listener import GRID, MARKER, Listener, ShownMarkers, listening
 from support.ros_robot import robot, shifted
 from triquad_client import Client, Status
 from triquad_server.ros2.topics import End, read_token
-from triquad_server.ros2_settings import Ros2Settings
-from triquad_server.settings import MeshSettings
+from triquad_server.settings import MeshSettings, Ros2Settings
 
 HEIGHT_M = 0.7
 WAYS = ["rmw", "humble", "bridge"]

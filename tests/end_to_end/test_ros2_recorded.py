@@ -11,8 +11,13 @@ from support import servers
 from support.ros_robot import SECOND, T0, robot
 from support.ros_server import accounted, until
 from triquad_client import Client
-from triquad_server.ros2_settings import Ros2Settings
-from triquad_server.settings import ScanSettings, ServiceSettings, Settings, TrainingSettings
+from triquad_server.settings import (
+    Ros2Settings,
+    ScanSettings,
+    ServiceSettings,
+    Settings,
+    TrainingSettings,
+)
 from triquad_tools.evaluation.map_scores import ask_withheld, score_withheld
 from triquad_tools.recordings.cloud import is_withheld, world_points
 from triquad_tools.recordings.folders.kitti import KittiFolder, read_kitti_folder

@@ -10,7 +10,7 @@ from support import servers
 from triquad_client import FlushReport
 from triquad_format.wire import codec
 from triquad_format.wire.messages import FlushReply, ServerStatus
-from triquad_server.source_settings import SourceSettings
+from triquad_server.settings import SourceSettings
 
 POSE = np.eye(4)
 

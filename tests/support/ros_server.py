@@ -8,8 +8,7 @@ import triquad_client
 from support import servers
 from support.ros_robot import Robot, shifted
 from triquad_client import Client, ServerStatus
-from triquad_server.ros2_settings import Ros2Settings
-from triquad_server.source_settings import SourceSettings
+from triquad_server.settings import Ros2Settings, SourceSettings
 
 AT = (20.0, -3.0, 1.0)  # of the robot in the map
 MAST = shifted(z=0.5)  # of the lidar on the robot

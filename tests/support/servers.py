@@ -1,6 +1,5 @@
 """Real servers and raw Zenoh sessions for the tests, on free ports of the loopback."""
 
-import json
 import os
 import queue
 import subprocess
@@ -21,11 +20,12 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, Scan
+from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.configuration import NetworkOptions, configuration
 from triquad_server.net.session import open_session
-from triquad_server.protection import protection
+from triquad_server.network_defaults import network_defaults
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
@@ -75,7 +75,9 @@ def running_service(
     """A service in this process; yields its endpoint, a free one unless it is given."""
     compiled()
     endpoint = endpoint or free_endpoint()
-    network = configuration(NetworkOptions((endpoint,), connect), protection(map_name, settings))
+    network = configuration(
+        NetworkOptions((endpoint,), connect), network_defaults(map_name, settings)
+    )
     opened = Store(store, map_name, settings.store) if store else None
     restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
@@ -113,13 +115,10 @@ def raw_session(
 ) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
     if access_control is not None:
-        config.insert_json5("access_control", json.dumps(access_control))
-    config.insert_json5("timestamping/enabled", json.dumps(timestamps))
-    config.insert_json5("mode", json.dumps(mode))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("transport/shared_memory/enabled", "false")
-    config.insert_json5("listen/endpoints", json.dumps([listen] if listen else []))
-    config.insert_json5("connect/endpoints", json.dumps([connect] if connect else []))
+        put(config, {"access_control": access_control})
+    endpoints = {"listen": [listen] if listen else [], "connect": [connect] if connect else []}
+    values = {f"{kind}/endpoints": there for kind, there in endpoints.items()}
+    put(config, {**QUIET, **values, "mode": mode, "timestamping/enabled": timestamps})
     with zenoh.open(config) as session:
         yield session
 

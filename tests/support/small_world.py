@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive

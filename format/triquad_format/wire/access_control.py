@@ -29,7 +29,7 @@ _EVERY_MESSAGE = (
 
 
 class Verb(Enum):
-    """What is done on a key: messages of Zenoh from who does it, and messages to him."""
+    """What is done on a key: messages of Zenoh from who does it, and messages to them."""
 
     ASK = (("query",), ("reply", "declare_queryable"))
     ANSWER = (("reply", "declare_queryable"), ("query",))
@@ -75,7 +75,7 @@ class Grant:
 
 
 def access_control(grants: Sequence[Grant]) -> dict[str, Any]:
-    """The section ``access_control`` of a Zenoh configuration, of who keeps the gate.
+    """The section ``access_control`` of the configuration of a server or a router.
 
     The names of subjects have to differ.
     """

@@ -18,9 +18,9 @@ class RequestOrigin(Message):
     timeout_s: float  # nobody waits for the reply for longer
 
 
-def read_origin(attachment: bytes | None) -> RequestOrigin | None:
+def read_origin(attachment: bytes) -> RequestOrigin | None:
     """The origin that an attachment names; ``None`` where it names none."""
-    if attachment is None or len(attachment) > MAX_ORIGIN_BYTES:
+    if len(attachment) > MAX_ORIGIN_BYTES:
         return None
     try:
         return codec.decode(RequestOrigin, attachment)

@@ -25,8 +25,8 @@ _RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Said:
-    """What a field's value is compared with."""
+class Exchange:
+    """A question and the reply to it: what the value of a field is compared with."""
 
     question: Message
     around: tuple[Message, ...]  # the messages that the field is in, innermost first
@@ -47,7 +47,7 @@ class Said:
 class Check(Protocol):
     """A bound of a field; an annotation may have several."""
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """What is wrong with a value, or ``None``."""
 
 
@@ -62,7 +62,7 @@ class Within:
     most: float | str = math.inf
     nan: bool = False  # some may be no numbers
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """What is out of bounds, or not finite."""
         array = np.asarray(value)
         if array.size == 0:
@@ -72,7 +72,7 @@ class Within:
         ends = [end.reduce(array, axis=None).item() for end in (low, high)]
         if self.nan and math.isnan(ends[0]):
             return None
-        least, most = said.number(self.least), said.number(self.most)
+        least, most = exchange.number(self.least), exchange.number(self.most)
         for end in ends:
             if not math.isfinite(end):
                 return f"{end} is not finite"
@@ -88,7 +88,7 @@ class Text:
     most: int
     form: str = ""  # a regular expression
 
-    def problem(self, value: Any, said: Said) -> str | None:  # noqa: ARG002
+    def problem(self, value: Any, exchange: Exchange) -> str | None:  # noqa: ARG002
         """What is too long, or of another form."""
         if len(value) > self.most:
             return f"{len(value)} characters are more than {self.most}"
@@ -103,9 +103,9 @@ class AskedBy:
 
     field: str
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """Where the numbers differ."""
-        asked = getattr(said.question, self.field)
+        asked = getattr(exchange.question, self.field)
         count = asked if isinstance(asked, int) else len(asked)
         return None if len(value) == count else f"{len(value)} came for {count}"
 
@@ -116,9 +116,9 @@ class AtMostAsked:
 
     field: str
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """Where there are more."""
-        most: int = getattr(said.question, self.field)
+        most: int = getattr(exchange.question, self.field)
         return None if len(value) <= most else f"{len(value)} came, and {most} were asked for"
 
 
@@ -128,9 +128,9 @@ class ShapeAskedBy:
 
     field: str
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """Where the sizes differ."""
-        shape, asked = list(value.shape), getattr(said.question, self.field).tolist()
+        shape, asked = list(value.shape), getattr(exchange.question, self.field).tolist()
         return None if shape == asked else f"{shape} came for {asked}"
 
 
@@ -140,9 +140,9 @@ class SameAsAsked:
 
     field: str
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """Where it is another one."""
-        asked = getattr(said.question, self.field, 0)
+        asked = getattr(exchange.question, self.field, 0)
         return f"{value} came for {asked}" if asked and value != asked else None
 
 
@@ -153,9 +153,9 @@ class RowsOf:
     field: str
     more: int = 0
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """Where the numbers differ."""
-        count = said.rows(self.field) + self.more
+        count = exchange.rows(self.field) + self.more
         return None if len(value) == count else f"{len(value)} rows do not go with {count}"
 
 
@@ -165,18 +165,18 @@ class IndicesOf:
 
     field: str
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """What has no such row."""
-        return Within(0, said.rows(self.field) - 1).problem(value, said)
+        return Within(0, exchange.rows(self.field) - 1).problem(value, exchange)
 
 
 @dataclass(frozen=True)
 class RigidPose:
     """A rotation and a translation."""
 
-    def problem(self, value: Any, said: Said) -> str | None:
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
         """Where it is neither."""
-        if problem := Within(-1e12, 1e12).problem(value, said):
+        if problem := Within(-1e12, 1e12).problem(value, exchange):
             return problem
         rotation = np.clip(value[:3, :3], -2, 2)
         off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
@@ -196,25 +196,27 @@ def check_answers(question: Message, reply: Message) -> None:
 def _problems(
     message: Message, question: Message, outer: tuple[Message, ...]
 ) -> Iterator[tuple[str, str]]:
-    said = Said(question, (message, *outer))
+    exchange = Exchange(question, (message, *outer))
     for field, annotation in message.annotations().items():
         name = f"{type(message).__name__}.{field}"
-        yield from _of_field(name, annotation, getattr(message, field), said)
+        yield from _of_field(name, annotation, getattr(message, field), exchange)
 
 
-def _of_field(name: str, annotation: Any, value: Any, said: Said) -> Iterator[tuple[str, str]]:
+def _of_field(
+    name: str, annotation: Any, value: Any, exchange: Exchange
+) -> Iterator[tuple[str, str]]:
     if value is None:
         return
     if isinstance(value, Message):
-        yield from _problems(value, said.question, said.around)
+        yield from _problems(value, exchange.question, exchange.around)
     elif get_origin(annotation) is dict:
         key_type, item = get_args(annotation)
         for key, entry in value.items():
-            yield from _of_field(f"{name} key", key_type, key, said)
-            yield from _of_field(f"{name}[{key!r}]", item, entry, said)
+            yield from _of_field(f"{name} key", key_type, key, exchange)
+            yield from _of_field(f"{name}[{key!r}]", item, entry, exchange)
     else:
         for check in _checks(annotation):
-            problem = check.problem(value, said)
+            problem = check.problem(value, exchange)
             if problem is not None:
                 yield name, problem
 

@@ -1,6 +1,6 @@
 """What each role may do on a network where certificates tell everybody apart.
 
-Servers and routers keep the gate: they allow a client what his role may do, on all maps, and the
+Servers and routers enforce it: they allow a client what its role may do, on all maps, and the
 rest is denied. Clients keep one of their own: they take nothing but from a server or a router.
 """
 
@@ -40,9 +40,9 @@ class Holder:
 
     name: str
     role: Role
-    sources: tuple[str, ...] = ()  # of scans that he publishes, and nobody else
-    ros2_domain: int | None = None  # of ROS 2, in which his nodes take part
-    issue: str = ""  # tells him from who had this name before, and may still have a certificate
+    sources: tuple[str, ...] = ()  # of scans that it publishes, and nobody else
+    ros2_domain: int | None = None  # of ROS 2, in which its nodes take part
+    issue: str = ""  # tells it from who had this name before, and may still have a certificate
 
     def __post_init__(self) -> None:
         keys.check_name("role", self.name)
@@ -51,7 +51,7 @@ class Holder:
 
     @property
     def common_name(self) -> str:
-        """Of his certificate, by which Zenoh knows him."""
+        """Of its certificate, by which Zenoh knows it."""
         return f"{self.role.value}:{self.name}:{self.issue}"
 
 

@@ -10,8 +10,8 @@ from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
 
-from triquad_server.intake.scan_queue import MAX_SEQUENCE, SourceLedger
-from triquad_server.net.requests import Request
+from triquad_server.intake.source_ledger import MAX_SEQUENCE, SourceLedger
+from triquad_server.net.request import Request
 
 ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived so long after the flush request, which travels the same way behind

@@ -10,8 +10,7 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import empty_keys, enter
 
 from triquad_server.errors import ScanRefusedError
-from triquad_server.scan_settings import ScanSettings
-from triquad_server.source_settings import ANY_SOURCE, SourceSettings
+from triquad_server.settings import ANY_SOURCE, ScanSettings, SourceSettings
 
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""

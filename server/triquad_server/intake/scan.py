@@ -14,7 +14,7 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.fair_queue import FairQueue, Owner
 from triquad_server.intake.rays import check_count
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.net.requests import payload_limit
+from triquad_server.net.payload_limit import payload_limit
 
 _log = logging.getLogger(__name__)
 

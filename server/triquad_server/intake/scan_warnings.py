@@ -11,8 +11,7 @@ import numpy as np
 
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.settings import Settings
-from triquad_server.source_settings import ANY_SOURCE
+from triquad_server.settings import ANY_SOURCE, Settings
 
 _log = logging.getLogger(__name__)
 

@@ -32,7 +32,7 @@ from triquad_server.engine.live_field import (
     training_state,
 )
 from triquad_server.engine.tensor_trainer import TensorTrainer
-from triquad_server.epochs import FrozenRegion
+from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals

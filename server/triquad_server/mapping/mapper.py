@@ -1,7 +1,5 @@
 """The live map: takes in scans, trains, publishes epochs. Owned by one thread."""
 
-import itertools
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,19 +10,19 @@ from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord
 
 from triquad_server.engine.compiled_trainer import GradientSums
-from triquad_server.epochs import Epoch, FrozenRegion
+from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mapping.region_setup import RegionSetup
-from triquad_server.settings import Settings
-from triquad_server.source_settings import ANY_SOURCE
-from triquad_server.threads import Teams
+from triquad_server.mapping.regions_around import regions_around
+from triquad_server.mapping.replay_pool import shared_limit
+from triquad_server.process.threads import Teams
+from triquad_server.settings import ANY_SOURCE, Settings
 
 _LOSS_MEMORY = 0.95
-_POOL_STEP = 1.1
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ class Mapper:
             source=of_source,
             no_return=no_return,
         )
-        around = self._regions_around(rays)
+        around = regions_around(rays, self._regions, self._field_settings)
         self._check_regions(around)
         self._check_memory(rays, around)
         try:
@@ -268,38 +266,6 @@ class Mapper:
             return before[region.index]
         return region.freeze(self._number, before.get(region.index))
 
-    def _regions_around(self, rays: ScanRays) -> list[RegionIndex]:
-        """Regions whose cubes hold an end point or the sensor, and those of the map in between.
-
-        Rays that met nothing, and the robot, make no region: they are recorded in those there are.
-        """
-        half = self._field_settings.region_side_m / 2
-        pitch = self._field_settings.region_pitch_m
-
-        def spanned(column: Doubles) -> range:
-            low, high = column.min() - half, column.max() + half
-            return range(math.floor(low / pitch) + 1, math.ceil(high / pitch))
-
-        columns = [np.append(rays.ends[:, axis], rays.origin[axis]) for axis in range(3)]
-        x, y, z = map(spanned, columns)
-        around = list(itertools.product(x, y, z))
-
-        def holds_any(index: RegionIndex) -> bool:
-            near = [
-                np.abs(column - i * pitch) < half for column, i in zip(columns, index, strict=True)
-            ]
-            return bool((near[0] & near[1] & near[2]).any())
-
-        if len(around) > 1:
-            around = [index for index in around if index in self._regions or holds_any(index)]
-        free = rays.free_corners
-        reached = [spanned(np.append(columns[axis], free[:, axis])) for axis in range(3)]
-        return around + [
-            index
-            for index in self._regions
-            if index not in around and all(map(range.__contains__, reached, index))
-        ]
-
     def _check_regions(self, wanted: list[RegionIndex]) -> None:
         limit = self._settings.training.max_regions
         count = len(self._regions.keys() | set(wanted))
@@ -311,7 +277,7 @@ class Mapper:
             )
 
     def _check_memory(self, rays: ScanRays, wanted: list[RegionIndex]) -> None:
-        """Refuse a scan that does not fit; the closer to the limit, the better that is looked at.
+        """Refuse a scan that does not fit; the closer to the limit, the more exact the count.
 
         Raises:
             ScanRefusedError: ``map_full``.
@@ -339,13 +305,7 @@ class Mapper:
 
     def _share_pool(self) -> None:
         """Let the regions keep as many rays as they were offered, all up to one limit."""
-        left = self._settings.training.pool_rays
-        offered = sorted(region.pool.offered for region in self._regions.values())
-        limit = left
-        for position, count in enumerate(offered):
-            limit = max(1, left // (len(offered) - position))
-            left -= min(count, limit)
-        # In coarse steps: to lower the limit is expensive.
-        limit = int(_POOL_STEP ** math.floor(math.log(limit, _POOL_STEP)))
+        offered = [region.pool.offered for region in self._regions.values()]
+        limit = shared_limit(offered, self._settings.training.pool_rays)
         for region in self._regions.values():
-            region.pool.limit(max(1, limit))
+            region.pool.limit(limit)

@@ -13,18 +13,17 @@ from triquad_format.wire.messages import ResetReply, ResetRequest, Scan
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
-from triquad_server.epochs import EpochHistory
+from triquad_server.epochs.history import EpochHistory
+from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.errors import MapLostError, MapperStoppedError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
-from triquad_server.memory_settings import MemorySettings
 from triquad_server.mesh.mesher import check_box
-from triquad_server.settings import ServiceSettings
-from triquad_server.surface_history import SurfaceHistory
-from triquad_server.threads import NICENESS
+from triquad_server.process.threads import NICENESS
+from triquad_server.settings import MemorySettings, ServiceSettings
 
 _log = logging.getLogger(__name__)
 

@@ -24,7 +24,7 @@ from triquad_map.compiled.team import Team
 
 from triquad_server.engine.live_field import Batch
 from triquad_server.intake.rays import ScanRays
-from triquad_server.scan_settings import ScanSettings
+from triquad_server.settings import ScanSettings
 
 END = 0  # and the two columns after it: the end point
 DIRECTION = 3  # and the two columns after it: away from the sensor; 0 for a single sample

@@ -8,8 +8,7 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.compiled_trainer import GradientSums
-from triquad_server.scan_settings import ScanSettings
-from triquad_server.settings import ChangeSettings, TrainingSettings
+from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
 
 @dataclass(frozen=True)

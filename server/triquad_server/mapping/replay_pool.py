@@ -6,6 +6,7 @@ take over.
 """
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from triquad_server.mapping.ray_intervals import (
 _BIN_LEAVES = 4.0
 _BINS = 1 << 18
 _AHEAD = 16  # places that are brought into the cache before their turn
+_LIMIT_STEP = 1.1  # by which limits grow and shrink, since to lower one is expensive
 
 
 @kernel()
@@ -276,3 +278,13 @@ def _coprime(size: int) -> int:
     while math.gcd(stride, size) != 1:
         stride += 1
     return stride
+
+
+def shared_limit(offered: Iterable[int], most: int) -> int:
+    """The limit of pools that were ``offered`` so many rays, which keep ``most`` together."""
+    left = limit = most
+    counts = sorted(offered)
+    for position, count in enumerate(counts):
+        limit = max(1, left // (len(counts) - position))
+        left -= min(count, limit)
+    return max(1, int(_LIMIT_STEP ** math.floor(math.log(limit, _LIMIT_STEP))))

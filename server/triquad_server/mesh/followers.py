@@ -22,8 +22,8 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.mesh.mesher import TileIndex, TileLattice, check_box, check_level
 from triquad_server.mesh.tile_cache import CachedTile
+from triquad_server.process.threads import NICENESS
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +35,6 @@ MAX_CLIENTS = 1024
 BURST_S = 1.0
 """A client that asked for nothing for so long may be sent as many seconds' worth at once."""
 
-
 MAX_HELD_BYTES = 64_000_000
 """Of all requests that are held together; more are refused."""
 
@@ -43,8 +42,8 @@ _FOLLOWER_BYTES, _KNOWN_BYTES = 4096, 300
 """Of one that is held, and of each tile that it names as known."""
 
 
-class Asker(Protocol):
-    """Who asks for updates and gets one answer: a request of the network, or of this process."""
+class PendingRequest(Protocol):
+    """A request for updates, which gets one answer: of the network, or of this process."""
 
     @property
     def size(self) -> int:
@@ -67,7 +66,7 @@ class Asker(Protocol):
 class Follower:
     """A pending request for what changed."""
 
-    request: Asker
+    request: PendingRequest
     asks: TileUpdatesRequest
     needs_epoch: int  # the newest epoch when it came
     deadline_s: float  # monotonic
@@ -84,7 +83,12 @@ class Follower:
 
 
 def new_follower(
-    request: Asker, asks: TileUpdatesRequest, *, server: str, epoch: int, settings: MeshSettings
+    request: PendingRequest,
+    asks: TileUpdatesRequest,
+    *,
+    server: str,
+    epoch: int,
+    settings: MeshSettings,
 ) -> Follower:
     """A request that begins to wait; it has passed its checks.
 

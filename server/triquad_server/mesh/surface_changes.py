@@ -9,7 +9,7 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.compiled.team import Team
 
-from triquad_server.epochs import FrozenRegion
+from triquad_server.epochs.epoch import FrozenRegion
 
 _KEY_BITS = 20  # of each coordinate of a voxel, or of a group, in its region
 

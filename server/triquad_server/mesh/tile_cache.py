@@ -14,7 +14,7 @@ from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.compiled.team import Team
 from triquad_map.composition.composed_view import ComposedView
 
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.mesher import TileBorder, TileIndex, TileLattice, mesh_tile, tile_lattice
 from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
 from triquad_server.settings import MeshSettings

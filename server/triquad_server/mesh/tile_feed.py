@@ -10,12 +10,12 @@ from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.epochs import EpochHistory
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.followers import (
     BURST_S,
     MAX_HELD_BYTES,
-    Asker,
     Follower,
+    PendingRequest,
     TileReply,
     TileSenders,
     check_updates,
@@ -23,8 +23,8 @@ from triquad_server.mesh.followers import (
 )
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
+from triquad_server.process.threads import NICENESS
 from triquad_server.settings import MeshSettings
-from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ class TileFeed:
         self._thread.join()
         self._senders.close()
 
-    def add(self, request: Asker) -> None:
+    def add(self, request: PendingRequest) -> None:
         """Take over a request for updates; it is answered once there are some, or in time.
 
         Raises:

@@ -6,7 +6,8 @@ from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
-from triquad_server.epochs import Epoch, EpochHistory
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.mesher import TileLattice, check_box, check_level, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
 

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import ListenError, ServerError
-from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.monitoring.family import Figures
 from triquad_server.monitoring.metrics import Metrics
-from triquad_server.threads import NICENESS
+from triquad_server.process.threads import NICENESS
+from triquad_server.settings import MetricsSettings
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer

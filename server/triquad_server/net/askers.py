@@ -6,14 +6,13 @@ import time
 from dataclasses import dataclass
 
 import zenoh
-from triquad_format.wire.origin import MAX_ORIGIN_BYTES, RequestOrigin, read_origin
+from triquad_format.wire.origin import RequestOrigin, read_origin
 
 from triquad_server.fair_queue import Owner
 
 _UNLINKED = ""
 """The group of all who are not linked to the server itself: they take one turn together, since
-anybody may call himself as he likes."""
-
+any name can be invented."""
 
 _LATELY_S = 1.0
 _GRACE_S = 0.5  # a client's own time-out comes first
@@ -22,7 +21,7 @@ _EVENTS = 1024  # that wait to be heard of
 
 @dataclass(frozen=True)
 class Asker:
-    """Who asked, and until when he waits for the answer."""
+    """Who asked, and until when the answer is waited for."""
 
     owner: Owner  # of the request
     linked: bool  # whether it is the session at the other end of a link
@@ -60,7 +59,7 @@ class Askers:
         return time.monotonic() - self._others_s < _LATELY_S
 
     def asker(self, query: zenoh.Query, longest_s: float) -> Asker:
-        """Who asks; he is not believed to wait for more than ``longest_s``."""
+        """Who asks; nobody is believed to wait for more than ``longest_s``."""
         asker = self._identify(_origin(query), longest_s)
         with self._lock:
             if asker.owner != self._latest:
@@ -93,6 +92,4 @@ class Askers:
 
 def _origin(query: zenoh.Query) -> RequestOrigin | None:
     attachment = query.attachment
-    if attachment is None or len(attachment) > MAX_ORIGIN_BYTES:
-        return None
-    return read_origin(attachment.to_bytes())
+    return None if attachment is None else read_origin(attachment.to_bytes())

@@ -35,7 +35,7 @@ class NetworkOptions:
 
 
 @dataclass(frozen=True)
-class Protection:
+class NetworkDefaults:
     """What a server lets in, where a file does not say otherwise."""
 
     grants: tuple[Grant, ...]  # who may do what
@@ -48,7 +48,7 @@ class Configuration:
     """A configuration to open a session with."""
 
     zenoh: zenoh.Config
-    protection_is_own: bool  # whether access control is the server's own, not that of a file
+    own_access_control: bool  # whether that is the server's, not that of a file
 
     @property
     def mode(self) -> str:
@@ -78,7 +78,7 @@ class Configuration:
         return tuple(endpoints)
 
 
-def configuration(options: NetworkOptions, protection: Protection) -> Configuration:
+def configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Configuration:
     """The configuration of a server.
 
     What the options leave out is as the file has it; and what both leave out, as is safe: a router
@@ -89,20 +89,20 @@ def configuration(options: NetworkOptions, protection: Protection) -> Configurat
         ServerError: the file cannot be read, or a value is not valid.
     """
     try:
-        return _configuration(options, protection)
+        return _configuration(options, defaults)
     except (zenoh.ZError, ValueError, OSError) as error:
         raise ServerError(f"Zenoh configuration: {first_line(error)}") from error
 
 
-def _configuration(options: NetworkOptions, protection: Protection) -> Configuration:
+def _configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Configuration:
     unset = zenoh.Config()
     file = options.config_file
     config = zenoh.Config() if file is None else zenoh.Config.from_file(str(file))
     put(config, _of_options(options))
     fill(config, {"mode": "router"}, unset)
     is_own = not is_set(config, "access_control", unset)
-    fill(config, _safe(protection), unset)
-    found = Configuration(config, protection_is_own=is_own)
+    fill(config, _safe(defaults), unset)
+    found = Configuration(config, own_access_control=is_own)
     if found.mode != "client":
         fill(config, {"listen/endpoints": [DEFAULT_ENDPOINT]}, unset)
     return found
@@ -125,13 +125,13 @@ def _of_options(options: NetworkOptions) -> dict[str, Any]:
     return given
 
 
-def _safe(protection: Protection) -> dict[str, Any]:
+def _safe(defaults: NetworkDefaults) -> dict[str, Any]:
     return {
         **QUIET,
         **_LINKS,
-        "scouting/gossip/enabled": protection.gossip,
-        "transport/link/rx/max_message_size": protection.max_message_bytes,
-        "access_control": access_control(protection.grants),
+        "scouting/gossip/enabled": defaults.gossip,
+        "transport/link/rx/max_message_size": defaults.max_message_bytes,
+        "access_control": access_control(defaults.grants),
     }
 
 

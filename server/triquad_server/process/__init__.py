@@ -1,1 +1,1 @@
-"""The server as a process: its log, and the service manager that started it."""
+"""The server as a process: its log, who started it and asks it to stop, memory, threads, files."""

@@ -4,7 +4,7 @@ from triquad_format.wire.access_control import Rule, take_part_in_ros2
 
 from triquad_server.ros2.intake.feeds import full_name, prefix_of
 from triquad_server.ros2.topics import bridge_key
-from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.settings import Ros2Settings
 
 
 def ros2_rules(map_name: str, settings: Ros2Settings) -> tuple[Rule, ...]:

@@ -10,7 +10,7 @@ import zenoh
 from triquad_map.compiled.team import Team
 from triquad_sensors.ros.type_store import MARKER, OCCUPANCY_GRID
 
-from triquad_server.epochs import EpochHistory
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.ros2.intake.feeds import full_name, prefix_of
@@ -20,7 +20,7 @@ from triquad_server.ros2.output.grid_outlet import GridOutlet, SliceShape
 from triquad_server.ros2.output.mesh_outlet import MeshOutlet
 from triquad_server.ros2.output.outlet import Outlet
 from triquad_server.ros2.topics import Delivery, Topic
-from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.settings import Ros2Settings
 
 _log = logging.getLogger("triquad_server.ros2")
 

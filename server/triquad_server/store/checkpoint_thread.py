@@ -22,8 +22,8 @@ from triquad_server.errors import (
 )
 from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
-from triquad_server.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""A slow look at all that lies in a store: what rots there is found while the map is in memory."""
+"""A slow check of all that lies in a store: what rots there is found while the map is in memory."""
 
 import logging
 import threading
@@ -13,7 +13,7 @@ from triquad_format.mapfile.index import FileBytes, MapIndex, named
 from triquad_format.mapfile.reader import read_map_file
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.threads import NICENESS
+from triquad_server.process.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ class Scrubber:
     def __init__(self, folder: Path, period_h: float, damaged: Callable[[str], None]) -> None:
         """Begin; ``damaged`` is called with the name of each file that is found damaged.
 
-        ``period_h`` goes by between the end of one look and the next, and before the first.
+        ``period_h`` goes by between the end of one check and the next, and before the first.
         """
         self._folder = folder
         self._period_s = period_h * _HOUR_S

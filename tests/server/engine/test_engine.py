@@ -11,7 +11,7 @@ from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
 from triquad_server.engine.tensor_field import TensorField
 from triquad_server.engine.tensor_trainer import TensorTrainer, step_rows, step_where
-from triquad_server.threads import Teams
+from triquad_server.process.threads import Teams
 
 CPU = torch.device("cpu")
 RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99)

@@ -7,9 +7,9 @@ import pytest
 from support import servers
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import FlushReply, FlushRequest
-from triquad_server.intake import flush, scan_queue
+from triquad_server.intake import flush, source_ledger
 from triquad_server.intake.flush import FlushHandler
-from triquad_server.intake.scan_queue import SourceLedger
+from triquad_server.intake.source_ledger import SourceLedger
 
 
 class PendingRequest:
@@ -61,7 +61,7 @@ def asks(sequence=0, **changes):
     "request_",
     [
         asks(-1),
-        asks(scan_queue.MAX_SEQUENCE),
+        asks(source_ledger.MAX_SEQUENCE),
         asks(2**63 - 1),
         asks(source=""),
         asks(source="a/b"),
@@ -116,7 +116,7 @@ def test_pending_requests_are_refused_when_the_server_stops(ledger):
 
 
 def test_questions_about_strangers_push_nobody_out(handler, ledger, monkeypatch):
-    monkeypatch.setattr(scan_queue, "MAX_SESSIONS", 2)
+    monkeypatch.setattr(source_ledger, "MAX_SESSIONS", 2)
     ledger.arrive(servers.scan(0))
     for session in range(100, 110):
         stranger = PendingRequest(asks(4, session=session))

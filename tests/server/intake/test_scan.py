@@ -3,8 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import RobotBox, usable_rays
-from triquad_server.scan_settings import ScanSettings
-from triquad_server.source_settings import SourceSettings
+from triquad_server.settings import ScanSettings, SourceSettings
 
 SETTINGS = ScanSettings()
 BY_DIRECTION = ScanSettings(thin_by="direction")

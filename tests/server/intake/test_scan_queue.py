@@ -1,8 +1,9 @@
 import threading
 
 from support import servers
-from triquad_server.intake import scan_queue
-from triquad_server.intake.scan_queue import ScanQueue, SourceLedger
+from triquad_server.intake import scan_queue, source_ledger
+from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.intake.source_ledger import SourceLedger
 
 SCAN = servers.scan()
 SOURCE = (SCAN.source, SCAN.session)
@@ -88,8 +89,8 @@ def test_a_leap_that_no_loss_explains_changes_nothing_for_the_scans_that_follow(
 def test_sequences_may_leap_by_what_a_long_silence_explains(monkeypatch):
     ledger = SourceLedger()
     arrive_and_take(ledger, 0)
-    now = scan_queue.time.monotonic()
-    monkeypatch.setattr(scan_queue.time, "monotonic", lambda: now + 3600)
+    now = source_ledger.time.monotonic()
+    monkeypatch.setattr(source_ledger.time, "monotonic", lambda: now + 3600)
     assert ledger.arrive(servers.scan(3_000_000)) is None
 
 
@@ -115,7 +116,7 @@ def test_what_is_given_up_counts_as_lost():
 
 
 def test_sessions_remembered_are_bounded_and_losses_are_not_forgotten(monkeypatch):
-    monkeypatch.setattr(scan_queue, "MAX_SESSIONS", 3)
+    monkeypatch.setattr(source_ledger, "MAX_SESSIONS", 3)
     ledger = SourceLedger()
     for session in range(10):
         ledger.arrive(servers.scan(1, session=session))
@@ -132,7 +133,7 @@ def test_losses_of_a_hostile_publisher_still_fit_a_message():
 
 
 def test_sources_that_are_listed_are_bounded_and_the_others_are_put_together(monkeypatch):
-    monkeypatch.setattr(scan_queue, "MAX_SOURCES_LISTED", 2)
+    monkeypatch.setattr(source_ledger, "MAX_SOURCES_LISTED", 2)
     ledger = SourceLedger()
     for session, source in enumerate(["old", "older", "front", "rear", "front"]):
         scan = servers.scan(3, source=source, session=session)

@@ -7,9 +7,8 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_server.intake.rays import usable_rays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
-from triquad_server.settings import Settings
-from triquad_server.settings_loading import load_settings
-from triquad_server.source_settings import SourceSettings
+from triquad_server.settings import Settings, SourceSettings
+from triquad_server.settings.loading import load_settings
 
 SETTINGS = Settings()
 

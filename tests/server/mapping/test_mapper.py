@@ -10,8 +10,8 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.region_setup import RegionSetup
+from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
-from triquad_server.threads import Teams
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 

@@ -7,7 +7,7 @@ from support.small_world import settings
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import usable_rays
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.memory_settings import MemorySettings
+from triquad_server.settings import MemorySettings
 
 LIMIT = 8_000_000
 

@@ -12,7 +12,7 @@ from triquad_format.records.region import Region
 from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
-from triquad_server.epochs import Epoch, FrozenRegion
+from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.marching_cubes import centroids
 from triquad_server.mesh.mesher import mesh_tile, tile_lattice

@@ -10,7 +10,7 @@ from triquad_map.questions.ground import ground
 from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_map.questions.spheres import spheres
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene

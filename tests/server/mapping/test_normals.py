@@ -1,6 +1,6 @@
 import numpy as np
 from triquad_server.mapping.normals import SurfaceNormals
-from triquad_server.threads import Teams
+from triquad_server.process.threads import Teams
 
 TEAM = Teams().mapping
 RNG = np.random.default_rng(0)

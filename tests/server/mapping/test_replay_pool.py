@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from triquad_server.mapping.ray_intervals import Placement, sample_intervals
 from triquad_server.mapping.replay_pool import ReplayPool
-from triquad_server.threads import Teams
+from triquad_server.process.threads import Teams
 
 CPU = torch.device("cpu")
 PLACEMENT = Placement(surface_share=0.5, spread_m=0.08, truncation_m=0.3, half_side_m=400.0)

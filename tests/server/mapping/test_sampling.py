@@ -9,8 +9,8 @@ from triquad_server.mapping.ray_intervals import (
     draw_samples,
     ray_intervals,
 )
-from triquad_server.scan_settings import ScanSettings
-from triquad_server.threads import Teams
+from triquad_server.process.threads import Teams
+from triquad_server.settings import ScanSettings
 
 HALF_SIDE_M = 400.0
 TEAM = Teams().mapping

@@ -15,7 +15,7 @@ from support.small_world import settings, settled_mapper, world
 from triquad_client import Mesh, OfflineMap
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import FieldSettings
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.coarse_mesh import FACES_MIN, coarse_mesh
 from triquad_server.mesh.preview import previews_of
 from triquad_tools.evaluation.metrics import mesh_area_m2, sample_mesh

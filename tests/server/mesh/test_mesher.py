@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from support.small_world import settings, settled_mapper, world
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import TileMesh, mesh_tile, tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles

@@ -10,12 +10,12 @@ from support.exact_maps import SETTINGS, exact_map, flat, table
 from support.small_world import settings, settle, world
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import TileIndex, TileLattice, mesh_tile, tile_lattice
 from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
-from triquad_server.threads import Teams
 from triquad_tools.simulation.lidar import SimulatedScan
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)

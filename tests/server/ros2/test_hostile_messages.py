@@ -13,7 +13,7 @@ from triquad_format.wire.messages import Scan
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.ros2.intake.ros2_intake import Ros2Intake
 from triquad_server.ros2.node import Node
-from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.settings import Ros2Settings
 
 MESSAGES = RosMessages()
 

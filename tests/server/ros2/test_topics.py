@@ -20,7 +20,7 @@ from triquad_server.ros2.topics import (
     rmw_topic_name,
     type_hash,
 )
-from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.settings import Ros2Settings
 
 STRING = "std_msgs/msg/String"
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"

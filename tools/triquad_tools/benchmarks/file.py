@@ -17,7 +17,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.reference.evaluator import MapEvaluator
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.preview import previews_of
 
 from triquad_tools.benchmarks.core import seen_points

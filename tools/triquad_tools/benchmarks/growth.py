@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.memory import resident_bytes
+from triquad_server.process.memory import resident_bytes
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.figures import Figure, seconds

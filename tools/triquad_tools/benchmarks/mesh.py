@@ -12,11 +12,11 @@ from triquad_client import Client, Mesh, MeshWatch
 from triquad_format.records.arrays import Bools
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_sensors.pose import moved
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.mesher import TileIndex, tile_lattice
 from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
-from triquad_server.threads import Teams
 
 from triquad_tools.benchmarks.figures import Figure, seconds
 from triquad_tools.benchmarks.served import latency_figures, served

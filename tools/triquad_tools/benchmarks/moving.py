@@ -11,7 +11,7 @@ import numpy as np
 from triquad_client import Mesh
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_map.questions.segments import SegmentOptions, segments
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.launch import warm_up
 from triquad_server.mesh.marching_cubes import centroids
 from triquad_server.mesh.mesher import mesh_tile, tile_lattice

@@ -6,8 +6,8 @@ from contextlib import ExitStack
 import numpy as np
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.benchmarks.bad_neighbours import frozen_neighbours, neighbour
 from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.noisy_neighbours import frozen_neighbours, neighbour
 from triquad_tools.benchmarks.served import MAP, Served, served, stream
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.demo.probe import ProbeReport
@@ -20,7 +20,7 @@ _SETTLE_S = 600.0
 
 
 def measure_neighbours(made: BenchStreet) -> list[Figure]:
-    """Figures of a planner at 20 Hz and a lidar at 10 Hz, alone and beside bad neighbours."""
+    """Figures of a planner at 20 Hz and a lidar at 10 Hz, alone and beside noisy neighbours."""
     place = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
     box = (-8, -8, -1.5), (8, 8, 2.0)
     points = place + np.random.default_rng(0).uniform(*box, (_ASKED, 3))

@@ -12,6 +12,7 @@ import zenoh
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import keys
+from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
@@ -33,7 +34,7 @@ _FREEZE_AFTER_S = 0.5
 _FROZEN = """
 import sys, triquad_client
 with triquad_client.connect(sys.argv[1], sys.argv[2], timeout_s=60.0) as client:
-    print_line("asking")
+    print("asking", flush=True)
     while True:
         client.mesh()
 """
@@ -149,9 +150,7 @@ def _mesh_reader(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
 def _samples(endpoint: str) -> Iterator[Callable[[], int]]:
     """Counts the status samples that come."""
     config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+    put(config, {**QUIET, "mode": "client", "connect/endpoints": [endpoint]})
     received: list[zenoh.Sample] = []
     with zenoh.open(config) as session:
         callback = zenoh.handlers.Callback(received.append, indirect=False)

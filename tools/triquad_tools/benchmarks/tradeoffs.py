@@ -12,7 +12,7 @@ from triquad_client import OfflineMap
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
-from triquad_server.epochs import Epoch
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.preview import previews_of

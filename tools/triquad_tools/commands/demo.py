@@ -55,7 +55,7 @@ def _demo(options: argparse.Namespace) -> int:
         status = _report(options.out, results)
         if options.view:
             with DemoServer(options.out, steps.MAP, endpoint=endpoint):
-                _say("the page shows what the server has now; Ctrl-C ends both")
+                print_remark("the page shows what the server has now; Ctrl-C ends both")
                 threading.Event().wait()
     return status
 
@@ -83,7 +83,7 @@ def _show(opened: ExitStack, port: int, endpoint: str) -> None:
     client = opened.enter_context(connect(endpoint, steps.MAP))
     viewer = Viewer(LiveSource(client, endpoint), "127.0.0.1", port)
     opened.callback(viewer.close)
-    _say(f"open {viewer.url} in a browser: the drive begins as soon as the page is there")
+    print_remark(f"open {viewer.url} in a browser: the drive begins as soon as the page is there")
     viewer.wait_for_browser()
 
 
@@ -104,7 +104,9 @@ def run_demo(
     (out / "server.log").unlink(missing_ok=True)
     street = driven_street(street_drive(street_seed, scans))
     laps.end("simulate")
-    _say("starting triquad-server (the first run of all compiles kernels: a minute more) ...")
+    print_remark(
+        "starting triquad-server (the first run of all compiles kernels: a minute more) ..."
+    )
     with DemoServer(out, steps.MAP, endpoint=endpoint) as server:
         laps.end("start")
         if started is not None:
@@ -113,12 +115,12 @@ def run_demo(
         learnt = steps.learn(server.endpoint, street)
         laps.end("learn")
         if not learnt.intake.settled:
-            _say("the server is still learning; it is scored as it is now")
+            print_remark("the server is still learning; it is scored as it is now")
         scored = steps.score(server.endpoint, street)
         laps.end("score")
         server.stop()
         laps.end("stop")
-    _say("starting triquad-server again, from its checkpoint ...")
+    print_remark("starting triquad-server again, from its checkpoint ...")
     with DemoServer(out, steps.MAP, endpoint=endpoint) as server:
         restart = steps.compare(server.endpoint, scored)
         server.stop()
@@ -146,10 +148,6 @@ class _Laps:
         now = time.monotonic()
         self.seconds[phase] = now - self._since
         self._since = now
-
-
-def _say(message: str) -> None:
-    print_remark(message)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -22,7 +22,7 @@ from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import Row, json_text, print_rows
-from triquad_tools.console.server_arguments import add_config
+from triquad_tools.console.server_arguments import DEFAULT_MAP, add_config
 from triquad_tools.evaluation.map_scores import (
     WithheldAnswer,
     WithheldScores,
@@ -234,7 +234,7 @@ def _add_map(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(evaluate=evaluate_map)
     add = parser.add_argument
     add("target", metavar="MAP", help="map file, or endpoint of a server (tcp/HOST:PORT)")
-    add("--map", default="default", metavar="NAME", help="map of the server (default: default)")
+    add("--map", default=DEFAULT_MAP, metavar="NAME", help="map of the server (default: default)")
     add_config(parser)
     truth = parser.add_mutually_exclusive_group(required=True)
     truth.add_argument(

@@ -12,9 +12,9 @@ from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.launch import choose_device, warm_up
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
-from triquad_server.settings_loading import PRESETS, load_settings
-from triquad_server.threads import Teams
+from triquad_server.settings.loading import PRESETS, load_settings
 
 from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, ToolError, run

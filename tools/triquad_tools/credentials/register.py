@@ -49,7 +49,7 @@ class Register:
         """Refuse a name or a source of scans that somebody has.
 
         Raises:
-            ToolError: one has it; the text names him.
+            ToolError: one has it; the text names which.
         """
         for holder in self.holders:
             if holder.name == name:

@@ -11,8 +11,8 @@ from triquad_format.records.region import MapRecord
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
-from triquad_server.threads import Teams
 
 from triquad_tools.console.progress import Speed, progress
 from triquad_tools.mapping.unfinished import MAP_NAME, UnfinishedMap

@@ -15,7 +15,8 @@ from triquad_sensors.ros.type_store import (
 )
 
 from triquad_server.ros2.topics import Topic, bridge_key, rmw_key
-from triquad_server.ros2_settings import TF_POSES, Ros2Settings
+from triquad_server.settings import Ros2Settings
+from triquad_server.settings.ros2 import TF_POSES
 
 
 class Role(Enum):

@@ -22,7 +22,7 @@ from triquad_server.ros2.intake.reading import Reader
 from triquad_server.ros2.intake.scans import Place, ScanMaker
 from triquad_server.ros2.intake.silence import Silence
 from triquad_server.ros2.node import Node
-from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.settings import Ros2Settings
 
 _log = logging.getLogger("triquad_server.ros2")
 

@@ -15,11 +15,12 @@ from triquad_map.composition.composed_view import ComposedView
 from triquad_map.questions.grid import Grid, GridShape, grid
 from triquad_sensors.ros.type_store import OCCUPANCY_GRID, encode_cdr, type_store
 
-from triquad_server.epochs import Epoch, EpochHistory
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs.history import EpochHistory
+from triquad_server.process.threads import NICENESS
 from triquad_server.ros2.intake.scans import Place
 from triquad_server.ros2.output.outlet import Outlet
-from triquad_server.ros2_settings import Ros2Settings
-from triquad_server.threads import NICENESS
+from triquad_server.settings import Ros2Settings
 
 _log = logging.getLogger("triquad_server.ros2")
 

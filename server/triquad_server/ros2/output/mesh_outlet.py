@@ -14,10 +14,10 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_feed import TileFeed
+from triquad_server.process.threads import NICENESS
 from triquad_server.ros2.intake.scans import Place
 from triquad_server.ros2.output.markers import Action, Marker
 from triquad_server.ros2.output.outlet import Outlet
-from triquad_server.threads import NICENESS
 
 _log = logging.getLogger("triquad_server.ros2")
 

@@ -1,0 +1,80 @@
+"""A published state of the map, and what it answers."""
+
+from collections import ChainMap
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.region import MapRecord, Region
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.surfels.surfel_map import SurfelMap
+from triquad_map.composition.composed_view import ComposedView
+from triquad_map.composition.region import Split
+
+from triquad_server.array_memory import Buffers
+from triquad_server.engine.live_field import FrozenField, region_record
+
+
+@dataclass(frozen=True)
+class FrozenRegion:
+    """A region as it was when it was published."""
+
+    index: RegionIndex
+    centre: Doubles  # [3] map frame
+    engine: FrozenField
+    evidence: FrozenEvidence
+    surfels: SurfelMap
+    vertices: int
+    parameters: int
+    changed: int  # epoch of its last change
+    live_bytes: Mapping[str, int]  # what the live region took beside this one, by part
+    buffers: Buffers  # memory of this one; other epochs may share it
+
+    def record(self) -> Region:
+        """The region as a map file holds it, without training state."""
+        return region_record(self.index, self.engine, self.evidence, training=None)
+
+
+class Epoch(ComposedView):
+    """An immutable map: every answer comes from the same state. Safe to read from any thread."""
+
+    def __init__(
+        self,
+        name: str,
+        number: int,
+        settings: FieldSettings,
+        regions: tuple[FrozenRegion, ...],
+        split: Split,
+    ) -> None:
+        """The map called ``name``; ``split`` runs the work of its answers."""
+        super().__init__(number, settings, regions, split=split)
+        self.number = number
+        self.field_settings = settings
+        self.frozen_regions = regions
+        self._name = name
+
+    @property
+    def regions(self) -> int:
+        """Regions of the map."""
+        return len(self.frozen_regions)
+
+    @property
+    def vertices(self) -> int:
+        """Quadtree vertices of all regions."""
+        return sum(region.vertices for region in self.frozen_regions)
+
+    @property
+    def parameters(self) -> int:
+        """Learnable numbers of all regions."""
+        return sum(region.parameters for region in self.frozen_regions)
+
+    @property
+    def buffers(self) -> Buffers:
+        """Its memory; epochs share that of what did not change between them."""
+        return ChainMap(*(dict(region.buffers) for region in self.frozen_regions))
+
+    def record(self) -> MapRecord:
+        """The epoch as a map file holds it, without training state."""
+        regions = tuple(region.record() for region in self.frozen_regions)
+        return MapRecord(self._name, self.number, settings=self.field_settings, regions=regions)

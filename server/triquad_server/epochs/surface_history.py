@@ -1,0 +1,185 @@
+"""Where surface appeared and vanished, epoch by epoch, as far back as there is room for."""
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.errors import RefusedError
+from triquad_format.records.arrays import Bools, Bytes, Ints, Longs
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
+from triquad_format.records.region import BLOCK_BYTES
+from triquad_map.clusters import same_cells
+from triquad_map.compiled.voxel_index import cells_of
+
+from triquad_server.epochs.epoch import Epoch, FrozenRegion
+
+
+@dataclass(frozen=True)
+class VoxelChanges:
+    """Voxels in which surface appeared or vanished."""
+
+    voxels: Longs  # [N, 3] of the map's lattice: a voxel ``v`` reaches from v to v + 1 leaves
+    appeared: Bools  # [N] else it vanished
+    epochs: Longs  # [N] of the newest change of each
+
+    def part(self, chosen: Bools) -> "VoxelChanges":
+        """Those of ``chosen`` [N]."""
+        return VoxelChanges(self.voxels[chosen], self.appeared[chosen], self.epochs[chosen])
+
+
+@dataclass(frozen=True)
+class _EpochChanges:
+    """What one epoch shows that the one before did not."""
+
+    epoch: int
+    voxels: Ints  # [N, 3]
+    appeared: Bools  # [N]
+
+
+class _Surface(NamedTuple):
+    """The surface that rays have shown of a region."""
+
+    keys: Longs  # [B] of the blocks
+    masks: Bytes  # [B, BLOCK_BYTES]
+
+
+class _Flips(NamedTuple):
+    """How the surface of a region differs from what it was."""
+
+    keys: Longs  # [B] of blocks
+    appeared: Bytes  # [B, BLOCK_BYTES]
+    vanished: Bytes  # [B, BLOCK_BYTES]
+
+
+_NO_SURFACE = _Surface(np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8))
+_VOXEL_BYTES = 13  # three numbers of 32 bits, and whether it appeared
+_NO_VOXELS = np.zeros((0, 3), np.int32)
+
+
+class SurfaceHistory:
+    """What became of the surface from epoch to epoch. One thread adds, any may ask.
+
+    The newest changes are kept, ``limit`` voxels at most: older epochs are forgotten as a whole.
+    """
+
+    def __init__(self, first: Epoch, limit: int) -> None:
+        """Begin with the epoch that is published first."""
+        self._newest = first
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._oldest = first.number  # what changed after it is known
+        self._changes: deque[_EpochChanges] = deque()  # oldest first, none of them empty
+        self._voxels = 0  # of all changes
+
+    def add(self, epoch: Epoch) -> None:
+        """Record what ``epoch`` changes; to be called before others can see it."""
+        changes = _changes(self._newest, epoch)
+        with self._lock:
+            self._newest = epoch
+            if len(changes.voxels):
+                self._changes.append(changes)
+                self._voxels += len(changes.voxels)
+            while self._voxels > self._limit:
+                forgotten = self._changes.popleft()
+                self._voxels -= len(forgotten.voxels)
+                self._oldest = forgotten.epoch
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the changes that are kept."""
+        return self._voxels * _VOXEL_BYTES
+
+    def between(self, since: int, until: int) -> VoxelChanges:
+        """What is different in epoch ``until`` from epoch ``since``.
+
+        What appeared and vanished again in between is not among it.
+
+        Raises:
+            RefusedError: ``epoch_gone``: changes are not known from ``since`` on.
+        """
+        with self._lock:
+            oldest, kept = self._oldest, list(self._changes)
+        if not oldest <= since <= until:
+            raise RefusedError(
+                "epoch_gone",
+                f"changes since epoch {since} are not known: the newest epoch is {until}, and the "
+                f"oldest to ask from is {oldest}; ask for the map anew, then for changes since "
+                f"its epoch",
+            )
+        newest_first = reversed([changes for changes in kept if changes.epoch <= until])
+        return _net(list(takewhile(lambda changes: changes.epoch > since, newest_first)))
+
+
+def _net(changes: list[_EpochChanges]) -> VoxelChanges:
+    """What is left of changes, the newest first: those of a voxel take turns, so pairs cancel."""
+    voxels = np.concatenate([_NO_VOXELS, *(one.voxels for one in changes)]).astype(np.int64)
+    appeared = np.concatenate([np.zeros(0, np.bool_), *(one.appeared for one in changes)])
+    numbers = np.array([one.epoch for one in changes], np.int64)
+    epochs = np.repeat(numbers, np.array([len(one.voxels) for one in changes], np.int64))
+    first, number = same_cells(voxels)
+    balance = np.bincount(number, np.where(appeared, 1, -1), minlength=len(first))
+    rows = first[balance != 0]
+    return VoxelChanges(voxels[rows], appeared[rows], epochs[rows])
+
+
+def _changes(before: Epoch, now: Epoch) -> _EpochChanges:
+    """What ``now`` shows that ``before`` did not."""
+    old = {region.index: region for region in before.frozen_regions}
+    new = {region.index: region for region in now.frozen_regions}
+    voxels, appeared = [_NO_VOXELS], [np.zeros(0, np.bool_)]
+    for index in old | new:
+        one, other = old.get(index), new.get(index)
+        if one and other and one.evidence is other.evidence:
+            continue
+        flips = _flips(_surface_of(one), _surface_of(other))
+        for masks, is_new in ((flips.appeared, True), (flips.vanished, False)):
+            if masks.any():
+                found = _map_voxels(index, flips.keys, masks, settings=now.field_settings)
+                voxels.append(found)
+                appeared.append(np.full(len(found), is_new))
+    return _EpochChanges(now.number, np.concatenate(voxels), np.concatenate(appeared))
+
+
+def _surface_of(region: FrozenRegion | None) -> _Surface:
+    if region is None:
+        return _NO_SURFACE
+    seen = region.evidence.seen
+    return _Surface(seen.blocks.row_keys, seen.surface)
+
+
+def _flips(old: _Surface, new: _Surface) -> _Flips:
+    """What differs. As a rule the blocks of ``new`` are those of ``old`` and more."""
+    shared = min(len(old.keys), len(new.keys))
+    if not np.array_equal(old.keys[:shared], new.keys[:shared]):
+        shared = 0  # the region was forgotten and made anew: all vanished, and all appeared
+    rows = _differing_rows(old.masks[:shared], new.masks[:shared])
+    gone, added = old.masks[shared:], new.masks[shared:]
+    before = np.concatenate([old.masks[rows], gone, np.zeros_like(added)])
+    now = np.concatenate([new.masks[rows], np.zeros_like(gone), added])
+    keys = np.concatenate([old.keys[rows], old.keys[shared:], new.keys[shared:]])
+    return _Flips(keys, now & ~before, before & ~now)
+
+
+def _differing_rows(one: Bytes, other: Bytes) -> NDArray[np.intp]:
+    """The blocks whose masks [B, BLOCK_BYTES] are not the same; most are."""
+    words = np.flatnonzero(one.reshape(-1).view(np.uint64) != other.reshape(-1).view(np.uint64))
+    return np.unique(words // (BLOCK_BYTES // np.dtype(np.uint64).itemsize))
+
+
+def _map_voxels(index: RegionIndex, keys: Longs, masks: Bytes, settings: FieldSettings) -> Ints:
+    """The voxels [N, 3] of the map's lattice set in ``masks``, but for those that neighbours own.
+
+    Neighbouring regions overlap, and know the same of where they do.
+    """
+    used = np.flatnonzero(masks.any(axis=1))
+    cells, mine = cells_of(keys[used]), settings.owned_blocks
+    owned = ((cells >= mine.start) & (cells < mine.stop)).all(axis=1)
+    bits = np.unpackbits(masks[used[owned]], bitorder="little").view(np.bool_)
+    block, *inner = np.unravel_index(np.flatnonzero(bits), (len(used), *[BLOCK_VOXELS] * 3))
+    corner = np.rint(settings.region_corner(index) / settings.leaf_m).astype(np.int64)
+    corners = (corner + cells[owned] * BLOCK_VOXELS).astype(np.int32)
+    return corners[block] + np.stack(inner, axis=1, dtype=np.int32, casting="unsafe")

@@ -1,0 +1,156 @@
+"""Groups of operations, each with a queue and workers; every request is answered exactly once."""
+
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import zenoh
+from triquad_format.errors import RefusedError
+from triquad_format.wire.codec import Message
+from triquad_format.wire.metrics_messages import QueueMetrics
+
+from triquad_server.net.askers import Askers
+from triquad_server.net.asking_client import asking_client
+from triquad_server.net.operation_counts import OperationCounts
+from triquad_server.net.request import Request, RequestT, Turns
+from triquad_server.net.request_queue import MOST_BEGUN, MOST_SENDING, Job, RequestQueue
+
+_REFUSALS = 2  # threads that send them
+_STOPPING = "the server is stopping"
+
+Handler = Callable[[Request], None]
+"""Reads the request and answers it, or raises :class:`RefusedError`."""
+
+
+class Operation(NamedTuple):
+    """How the requests of an operation are handled, and where they are counted."""
+
+    handle: Handler
+    counts: OperationCounts
+
+
+def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Handler:
+    """A handler that decodes a ``kind`` and replies with what ``answer`` makes of it."""
+
+    def handle(request: Request) -> None:
+        request.answer(answer(request.read(kind)))
+
+    return handle
+
+
+@dataclass(frozen=True)
+class RequestLimits:
+    """Bounds of what waits for the workers of a group."""
+
+    waiting: int  # requests
+    waiting_bytes: int  # of their payloads
+    max_bytes: int  # of a single payload
+    longest_s: float  # for which any client is believed to wait
+
+
+class RequestHandlers:
+    """A group of operations that share a queue and workers, so that no other waits for them."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        operations: Mapping[str, Operation],
+        askers: Askers,
+        *,
+        workers: int,
+        limits: RequestLimits,
+    ) -> None:
+        """Begin to serve ``operations``, by key, with so many ``workers``."""
+        self._operations = operations
+        self._askers = askers
+        self._limits = limits
+        self._queue: RequestQueue[Request] = RequestQueue(
+            self._begin,
+            lambda: askers.are_several,
+            workers=workers,
+            limit=limits.waiting,
+            limit_bytes=limits.waiting_bytes,
+        )
+        self._stopping = False
+        # As many as ever work or send at a time; they are started when they are needed.
+        self._workers = ThreadPoolExecutor(max(MOST_BEGUN, workers) + MOST_SENDING, "worker")
+        self._refusals = ThreadPoolExecutor(_REFUSALS, "refusals")
+        self._queryables: list[zenoh.Queryable[Any]] = []
+        self._receivers: list[threading.Thread] = []
+        for key in operations:
+            channel = zenoh.handlers.FifoChannel(limits.waiting)
+            queryable = session.declare_queryable(key, channel, complete=True)
+            receive = threading.Thread(
+                target=self._receive, args=(queryable, key), name=f"receiver-{key}"
+            )
+            self._queryables.append(queryable)
+            self._receivers.append(receive)
+        for thread in self._receivers:
+            thread.start()
+
+    @property
+    def queue(self) -> QueueMetrics:
+        """What waits for a worker."""
+        return self._queue.metrics
+
+    def stop(self) -> None:
+        """Refuse what waits and what comes, and end what is worked at as soon as it pauses."""
+        self._stopping = True
+        for request in self._queue.clear():
+            self._refuse_aside(request, "busy", _STOPPING)
+
+    def close(self) -> None:
+        """As :meth:`stop`, and take no more requests."""
+        for queryable in self._queryables:
+            queryable.undeclare()
+        for thread in self._receivers:
+            thread.join()
+        self.stop()
+        self._workers.shutdown()
+        self._refusals.shutdown()
+
+    def _receive(self, queryable: zenoh.Queryable[Any], key: str) -> None:
+        """Empty the channel at once: a full one would stall the network's threads."""
+        for query in queryable:
+            if str(query.key_expr) != key:
+                query.drop()  # unanswered: who means it names it
+                continue
+            asker = self._askers.asker(query, self._limits.longest_s)
+            request = Request(query, key, self._operations[key].counts, asker, self._askers)
+            if request.size > self._limits.max_bytes:
+                limit = self._limits.max_bytes
+                text = f"{request.size} bytes exceed the limit of {limit}: split it"
+                self._refuse_aside(request, "too_large", text)
+            elif self._stopping:
+                self._refuse_aside(request, "busy", _STOPPING)
+            else:
+                for excess in self._queue.put(asker.owner, request, request.size):
+                    text = f"{self._limits.waiting} requests wait already; try later"
+                    self._refuse_aside(excess, "busy", text)
+
+    def _refuse_aside(self, request: Request, code: str, text: str) -> None:
+        """Refuse a request in another thread: its client may not take the reply."""
+        self._refusals.submit(request.refuse, code, text)
+
+    def _begin(self, job: Job[Request]) -> None:
+        self._workers.submit(self._work, job)
+
+    def _work(self, job: Job[Request]) -> None:
+        request = job.request
+        turns = Turns(
+            pause=lambda: self._queue.pause(job),
+            send=lambda: self._queue.send(job),
+            problem=lambda: _STOPPING if self._stopping else None,
+        )
+        asking_client.set(request.asker.owner.group)
+        try:
+            request.begin(turns)
+            self._operations[request.key].handle(request)
+        except RefusedError as error:
+            request.refuse(error.code, error.message)
+        except Exception as error:
+            request.fail(error)
+        finally:
+            self._queue.finish(job)

@@ -1,0 +1,1 @@
+"""What clients ask of the map: which operations there are, and what answers them."""

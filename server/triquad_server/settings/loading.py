@@ -1,0 +1,281 @@
+"""Where settings come from: a preset, over it a TOML file, the environment, the command line."""
+
+import difflib
+import json
+import os
+import reprlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import Json, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
+from triquad_format.errors import SettingsError
+
+from triquad_server.settings.leaf_lengths import follows_leaf
+from triquad_server.settings.schemas import SOURCE_SECTION, setting_schemas
+from triquad_server.settings.settings import Settings, UnfitSettingsError
+
+_PREFIX, _DELIMITER = "TRIQUAD_", "__"
+
+_PRESET_FOLDER = Path(__file__).with_name("presets")
+
+PRESETS = ("street", "indoor", "tabletop", "long-range")
+"""Settings that fit a kind of place and sensor; each is a file in the folder ``presets``."""
+
+_FILE = 1  # its place among the origins
+
+_READERS: dict[str, TypeAdapter[Any]] = {
+    "integer": TypeAdapter(int),
+    "number": TypeAdapter(float),
+    "boolean": TypeAdapter(bool),
+    "array": TypeAdapter(Json[list[Any]]),
+}
+"""What reads text, by the type in a setting's schema."""
+
+
+class _NamedSettings(Settings, BaseSettings):
+    """Settings with the names that they have in the environment."""
+
+    model_config = SettingsConfigDict(
+        env_prefix=_PREFIX, env_nested_delimiter=_DELIMITER, enable_decoding=False
+    )
+
+
+class _Origin(NamedTuple):
+    """Settings from one place, as nested tables of values that are not checked yet."""
+
+    name: str
+    tables: dict[str, Any]
+
+    def gives(self, location: tuple[int | str, ...]) -> bool:
+        """Whether the value at a section and key, or a part of it, comes from here."""
+        table: Any = self.tables
+        for part in location:
+            if not isinstance(table, dict):  # a list comes as a whole
+                break
+            if part not in table:
+                return False
+            table = table[part]
+        return bool(location)
+
+
+def load_settings(
+    file: Path | None = None, assignments: Iterable[str] = (), *, preset: str | None = None
+) -> Settings:
+    """The effective settings.
+
+    Args:
+        file: a TOML file; what it leaves out is as in the preset, or keeps its default.
+        assignments: of the command line, such as ``training.batch=4096``.
+        preset: one of :data:`PRESETS`, below all else.
+
+    Raises:
+        SettingsError: the file cannot be read, there is no such preset, or a setting is unknown,
+            of the wrong type or out of range. The text names the setting, where it comes from
+            and what is allowed.
+    """
+    origins = [
+        _Origin(f"preset {preset}", {} if preset is None else _read_preset(preset)),
+        _Origin(f"settings file {file}", {} if file is None else _read_file(file)),
+        _Origin("environment", _as_in_a_file(_read_environment())),
+        _Origin("--set", _as_in_a_file(_parse_assignments(assignments))),
+    ]
+    merged: dict[str, Any] = {}
+    for _, tables in origins:
+        merged = _merged(merged, tables)
+    try:
+        return Settings.model_validate(merged)
+    except ValidationError as error:
+        texts = [_explain(details, origins) for details in error.errors()]
+        raise SettingsError("; ".join(texts)) from error
+
+
+def settings_toml(settings: Settings) -> str:
+    """The settings as a TOML file that :func:`load_settings` reads."""
+    tables = settings.model_dump(exclude_none=True)
+    # A name in quotes may hold points.
+    tables |= {f'sources."{name}"': table for name, table in tables.pop("sources").items()}
+    followers = {
+        (section, key)
+        for section in ("scan", "mesh")
+        for key in tables[section]
+        if follows_leaf(getattr(settings, section), key)
+    }
+    lines: list[str] = []
+    for section, table in tables.items():
+        lines.append(f"[{section}]")
+        for key, value in table.items():
+            follows = "  # follows field.leaf_m" if (section, key) in followers else ""
+            lines.append(f"{key} = {json.dumps(value)}{follows}")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Nested tables, the values of the latter going before those of the former."""
+    both = tables | over
+    for key in tables.keys() & over.keys():
+        if isinstance(tables[key], dict) and isinstance(over[key], dict):
+            both[key] = _merged(tables[key], over[key])
+    return both
+
+
+def _read_preset(name: str) -> dict[str, Any]:
+    if name not in PRESETS:
+        raise SettingsError(f"there is no preset {name!r}: use {', '.join(PRESETS)}")
+    return _read_file(_PRESET_FOLDER / f"{name}.toml")
+
+
+def _read_file(file: Path) -> dict[str, Any]:
+    try:
+        file.open("rb").close()  # what is missing, or a folder, would count as empty
+        # As it is written: a call would take [Scan] for [scan], and of both drop one.
+        return TomlConfigSettingsSource(_NamedSettings, file).toml_data
+    except (OSError, ValueError, RecursionError) as error:
+        raise SettingsError(f"settings file {file}: {error}") from error
+
+
+def _read_environment() -> dict[str, Any]:
+    for variable in os.environ:
+        section, delimiter, key = variable.removeprefix(_PREFIX).lower().partition(_DELIMITER)
+        if variable.startswith(_PREFIX) and delimiter and section not in Settings.model_fields:
+            raise SettingsError(f"environment: {variable}: {_unknown((section, key))}")
+    return EnvSettingsSource(_NamedSettings)()
+
+
+def _parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
+    tables: dict[str, Any] = {}
+    for assignment in assignments:
+        name, equals, value = assignment.partition("=")
+        section, dot, key = name.partition(".")
+        table = tables.setdefault(section, {})
+        if section == "sources":
+            source, dot, key = key.rpartition(".")
+            table = table.setdefault(source, {})
+        if not (equals and dot):
+            form = "sources.NAME" if section == "sources" else "SECTION"
+            raise SettingsError(f"--set {assignment}: write {form}.KEY=VALUE")
+        table[key] = value
+    return tables
+
+
+def _as_in_a_file(tables: dict[str, Any]) -> dict[str, Any]:
+    """Tables of texts as a file would have them: what stands for another value is read."""
+    schemas = setting_schemas()
+
+    def read(section: str, key: str, text: str) -> Any:
+        reader = _READERS.get(schemas.get(section, {}).get(key, {}).get("type", "string"))
+        try:
+            return reader.validate_python(text) if reader else text
+        except ValidationError:
+            return text
+
+    def read_all(section: str, table: Any) -> Any:
+        if section == "sources":
+            return _with_values(table)
+        if not isinstance(table, dict):
+            return table
+        return {key: read(section, key, text) for key, text in table.items()}
+
+    return {section: read_all(section, table) for section, table in tables.items()}
+
+
+def _with_values(table: Any) -> Any:
+    """Nested tables of texts, with what each text stands for: a number, true or false, a list."""
+    if isinstance(table, dict):
+        return {key: _with_values(entry) for key, entry in table.items()}
+    if not isinstance(table, str):
+        return table
+    try:
+        return json.loads(table)
+    except (ValueError, RecursionError):
+        return table
+
+
+def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:
+    """What is wrong with a setting, and what is right."""
+    location = details["loc"]
+    cause = details.get("ctx", {}).get("error")
+    keys = cause.keys if isinstance(cause, UnfitSettingsError) else [location]
+    givers = [origin for origin in origins if any(map(origin.gives, keys))]
+    problem = _problem(details, ".".join(map(str, location)))
+    if not givers:
+        return problem
+    # The last has the last word, and only a file has numbers beside text.
+    is_number = details["type"] in ("int_type", "float_type")
+    quoted = is_number and isinstance(details["input"], str) and givers[-1] == origins[_FILE]
+    return f"{givers[-1].name}: {problem}" + (", without quotes" if quoted else "")
+
+
+def _problem(details: ErrorDetails, name: str) -> str:
+    location, value = details["loc"], reprlib.repr(details["input"])
+    match details["type"]:
+        case "value_error":
+            return str(details["ctx"]["error"])
+        case "extra_forbidden" | "unexpected_keyword_argument":
+            if location[0] == "sources" and isinstance(details["input"], dict):
+                return _split_name(location, details["input"])
+            return _unknown(location)
+        case "model_type" | "dataclass_type":
+            return f"{name} = {value} is not a section: write [{name}]"
+        case "dict_type":
+            return f"{name} = {value} is not a section: write [{SOURCE_SECTION}]"
+        case "bool_type":
+            return f"{name} = {value}: use true or false"
+        case "tuple_type" | "missing" | "too_long":
+            return f"{name} = {value}: write two corners, [[x, y, z], [x, y, z]]"
+        case "greater_than_equal" | "less_than_equal" | "finite_number":
+            return f"{name} = {value} is out of range: use {_allowed(location)}"
+        case "list_type":
+            return f'{name} = {value}: write a list, such as ["/points"]'
+        case "string_pattern_mismatch":
+            return f"{name} = {value} is no topic: use names of letters, digits and _ behind /"
+        case "int_type" | "float_type":
+            return f"{name} = {value} is of another type: use {_allowed(location)}"
+        case _:
+            return f"{name} = {value}: {details['msg']}"
+
+
+def _split_name(location: tuple[int | str, ...], table: dict[str, Any]) -> str:
+    """That a table lies in the section of a source, where the points of a name cut it up."""
+    section, *parts = map(str, location)
+    while len(table) == 1 and isinstance(inner := next(iter(table.values())), dict):
+        parts.extend(table)
+        table = inner
+    name = ".".join(parts)
+    return (
+        f"{section}.{name} is no section: in a file, the name of a source that has points in it "
+        f'stands in quotes, [{section}."{name}"]'
+    )
+
+
+def _allowed(location: tuple[int | str, ...]) -> str:
+    """The type and the range of a number."""
+    section, key, *inner = map(str, location)
+    if section == "sources":
+        section, key, *inner = SOURCE_SECTION, *inner
+    schema = setting_schemas()[section][key]
+    schema = schema.get("anyOf", [schema])[0]
+    for index in inner:
+        schema = schema["prefixItems"][int(index)]
+    return f"{schema['minimum']} to {schema['maximum']} ({schema['type']})"
+
+
+def _unknown(location: tuple[int | str, ...]) -> str:
+    """That a setting or a section is unknown, with the name that is nearest to it."""
+    schemas = setting_schemas()
+    if len(location) > 2:
+        schemas[f"sources.{location[1]}"] = schemas.pop(SOURCE_SECTION)
+    names = [f"{section}.{key}" for section, table in schemas.items() for key in table]
+    if len(location) < 2:
+        names = [section.partition(".")[0] for section in schemas]
+    name = ".".join(map(str, location))
+    nearest = difflib.get_close_matches(name, names, n=1, cutoff=0)[0]
+    return f"unknown setting {name}: did you mean {nearest}?"

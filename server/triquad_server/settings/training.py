@@ -1,0 +1,56 @@
+"""Settings of the section ``[training]``."""
+
+from typing import Annotated
+
+from pydantic import BaseModel, Field, model_validator
+
+from triquad_server.settings.section import SECTION
+
+
+class TrainingSettings(BaseModel):
+    """How the field is trained."""
+
+    model_config = SECTION
+
+    batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
+    """Samples per step."""
+
+    learning_rate: Annotated[float, Field(ge=0, le=1)] = 0.01
+    """Learning rate of Adam, before it cools."""
+
+    beta1: Annotated[float, Field(ge=0.001, le=0.9999)] = 0.9
+    """Decay of Adam's mean of gradients."""
+
+    beta2: Annotated[float, Field(ge=0.001, le=0.99999)] = 0.99
+    """Decay of Adam's mean of squared gradients; at least the square of `beta1`."""
+
+    pool_rays: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
+    """What so many rays taught is kept for training, over the whole map."""
+
+    fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """Share of a batch that is drawn from the newest scans while they stream in."""
+
+    samples_per_ray: Annotated[float, Field(ge=0, le=1000)] = 48.0
+    """Each new ray raises the training budget of its region by so many samples."""
+
+    max_budget_samples: Annotated[int, Field(ge=1, le=10_000_000_000)] = 24_000_000
+    """Largest training budget of a region, in samples."""
+
+    cooldown: Annotated[float, Field(ge=0.001, le=1000)] = 8.0
+    """The learning rate falls once the budget is less than this many samples per kept ray."""
+
+    max_regions: Annotated[int, Field(ge=1, le=1_000_000)] = 256
+    """Regions of the map; a scan that would need more is refused."""
+
+    seed: Annotated[int, Field(ge=0, le=2**31)] = 42
+    """Seed of all random choices."""
+
+    @model_validator(mode="after")
+    def _steps_are_bounded(self) -> "TrainingSettings":
+        """Kingma and Ba, section 4."""
+        if self.beta2 < self.beta1**2:
+            raise ValueError(
+                f"training.beta2 = {self.beta2} is too small for training.beta1 = {self.beta1}: "
+                f"use at least {self.beta1**2:.6g}"
+            )
+        return self

@@ -1,0 +1,209 @@
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from triquad_format.errors import RefusedError
+from triquad_format.records.field_settings import FieldSettings
+from triquad_map.composition.field_view import in_one
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs.history import EpochHistory
+from triquad_server.net.asking_client import asking_client
+from triquad_server.settings import ServiceSettings
+
+
+@dataclass
+class Clock:
+    now: float = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def epoch(number):
+    return Epoch("lab", number, FieldSettings(), (), in_one)
+
+
+def history(kept, pinned=0, pin_s=30.0, clock=None, client_pins=3):
+    settings = ServiceSettings(
+        epochs_kept=kept, epochs_pinned=pinned, pin_s=pin_s, client_pins=client_pins
+    )
+    return EpochHistory(epoch(1), settings, clock or Clock())
+
+
+def is_gone(epochs, number):
+    try:
+        found = epochs.get(number)
+    except RefusedError as error:
+        return error.code == "epoch_gone"
+    assert found.number == number  # never another one
+    return False
+
+
+def test_zero_asks_for_the_newest():
+    epochs = history(kept=2)
+    epochs.add(epoch(2))
+    assert epochs.get(0).number == epochs.newest.number == 2
+    assert epochs.get(1).number == 1
+
+
+def test_an_epoch_stays_while_it_is_worked_on_and_for_the_parts_that_follow():
+    epochs = history(kept=1, pinned=1)
+    with epochs.view(0) as worked_on:
+        for number in range(2, 6):
+            epochs.add(epoch(number))
+    epochs.add(epoch(6))
+    assert epochs.get(1) is worked_on
+    with pytest.raises(RefusedError, match="epoch_gone"):
+        epochs.get(5)
+
+
+def test_older_epochs_that_nobody_asked_for_go():
+    epochs = history(kept=2, pinned=8)
+    for number in (2, 3):
+        epochs.get(0)
+        epochs.add(epoch(number))
+    with pytest.raises(RefusedError, match=r"epoch 1 is not kept; kept are \[2, 3\]") as caught:
+        epochs.get(1)
+    assert caught.value.code == "epoch_gone"
+
+
+def test_an_epoch_that_is_asked_for_stays_for_its_time_and_each_time_renews_it():
+    clock = Clock()
+    epochs = history(kept=1, pinned=1, pin_s=30.0, clock=clock)
+    for number in range(2, 20):
+        assert not is_gone(epochs, 1)
+        clock.now += 30.0
+        epochs.add(epoch(number))
+        assert epochs.get(0).number == number
+    clock.now += 0.1
+    epochs.add(epoch(20))
+    assert is_gone(epochs, 1)
+
+
+def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
+    clock = Clock()
+    epochs = history(kept=1, pinned=1, pin_s=30.0, clock=clock)
+    epochs.get(1)
+    epochs.add(epoch(2))
+    clock.now = 31.0
+    epochs.get(0)
+    assert is_gone(epochs, 1)
+
+
+def of_client(epochs, client, number):
+    """Whether a client that has a name is refused an epoch."""
+    token = asking_client.set(client)
+    try:
+        return is_gone(epochs, number)
+    finally:
+        asking_client.reset(token)
+
+
+def test_a_client_that_pins_too_many_loses_the_one_it_asked_for_longest_ago():
+    clock = Clock()
+    epochs = history(kept=1, pinned=8, clock=clock, client_pins=2)
+    for number in range(1, 4):
+        epochs.add(epoch(number))
+        assert not of_client(epochs, "robot", number)
+        clock.now += 1
+    epochs.add(epoch(4))
+    assert [is_gone(epochs, number) for number in (1, 2, 3, 4)] == [True, False, False, False]
+
+
+@pytest.mark.parametrize("stranger", ["", "stranger"])
+def test_who_pins_every_epoch_takes_no_other_clients_pin(stranger):
+    clock = Clock()
+    epochs = history(kept=2, pinned=4, clock=clock, client_pins=2)
+    assert not of_client(epochs, "robot", 1)
+    for number in range(2, 40):
+        epochs.add(epoch(number))
+        assert not of_client(epochs, stranger, number)
+        clock.now += 5.0
+        assert not of_client(epochs, "robot", 1)
+    epochs.add(epoch(40))
+    assert not of_client(epochs, "late", 39), "there is room for one who comes later"
+    for number in range(41, 50):
+        epochs.add(epoch(number))
+        assert not of_client(epochs, stranger, number)
+        assert not of_client(epochs, "late", 39)
+        assert len(epochs.kept().epochs) <= 2 + 4
+
+
+class LargeEpoch(Epoch):
+    """One with memory of its own, and some that all share."""
+
+    buffers: dict[int, int] = {}
+
+
+def large(number, size):
+    made = LargeEpoch("lab", number, FieldSettings(), (), in_one)
+    made.buffers = {number: size, 10**6: 500}
+    return made
+
+
+def test_older_epochs_have_a_share_of_the_memory_and_pinned_ones_half_of_it():
+    settings = ServiceSettings(epochs_kept=4, epochs_pinned=8, client_pins=8)
+    epochs = EpochHistory(large(1, 100), settings, Clock(), older_bytes=400)
+    for number in range(2, 10):
+        epochs.add(large(number, 100))
+    assert [one.number for one in epochs.kept().epochs] == [6, 7, 8, 9]
+    for number in range(10, 15):
+        of_client(epochs, "robot", number - 1)
+        epochs.add(large(number, 100))
+    assert [one.number for one in epochs.kept().epochs] == [9, 10, 12, 13, 14]
+    epochs.add(large(15, 10_000))
+    epochs.add(large(16, 100))
+    assert [one.number for one in epochs.kept().epochs] == [9, 10, 13, 14, 16]
+
+
+def test_the_newest_never_goes():
+    epochs = history(kept=1)
+    epochs.add(epoch(2))
+    assert epochs.get(0).number == epochs.get(2).number == 2
+    assert is_gone(epochs, 1)
+
+
+DEEDS = st.one_of(
+    st.just("publish"),
+    st.tuples(st.just("ask"), st.integers(0, 12)),  # so many epochs back
+    st.tuples(st.just("wait"), st.sampled_from([0.5, 7.0, 10.0, 11.0])),
+)
+
+
+@given(st.integers(1, 4), st.integers(0, 4), st.lists(DEEDS, max_size=60))
+def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, deeds):
+    pin_s = 10.0
+    clock = Clock()
+    epochs = history(kept, pinned, pin_s, clock)
+    newest = 1
+    asked: dict[int, float] = {}  # in the order of asking
+    for deed in deeds:
+        if deed == "publish":
+            newest += 1
+            epochs.add(epoch(newest))
+        elif deed[0] == "wait":
+            clock.now += deed[1]
+        else:
+            number = max(1, newest - deed[1])
+            if is_gone(epochs, number):
+                assert number <= newest - kept
+                expired = clock.now - asked.get(number, -1e9) > pin_s
+                alive = [other for other, at in asked.items() if clock.now - at <= pin_s]
+                assert expired or len(alive) > pinned
+            else:
+                asked.pop(number, None)
+                asked[number] = clock.now
+        assert epochs.get(0) is epochs.newest
+        assert epochs.newest.number == newest
+
+
+@given(st.integers(1, 4), st.integers(0, 4), st.integers(5, 30), st.data())
+def test_no_more_stay_than_may(kept, pinned, count, data):
+    epochs = history(kept, pinned)
+    for number in range(2, count):
+        epochs.get(number - 1)
+        epochs.add(epoch(number))
+        back = data.draw(st.integers(0, 6))
+        is_gone(epochs, max(1, number - back))
+    assert len(epochs.kept().epochs) == min(count - 1, kept + pinned)
