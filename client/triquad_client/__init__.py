@@ -11,7 +11,13 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 from triquad_format import __version__
 from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
-from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    MapInfo,
+    ResetReply,
+    ServerStatus,
+    TileList,
+)
 from triquad_format.wire.metrics_messages import (
     CheckpointMetrics,
     OperationMetrics,
@@ -47,6 +53,7 @@ from triquad_client.errors import (
     ClosedError,
     ConnectError,
     DownloadError,
+    EmptierMapError,
     NoReplyError,
     RequestTimeoutError,
     UnknownMapError,
@@ -77,6 +84,7 @@ __all__ = [
     "ConnectError",
     "Distances",
     "DownloadError",
+    "EmptierMapError",
     "FlushReport",
     "Grid",
     "Ground",
@@ -104,6 +112,7 @@ __all__ = [
     "RayRanges",
     "RefusedError",
     "RequestTimeoutError",
+    "ResetReply",
     "ScanSource",
     "SdfResult",
     "Segments",

@@ -4,7 +4,13 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
-from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    MapInfo,
+    ResetReply,
+    ServerStatus,
+    TileList,
+)
 from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
@@ -135,7 +141,7 @@ class AsyncClient(AsyncMapQueries):
     async def checkpoint(self) -> CheckpointInfo:
         return await self._run(admin.checkpoint())
 
-    async def reset(self, bounds: Bounds | None = None) -> int:
+    async def reset(self, bounds: Bounds | None = None) -> ResetReply:
         return await self._run(admin.reset(bounds))
 
     async def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
@@ -148,9 +154,11 @@ class AsyncClient(AsyncMapQueries):
             download.fetch_box(Path(path), bounds, self._connection.max_download_bytes)
         )
 
-    async def sync(self, bounds: Bounds, path: str | Path) -> AsyncSyncedMap:
+    async def sync(
+        self, bounds: Bounds, path: str | Path, accept_emptier: bool = False
+    ) -> AsyncSyncedMap:
         synced = AsyncSyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
-        await synced.refresh()
+        await synced.refresh(accept_emptier)
         return synced
 
     async def maps(self) -> list[str]:

@@ -4,7 +4,13 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.writer import MapFileInfo
-from triquad_format.wire.messages import CheckpointInfo, MapInfo, ServerStatus, TileList
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    MapInfo,
+    ResetReply,
+    ServerStatus,
+    TileList,
+)
 from triquad_format.wire.metrics_messages import ServerMetrics
 from triquad_sensors.depth_image import Intrinsics, depth_points
 
@@ -239,11 +245,21 @@ class Client(MapQueries):
         """
         return self._run(admin.checkpoint())
 
-    def reset(self, bounds: Bounds | None = None) -> int:
-        """Forget what was learnt within ``bounds``; returns the first epoch without it.
+    def reset(self, bounds: Bounds | None = None) -> ResetReply:
+        """Forget what was learnt within ``bounds``.
+
+        A server with a store first writes the map as it is to a checkpoint, which stays for its
+        setting ``store.protect_h``, whatever else happens.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everything is forgotten.
+
+        Returns:
+            ``epoch``: the first without it. ``kept_epoch``: the checkpoint of the map before;
+            ``None`` where there is none. ``undo``: how to go back to it, or why one cannot.
+
+        Raises:
+            RefusedError: ``store``, where the map as it is cannot be kept: nothing is forgotten.
         """
         return self._run(admin.reset(bounds))
 
@@ -279,7 +295,7 @@ class Client(MapQueries):
             download.fetch_box(Path(path), bounds, self._connection.max_download_bytes)
         )
 
-    def sync(self, bounds: Bounds, path: str | Path) -> SyncedMap:
+    def sync(self, bounds: Bounds, path: str | Path, accept_emptier: bool = False) -> SyncedMap:
         """Keep a copy of what the map needs to answer within ``bounds``, and ask that.
 
         What is in the file already is taken up: only the parts that changed are sent. The copy
@@ -290,14 +306,17 @@ class Client(MapQueries):
                 make it larger than where you ask by the largest distance that you ask for.
             path: the file; one that is no valid map file is replaced. :func:`open_map` opens it
                 without a server.
+            accept_emptier: replace a copy that is in the file already also by a map that knows less
+                than half as much of the box.
 
         Raises:
             InvalidInputError: the bounds are not a box, or hold nothing.
+            EmptierMapError: the file has a copy that knows far more, and stays as it is.
             DownloadError: what arrived is not valid.
             OSError: the file cannot be read or written.
         """
         synced = SyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
-        synced.refresh()
+        synced.refresh(accept_emptier)
         return synced
 
     def maps(self) -> list[str]:

@@ -34,6 +34,10 @@ class BadReplyError(TriquadError):
     """A reply that is no answer to the question, or that this release does not understand."""
 
 
+class EmptierMapError(TriquadError):
+    """Another run of the server has a map with far less in it: the older copy stays."""
+
+
 class ClosedError(TriquadError):
     """The client was closed."""
 

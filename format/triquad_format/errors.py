@@ -10,7 +10,7 @@ ERROR_CODES = {
     "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
     "timeout": "the server could not finish in the time that the request allows",
     "busy": "too many requests are waiting",
-    "store": "the checkpoint could not be written",
+    "store": "the checkpoint could not be written, or the map not be kept before a reset",
     "internal": "an error inside the server; its log has the details",
 }
 """Why a request is refused; they travel in :class:`triquad_format.wire.messages.ErrorReply`."""

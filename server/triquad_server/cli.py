@@ -13,14 +13,19 @@ import triquad_format
 from triquad_format.errors import FormatError
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 
-from triquad_server.errors import ListenError, ServerError, StoreError
+from triquad_server.errors import (
+    LastCheckpointError,
+    ListenError,
+    ServerError,
+    StoreError,
+)
 from triquad_server.installed import require_libraries
 from triquad_server.process.log_output import LOG_FORMATS, TEXT, start_log
 
 _PROGRAM = "triquad-server"
 _LOG_FORMAT_VARIABLE = "TRIQUAD_LOG_FORMAT"
 
-OK, UNEXPECTED, USAGE, CANNOT_LISTEN, STORE = 0, 1, 2, 3, 4
+OK, UNEXPECTED, USAGE, CANNOT_LISTEN, STORE, LAST_CHECKPOINT = 0, 1, 2, 3, 4, 5
 
 _EPILOG = """\
 exit codes:
@@ -29,7 +34,9 @@ exit codes:
   2  wrong usage or settings, or a missing extra (install triquad[server])
   3  cannot listen on an endpoint or on the port for metrics (in use), or cannot connect to one
   4  the store cannot be used: not readable or writable, in use, all checkpoints are damaged,
-     or the newest needs a newer release or more memory; or the last one was not written
+     or the newest needs a newer release or more memory; or there is none of --restore
+  5  the last checkpoint could not be written, such as on a full disk: what was mapped since the
+     one before is lost; the log says which that is
 """
 
 _log = logging.getLogger("triquad_server")
@@ -63,6 +70,9 @@ def _exit_code(options: argparse.Namespace) -> int:
     except ListenError as error:
         _log.error("%s", error)
         return CANNOT_LISTEN
+    except LastCheckpointError as error:
+        _log.error("%s", error)
+        return LAST_CHECKPOINT
     except StoreError as error:
         _log.error("%s", error)
         return STORE
@@ -79,13 +89,15 @@ def _run(options: argparse.Namespace) -> int:
     from triquad_format.wire.keys import check_name
 
     from triquad_server.launch_options import LaunchOptions
-    from triquad_server.net.session import NetworkOptions
+    from triquad_server.net.configuration import NetworkOptions
     from triquad_server.settings_loading import load_settings, settings_toml
     from triquad_server.stop import Stop, Stops
 
     check_name("map", options.map)
     assignments = [*options.set, *_implied(options)]
     settings = load_settings(options.settings, assignments, preset=options.preset)
+    if options.restore is not None and options.store is None:
+        raise ServerError("--restore needs the --store that the map is taken from")
     if options.print_settings:
         sys.stdout.write(settings_toml(settings))
         return OK
@@ -99,7 +111,7 @@ def _run(options: argparse.Namespace) -> int:
         connect=tuple(map(full_endpoint, options.connect)),
         mode=options.mode,
         config_file=options.config,
-        multicast_scouting=False if options.no_multicast_scouting else None,
+        multicast_scouting=options.multicast_scouting,
     )
     why = run_server(
         LaunchOptions(
@@ -108,6 +120,7 @@ def _run(options: argparse.Namespace) -> int:
             settings=settings,
             store=options.store,
             device=options.device,
+            restore=options.restore,
         ),
         stops,
     )
@@ -145,6 +158,14 @@ def _log_format(name: str) -> str:
     return name
 
 
+def _epoch(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise argparse.ArgumentTypeError(
+            f"{text!r:.80} is not the number of an epoch: triquad-inspect STORE --log lists them"
+        )
+    return int(text)
+
+
 def _parser(log_options: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_PROGRAM,
@@ -161,6 +182,13 @@ def _parser(log_options: argparse.ArgumentParser) -> argparse.ArgumentParser:
         type=Path,
         metavar="DIR",
         help="folder for checkpoints, in a folder per map; without it the map is not kept",
+    )
+    add(
+        "--restore",
+        type=_epoch,
+        metavar="EPOCH",
+        help="take the map back to an older checkpoint of the store, such as the one that is kept "
+        "before a reset (triquad-inspect STORE --log lists them); what it was stays on disk",
     )
     add(
         "--ros2",
@@ -221,14 +249,25 @@ def _add_network(group: argparse._ArgumentGroup) -> None:
         help="another Zenoh router to connect to, repeatable",
     )
     add("-m", "--mode", choices=("router", "peer", "client"), help="default: router")
-    add("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration, JSON5")
+    add(
+        "-c",
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="Zenoh configuration, JSON5; what it leaves out is as without it: docs/server.md",
+    )
     add(
         "--metrics-port",
         metavar="PORT",
         help="answer /metrics (Prometheus) and /healthz there, on this machine alone unless "
         "metrics.address says otherwise: docs/metrics.md",
     )
-    add("--no-multicast-scouting", action="store_true", help="do not look for others by multicast")
+    add(
+        "--multicast-scouting",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="look for others by multicast, and be found (default: no)",
+    )
 
 
 if __name__ == "__main__":

@@ -191,14 +191,13 @@ def serve(
     from triquad_format.wire.keys import check_name
 
     from triquad_server.launch_options import LaunchOptions
-    from triquad_server.net.session import NetworkOptions
+    from triquad_server.net.configuration import NetworkOptions
 
     check_name("map", map)
     loaded = _loaded(settings)
     folder = None if store is None else Path(store)
     with _free_endpoint() if listen is None else nullcontext(full_endpoint(listen)) as endpoint:
-        # Servers of programs on one network do not find each other: their maps have one name.
-        network = NetworkOptions(listen=(endpoint,), multicast_scouting=False)
+        network = NetworkOptions(listen=(endpoint,))
         return Server(LaunchOptions(map, network, settings=loaded, store=folder, device=device))
 
 

@@ -19,8 +19,16 @@ class StoreBaseError(StoreError):
     """Files that hold parts of the newest checkpoint are damaged: a complete one is due."""
 
 
+class LastCheckpointError(StoreError):
+    """The server stops, and what was mapped since its last checkpoint is lost."""
+
+
 class MapperStoppedError(ServerError):
     """The mapper thread has ended and takes no more commands."""
+
+
+class MapLostError(ServerError):
+    """The live map is not what it should be; its checkpoints and epochs are."""
 
 
 class ScanRefusedError(TriquadError):

@@ -43,6 +43,7 @@ class Health:
     warnings: ScanWarnings
     mapper: MapperThread
     checkpoints: CheckpointThread
+    map_max_bytes: int  # beyond which the map does not grow
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
@@ -74,6 +75,8 @@ class Health:
             store_error=self.checkpoints.error,
             warnings=self.warnings.all(),
             samples_left=progress.samples_left,
+            map_bytes=progress.map_bytes,
+            map_max_bytes=self.map_max_bytes,
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:

@@ -17,11 +17,15 @@ from triquad_server.errors import ServerError
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.memory import give_back_early
+from triquad_server.memory_settings import MemorySettings
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.monitoring.http_server import MonitoringServer
-from triquad_server.net.session import listen_endpoints, open_session
+from triquad_server.net.configuration import Configuration, configuration
+from triquad_server.net.session import open_session
+from triquad_server.open_files import allow_open_files
 from triquad_server.phases import Phases
 from triquad_server.process.service_manager import ServiceManager
+from triquad_server.protection import protection
 from triquad_server.self_question import SelfQuestion
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
@@ -57,8 +61,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     give_back_early()
-    if not options.network.listen and options.network.config_file is None:
-        _log.info("no --listen: only this machine can connect")
+    allow_open_files()
     if options.store is None:
         _log.warning("no --store: the map is not kept when the server stops")
     with closing(Supervision(ServiceManager())) as supervision:
@@ -95,12 +98,16 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     """Open all parts of a server, to be closed by ``stack``."""
     device = choose_device(options.device)
     settings = options.settings
+    network = configuration(options.network, protection(options.map_name, settings))
     monitoring = _open_monitoring(settings, stack)
     store = None
     restored = None
     if options.store is not None:
         store = Store(options.store, options.map_name, settings.store)
         stack.enter_context(closing(store))
+        if options.restore is not None:
+            phases.starting(f"taking the map back to epoch {options.restore}")
+            store.restore(options.restore)
         phases.starting("restoring the newest checkpoint")
         restored = _restored(store, options)
     if restored is not None:
@@ -115,7 +122,7 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
         record=restored.record if restored else None,
         teams=teams,
     )
-    session = stack.enter_context(closing(open_session(options.network)))
+    session = stack.enter_context(closing(open_session(network)))
     served = ServedMap(
         name=options.map_name,
         mapper=mapper,
@@ -129,7 +136,8 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     stack.enter_context(closing(service))
     if monitoring is not None:
         stack.enter_context(monitoring.showing(service.metrics))
-    _log_ready(options, service.epoch, device)
+    _log_who_gets_in(network)
+    _log_ready(options, network, service.epoch, device)
     phases.serving(service.health, SelfQuestion(session, options.map_name))
 
 
@@ -237,9 +245,11 @@ def warm_up(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     radius = min(max(_WARM_UP_RADIUS_M, settings.scan.range_min_m), settings.scan.range_max_m)
     teams = teams or Teams()
+    settings = settings.model_copy(update={"memory": MemorySettings()})  # with room for it
     mapper = Mapper("warm-up", settings, device, teams=teams)
     report("taking in scans")
-    mapper.ingest((directions * radius).astype(np.float32), np.eye(4))
+    rays = mapper.ingest((directions * radius).astype(np.float32), np.eye(4))
+    mapper.regions[0].growth_by(rays)
     report("training")
     mapper.train()
     mapper.publish()
@@ -257,8 +267,22 @@ def warm_up(
     cache.make(0, (0, 0, 0))
 
 
-def _log_ready(options: LaunchOptions, epoch: int, device: str) -> None:
-    endpoints = ", ".join(listen_endpoints(options.network)) or "the configured endpoints"
+def _log_who_gets_in(network: Configuration) -> None:
+    """Say whom the network lets in, and what they may do."""
+    if not network.protection_is_own:
+        _log.info("access: as the Zenoh configuration says")
+    elif network.listens_beyond or network.connect:
+        _log.info(
+            "access: without credentials, whoever reaches this server from beyond this machine may "
+            "question and follow the map and publish scans; only programs of this machine may "
+            "reset it or write checkpoints"
+        )
+    else:
+        _log.info("access: programs of this machine; --listen tcp/0.0.0.0:7447 lets others connect")
+
+
+def _log_ready(options: LaunchOptions, network: Configuration, epoch: int, device: str) -> None:
+    endpoints = ", ".join(network.listen) or f"a {network.mode} of {', '.join(network.connect)}"
     _log.info(
         "ready: map '%s' on %s, epoch %d, %s, store %s",
         options.map_name,

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_server.net.session import NetworkOptions
+from triquad_server.net.configuration import NetworkOptions
 from triquad_server.settings import Settings
 
 
@@ -16,3 +16,4 @@ class LaunchOptions:
     settings: Settings
     store: Path | None
     device: str  # "cpu", "cuda" or "auto"
+    restore: int | None = None  # the epoch that the map is taken back to; None: the newest

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 
 import zenoh
 from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.net.askers import Askers
@@ -21,6 +22,22 @@ ReadQueue = Callable[[], QueueMetrics]
 """What waits in a queue now."""
 
 
+_OF_POINTS = frozenset({"field", "distances", "places", "poses"})
+"""The groups of operations that ask about points."""
+
+_KNOWN_TILE_BYTES = 20
+_PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
+
+
+def _largest_request(queue: str, limits: ServiceSettings) -> int:
+    """Most bytes of a request of a group: what is larger is refused before it is held."""
+    if queue in _OF_POINTS:
+        return payload_limit(limits.max_query_points)
+    if queue == "tile_updates":
+        return MAX_KNOWN_TILES * _KNOWN_TILE_BYTES + _PLAIN_BYTES
+    return _PLAIN_BYTES
+
+
 class ServedOperations:
     """What is served of a map so far, what became of the requests, and where they wait."""
 
@@ -29,12 +46,7 @@ class ServedOperations:
         self._map_name = map_name
         self._askers = Askers(session)
         self._groups: list[RequestHandlers] = []
-        self._limits = RequestLimits(
-            waiting=limits.request_queue,
-            waiting_bytes=limits.request_queue_bytes,
-            max_bytes=payload_limit(limits.max_query_points),
-            longest_s=limits.request_timeout_max_s,
-        )
+        self._limits = limits
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
         self.queues: dict[str, ReadQueue] = {}  # by name
 
@@ -50,11 +62,19 @@ class ServedOperations:
             counts = self.counts[name] = OperationCounts()
             operations[keys.operation_key(self._map_name, name)] = Operation(handler, counts)
         group = RequestHandlers(
-            self._session, operations, self._askers, workers=workers, limits=self._limits
+            self._session, operations, self._askers, workers=workers, limits=self._limits_of(queue)
         )
         self._groups.append(group)
         self.queues[queue] = lambda: group.queue
         return group
+
+    def _limits_of(self, queue: str) -> RequestLimits:
+        return RequestLimits(
+            waiting=self._limits.request_queue,
+            waiting_bytes=self._limits.request_queue_bytes,
+            max_bytes=_largest_request(queue, self._limits),
+            longest_s=self._limits.request_timeout_max_s,
+        )
 
     def stop(self) -> None:
         """Refuse what waits and what comes in all groups; the end of none waits for another."""

@@ -51,6 +51,8 @@ from triquad_server.settings import Settings
 from triquad_server.source_queries import SourceQueries
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
+from triquad_server.store.resets import Resets
+from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
 from triquad_server.threads import Teams
 
@@ -125,24 +127,35 @@ class Service:
             warnings=self._warnings,
             mapper=self._mapper,
             checkpoints=checkpoints,
+            map_max_bytes=self._settings.memory.max_bytes,
         )
         self._serve_queries()
         self._serve_changes(health.server)
         self._serve_sources(health.server)
         feed, tiles = self._serve_mesh(health.server)
-        downloads = self._serve_downloads()
+        downloads = self._serve_downloads(health.server)
         self.metrics = Metrics(
             health, self._session, tiles=tiles, downloads=downloads, queues=self._operations.queues
         )
         self._serve_status()
         checkpoints.start()
         self._parts.callback(checkpoints.close)
+        store, scrub_h = self._served.store, self._settings.store.scrub_h
+        if store is not None and scrub_h > 0:
+            scrubber = Scrubber(store.folder, scrub_h, damaged=checkpoints.found_damaged)
+            self._parts.callback(scrubber.close)
+        resets = Resets(
+            self._mapper,
+            checkpoints,
+            self._served.store,
+            protect_h=self._settings.store.protect_h,
+        )
         # Closed before the last checkpoint is written: it shows every reset that was answered.
         self._serve(
             "admin",
             {
                 keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
-                keys.RESET: answering(ResetRequest, self._mapper.reset),
+                keys.RESET: answering(ResetRequest, resets.answer),
             },
         )
         self._parts.callback(self._mapper.rest)
@@ -161,6 +174,7 @@ class Service:
             self._settings.service,
             failed=failed,
             warnings=self._warnings,
+            memory=self._settings.memory,
         )
         mapper.start()
         self._parts.callback(mapper.close)
@@ -270,8 +284,8 @@ class Service:
             },
         )
 
-    def _serve_downloads(self) -> MapDownloads:
-        downloads = MapDownloads(self._mapper)
+    def _serve_downloads(self, server: str) -> MapDownloads:
+        downloads = MapDownloads(self._mapper, server)
         self._serve(
             "downloads",
             {

@@ -11,6 +11,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
 from triquad_server.leaf_lengths import DEFAULT_LEAF_M, at_leaf, follows_leaf, length
+from triquad_server.memory_settings import MemorySettings
 from triquad_server.metrics_settings import MetricsSettings
 from triquad_server.ros2_settings import Ros2Settings
 from triquad_server.scan_settings import ScanSettings
@@ -139,6 +140,17 @@ class StoreSettings(BaseModel):
     keep_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
     """The oldest checkpoints are deleted while all take more; 0: no limit."""
 
+    protect_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
+    """Hours for which the map as it was before a reset stays on disk, whatever the limits above
+    say; 0: a reset keeps nothing."""
+
+    protect_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
+    """Bytes of all checkpoints that are kept for that. A reset that would need more is refused: so
+    nothing pushes out what is kept already; 0: no limit."""
+
+    scrub_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
+    """Hours between checks of all checkpoints on disk, which find what rots there; 0: none."""
+
 
 class ServiceSettings(BaseModel):
     """Limits of the network service."""
@@ -180,8 +192,10 @@ class ServiceSettings(BaseModel):
     """Newest epochs that requests can ask for by number."""
 
     epochs_pinned: Annotated[int, Field(ge=0, le=1000)] = 8
-    """Older epochs that stay because they were asked for by number; of more, the one asked for
-    longest ago goes."""
+    """Older epochs that stay because they were asked for by number, of all clients together."""
+
+    client_pins: Annotated[int, Field(ge=1, le=1000)] = 3
+    """Epochs that one client may pin; of more, the one that it asked for longest ago goes."""
 
     pin_s: Annotated[float, Field(ge=0, le=1e6)] = 30.0
     """Time for which an epoch stays after it was last asked for by number."""
@@ -217,6 +231,7 @@ class Settings(BaseModel):
     mesh: MeshSettings = MeshSettings()
     store: StoreSettings = StoreSettings()
     service: ServiceSettings = ServiceSettings()
+    memory: MemorySettings = MemorySettings()
     metrics: MetricsSettings = MetricsSettings()
     ros2: Ros2Settings = Ros2Settings()
     sources: dict[str, SourceSettings] = {}

@@ -1,5 +1,7 @@
 """A client takes nothing from a server but answers to what it asked."""
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -75,6 +77,36 @@ def test_a_download_stays_below_what_the_client_takes(
     with triquad_client.connect(server.endpoint, max_download_bytes=len(FILE)) as client:
         client.download_map(tmp_path / "map.triquad")
     assert (tmp_path / "map.triquad").read_bytes() == FILE
+
+
+def test_a_file_for_which_the_disk_has_no_room_is_not_begun(
+    server: HostileServer, tmp_path: Path
+) -> None:
+    server.lie = told(keys.MAP_INFO, lambda body: body.update(bytes=2**52))
+    with (
+        triquad_client.connect(server.endpoint, max_download_bytes=2**53) as client,
+        pytest.raises(DownloadError, match="free on its disk"),
+    ):
+        client.download_map(tmp_path / "map.triquad")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_is_full_amid_a_file_is_an_error_that_names_it(
+    server: HostileServer, tmp_path: Path
+) -> None:
+    path = tmp_path / "map.triquad"
+    code = f"""
+import resource, triquad_client
+resource.setrlimit(resource.RLIMIT_FSIZE, ({len(FILE) // 2}, {len(FILE) // 2}))
+with triquad_client.connect({server.endpoint!r}) as client:
+    client.download_map({str(path)!r})
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("OSError")
+    assert str(path) in last
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_watch_holds_no_more_than_the_client_takes(server: HostileServer) -> None:

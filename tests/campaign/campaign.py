@@ -22,6 +22,7 @@ _TURN_S = 600.0
 _HANG_S = 300.0
 """A turn that has not ended so long after that hangs."""
 _FIRST_SEED = 1
+_TESTS = Path(__file__).parents[1]
 
 
 class Campaign:
@@ -37,7 +38,8 @@ class Campaign:
         self._lock = threading.Lock()
         self._running: set[str] = set()
         self._children: set[subprocess.Popen[bytes]] = set()
-        self._ends_s = 0.0
+        self._stopped = threading.Event()
+        self._began_s = self._ends_s = 0.0
 
     @property
     def broken(self) -> int:
@@ -50,21 +52,30 @@ class Campaign:
 
     def run(self, seconds: float, lanes: int) -> None:
         """Run turns until the time is up; the part that is farthest from its goal comes next."""
+        self._began_s = time.monotonic() - self._record.seconds
         self._ends_s = time.monotonic() + seconds
-        started = time.monotonic()
         try:
             with ThreadPoolExecutor(lanes) as pool:
-                for lane in [pool.submit(self._lane) for _ in range(lanes)]:
-                    lane.result()
-        except BaseException:
-            self._ends_s = 0.0
-            for child in tuple(self._children):
-                _kill(child)
-            raise
+                running = [pool.submit(self._lane) for _ in range(lanes)]
+                try:
+                    for lane in running:
+                        lane.result()
+                except BaseException:
+                    self._stop()
+                    raise
         finally:
-            with self._lock:
-                self._record.seconds += time.monotonic() - started
-                self._record.write()
+            self._save()
+
+    def _save(self) -> None:
+        with self._lock:
+            self._record.seconds = time.monotonic() - self._began_s
+            self._record.write()
+
+    def _stop(self) -> None:
+        """End the turns that run; they do not count."""
+        self._stopped.set()
+        for child in tuple(self._children):
+            _kill(child)
 
     def _lane(self) -> None:
         while (part := self._next_part()) is not None:
@@ -73,14 +84,16 @@ class Campaign:
             result = self._turn(part, seed, min(left_s, _TURN_S))
             with self._lock:
                 self._running.discard(part.name)
+                if self._stopped.is_set():
+                    return
                 self._record.of(part.name).add(seed, result)
-                self._record.write()
+            self._save()
             self._tell(part, seed, result)
 
     def _next_part(self) -> Part | None:
         with self._lock:
             free = [part for part in self._parts if part.name not in self._running]
-            if not free or time.monotonic() >= self._ends_s:
+            if not free or self._stopped.is_set() or time.monotonic() >= self._ends_s:
                 return None
             part = min(free, key=lambda part: self._record.of(part.name).done / part.goal)
             self._running.add(part.name)
@@ -95,7 +108,13 @@ class Campaign:
         command += ["--result", str(told)]
         log = self._folder / f"{part.name}-{seed}.log"
         with log.open("wb") as output:
-            child = subprocess.Popen(command, stdout=output, stderr=output, start_new_session=True)
+            child = subprocess.Popen(
+                command,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+                env={**os.environ, "PYTHONPATH": str(_TESTS)},
+            )
             self._children.add(child)
             try:
                 child.wait(seconds + _HANG_S)

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import multiprocessing
 import os
 import resource
@@ -31,7 +32,7 @@ _LIMIT_BYTES = 64 * 2**20
 
 _MUTATIONS = (*DAMAGE * 3, *FORGERY * 3, add_bombs, forge_bombs)
 _READ, _ENDED = "read", "ended"
-_CHUNK = 100  # mutants between two looks at the time
+_CHUNK = 50  # mutants between two looks at the time
 
 
 def run(turn: Turn) -> None:
@@ -75,10 +76,10 @@ def _read_mutants(turn: Turn, part: int, tell: Connection) -> None:
     folder.mkdir()
     maps = valid_maps(folder)
 
-    chunk = 0
-    while not turn.over:
+    for chunk in itertools.count():
         _read_chunk(turn, maps, (turn.seed, part, chunk), tell)
-        chunk += 1
+        if turn.over:
+            break
     tell.send((_ENDED, ""))
 
 

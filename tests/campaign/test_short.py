@@ -1,5 +1,10 @@
 """Each part of the campaign for a moment, and the campaign itself: it counts and goes on."""
 
+import json
+import os
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -8,6 +13,7 @@ from campaign.campaign import Campaign
 from campaign.parts import BY_NAME, PARTS
 from campaign.turn import Part, Turn
 
+_PLENTY_S = 240.0  # the number of things ends a turn, however slow the machine
 _FEW = {
     "messages": 300,
     "files": 40,
@@ -25,7 +31,7 @@ _FEW = {
 def test_nothing_breaks_in_a_short_turn(part: Part, tmp_path: Path) -> None:
     if why := part.missing():
         pytest.skip(why)
-    turn = Turn(seed=1, folder=tmp_path, most=_FEW[part.name], seconds=20.0)
+    turn = Turn(seed=1, folder=tmp_path, most=_FEW[part.name], seconds=_PLENTY_S)
     part.run(turn)
     assert turn.broken == []
     assert turn.counts["done"] >= 1
@@ -35,10 +41,23 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
     counts = []
     for _ in range(2):
         campaign = Campaign(tmp_path, [BY_NAME["files"]])
-        campaign.run(seconds=3.0, lanes=1)
+        campaign.run(seconds=2.0, lanes=1)
         assert campaign.broken == 0
         counts.append(int(campaign.table().splitlines()[2].split()[3].replace(",", "")))
     assert 0 < counts[0] < counts[1]
+
+
+def test_ctrl_c_ends_all_turns_and_keeps_what_was_done(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "campaign", "--part", "driving", "--out", str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        while not list(tmp_path.glob("driving-1.log")):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        table, _ = process.communicate(timeout=30)
+    assert "0 turns, 0 promises broken" in table
+    assert json.loads((tmp_path / "campaign.json").read_text())["seconds"] > 0
 
 
 def test_a_part_whose_process_ends_is_told_as_broken(tmp_path: Path) -> None:

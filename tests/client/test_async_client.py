@@ -111,7 +111,7 @@ def test_scans_are_learnt_and_all_questions_answered_as_by_the_other_client(tmp_
             info = await client.download_map(tmp_path / "map.triquad")
             assert info.epoch == result.epoch
             await client.download_box(tmp_path / "box.triquad", ((-5, -5, -5), (0, 0, 0)))
-            epoch = await client.reset()
+            epoch = (await client.reset()).epoch
             assert (await client.query_sdf(POINTS)).epoch == epoch
             assert (await client.query_sdf(POINTS)).status.max() == Status.UNKNOWN
             for name in ("map", "box"):

@@ -261,7 +261,9 @@ def test_a_zenoh_configuration_file_is_used(endpoint: str, tmp_path: Path) -> No
     with pytest.raises(ConnectError, match="client.json5: "):
         triquad_client.connect(endpoint, config=file)
     with pytest.raises(ConnectError, match="missing.json5: No such file"):
-        open_connection(endpoint, servers.MAP, 1.0, tmp_path / "missing.json5")
+        open_connection(
+            endpoint, servers.MAP, 1.0, tmp_path / "missing.json5", max_download_bytes=1
+        )
 
 
 def test_only_the_expected_refusal_is_asked_again_and_not_for_ever() -> None:

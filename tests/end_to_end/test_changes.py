@@ -55,7 +55,7 @@ def test_a_program_polls_with_the_report_before(client):
 def test_what_is_forgotten_has_vanished_and_appears_again(client):
     servers.learn(client)
     start = client.changes()
-    forgotten = client.reset(EAST)
+    forgotten = client.reset(EAST).epoch
     gone = client.changes(since=start)
     assert kinds(gone) == {ChangeKind.VANISHED}
     assert {box.epoch for box in gone.boxes} == {forgotten}

@@ -183,13 +183,13 @@ def test_meshes_are_cropped_to_bounds(client):
 
 def test_reset_forgets_a_box_or_everything(client):
     servers.learn(client)
-    epoch = client.reset(((0, -10, -10), (10, 10, 10)))
+    epoch = client.reset(((0, -10, -10), (10, 10, 10))).epoch
     points = servers.sphere(400)
     result = client.query_sdf(points)
     assert result.epoch >= epoch
     assert (result.status[points[:, 0] > 0.2] == Status.UNKNOWN).all()
     assert (result.status[points[:, 0] < -0.2] == Status.SURFACE).all()
-    epoch = client.reset()
+    epoch = client.reset().epoch
     assert client.status().regions == 0
     assert client.query_sdf(points).epoch >= epoch
     assert servers.learn(client, 1).taken == 3

@@ -31,4 +31,4 @@ def test_everything_shown_is_visible(text: str) -> None:
 
 def test_errors_are_shown_that_way(capsys: pytest.CaptureFixture[str]) -> None:
     assert complain("tool", "no map 'a\x1b[2J'\nthere is b", 2) == 2
-    assert capsys.readouterr().err == "tool: no map 'a\\x1b[2J'\nthere is b\n"
+    assert capsys.readouterr().err == "tool: no map 'a\\x1b[2J'\n  there is b\n"

@@ -28,6 +28,7 @@ from triquad_format.records import morton
 from triquad_format.records.crop import without_training
 from triquad_format.records.region import seen_voxels
 from triquad_format.records.status import Status
+from triquad_format.recovery import intact_parts
 from triquad_format.recovery.recovered_map import recover
 from triquad_map.reference.evaluator import MapEvaluator
 
@@ -279,3 +280,13 @@ def test_a_delta_without_its_base(tmp_path):
     assert [region.index for region in recovery.record.regions] == [SECOND]
     assert (REGION, FIRST) in [(loss.key.topic, loss.key.region) for loss in recovery.losses]
     assert 0 < recovery.parts_intact < torn.parts_intact < recovery.parts_listed
+
+
+def test_what_only_looks_like_a_chunk_costs_no_part_of_a_valid_file(recovered, monkeypatch):
+    """Message indexes of a file without times do; what they claimed had used up the budget."""
+    monkeypatch.setattr(intact_parts, "_LEAST_BUDGET", 0)
+    monkeypatch.setattr(intact_parts, "_BUDGET_RATIO", 1)
+    settings = dataclasses.replace(SMALL, depth=13, leaf_m=0.05)
+    found = recovered(file_bytes(random_record(1, settings=settings, points=300), stamp_ns=None))
+    assert found.complete
+    assert found.parts_listed > 300

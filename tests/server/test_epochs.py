@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.composition.field_view import in_one
+from triquad_server.asking_client import asking_client
 from triquad_server.epochs import Epoch, EpochHistory
 from triquad_server.settings import ServiceSettings
 
@@ -22,8 +23,10 @@ def epoch(number):
     return Epoch("lab", number, FieldSettings(), (), in_one)
 
 
-def history(kept, pinned=0, pin_s=30.0, clock=None):
-    settings = ServiceSettings(epochs_kept=kept, epochs_pinned=pinned, pin_s=pin_s)
+def history(kept, pinned=0, pin_s=30.0, clock=None, client_pins=3):
+    settings = ServiceSettings(
+        epochs_kept=kept, epochs_pinned=pinned, pin_s=pin_s, client_pins=client_pins
+    )
     return EpochHistory(epoch(1), settings, clock or Clock())
 
 
@@ -76,15 +79,70 @@ def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
     assert is_gone(epochs, 1)
 
 
-def test_of_too_many_pinned_ones_that_which_was_asked_longest_ago_goes():
+def of_client(epochs, client, number):
+    """Whether a client that has a name is refused an epoch."""
+    token = asking_client.set(client)
+    try:
+        return is_gone(epochs, number)
+    finally:
+        asking_client.reset(token)
+
+
+def test_a_client_that_pins_too_many_loses_the_one_it_asked_for_longest_ago():
     clock = Clock()
-    epochs = history(kept=1, pinned=2, clock=clock)
+    epochs = history(kept=1, pinned=8, clock=clock, client_pins=2)
     for number in range(1, 4):
         epochs.add(epoch(number))
-        epochs.get(number)
-    epochs.get(1)
+        assert not of_client(epochs, "robot", number)
+        clock.now += 1
     epochs.add(epoch(4))
-    assert [is_gone(epochs, number) for number in (1, 2, 3, 4)] == [False, True, False, False]
+    assert [is_gone(epochs, number) for number in (1, 2, 3, 4)] == [True, False, False, False]
+
+
+@pytest.mark.parametrize("stranger", ["", "stranger"])
+def test_who_pins_every_epoch_takes_no_other_clients_pin(stranger):
+    clock = Clock()
+    epochs = history(kept=2, pinned=4, clock=clock, client_pins=2)
+    assert not of_client(epochs, "robot", 1)
+    for number in range(2, 40):
+        epochs.add(epoch(number))
+        assert not of_client(epochs, stranger, number)
+        clock.now += 5.0
+        assert not of_client(epochs, "robot", 1)
+    epochs.add(epoch(40))
+    assert not of_client(epochs, "late", 39), "there is room for one who comes later"
+    for number in range(41, 50):
+        epochs.add(epoch(number))
+        assert not of_client(epochs, stranger, number)
+        assert not of_client(epochs, "late", 39)
+        assert len(epochs.kept().epochs) <= 2 + 4
+
+
+class LargeEpoch(Epoch):
+    """One with memory of its own, and some that all share."""
+
+    buffers: dict[int, int] = {}
+
+
+def large(number, size):
+    made = LargeEpoch("lab", number, FieldSettings(), (), in_one)
+    made.buffers = {number: size, 10**6: 500}
+    return made
+
+
+def test_older_epochs_have_a_share_of_the_memory_and_pinned_ones_half_of_it():
+    settings = ServiceSettings(epochs_kept=4, epochs_pinned=8, client_pins=8)
+    epochs = EpochHistory(large(1, 100), settings, Clock(), older_bytes=400)
+    for number in range(2, 10):
+        epochs.add(large(number, 100))
+    assert [one.number for one in epochs.kept().epochs] == [6, 7, 8, 9]
+    for number in range(10, 15):
+        of_client(epochs, "robot", number - 1)
+        epochs.add(large(number, 100))
+    assert [one.number for one in epochs.kept().epochs] == [9, 10, 12, 13, 14]
+    epochs.add(large(15, 10_000))
+    epochs.add(large(16, 100))
+    assert [one.number for one in epochs.kept().epochs] == [9, 10, 13, 14, 16]
 
 
 def test_the_newest_never_goes():
@@ -119,8 +177,8 @@ def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, de
             if is_gone(epochs, number):
                 assert number <= newest - kept
                 expired = clock.now - asked.get(number, -1e9) > pin_s
-                order = [other for other in asked if other <= newest - kept]
-                assert expired or len(order) - order.index(number) > pinned
+                alive = [other for other, at in asked.items() if clock.now - at <= pin_s]
+                assert expired or len(alive) > pinned
             else:
                 asked.pop(number, None)
                 asked[number] = clock.now
@@ -136,6 +194,4 @@ def test_no_more_stay_than_may(kept, pinned, count, data):
         epochs.add(epoch(number))
         back = data.draw(st.integers(0, 6))
         is_gone(epochs, max(1, number - back))
-    there = [number for number in range(1, count) if not is_gone(epochs, number)]
-    assert len(there) == min(count - 1, kept + pinned)
-    assert there[-kept:] == list(range(count - kept, count))
+    assert len(epochs.kept().epochs) == min(count - 1, kept + pinned)

@@ -45,6 +45,7 @@ def running(
         warnings=ScanWarnings(scans, Settings()),
         mapper=thread,
         checkpoints=CheckpointThread(thread, None, period_s=0, last=None),
+        map_max_bytes=10**9,
     )
     with closing(thread):
         thread.start()

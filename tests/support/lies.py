@@ -202,6 +202,7 @@ _LIES: list[tuple[str, str, Callable[[Body], object]]] = [
     ("checkpoint", "no digest", _sets(sha256="../../etc/passwd")),
     ("reset", "epoch -1", _sets(epoch=-1)),
     ("download", "2^62 bytes", _sets(bytes=2**62)),
+    ("download", "epoch 2^53 and 1", _sets(epoch=2**53 + 1)),
     ("download", "chunks of 0 bytes", _sets(chunk_bytes=0)),
     ("download", "another digest", _sets(sha256="0" * 64)),
     ("chunk", "more than was asked", lambda body: body.update(data=body["data"] * 2)),

@@ -52,9 +52,10 @@ _EVENT_S = 30.0
 class _Inbox:
     """What a subscriber received."""
 
-    samples: list[tuple[str, str]] = field(default_factory=list)  # key, and whom it is from
+    samples: list[tuple[str, str]] = field(default_factory=list)  # key, and whom it is from:
+    # an attachment says so, which the server's own have not
     deleted_by: set[str] = field(default_factory=set)
-    arrived: threading.Event = field(default_factory=threading.Event)
+    from_server: threading.Event = field(default_factory=threading.Event)
 
     @property
     def senders(self) -> set[str]:
@@ -66,7 +67,8 @@ class _Inbox:
             self.deleted_by.add(sender)
         else:
             self.samples.append((str(sample.key_expr), sender))
-        self.arrived.set()
+        if not sender:
+            self.from_server.set()
 
 
 def status_replies(session: zenoh.Session) -> list[zenoh.Reply]:
@@ -150,13 +152,14 @@ def _forged(role: str, session: zenoh.Session, observer: zenoh.Session) -> set[s
 def _wait_for_status(observer: zenoh.Session) -> None:
     """Until the server has published its status once more."""
     with _subscribed(observer, keys.status_key(MAP)) as status:
-        assert status.arrived.wait(_EVENT_S), "the server publishes no status"
+        assert status.from_server.wait(_EVENT_S), "the server publishes no status"
 
 
 @contextmanager
 def _subscribed(session: zenoh.Session, key: str) -> Iterator[_Inbox]:
     inbox = _Inbox()
-    subscriber = session.declare_subscriber(key, inbox.take)
+    at_once = zenoh.handlers.Callback(inbox.take, indirect=False)  # before what comes later
+    subscriber = session.declare_subscriber(key, at_once)
     yield inbox
     subscriber.undeclare()
 

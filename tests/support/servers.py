@@ -23,7 +23,9 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, Scan
 from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.net.session import NetworkOptions, open_session
+from triquad_server.net.configuration import NetworkOptions, configuration
+from triquad_server.net.session import open_session
+from triquad_server.protection import protection
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
@@ -73,7 +75,7 @@ def running_service(
     """A service in this process; yields its endpoint, a free one unless it is given."""
     compiled()
     endpoint = endpoint or free_endpoint()
-    network = NetworkOptions((endpoint,), connect, multicast_scouting=False)
+    network = configuration(NetworkOptions((endpoint,), connect), protection(map_name, settings))
     opened = Store(store, map_name, settings.store) if store else None
     restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
@@ -246,7 +248,7 @@ def server_process(
     """
     endpoint = endpoint or free_endpoint()
     command = [sys.executable, "-m", "triquad_server.cli", "--listen", endpoint]
-    command += ["--no-multicast-scouting", "--device", "cpu", *map(str, arguments)]
+    command += ["--device", "cpu", *map(str, arguments)]
     variables = {**os.environ, **(environment or {})}
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=variables) as process:
         server = ServerProcess(process, endpoint)

@@ -182,7 +182,7 @@ def test_the_map_of_a_server_is_drawn(tmp_path, capsys):
         assert main([endpoint, "--at", "1", "--plot", str(picture)]) == 2
         assert "leave out --at" in capsys.readouterr().err
     assert main([str(tmp_path), "--map", "other"]) == 2
-    assert "--map is of a server" in capsys.readouterr().err
+    assert "--map and --config are of a server" in capsys.readouterr().err
 
 
 def test_pictures_of_maps_that_lack_something(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 from support.checkpoint_folder import write_checkpoints
 from support.map_records import random_record
 from support.mapfile_edit import file_bytes, without_index
+from triquad_format.mapfile.protections import Protection, Protections, write_protections
 from triquad_format.mapfile.reader import read_map_file
 from triquad_tools.commands.inspect import main
 from triquad_tools.commands.pack import main as pack
@@ -125,3 +126,14 @@ def test_what_was_set_aside_is_named(folder, tmp_path, capsys):
     assert f"{damaged} is newer, but damaged" in capsys.readouterr().out
     assert pack([str(damaged), str(tmp_path / "saved.triquad"), "--recover"]) == 0
     assert read_map_file(tmp_path / "saved.triquad").record.epoch == 15
+
+
+def test_what_is_protected_is_named_with_the_reason(folder, capsys):
+    protected = Protections(checkpoints=(Protection(12, 5.0, "before\x1b a reset"),))
+    write_protections(folder, protected)
+    assert main([str(folder), "--log"]) == 0
+    out = capsys.readouterr().out
+    assert "  epoch-000000012.delta.triquad: protected, before" in out
+    assert "\x1b" not in out
+    _, log = log_of(folder, capsys)
+    assert [one["protected"] is not None for one in log["checkpoints"]] == [False, True, False]

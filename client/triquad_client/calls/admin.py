@@ -1,5 +1,8 @@
 """What concerns the server itself: how it is doing, checkpoints, and forgetting."""
 
+from dataclasses import replace
+
+from triquad_format.printable import printable
 from triquad_format.wire import keys
 from triquad_format.wire.messages import (
     CheckpointInfo,
@@ -34,8 +37,8 @@ def checkpoint() -> Call[CheckpointInfo]:
     return ask(Ask(keys.CHECKPOINT, CheckpointRequest(), CheckpointInfo, min_timeout_s=_SLOW_S))
 
 
-def reset(bounds: Bounds | None) -> Call[int]:
-    """The first epoch without what was learnt in the bounds."""
+def reset(bounds: Bounds | None) -> Call[ResetReply]:
+    """Forgets what was learnt in the bounds."""
     request = ResetRequest(*checks.box(bounds))
-    done = yield from ask(Ask(keys.RESET, request, ResetReply, min_timeout_s=_SLOW_S))
-    return done.epoch
+    reply = yield from ask(Ask(keys.RESET, request, ResetReply, min_timeout_s=_SLOW_S))
+    return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))

@@ -2,7 +2,7 @@
 
 import json
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,6 +15,7 @@ from triquad_format.wire.endpoints import full_endpoint
 from triquad_format.wire.messages import ErrorReply
 from triquad_format.wire.origin import RequestOrigin
 from triquad_format.wire.reply import MAX_COUNT, check_answers
+from triquad_format.wire.zenoh_config import QUIET, fill, put
 
 from triquad_client import checks
 from triquad_client.errors import (
@@ -30,6 +31,13 @@ from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
 _HERE = "127.0.0.1"
 _LIVELINESS_TIMEOUT_S = 3.0
 _MAX_REASON = 2_000  # characters of why a request was refused
+
+_OF_CLIENTS: Mapping[str, Any] = {
+    "mode": "client",
+    "connect/timeout_ms": 0,  # one attempt, not retries
+    "transport/link/rx/max_message_size": codec.MAX_MESSAGE_BYTES,
+}
+"""How Zenoh is set up for a client, besides what a file says."""
 
 Receiver: TypeAlias = Any
 """``None``, or a ``zenoh.handlers.Callback[zenoh.Reply]``: the overloads of Zenoh take no union."""
@@ -129,6 +137,12 @@ class Connection:
             )
         if self.map_name not in available:
             return UnknownMapError(self.map_name, available)
+        if ask.operation.startswith("admin/"):
+            return NoReplyError(
+                f"no reply on {self._key(ask)} although the map is there: access control forbids "
+                "it (by default to all but programs of the server's machine that connect to "
+                "127.0.0.1), or the server is stopping or older than this operation"
+            )
         return NoReplyError(
             f"no reply on {self._key(ask)} although the map is there: the server is stopping "
             "or older than this question, access control forbids the request, or a message "
@@ -153,12 +167,18 @@ class Connection:
             raise self._broken(error) from error
 
     def look_for_maps(
-        self, receiver: Receiver = None, cancellation: zenoh.CancellationToken | None = None
+        self,
+        receiver: Receiver = None,
+        cancellation: zenoh.CancellationToken | None = None,
+        map_name: str = "*",
     ) -> Iterable[zenoh.Reply]:
-        """Ask all servers in reach for their maps; replies and errors as of :meth:`send`."""
+        """Ask all servers in reach for their maps, or for one of this name.
+
+        Replies and errors are as of :meth:`send`.
+        """
         try:
             replies: Iterable[zenoh.Reply] = self._session.liveliness().get(
-                keys.alive_key("*", "*"),
+                keys.alive_key(map_name, "*"),
                 receiver,
                 timeout=_LIVELINESS_TIMEOUT_S,
                 cancellation_token=cancellation,
@@ -240,9 +260,9 @@ def open_connection(
         ) from error
     connection = Connection(session, map_name, timeout_s, max_download_bytes=most)
     try:
-        available = map_names(connection.look_for_maps())
-        if map_name not in available:
-            raise UnknownMapError(map_name, available)
+        # Asked for by name first: there may be any number of others.
+        if not map_names(connection.look_for_maps(map_name=map_name)):
+            raise UnknownMapError(map_name, map_names(connection.look_for_maps()))
     except BaseException:
         connection.close()
         raise
@@ -250,20 +270,14 @@ def open_connection(
 
 
 def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | None) -> zenoh.Config:
-    if file is not None:
-        config = _read_configuration(file)
-    else:
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/timeout_ms", "0")  # one attempt, not retries
-        config.insert_json5("scouting/multicast/enabled", "false")
-        config.insert_json5("transport/shared_memory/enabled", "false")
+    config = zenoh.Config() if file is None else _read_configuration(file)
+    fill(config, {**QUIET, **_OF_CLIENTS}, unset=zenoh.Config())
+    put(config, {"transport/unicast/open_timeout": int(timeout_s * 1000)})
     if endpoint is not None or not json.loads(config.get_json("connect/endpoints")):
         only_tls = json.loads(config.get_json("transport/link/protocols")) == ["tls"]
         protocol = "tls" if only_tls else "tcp"
         full = full_endpoint(_HERE if endpoint is None else endpoint, protocol)
-        config.insert_json5("connect/endpoints", json.dumps([full]))
-    config.insert_json5("transport/unicast/open_timeout", str(int(timeout_s * 1000)))
+        put(config, {"connect/endpoints": [full]})
     return config
 
 

@@ -4,17 +4,18 @@ import asyncio
 import dataclasses
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.parts.part import Part, PartKey
+from triquad_format.mapfile.parts.part import EVIDENCE, Part, PartKey
 from triquad_format.mapfile.reader import assemble
 from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.record_check import check_record
+from triquad_format.wire.messages import MapInfo
 from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
@@ -23,9 +24,13 @@ from triquad_client.calls.download import RemoteBytes, newest_file
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.documentation import documented_as
-from triquad_client.errors import DownloadError
+from triquad_client.errors import DownloadError, EmptierMapError
 from triquad_client.net.call import AsyncRun, Call, ResultT, Run, offload, retried
 from triquad_client.offline.offline_map import LocalDriver
+
+_EMPTIER_SHARE = 0.5
+"""A map that knows less than this of what the copy knows was lost. A server that goes on from its
+last checkpoint knows nearly as much."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,8 @@ class _State:
     driver: LocalDriver
     checked_s: float  # of the monotonic clock, when the server had nothing newer
     report: SyncReport  # of the last update
+    server: str  # the run of the server that it was made from
+    seen_bytes: int  # see :func:`_seen_bytes`
 
 
 class LocalCopy:
@@ -89,27 +96,31 @@ class LocalCopy:
         """Answer a call, all of it from one epoch."""
         return self._current().driver.run(call)
 
-    def _update(self) -> Call[SyncReport]:
+    def _update(self, accept_emptier: bool) -> Call[SyncReport]:
         """Fetch what changed, as :meth:`SyncedMap.refresh`."""
-        return retried("chunk_gone", lambda: offload(self._fetch))
+        return retried("chunk_gone", lambda: offload(lambda run: self._fetch(run, accept_emptier)))
 
     def _current(self) -> _State:
         assert self._state is not None, "_update() comes first"
         return self._state
 
-    def _fetch(self, run: Run) -> SyncReport:
+    def _fetch(self, run: Run, accept_emptier: bool) -> SyncReport:
         with self._updating:
             asked_s = time.monotonic()
             info = run(newest_file(training=False, max_bytes=self._max_bytes))
             known = self._state
             if known is not None and known.sha256 == info.sha256:
                 report = SyncReport(info.epoch, 0, 0, parts_kept=known.report.parts)
-                self._state = dataclasses.replace(known, checked_s=asked_s, report=report)
+                self._state = dataclasses.replace(
+                    known, checked_s=asked_s, report=report, server=info.server
+                )
                 return report
             remote = RemoteBytes(run, info, self._max_bytes)
             try:
                 stored = StoredMap(remote)
                 wanted = stored.parts_in(self._low, self._high)
+                if not accept_emptier:
+                    self._refuse_emptier(info, _seen_bytes(wanted))
                 kept = _kept(self._path, wanted)
                 payloads = kept | {
                     entry.key: stored.payload(entry) for entry in wanted if entry.key not in kept
@@ -126,10 +137,49 @@ class LocalCopy:
                 parts_received=len(wanted) - len(kept),
                 parts_kept=len(kept),
             )
-            self._state = _State(info.sha256, LocalDriver(record), checked_s=asked_s, report=report)
+            self._state = _State(
+                info.sha256,
+                LocalDriver(record),
+                checked_s=asked_s,
+                report=report,
+                server=info.server,
+                seen_bytes=_seen_bytes(wanted),
+            )
             if known is not None:
                 known.driver.close()
             return report
+
+    def _refuse_emptier(self, info: MapInfo, seen_bytes: int) -> None:
+        """Raise where a server that was started again has lost what the copy holds.
+
+        The run that the copy was made from may forget as it likes: somebody has told it to. Of
+        which run a file is that was there before, is not known.
+
+        Raises:
+            EmptierMapError: it has.
+        """
+        known = self._state
+        if known is not None and known.server == info.server != "":
+            return
+        had_bytes = self._seen_before() if known is None else known.seen_bytes
+        if seen_bytes < _EMPTIER_SHARE * had_bytes:
+            raise EmptierMapError(
+                f"the server may have lost its map: it was started again, and what epoch "
+                f"{info.epoch} knows of the box takes {seen_bytes:,} bytes, that of the copy in "
+                f"{self._path} {had_bytes:,}. The copy stays as it is, and triquad_client.open_map "
+                "opens it; to take the emptier map, pass accept_emptier=True to sync or refresh"
+            )
+
+    def _seen_before(self) -> int:
+        """What the file that is there knows of the box; it may be no map file."""
+        with suppress(FormatError, FileNotFoundError), StoredMap.open(self._path) as older:
+            return _seen_bytes(older.parts_in(self._low, self._high))
+        return 0
+
+
+def _seen_bytes(parts: Iterable[Entry]) -> int:
+    """Bytes of what rays have shown: a measure of how much of the world a map knows."""
+    return sum(part.size for part in parts if part.key.topic == EVIDENCE)
 
 
 def _kept(path: Path, wanted: Sequence[Entry]) -> dict[PartKey, bytes]:
@@ -165,15 +215,20 @@ class SyncedMap(LocalCopy, MapQueries):
         MapQueries.__init__(self, self._answer)
         self._ask_server = run
 
-    def refresh(self) -> SyncReport:
+    def refresh(self, accept_emptier: bool = False) -> SyncReport:
         """Fetch what changed on the server. Where that fails, the copy stays as it was.
+
+        Args:
+            accept_emptier: take the map also where the server was started again and knows less than
+                half of what the copy does.
 
         Raises:
             TriquadError: the server cannot be reached, as for any call of :class:`Client`.
+            EmptierMapError: the server has lost its map, and ``accept_emptier`` is not set.
             DownloadError: what arrived is not valid.
             OSError: the file cannot be written.
         """
-        return self._ask_server(self._update())
+        return self._ask_server(self._update(accept_emptier))
 
 
 @documented_as(SyncedMap)
@@ -189,8 +244,8 @@ class AsyncSyncedMap(LocalCopy, AsyncMapQueries):
         AsyncMapQueries.__init__(self, self._answer_in_thread)
         self._ask_server = run
 
-    async def refresh(self) -> SyncReport:  # noqa: D102 - documented as the one above
-        return await self._ask_server(self._update())
+    async def refresh(self, accept_emptier: bool = False) -> SyncReport:  # noqa: D102 - as above
+        return await self._ask_server(self._update(accept_emptier))
 
     async def _answer_in_thread(self, call: Call[ResultT]) -> ResultT:
         return await asyncio.to_thread(self._answer, call)

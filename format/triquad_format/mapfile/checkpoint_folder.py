@@ -16,6 +16,8 @@ from triquad_format.mapfile.manifest import Manifest
 
 _NAME = re.compile(r"epoch-([0-9]{9,19})(\.delta)?\.triquad")
 
+_LISTED = 40  # epochs in the text of an error
+
 
 @dataclass(frozen=True, order=True)
 class CheckpointFile:
@@ -95,6 +97,22 @@ def open_manifest(file: CheckpointFile) -> Manifest:
     """
     with closing(FileBytes(file.path)) as source, named(str(file.path)):
         return MapIndex(source).manifest
+
+
+def checkpoint_of(folder: Path, epoch: int) -> CheckpointFile:
+    """The checkpoint of an epoch; the complete one where there are two.
+
+    Raises:
+        MapFileError: there is none; the text tells which there are.
+        OSError: the folder cannot be read.
+    """
+    files = newest_of_each(checkpoint_files(folder))
+    for file in files:
+        if file.epoch == epoch:
+            return file
+    there = ", ".join(str(file.epoch) for file in files[:_LISTED]) or "none"
+    more = ", ..." if len(files) > _LISTED else ""
+    raise MapFileError(f"{folder} holds no checkpoint of epoch {epoch}; there are: {there}{more}")
 
 
 def checkpoint_at(folder: Path, when: str) -> CheckpointFile:

@@ -85,6 +85,10 @@ class FileBytes:
             data += more
         return data
 
+    def drop_cached(self) -> None:
+        """Have the system read the file from its disk, not from what it has in memory of it."""
+        os.posix_fadvise(self._stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
     def close(self) -> None:
         """Close the file."""
         self._stream.close()

@@ -9,7 +9,7 @@ import hashlib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -45,12 +45,20 @@ from triquad_format.records.field_settings import RegionIndex
 _Content = TypeVar("_Content")
 
 _LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
-"""Bytes of all places that are tried: a constant, and a multiple of the file's size."""
+"""Bytes of all places whose contents are tried: a constant, and a multiple of the file's size."""
 
 # A record below 4 GiB; in a chunk then times, size and checksum, and the name of its compression.
 _CHUNK = re.compile(rb"\x06.{4}\x00{4}.{28}(?:\x04\x00{3}zstd|\x00{4})", re.DOTALL)
 _METADATA = re.compile(rb"\x0c.{4}\x00{4}\x07\x00{3}" + METADATA_NAME.encode(), re.DOTALL)
 _CHANNEL = re.compile(rb"\x04.{4}\x00{4}(..)...\x00{3}(/[a-z/]+).\x00{3}([a-z]+)\x00{4}", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class PartsOfRegion:
+    """The parts of one region."""
+
+    found: dict[PartKey, bytes] = field(default_factory=dict)  # payloads of those that are intact
+    missing: set[PartKey] = field(default_factory=set)  # as far as the manifest tells
 
 
 @dataclass(frozen=True)
@@ -63,18 +71,14 @@ class IntactParts:
     parts_listed: int | None  # in the manifest; None: it is lost
     stamp_ns: int  # when the epoch was written, nanoseconds since 1970; 0 if not known
 
-    @property
-    def regions(self) -> list[RegionIndex]:
+    def by_region(self) -> dict[RegionIndex, "PartsOfRegion"]:
         """The regions of which there is a part, or was one."""
-        return list(dict.fromkeys(key.region for key in (*self.payloads, *sorted(self.missing))))
-
-    def found_of(self, region: RegionIndex) -> dict[PartKey, bytes]:
-        """The parts of a region."""
-        return {key: data for key, data in self.payloads.items() if key.region == region}
-
-    def missing_of(self, region: RegionIndex) -> set[PartKey]:
-        """The parts that a region lacks."""
-        return {key for key in self.missing if key.region == region}
+        regions: dict[RegionIndex, PartsOfRegion] = {}
+        for key, data in self.payloads.items():
+            regions.setdefault(key.region, PartsOfRegion()).found[key] = data
+        for key in sorted(self.missing):
+            regions.setdefault(key.region, PartsOfRegion()).missing.add(key)
+        return regions
 
 
 def intact_parts(path: Path, max_bytes: int) -> IntactParts:
@@ -199,10 +203,11 @@ def intact_messages(data: bytes, max_bytes: int) -> Iterator[Message]:
         at = match.start() + 1
         try:
             record = next(walk(memoryview(data), match.start()))
+            # Told by its head alone, at no cost: what only looks like a chunk takes no budget.
+            chunk = read_chunk(record)
             if len(record.content) > budget:
                 continue
             budget -= len(record.content)
-            chunk = read_chunk(record)
             messages = list(chunk.messages(dict(channels)))
         except FormatError:
             continue

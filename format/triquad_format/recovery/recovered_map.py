@@ -5,7 +5,8 @@ themselves.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +38,10 @@ from triquad_format.recovery.intact_parts import IntactParts, intact_parts
 STATUS_REACH_LEAVES = 2
 """How far beyond lost vertices a status may change: voxels that have an effect there are dropped
 whole, and had an effect half a leaf beyond."""
+
+_AROUND = tuple(itertools.product((-2, -1, 0, 1, 2), repeat=3))
+"""From a region to those whose losses may reach into it: lost vertices have an effect beyond the
+border of their own region, but never beyond the cubes of those around."""
 
 
 @dataclass(frozen=True)
@@ -96,12 +101,27 @@ def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> RecoveredMap:
         return recovered
 
 
+class _LossesNear:
+    """Losses by where they are: of a large map, each region is compared with few of them."""
+
+    def __init__(self, losses: Iterable[Loss]) -> None:
+        self._losses: dict[RegionIndex, list[Loss]] = {}
+        for loss in losses:
+            self._losses.setdefault(loss.key.region, []).append(loss)
+
+    def of(self, index: RegionIndex) -> Iterator[Loss]:
+        """Those that may reach into a region: its own, and of the regions around."""
+        x, y, z = index
+        for dx, dy, dz in _AROUND:
+            yield from self._losses.get((x + dx, y + dy, z + dz), ())
+
+
 def _recovered(found: IntactParts) -> RecoveredMap:
     settings = found.facts.settings
     regions: list[Region] = []
     lost: set[PartKey] = set()
-    for index in found.regions:
-        payloads, missing = found.found_of(index), found.missing_of(index)
+    for index, parts in found.by_region().items():
+        payloads, missing = parts.found, parts.missing
         region = _region(index, settings, payloads, missing=missing)
         if region is None:
             lost.add(PartKey(REGION, index))
@@ -116,7 +136,8 @@ def _recovered(found: IntactParts) -> RecoveredMap:
     losses = tuple(
         loss_of(key, settings) for key in sorted(lost, key=lambda key: (key.region, key))
     )
-    regions = [_masked_where_lost(settings, region, losses) for region in regions]
+    near = _LossesNear(losses)
+    regions = [_masked_where_lost(settings, region, near.of(region.index)) for region in regions]
     record = MapRecord(found.facts.name, found.facts.epoch, settings, regions=tuple(regions))
     return RecoveredMap(
         record,

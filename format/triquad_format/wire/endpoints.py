@@ -30,6 +30,15 @@ def full_endpoint(text: str, protocol: str = "tcp") -> str:
     return f"{protocol}/{host}:{port}"
 
 
+def is_of_this_machine(endpoint: str) -> bool:
+    """Whether only programs of this machine reach an endpoint of Zenoh that is listened on."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol.startswith("unix"):
+        return True
+    host, _, _ = address.partition("#")[0].partition("?")[0].rpartition(":")
+    return host in ("localhost", "[::1]") or host.startswith("127.")
+
+
 def _host_and_port(text: str) -> tuple[str, str]:
     """A host and its port; an address of IPv6 is in brackets then."""
     if text.startswith("["):

@@ -214,6 +214,8 @@ class ServerStatus(Message):
     store_error: str | None  # why the map is not durable, None if it is
     warnings: str | None = None  # what goes wrong with scans, and what helps: a line each
     samples_left: Count = 0  # training samples until nothing is left to learn
+    map_bytes: Count = 0  # memory of the map with its newest epoch
+    map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not told
 
 
 @dataclass(frozen=True)
@@ -252,9 +254,11 @@ class ResetRequest(Message):
 
 @dataclass(frozen=True)
 class ResetReply(Message):
-    """Answer to :class:`ResetRequest`: the first epoch without the box's content."""
+    """Answer to :class:`ResetRequest`: what has happened, and how to go back."""
 
-    epoch: Epoch
+    epoch: Epoch  # the first without the box's content
+    kept_epoch: Epoch | None = None  # as which the map of before stays on disk; None: it does not
+    undo: Annotated[str, Text(4096)] | None = None  # how to go back to it, or why one cannot
 
 
 @dataclass(frozen=True)
@@ -272,6 +276,7 @@ class MapInfo(Message):
     bytes: Count
     sha256: Digest
     chunk_bytes: Annotated[int, Within(1, MAX_CHUNK_BYTES)]
+    server: Name = ""  # a name of this server process; empty where it does not tell
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,8 @@ class Within:
         if array.size == 0:
             return None
         low, high = (np.fmin, np.fmax) if self.nan else (np.minimum, np.maximum)
-        ends = [float(end.reduce(array, axis=None)) for end in (low, high)]
+        # Whole numbers as they are: as doubles, what is beyond MAX_COUNT could round down to it.
+        ends = [end.reduce(array, axis=None).item() for end in (low, high)]
         if self.nan and math.isnan(ends[0]):
             return None
         least, most = said.number(self.least), said.number(self.most)

@@ -27,11 +27,11 @@ ROUTER = "router"
 
 
 class Role(Enum):
-    """What a client is for; each role may do what those before it may."""
+    """What a client is for; all may do what a viewer may."""
 
     VIEWER = "viewer"  # questions the map, and follows it
     ROBOT = "robot"  # publishes scans as its own sources
-    ADMIN = "admin"  # resets, restores, pins, has checkpoints written
+    ADMIN = "admin"  # resets the map, has checkpoints written
 
 
 @dataclass(frozen=True)

@@ -144,6 +144,10 @@ class LiveField:
         new = torch.randn(size, generator=self._generator, device=self.device)
         self.features.append(new * self.settings.feature_std)
 
+    def growth_by(self, leaves: Longs) -> int:
+        """How many vertices :meth:`grow` would add."""
+        return 0 if self.settings.encoding == "fourier" else self.tree.growth_by(leaves)
+
     def restore(self, plane: int, h: int, codes: Longs, features: Tensor) -> None:
         """Add the vertices ``codes`` [V] of one level with their ``features`` [V, d]."""
         self.tree.restore(plane, h, codes)

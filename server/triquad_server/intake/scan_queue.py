@@ -25,6 +25,11 @@ _SCAN_BYTES = 2_000  # that a scan takes beside its points
 
 MAX_SEQUENCE = 2**48
 
+_AHEAD_AT_ONCE = 1000
+_AHEAD_PER_S = 1000
+"""How far sequences may leap: as many scans as may get lost at once, and in each second in which
+nothing was heard of the session. Whoever leaps farther does not count on from where it was."""
+
 FORGOTTEN = "*"
 """Stands for all forgotten sources where losses are listed."""
 
@@ -46,6 +51,7 @@ class _Track:
     done: int = -1  # highest sequence that came out of the queue
     waiting: int = 0  # scans in the queue
     unpublished: int | None = None  # lowest sequence taken that no epoch shows yet
+    unpublished_scans: int = 0  # taken, that no epoch shows yet
     stamp_ns: int = -(2**63)
     taken: int = 0
     refused: int = 0
@@ -57,6 +63,13 @@ class _Track:
         """Count what did not arrive, up to and with ``sequence``, as lost."""
         self.lost += max(0, sequence - self.arrived)
         self.arrived = max(self.arrived, sequence)
+
+    def is_ahead(self, sequence: int) -> bool:
+        """Whether a sequence lies farther ahead than scans can have got lost since the last."""
+        if self.arrived < 0:
+            return False  # it may have begun long before this process
+        silent_s = time.monotonic() - self.heard_s
+        return sequence - self.arrived > _AHEAD_AT_ONCE + _AHEAD_PER_S * silent_s
 
     def refuse(self, text: str) -> None:
         """Count a refused scan."""
@@ -85,6 +98,8 @@ class SourceLedger:
             if not 0 <= scan.sequence < MAX_SEQUENCE:
                 return "bad_sequence"
             track = self._track(scan.source, scan.session)
+            if track.is_ahead(scan.sequence):
+                return "sequence_ahead"
             track.heard_s = time.monotonic()
             if scan.sequence <= track.arrived:
                 return "sequence_backwards"
@@ -93,8 +108,9 @@ class SourceLedger:
             if scan.stamp_ns < track.stamp_ns:
                 track.refuse(
                     f"scan {scan.sequence}: its stamp {scan.stamp_ns} ns lies before the "
-                    f"{track.stamp_ns} ns of an earlier scan; stamp scans in order"
+                    f"{track.stamp_ns} ns of the scan before; stamp scans in order"
                 )
+                track.stamp_ns = scan.stamp_ns  # a clock that was set back costs one scan
                 self.changed.notify_all()
                 return "time_backwards"
             track.stamp_ns = scan.stamp_ns
@@ -106,6 +122,7 @@ class SourceLedger:
         with self.changed:
             track = self._leave_queue(scan)
             track.taken += 1
+            track.unpublished_scans += 1
             if track.unpublished is None:
                 track.unpublished = scan.sequence
 
@@ -130,25 +147,43 @@ class SourceLedger:
         with self.changed:
             self._leave_queue(scan).lost += 1
 
+    def take_back(self, why: str) -> int:
+        """Record that scans which no epoch shows yet are not in the map after all; how many."""
+        with self.changed:
+            count = 0
+            for track in self._tracks.values():
+                if track.unpublished is None:
+                    continue
+                count += track.unpublished_scans
+                track.taken -= track.unpublished_scans
+                track.refused += track.unpublished_scans
+                track.last_refusal = f"scan {track.unpublished} and later ones: {why}"
+                track.unpublished, track.unpublished_scans = None, 0
+            self.changed.notify_all()
+            return count
+
     def publish(self) -> None:
         """Record that an epoch shows all scans that were taken so far."""
         with self.changed:
             shown = [track for track in self._tracks.values() if track.unpublished is not None]
             for track in shown:
-                track.unpublished = None
+                track.unpublished, track.unpublished_scans = None, 0
             if shown:
                 self.changed.notify_all()
 
     def give_up(self, source: str, session: int, sequence: int) -> FlushReply | None:
         """Count what has not arrived up to ``sequence`` as lost; the outcome, as :meth:`outcome`.
 
-        A session that was never heard of is answered but not remembered: questions must not push
-        out the sessions that send scans.
+        What cannot have been sent is answered but not remembered, be it of a session that was never
+        heard of or far ahead in one: questions must not push out, nor hold up, who sends scans.
         """
         with self.changed:
             track = self._tracks.get((source, session))
             if track is None:
                 return FlushReply(taken=0, refused=0, lost=sequence + 1, last_refusal=None)
+            if track.is_ahead(sequence):
+                lost = track.lost + sequence - track.arrived
+                return FlushReply(track.taken, track.refused, lost, track.last_refusal)
             track.lose_up_to(sequence)
             return self.outcome(source, session, sequence)
 

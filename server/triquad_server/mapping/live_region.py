@@ -12,6 +12,7 @@ from triquad_format.records.region import Region
 from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.growth import EvidenceSize, NewEnds
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence, Marks
 from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
@@ -33,6 +34,7 @@ from triquad_server.engine.live_field import (
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs import FrozenRegion
 from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
@@ -116,6 +118,24 @@ class LiveRegion:
             region.pool.add(sample_intervals(state.sample_points, state.sample_labels))
             region.budget_samples = min(state.budget_samples, setup.training.max_budget_samples)
         return region
+
+    @property
+    def size(self) -> RegionSize:
+        """How much it holds."""
+        return RegionSize(self.evidence.size, self.field.vertices)
+
+    def new_ends(self, rays: ScanRays) -> NewEnds:
+        """The voxels in which rays would end for the first time."""
+        return self.evidence.new_ends(self.voxels(rays.ends))
+
+    def growth_by(self, rays: ScanRays) -> RegionSize:
+        """What the rays would add to it; of the space that they cross, an estimate."""
+        origin = self.voxels(rays.origin[None])[0]
+        new = self.new_ends(rays)
+        ways = self.voxels(np.concatenate([rays.ends, rays.free_corners]))
+        blocks = self.evidence.new_blocks(origin, ways)
+        size = EvidenceSize(blocks, new.blocks, len(new.voxels))
+        return RegionSize(size, self.field.growth_by(new.voxels))
 
     def see(self, rays: ScanRays, stamp_s: int) -> Callable[[], None]:
         """Record where the rays ended, and grow the field there; outside the cube nothing is.
@@ -233,6 +253,7 @@ class LiveRegion:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)
             self._restored = False
         self._forget_gone(surfels)
+        own = buffers_of((field, evidence, surfels))
         live = {"field": self.field, "evidence": self.evidence, "replay_pools": self.pool}
         return FrozenRegion(
             index=self.index,
@@ -243,7 +264,8 @@ class LiveRegion:
             vertices=self.field.vertices,
             parameters=self.field.parameters,
             changed=epoch,
-            live_bytes=bytes_by_part(live, without=buffers_of((field, evidence, surfels))),
+            live_bytes=bytes_by_part(live, without=own),
+            buffers=own,
         )
 
     def record(self) -> Region:

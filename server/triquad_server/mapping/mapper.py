@@ -13,9 +13,10 @@ from triquad_format.records.region import MapRecord
 
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.epochs import Epoch, FrozenRegion
-from triquad_server.errors import ScanRefusedError
+from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion
+from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.settings import Settings
@@ -65,6 +66,7 @@ class Mapper:
             sums=GradientSums(),
             team=self._teams.mapping,
         )
+        self._budget = MemoryBudget(settings.memory.max_bytes, self._field_settings)
         self._regions: dict[RegionIndex, LiveRegion] = {}
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
@@ -89,6 +91,11 @@ class Mapper:
     def loss(self) -> float:
         """The loss of the last steps; on a GPU, to read it waits for all of them."""
         return 0.0 if self._loss is None else float(self._loss)
+
+    @property
+    def bytes_used(self) -> int:
+        """Memory of the map with its newest epoch, without the replay pools; an estimate."""
+        return self._budget.bytes_of(region.size for region in self._regions.values())
 
     @property
     def regions(self) -> list[LiveRegion]:
@@ -122,7 +129,11 @@ class Mapper:
             What of it is used, and how many points and rays without a return are not.
 
         Raises:
-            ScanRefusedError: the scan cannot be used; the map is unchanged.
+            ScanRefusedError: the scan cannot be used; the map is unchanged. Where memory ran out
+                amid it, the reason is ``out_of_memory``, and the map as after any other exception.
+            MapLostError: the scan is half in the map, and what was published cannot be restored.
+            Exception: the scan failed midway. Of it nothing is in the map: regions that it touched
+                are as in the newest epoch.
         """
         of_source = self._settings.sources.get(source, ANY_SOURCE)
         rays = usable_rays(
@@ -134,6 +145,20 @@ class Mapper:
         )
         around = self._regions_around(rays)
         self._check_regions(around)
+        self._check_memory(rays, around)
+        try:
+            self._take_in(rays, around, stamp_s)
+        except MemoryError as error:
+            self._go_back(rays, around)
+            raise ScanRefusedError(
+                "out_of_memory", "the system gives the server no more memory"
+            ) from error
+        except Exception:
+            self._go_back(rays, around)
+            raise
+        return rays
+
+    def _take_in(self, rays: ScanRays, around: list[RegionIndex], stamp_s: int) -> None:
         regions = [self._region(index) for index in around]
         with self._teams.mapping.beside() as beside:
             for region in regions:
@@ -144,7 +169,29 @@ class Mapper:
             self._share_pool()
         for region in regions:
             region.set_normals(normals)
-        return rays
+
+    def _go_back(self, rays: ScanRays, touched: list[RegionIndex]) -> None:
+        """Undo a scan that failed midway: what it touched is again as it was published last.
+
+        What those regions had learnt since, and what training needs beyond the field, goes too.
+
+        Raises:
+            MapLostError: that fails as well.
+        """
+        published = {old.index: old for old in self._epoch.frozen_regions} if self._epoch else {}
+        for index in touched:
+            self._regions.pop(index, None)  # first: memory may be what is short
+        self._structure_changed = True
+        try:
+            for index in published.keys() & set(touched):
+                region = LiveRegion.restore(published[index].record(), self._setup)
+                self._regions[index] = region
+            if len(rays.ends):
+                self._normals.forget(rays.ends.min(axis=0), rays.ends.max(axis=0))
+            self._share_pool()
+        except Exception as error:
+            text = f"a scan failed, and the map before it is lost: {error!r}"
+            raise MapLostError(text) from error
 
     def train(self) -> None:
         """One optimiser step where the training budget is largest; nothing once all is settled."""
@@ -164,7 +211,12 @@ class Mapper:
         if self._epoch is not None or not self._number:
             self._number += 1
         before = {old.index: old for old in self._epoch.frozen_regions} if self._epoch else {}
-        regions = tuple(self._freeze(region, before) for region in self._regions.values())
+        try:
+            regions = tuple(self._freeze(region, before) for region in self._regions.values())
+        except BaseException:
+            for region in self._regions.values():  # the next epoch is to show what this did not
+                region.changed = True
+            raise
         self._epoch = Epoch(
             name=self._name,
             number=self._number,
@@ -257,6 +309,26 @@ class Mapper:
                 f"the scan would make {count} regions of the map, more than "
                 f"training.max_regions = {limit}",
             )
+
+    def _check_memory(self, rays: ScanRays, wanted: list[RegionIndex]) -> None:
+        """Refuse a scan that does not fit; the closer to the limit, the better that is looked at.
+
+        Raises:
+            ScanRefusedError: ``map_full``.
+        """
+        used, budget = self.bytes_used, self._budget
+        if used + budget.most_added(rays, [len(rays.ends)] * len(wanted)) <= budget.limit:
+            return
+        regions = [
+            self._regions.get(index) or LiveRegion.unseen(index, self._setup) for index in wanted
+        ]
+        new_voxels = [len(region.new_ends(rays).voxels) for region in regions]
+        if used + budget.most_added(rays, new_voxels) <= budget.limit:
+            return
+        unseen = budget.bytes_of(NO_SIZE for index in wanted if index not in self._regions)
+        needed = unseen + sum(budget.grown(region.growth_by(rays)) for region in regions)
+        if needed and used + needed > budget.limit:
+            raise budget.refusal(used, needed)
 
     def _region(self, index: RegionIndex) -> LiveRegion:
         if index not in self._regions:

@@ -14,12 +14,13 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
 from triquad_server.epochs import EpochHistory
-from triquad_server.errors import MapperStoppedError, ScanRefusedError
+from triquad_server.errors import MapLostError, MapperStoppedError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
-from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
+from triquad_server.memory_settings import MemorySettings
 from triquad_server.mesh.mesher import check_box
 from triquad_server.settings import ServiceSettings
 from triquad_server.surface_history import SurfaceHistory
@@ -46,7 +47,16 @@ class Progress:
     samples_trained: int = 0
     samples_left: int = 0
     rays_kept: int = 0
+    map_bytes: int = 0  # that the map and its newest epoch take
     loss: float = 0.0
+
+
+@dataclass(frozen=True)
+class Forgotten:
+    """What a reset did."""
+
+    before: MapChanges  # of the map that was
+    epoch: int  # the first that shows it
 
 
 @dataclass(frozen=True)
@@ -67,10 +77,11 @@ class MapperThread:
         settings: ServiceSettings,
         failed: Callable[[], None],
         warnings: ScanWarnings | None = None,
+        memory: MemorySettings | None = None,
     ) -> None:
         """Publish the first epoch; ``failed`` is called where an internal error ends the thread.
 
-        ``warnings`` are told what was used of each scan.
+        ``warnings`` are told what was used of each scan; ``memory`` bounds the epochs that stay.
         """
         self._mapper = mapper
         self._scans = scans
@@ -92,7 +103,8 @@ class MapperThread:
         self._loss = 0.0  # as of the newest epoch
         self._step_s = _GIVE_WAY_S  # what the last step of training took
         first = mapper.publish()
-        self.epochs = EpochHistory(first, settings)
+        older_bytes = (memory or MemorySettings()).epochs_bytes
+        self.epochs = EpochHistory(first, settings, older_bytes=older_bytes)
         self.surface = SurfaceHistory(first, settings.changes_kept)
         self.trails = SourceTrails(first.field_settings.leaf_m)
         self.progress = Progress()
@@ -147,13 +159,27 @@ class MapperThread:
             RefusedError: it is not a box.
         """
         check_box(request.minimum, request.maximum)
+        return ResetReply(self.call(lambda mapper: self._forget(mapper, request)))
 
-        def reset(mapper: Mapper) -> int:
-            mapper.reset(request.minimum, request.maximum)
-            self.trails.forget(request.minimum, request.maximum)
-            return mapper.publish().number
+    def reset_after(self, request: ResetRequest, base: int | None) -> Forgotten:
+        """As :meth:`reset`, with the map as it was just before: no scan comes in between.
 
-        return ResetReply(self.call(reset))
+        ``base`` is the epoch after which changes are enough; ``None``: all is needed.
+
+        Raises:
+            RefusedError: it is not a box.
+        """
+        check_box(request.minimum, request.maximum)
+
+        def reset(mapper: Mapper) -> Forgotten:
+            return Forgotten(mapper.changes_since(base), self._forget(mapper, request))
+
+        return self.call(reset)
+
+    def _forget(self, mapper: Mapper, request: ResetRequest) -> int:
+        mapper.reset(request.minimum, request.maximum)
+        self.trails.forget(request.minimum, request.maximum)
+        return mapper.publish().number
 
     def _run(self) -> None:
         lower_priority(NICENESS)
@@ -244,13 +270,19 @@ class MapperThread:
                 source=scan.source,
                 no_return=scan.no_return,
             )
+        except MapLostError:
+            raise
         except ScanRefusedError as error:
             self._scans.dropped.add(error.reason)
             self._scans.ledger.refuse(scan, str(error))
+            if error.reason == "out_of_memory":
+                self._take_back(str(error))
             _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
         except Exception as error:  # bad input, whatever it is, must not stop the server
             self._scans.dropped.add("internal")
-            self._scans.ledger.refuse(scan, f"internal error of the server: {error!r}")
+            text = f"internal error of the server: {error!r}"
+            self._scans.ledger.refuse(scan, text)
+            self._take_back(text)
             _log.exception("scan %d of %s could not be taken in", scan.sequence, scan.source)
         else:
             for reason, count in rays.points_dropped.items():
@@ -261,6 +293,13 @@ class MapperThread:
             self._scans_taken += 1
             self._unpublished = True
             self._scans.ledger.take(scan)
+
+    def _take_back(self, why: str) -> None:
+        """Count as refused what no epoch shows yet: a scan failed, and the map went back."""
+        count = self._scans.ledger.take_back(why)
+        self._scans_taken -= count
+        if count:
+            _log.warning("%d scans were taken back with one that failed: %s", count, why)
 
     def _publish(self) -> None:
         self.time.begin(Activity.PUBLISHING)
@@ -286,5 +325,6 @@ class MapperThread:
             samples_trained=self._mapper.samples_trained,
             samples_left=self._mapper.samples_left,
             rays_kept=self._mapper.rays_kept,
+            map_bytes=self._mapper.bytes_used,
             loss=self._loss,
         )

@@ -36,8 +36,19 @@ BURST_S = 1.0
 """A client that asked for nothing for so long may be sent as many seconds' worth at once."""
 
 
+MAX_HELD_BYTES = 64_000_000
+"""Of all requests that are held together; more are refused."""
+
+_FOLLOWER_BYTES, _KNOWN_BYTES = 4096, 300
+"""Of one that is held, and of each tile that it names as known."""
+
+
 class Asker(Protocol):
     """Who asks for updates and gets one answer: a request of the network, or of this process."""
+
+    @property
+    def size(self) -> int:
+        """Bytes that it takes while it is held."""
 
     def read(self, kind: type[TileUpdatesRequest]) -> TileUpdatesRequest:
         """What is asked for."""
@@ -65,6 +76,11 @@ class Follower:
     known_to: int  # it knows everything up to this revision
     known: dict[TileIndex, int]  # versions of tiles that it has whatever the revision
     nothing_at: tuple[int, int] | None = None  # state of the cache that had nothing for it
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes while it is held, about."""
+        return _FOLLOWER_BYTES + 2 * self.request.size + len(self.known) * _KNOWN_BYTES
 
 
 def new_follower(

@@ -13,6 +13,7 @@ from triquad_map.compiled.team import lower_priority
 from triquad_server.epochs import EpochHistory
 from triquad_server.mesh.followers import (
     BURST_S,
+    MAX_HELD_BYTES,
     Asker,
     Follower,
     TileReply,
@@ -79,6 +80,15 @@ class TileFeed:
         with self._changed:
             return QueueMetrics(len(self._pending) + self._senders.sending, self._limit)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the followers that wait."""
+        with self._changed:
+            return self._held_bytes()
+
+    def _held_bytes(self) -> int:
+        return sum(follower.nbytes for follower in self._pending)
+
     def close(self) -> None:
         """Refuse what is pending, and end."""
         with self._changed:
@@ -106,6 +116,12 @@ class TileFeed:
             waiting = len(self._pending) + self._senders.sending
             if self._stopping or waiting >= self._limit:
                 raise RefusedError("busy", f"{waiting} followers of the mesh wait already")
+            if self._held_bytes() + follower.nbytes > MAX_HELD_BYTES:
+                raise RefusedError(
+                    "busy",
+                    f"followers of the mesh that wait take {self._held_bytes()} bytes already, and "
+                    f"this one would take {follower.nbytes}: name fewer known tiles",
+                )
             self._pending.append(follower)
             self._changed.notify_all()
 

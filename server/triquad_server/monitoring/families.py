@@ -224,6 +224,16 @@ _TRAINING = (
 
 _MEMORY = (
     gauge(
+        "triquad_map_memory_bytes",
+        "Memory of the map with its newest epoch",
+        single(lambda f: f.status.map_bytes),
+    ),
+    gauge(
+        "triquad_map_memory_limit_bytes",
+        "Beyond this, scans are refused as map_full",
+        single(lambda f: f.status.map_max_bytes),
+    ),
+    gauge(
         "triquad_resident_memory_bytes",
         "Memory of the process, with its libraries",
         single(lambda f: f.metrics.resident_bytes),

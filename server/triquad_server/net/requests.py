@@ -15,6 +15,7 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 from triquad_format.wire.metrics_messages import QueueMetrics
 
+from triquad_server.asking_client import asking_client
 from triquad_server.net.askers import Asker, Askers
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.request_queue import MOST_BEGUN, MOST_SENDING, Job, RequestQueue
@@ -150,7 +151,13 @@ class Request:
         self._finish(lambda: self._query.reply_err(payload, encoding=keys.encoding(ErrorReply)))
 
     def fail(self, error: Exception) -> None:
-        """Reply that handling the request met an internal error, which is being handled."""
+        """Reply that handling the request met an internal error, which is being handled.
+
+        Too little memory is none: another request may be answered.
+        """
+        if isinstance(error, MemoryError):
+            self.refuse("busy", "the server has too little memory for this; ask for less, or later")
+            return
         _log.exception("a request on %s met an internal error", self.key)
         self.refuse("internal", f"{type(error).__name__}: {error}")
 
@@ -262,6 +269,9 @@ class RequestHandlers:
     def _receive(self, queryable: zenoh.Queryable[Any], key: str) -> None:
         """Empty the channel at once: a full one would stall the network's threads."""
         for query in queryable:
+            if str(query.key_expr) != key:
+                query.drop()  # unanswered: who means it names it
+                continue
             asker = self._askers.asker(query, self._limits.longest_s)
             request = Request(query, key, self._operations[key].counts, asker, self._askers)
             if request.size > self._limits.max_bytes:
@@ -289,6 +299,7 @@ class RequestHandlers:
             send=lambda: self._queue.send(job),
             problem=lambda: _STOPPING if self._stopping else None,
         )
+        asking_client.set(request.asker.owner.group)
         try:
             request.begin(turns)
             self._operations[request.key].handle(request)

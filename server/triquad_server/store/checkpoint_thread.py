@@ -4,15 +4,22 @@ import logging
 import queue
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
 from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.errors import StoreBaseError, StoreError
+from triquad_server.errors import (
+    LastCheckpointError,
+    MapperStoppedError,
+    StoreBaseError,
+    StoreError,
+)
 from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.store import Store
@@ -21,6 +28,16 @@ from triquad_server.threads import NICENESS
 _log = logging.getLogger(__name__)
 
 _NO_STORE = "the server was started without a store: the map is not kept"
+
+ResultT = TypeVar("ResultT")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is to be run on the thread, and who waits for it."""
+
+    run: Callable[[], Any]
+    result: Future[Any]
 
 
 @dataclass(frozen=True)
@@ -50,7 +67,7 @@ class CheckpointThread:
         self._mapper = mapper
         self._store = store
         self._period_s = period_s
-        self._asked: queue.SimpleQueue[Future[CheckpointInfo]] = queue.SimpleQueue()
+        self._asked: queue.SimpleQueue[_Job] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._wake = threading.Event()
         self.last = last
@@ -78,14 +95,21 @@ class CheckpointThread:
         """Write a last checkpoint, if the map changed since the one before.
 
         Raises:
-            StoreError: it cannot be written.
+            LastCheckpointError: it cannot be written.
         """
         self._stopping.set()
         self._wake.set()
         if self._thread.ident is not None:
             self._thread.join()
-        if self._store is not None:
-            self._write()
+        if self._store is None:
+            return
+        try:
+            self.write()
+        except (StoreError, MapperStoppedError) as error:
+            raise LastCheckpointError(
+                f"the last checkpoint was not written, and what was mapped since {self._kept()} "
+                f"is lost: {error}"
+            ) from error
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
         """A checkpoint of the map as it is now; the last one where nothing changed.
@@ -93,15 +117,35 @@ class CheckpointThread:
         Raises:
             RefusedError: there is no store, or it cannot be written.
         """
-        if self._store is None:
-            raise RefusedError("store", _NO_STORE)
-        asked: Future[CheckpointInfo] = Future()
-        self._asked.put(asked)
-        self._wake.set()
         try:
-            return asked.result()
+            return self.call(self.write)
         except StoreError as error:
             raise RefusedError("store", str(error)) from error
+
+    def call(self, job: Callable[[], ResultT]) -> ResultT:
+        """What ``job`` returns when run on this thread: nothing else is written meanwhile.
+
+        Raises:
+            StoreError: there is no store.
+        """
+        if self._store is None:
+            raise StoreError(_NO_STORE)
+        result: Future[ResultT] = Future()
+        self._asked.put(_Job(job, result))
+        self._wake.set()
+        return result.result()
+
+    def found_damaged(self, name: str) -> None:
+        """Have all of the map written anew, if the newest checkpoint needs the file ``name``."""
+        self._asked.put(_Job(lambda: self._write_anew(name), Future()))
+        self._wake.set()
+
+    def _write_anew(self, name: str) -> None:
+        assert self._store is not None
+        if self._store.forget_base(name):
+            _log.warning("the newest checkpoint needs %s: all of the map is written anew", name)
+            self.last = None
+            self._write_if_changed()
 
     def _run(self) -> None:
         lower_priority(2 * NICENESS)  # mapping comes first, too
@@ -109,36 +153,49 @@ class CheckpointThread:
         while not self._stopping.is_set():
             self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)
             self._wake.clear()
-            self._write_as_asked()
+            self._run_jobs()
             if self._period_s > 0 and time.monotonic() >= due:
                 self._write_if_changed()
                 due = time.monotonic() + self._period_s
             self._fold()
 
-    def _write_as_asked(self) -> None:
+    def _run_jobs(self) -> None:
         while not self._asked.empty():
             asked = self._asked.get()
             try:
-                asked.set_result(self._write())
+                asked.result.set_result(asked.run())
             except Exception as error:
-                asked.set_exception(error)
+                asked.result.set_exception(error)
 
     def _write_if_changed(self) -> None:
         try:
-            self._write()
+            self.write()
         except StoreError:
             return  # the status and the log have it
         except Exception:
             self.error = "an internal error of the server; its log has the details"
             _log.exception("a checkpoint met an internal error")
 
-    def _write(self) -> CheckpointInfo:
+    def write(self) -> CheckpointInfo:
+        """Write what changed; only for what runs on this thread. As :meth:`answer`.
+
+        Raises:
+            StoreError: it cannot be written.
+        """
         assert self._store is not None
         base = self._store.base_epoch
-        changes = self._mapper.call(lambda mapper: mapper.changes_since(base))
+        return self.write_changes(self._changes_since(base))
+
+    def write_changes(self, changes: MapChanges) -> CheckpointInfo:
+        """Write what changed since the last checkpoint; only for what runs on this thread.
+
+        Raises:
+            StoreError: it cannot be written.
+        """
+        assert self._store is not None
         last = self.last
         # The base is the last checkpoint, as long as its files are as they were written.
-        if last is not None and last.epoch == changes.record.epoch == base:
+        if last is not None and last.epoch == changes.record.epoch == self._store.base_epoch:
             return last
         started = time.monotonic()
         try:
@@ -166,7 +223,18 @@ class CheckpointThread:
             return store.write(changes)
         except StoreBaseError as error:
             _log.warning("%s; all of the map is written instead", error)
-            return store.write(self._mapper.call(lambda mapper: mapper.changes_since(None)))
+            return store.write(self._changes_since(None))
+
+    def _changes_since(self, base: int | None) -> MapChanges:
+        """What a checkpoint needs that follows the epoch ``base``.
+
+        Raises:
+            StoreError: memory does not suffice for a copy of it.
+        """
+        try:
+            return self._mapper.call(lambda mapper: mapper.changes_since(base))
+        except MemoryError as error:
+            raise StoreError("the map cannot be copied for a checkpoint: out of memory") from error
 
     def _fold(self) -> None:
         """Put old checkpoints together, where there are many."""
@@ -190,6 +258,9 @@ class CheckpointThread:
         _log.info("folded %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         if self.last is not None and self.last.epoch == info.epoch:
             self.last = info
+
+    def _kept(self) -> str:
+        return "the server started" if self.last is None else f"epoch {self.last.epoch}"
 
     def _interrupted(self) -> bool:
         """Whether something is more urgent than folding, which can be begun again."""

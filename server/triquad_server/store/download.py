@@ -29,7 +29,9 @@ class _MapBytes:
 class MapDownloads:
     """Serialises epochs on request; the files asked for last are kept."""
 
-    def __init__(self, mapper: MapperThread) -> None:
+    def __init__(self, mapper: MapperThread, server: str = "") -> None:
+        """``server`` is a name of this process."""
+        self._server = server
         self._mapper = mapper
         self._lock = threading.Lock()
         self._files: OrderedDict[str, _MapBytes] = OrderedDict()
@@ -57,7 +59,11 @@ class MapDownloads:
         previews = previews_of(record, distances=newest.distances, stamp_ns=stamp_ns)
         written = write_map(record, buffer, stamp_ns=stamp_ns, previews=previews)
         info = MapInfo(
-            epoch=written.epoch, bytes=written.bytes, sha256=written.sha256, chunk_bytes=CHUNK_BYTES
+            epoch=written.epoch,
+            bytes=written.bytes,
+            sha256=written.sha256,
+            chunk_bytes=CHUNK_BYTES,
+            server=self._server,
         )
         with self._lock:
             self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())

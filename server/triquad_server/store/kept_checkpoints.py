@@ -6,7 +6,7 @@ import fcntl
 import logging
 import os
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -18,16 +18,19 @@ from triquad_format.mapfile.checkpoint_folder import (
     newest_of_each,
     open_manifest,
 )
+from triquad_format.mapfile.protections import PROTECTIONS_NAME, Restored
 
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
+from triquad_server.store.protected_checkpoints import ProtectedCheckpoints
+from triquad_server.store.retention import KeptCheckpoint, bytes_of, needed_files
 
 _log = logging.getLogger(__name__)
 
 _LOCK = "lock"
-_UNFINISHED = ".epoch-*.tmp"  # left by a server that was killed while it wrote
-_MIN_KEPT = 2
-"""The newest checkpoints that always stay: should one be damaged, there is another."""
+_UNFINISHED = (".epoch-*.tmp", f".{PROTECTIONS_NAME}.*.tmp")
+"""Left by a server that was killed while it wrote."""
+_MAX_PROTECTED = 1000
 
 
 @dataclass(frozen=True)
@@ -39,14 +42,6 @@ class _FileIdentity:
     size: int  # bytes
     modified_ns: int  # when its contents changed, nanoseconds since 1970
     changed_ns: int  # when anything about it changed: nobody can set this back
-
-
-@dataclass(frozen=True)
-class _Checkpoint:
-    """What decides whether a checkpoint stays."""
-
-    stamp_ns: int  # when it was written, nanoseconds since 1970
-    files: frozenset[str]  # that it consists of
 
 
 class KeptCheckpoints:
@@ -68,7 +63,9 @@ class KeptCheckpoints:
         self._retention = retention
         self._needed: dict[Path, frozenset[str]] = {}  # names of files, by checkpoint
         self._identities: dict[str, _FileIdentity | None] = {}  # of files that were valid
-        _delete(path.glob(_UNFINISHED))
+        self._protected = ProtectedCheckpoints(path, retention.protect_h)
+        for unfinished in _UNFINISHED:
+            _delete(path.glob(unfinished))
 
     def close(self) -> None:
         """Let others have the folder."""
@@ -116,36 +113,73 @@ class KeptCheckpoints:
         try:
             files = [file for file in checkpoint_files(self.path) if file.epoch <= newest]
             sizes = {file.path.name: file.path.stat().st_size for file in files}
-            checkpoints = [
-                _Checkpoint(file.path.stat().st_mtime_ns, self._needed_by(file))
-                for file in newest_of_each(files)
-            ]
+            checkpoints = [self._kept(file) for file in newest_of_each(files)]
         except OSError as error:
             _log.warning("old checkpoints in %s stay: %s", self.path, error)
             return
-        count = self._kept(checkpoints, sizes)
-        needed = frozenset().union(*(checkpoint.files for checkpoint in checkpoints[:count]))
+        self._protected.renew(checkpoint.epoch for checkpoint in checkpoints)
+        needed = needed_files(
+            checkpoints,
+            sizes,
+            self._retention,
+            protected=self._protected.epochs,
+            now_ns=time.time_ns(),
+        )
         old = [file.path for file in files if file.path.name not in needed]
         for path in old:
             self._needed.pop(path, None)
             self._identities.pop(path.name, None)
         _delete(old)
 
-    def _kept(self, checkpoints: Sequence[_Checkpoint], sizes: Mapping[str, int]) -> int:
-        """How many stay of ``checkpoints``, which are sorted, the newest first.
+    @property
+    def restored(self) -> Restored | None:
+        """The last time that the map was taken back."""
+        return self._protected.restored
 
-        ``sizes`` are the bytes of each file; files that several checkpoints need count once.
+    def protect(self, epoch: int, why: str, instead_of: int | None = None) -> None:
+        """Have a checkpoint stay for ``protect_h``, whatever else retention says.
+
+        The time of one that is protected already begins anew. ``instead_of`` is one that may go
+        for it.
+
+        Raises:
+            StoreError: too much is protected already.
+            OSError: this cannot be recorded, and does not count.
         """
-        now_ns, settings = time.time_ns(), self._retention
-        needed: set[str] = set()
-        for number, checkpoint in enumerate(checkpoints):
-            needed |= checkpoint.files
-            too_many = settings.keep <= number
-            too_old = 0 < settings.keep_age_s * 1e9 < now_ns - checkpoint.stamp_ns
-            too_large = 0 < settings.keep_bytes < sum(sizes.get(name, 0) for name in needed)
-            if number >= _MIN_KEPT and (too_many or too_old or too_large):
-                return number
-        return len(checkpoints)
+        already = self._protected.epochs
+        if epoch not in already:
+            self._check_protected(epoch, already - {instead_of})
+        self._protected.add(epoch, why)
+        if instead_of in already:
+            self._protected.remove(instead_of)
+
+    def protect_restored(self, restored: Restored, why: str) -> None:
+        """Record that the map was taken back to an older checkpoint; the copy stays, too.
+
+        Raises:
+            OSError: this cannot be recorded.
+        """
+        self._protected.set_restored(restored, why)
+
+    def _check_protected(self, epoch: int, others: frozenset[int]) -> None:
+        """Raise unless there is room for another protected checkpoint; the first always has."""
+        limit = self._retention.protect_bytes
+        files = [f for f in checkpoint_files(self.path) if f.epoch == epoch or f.epoch in others]
+        names = frozenset().union(*(self._needed_by(file) for file in newest_of_each(files)))
+        sizes = {name: path.stat().st_size for name in names if (path := self.path / name).exists()}
+        used = bytes_of(names, sizes)
+        too_large = 0 < limit < used
+        if others and (too_large or len(others) >= _MAX_PROTECTED):
+            raise StoreError(
+                f"{len(others)} checkpoints are protected already, with this one {used:,} bytes, "
+                f"and store.protect_bytes = {limit:,} (and {_MAX_PROTECTED:,} checkpoints) is the "
+                f"limit; the first becomes free in {self._protected.first_ends_h:.1f} h: wait, "
+                "raise the limit, or lower store.protect_h"
+            )
+
+    def _kept(self, file: CheckpointFile) -> KeptCheckpoint:
+        stamp_ns = file.path.stat().st_mtime_ns
+        return KeptCheckpoint(file.epoch, stamp_ns, files=self._needed_by(file))
 
     def _needed_by(self, file: CheckpointFile) -> frozenset[str]:
         """Names of the files that a checkpoint consists of."""

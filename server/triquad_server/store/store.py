@@ -5,21 +5,27 @@ and then all is folded into one file. How far back they reach, the settings deci
 """
 
 import dataclasses
+import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_name, open_manifest
+from triquad_format.mapfile.checkpoint_folder import (
+    checkpoint_file,
+    checkpoint_files,
+    checkpoint_name,
+    checkpoint_of,
+    open_manifest,
+)
 from triquad_format.mapfile.index import OtherFiles, files_in
-from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
+from triquad_format.mapfile.manifest import Entry, FileRef
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_region
-from triquad_format.mapfile.parts.part import MAP, Part, PartKey
+from triquad_format.mapfile.parts.part import MAP, Part
+from triquad_format.mapfile.protections import Restored
 from triquad_format.mapfile.writer import WrittenMap, write_parts
-from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
 from triquad_format.wire.messages import CheckpointInfo
 
@@ -28,67 +34,17 @@ from triquad_server.mapping.mapper import MapChanges
 from triquad_server.mesh.preview import preview_part, preview_schema
 from triquad_server.settings import StoreSettings
 from triquad_server.store.kept_checkpoints import KeptCheckpoints
-from triquad_server.store.restore import ValidCheckpoint, newest_valid
+from triquad_server.store.known_parts import KnownParts, own_bytes
+from triquad_server.store.restore import (
+    ValidCheckpoint,
+    check_countable,
+    newest_valid,
+    valid_checkpoint,
+)
+
+_log = logging.getLogger(__name__)
 
 _FEATURE_DTYPE = "<f2"
-_MAX_FILES = 8
-_MAX_STORED_RATIO = 1.5  # of the bytes that are needed
-_LARGE_SHARE = 0.5
-
-
-@dataclass(frozen=True)
-class KnownParts:
-    """The parts of the newest checkpoint, wherever they lie: what need not be written again.
-
-    Each entry names the file with the part, as any later file sees it.
-    """
-
-    facts: MapFacts
-    stamp_ns: int
-    entries: Mapping[PartKey, Entry]
-    stored: Mapping[FileRef, int]  # bytes of the parts in each of its files, needed or not
-
-    @classmethod
-    def after(
-        cls, manifest: Manifest, file: FileRef, stored_before: Mapping[FileRef, int]
-    ) -> "KnownParts":
-        """What is known once ``file`` with this manifest is on the disk.
-
-        ``stored_before`` gives the bytes of the parts in each of the other files.
-        """
-        stored = {other: stored_before.get(other, 0) for other in manifest.files}
-        stored[file] = _own_bytes(manifest)
-        return cls(
-            manifest.facts, manifest.stamp_ns, entries=manifest.elsewhere(file), stored=stored
-        )
-
-    @property
-    def files(self) -> frozenset[str]:
-        """Names of all its files."""
-        return frozenset(file.name for file in self.stored)
-
-    @property
-    def worth_folding(self) -> bool:
-        """Whether the files are many, or a third of their bytes is no longer needed."""
-        needed = sum(entry.size for entry in self.entries.values())
-        stored = sum(self.stored.values())
-        return len(self.stored) > _MAX_FILES or stored > _MAX_STORED_RATIO * needed
-
-    def of_region(self, index: RegionIndex) -> list[Entry]:
-        """The parts of a region, in their order."""
-        return [
-            entry for key, entry in self.entries.items() if key.region == index and key.topic != MAP
-        ]
-
-    def is_small(self, regions: Collection[RegionIndex]) -> bool:
-        """Whether these regions take so little that the others are better not written again."""
-        sizes = [(key.region, e.size) for key, e in self.entries.items() if key.topic != MAP]
-        changed = sum(size for region, size in sizes if region in regions)
-        return changed < _LARGE_SHARE * sum(size for _, size in sizes)
-
-    def stored_here(self) -> dict[PartKey, Entry]:
-        """The entries as a file lists them that holds all parts itself."""
-        return {key: dataclasses.replace(e, file=None) for key, e in self.entries.items()}
 
 
 class Store:
@@ -127,10 +83,7 @@ class Store:
         """
         newest = newest_valid(self.folder)
         if newest is not None:
-            manifest = newest.file.manifest
-            own = FileRef(newest.path.name, newest.file.manifest_sha256)
-            stored = {other: self._stored_bytes(other) for other in manifest.files}
-            self._known = KnownParts.after(manifest, own, stored)
+            self._known = self._known_of(newest)
             self._files.record(self._known.files)
         return newest
 
@@ -161,6 +114,13 @@ class Store:
         self._set_newest(path, written, {} if known is None else known.stored)
         return info
 
+    def forget_base(self, name: str) -> bool:
+        """Write all of the map next time, if the newest checkpoint needs the file ``name``."""
+        if self._known is None or name not in self._known.files:
+            return False
+        self._known = None
+        return True
+
     def fold(self, stopping: Callable[[], bool]) -> CheckpointInfo | None:
         """Put the newest checkpoint into one file, where that pays; the answer tells of it.
 
@@ -173,21 +133,83 @@ class Store:
         known = self._known
         if known is None or not known.worth_folding:
             return None
-        path = self.folder / checkpoint_name(known.facts.epoch, complete=True)
         try:
-            with self._writing(f"{path} cannot be folded") as others:
-                parts = _abortable(stopping, _copied_parts(known.entries.values(), others))
-                written = write_parts(
-                    path,
-                    known.facts,
-                    parts,
-                    stamp_ns=known.stamp_ns,
-                    known=known.stored_here(),
-                    preview_schema=preview_schema(),
-                )
-                info = _info(path, written)
+            return self._write_whole(known, "folded", stopping)
         except _StoppedError:
             return None
+
+    def protect(self, epoch: int, why: str, instead_of: int | None = None) -> None:
+        """Have a checkpoint stay for ``protect_h``, whatever else retention says.
+
+        ``instead_of`` is another that need not stay any more.
+
+        Raises:
+            StoreError: too much is protected already, or this cannot be recorded.
+        """
+        try:
+            self._files.protect(epoch, why, instead_of)
+        except OSError as error:
+            raise StoreError(f"epoch {epoch} in {self.folder} cannot be kept: {error}") from error
+
+    def restore(self, epoch: int) -> None:
+        """Take the map back to an older checkpoint, which is written anew as the newest.
+
+        What was the newest so far stays for ``protect_h``, as does the one that is written. A
+        server that is started again with the same ``epoch`` does not lose what was learnt since:
+        to take the map back there once more changes nothing.
+
+        Raises:
+            StoreError: there is no such checkpoint, it is not valid, or it cannot be written anew.
+        """
+        done = self._files.restored
+        if done is not None and done.epoch == epoch:
+            _log.warning(
+                "the map was taken back to epoch %d before, as epoch %d, and goes on from its "
+                "newest checkpoint; to go back there again, use --restore %d",
+                *(epoch, done.as_epoch, done.as_epoch),
+            )
+            return
+        try:
+            newest = checkpoint_files(self.folder)[:1]
+            checkpoint = checkpoint_of(self.folder, epoch)
+            if checkpoint.epoch == newest[0].epoch:
+                return
+            number = newest[0].epoch + 1
+            check_countable(newest[0].path, number)
+            known = self._known_of(valid_checkpoint(checkpoint))
+            self._files.protect(newest[0].epoch, f"before epoch {epoch} was restored")
+            facts = dataclasses.replace(known.facts, epoch=number)
+            anew = dataclasses.replace(known, facts=facts, stamp_ns=stamp_now_ns())
+            self._write_whole(anew, "restored", stopping=lambda: False)
+            self._files.protect_restored(Restored(epoch, number), f"epoch {epoch}, restored")
+        except (MapFileError, OSError) as error:
+            raise StoreError(f"epoch {epoch} cannot be restored: {error}") from error
+        _log.warning(
+            "the map is that of epoch %d again, as epoch %d; what it was is kept as epoch %d",
+            *(epoch, number, newest[0].epoch),
+        )
+
+    def _write_whole(
+        self, known: KnownParts, verb: str, stopping: Callable[[], bool]
+    ) -> CheckpointInfo:
+        """Write known parts into one file, as the newest checkpoint.
+
+        Raises:
+            _StoppedError: ``stopping()`` said so.
+            StoreError: as of :meth:`fold`.
+        """
+        path = self.folder / checkpoint_name(known.facts.epoch, complete=True)
+        with self._writing(f"{path} cannot be {verb}") as others:
+            parts = _abortable(stopping, _copied_parts(known.entries.values(), others))
+            written = write_parts(
+                path,
+                known.facts,
+                parts,
+                stamp_ns=known.stamp_ns,
+                known=known.stored_here(),
+                preview_schema=preview_schema(),
+            )
+            info = _info(path, written)
         self._set_newest(path, written, {})
         return info
 
@@ -213,15 +235,16 @@ class Store:
         self._files.add(path, self._known.files)
         self._files.delete_old(self._known.facts.epoch)
 
+    def _known_of(self, checkpoint: ValidCheckpoint) -> KnownParts:
+        manifest = checkpoint.file.manifest
+        own = FileRef(checkpoint.path.name, checkpoint.file.manifest_sha256)
+        stored = {other: self._stored_bytes(other) for other in manifest.files}
+        return KnownParts.after(manifest, own, stored)
+
     def _stored_bytes(self, file: FileRef) -> int:
         """Bytes of the parts in a file, needed or not."""
         checkpoint = checkpoint_file(self.folder / file.name)
-        return 0 if checkpoint is None else _own_bytes(open_manifest(checkpoint))
-
-
-def _own_bytes(manifest: Manifest) -> int:
-    """Bytes of the parts in the manifest's own file."""
-    return sum(entry.size for entry in manifest.own)
+        return 0 if checkpoint is None else own_bytes(open_manifest(checkpoint))
 
 
 def _info(path: Path, written: WrittenMap) -> CheckpointInfo:

@@ -66,6 +66,33 @@ def test_time_that_runs_backwards_is_refused_per_session():
     assert ledger.arrive(servers.scan(0, stamp_ns=1, session=8)) is None
 
 
+def test_a_clock_that_was_far_ahead_or_is_set_back_costs_one_scan():
+    ledger = SourceLedger()
+    arrive_and_take(ledger, 0)
+    assert ledger.arrive(servers.scan(1, stamp_ns=2**62)) is None
+    assert ledger.arrive(servers.scan(2)) == "time_backwards"
+    assert ledger.arrive(servers.scan(3)) is None
+
+
+def test_a_leap_that_no_loss_explains_changes_nothing_for_the_scans_that_follow():
+    ledger = SourceLedger()
+    arrive_and_take(ledger, 0)
+    ledger.publish()
+    assert ledger.arrive(servers.scan(2**40)) == "sequence_ahead"
+    assert ledger.give_up(*SOURCE, 2**40).lost == 2**40
+    assert not ledger.arrived(*SOURCE, 1)
+    assert ledger.arrive(servers.scan(900)) is None
+    assert ledger.lost() == {"lidar": 899}
+
+
+def test_sequences_may_leap_by_what_a_long_silence_explains(monkeypatch):
+    ledger = SourceLedger()
+    arrive_and_take(ledger, 0)
+    now = scan_queue.time.monotonic()
+    monkeypatch.setattr(scan_queue.time, "monotonic", lambda: now + 3600)
+    assert ledger.arrive(servers.scan(3_000_000)) is None
+
+
 def test_sequences_out_of_range_or_order_are_refused_and_change_nothing():
     ledger = SourceLedger()
     for sequence in (-1, 2**48, 2**63 - 1):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support import servers
 from support.small_world import settings, world
+from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan_queue import ScanQueue
@@ -97,4 +98,20 @@ def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Pat
                 info = checkpoints.answer(CheckpointRequest())
                 assert info.epoch <= before + 1
                 assert thread.epochs.newest.number == info.epoch
+            thread.rest()
+
+
+def test_a_checkpoint_for_which_there_is_no_memory_is_refused_and_the_next_one_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path, "test", StoreSettings())
+    with closing(store), running(learning_mapper()) as thread:
+        checkpoints = CheckpointThread(thread, store, 0.0, None)
+        checkpoints.start()
+        with closing(checkpoints):
+            with monkeypatch.context() as patched:
+                patched.setattr(Mapper, "changes_since", lambda *_: bytes(2**60))
+                with pytest.raises(RefusedError, match="store: .* out of memory"):
+                    checkpoints.answer(CheckpointRequest())
+            assert checkpoints.answer(CheckpointRequest()).epoch == thread.epochs.newest.number
             thread.rest()

@@ -40,6 +40,7 @@ _USUAL_ON_STREET = (
     "align",
     "offline",
     "metrics",
+    "security",
     "neighbours",
 )
 _ON_STREET = (*_USUAL_ON_STREET, "tradeoffs", "viewer")
@@ -93,6 +94,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
     from triquad_tools.benchmarks.neighbours import measure_neighbours
     from triquad_tools.benchmarks.planners import measure_planners
     from triquad_tools.benchmarks.scraping import measure_scraping
+    from triquad_tools.benchmarks.security import measure_security
     from triquad_tools.benchmarks.server import measure_server
     from triquad_tools.benchmarks.store import measure_store
     from triquad_tools.benchmarks.street import bench_street
@@ -109,6 +111,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
         "offline": measure_offline,
         "tradeoffs": measure_tradeoffs,
         "metrics": measure_scraping,
+        "security": measure_security,
         "neighbours": measure_neighbours,
         "viewer": _viewer,
     }
@@ -204,10 +207,10 @@ _DESCRIPTION = (
     "Measure triquad on this machine, on a simulated street: a server under a "
     "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
     "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
-    "opened offline, a server whose metrics are read, clients that want too much, open air, "
-    "things that move, a lidar that moves while it turns, clouds of ROS 2, rooms, tables and "
-    "streets with the presets that are for them, and, if asked for, the viewer in a browser and "
-    "the ablation. Takes over half an hour; nothing else should run meanwhile."
+    "opened offline, a server whose metrics are read, one with roles, clients that want too much, "
+    "open air, things that move, a lidar that moves while it turns, clouds of ROS 2, rooms, tables "
+    "and streets with the presets that are for them, and, if asked for, the viewer in a browser "
+    "and the ablation. Takes over half an hour; nothing else should run meanwhile."
 )
 
 

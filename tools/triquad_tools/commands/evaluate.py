@@ -22,6 +22,7 @@ from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import Row, json_text, print_rows
+from triquad_tools.console.server_arguments import add_config
 from triquad_tools.evaluation.map_scores import (
     WithheldAnswer,
     WithheldScores,
@@ -44,7 +45,7 @@ from triquad_tools.evaluation.metrics import (
 from triquad_tools.evaluation.open_map import newest_epoch, open_map
 from triquad_tools.evaluation.score_rows import TRUSTED, mesh_rows, street_rows, withheld_rows
 from triquad_tools.mapfiles.meshfile import read_mesh
-from triquad_tools.mapfiles.source import is_endpoint
+from triquad_tools.mapfiles.source import Access, is_endpoint
 from triquad_tools.recordings.cloud import is_withheld, merged, world_points
 from triquad_tools.recordings.folders.kitti import read_kitti_folder
 from triquad_tools.simulation.street import street_drive
@@ -102,7 +103,7 @@ def _on_street(options: argparse.Namespace) -> Results:
     drive = street_drive(options.street, options.scans, options.step)
     probes = street_probes(drive, np.random.default_rng(_SEED))
     truth = drive_truth(drive, STREET_SETTINGS)
-    with open_map(options.target, options.map) as opened:
+    with open_map(options.target, Access(options.map, options.config)) as opened:
         street = score_street(opened.query_sdf, probes)
         mesh = opened.mesh(scored_box(truth.points, STREET_SETTINGS))
     name = f"{_map_name(options)}, epoch {mesh.epoch}"
@@ -148,7 +149,7 @@ def _at_withheld(options: argparse.Namespace) -> Results:
             "use a smaller number"
         )
     limits = (options.range_min, options.range_max)
-    with open_map(options.target, options.map) as opened:
+    with open_map(options.target, Access(options.map, options.config)) as opened:
         clouds = (world_points(scan, *limits) for scan in folder.read(indices))
         answers = ask_withheld(opened.query_sdf, clouds)
         if options.plot is None:
@@ -234,6 +235,7 @@ def _add_map(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("target", metavar="MAP", help="map file, or endpoint of a server (tcp/HOST:PORT)")
     add("--map", default="default", metavar="NAME", help="map of the server (default: default)")
+    add_config(parser)
     truth = parser.add_mutually_exclusive_group(required=True)
     truth.add_argument(
         "--withheld",

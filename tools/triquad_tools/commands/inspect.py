@@ -15,10 +15,12 @@ from triquad_tools.console.command import FAILED, OK, ToolError, complain, refus
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
+from triquad_tools.console.server_arguments import DEFAULT_MAP, add_config
 from triquad_tools.mapfiles.checks import FailedCheckError, verify
 from triquad_tools.mapfiles.diff import compare, difference, print_diff
 from triquad_tools.mapfiles.object_changes import object_changes, print_objects
 from triquad_tools.mapfiles.source import (
+    Access,
     MissingFilesError,
     chosen_file,
     is_endpoint,
@@ -34,7 +36,6 @@ _TILE_M = 6.4
 _LEAST_TILE_M = 0.1
 _ROWS = 20
 _CELL_M = 0.1
-_MAP = "default"  # of a server
 _PICTURE_SUFFIX = ".png"
 
 
@@ -62,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
         "server, such as tcp/127.0.0.1:7447, whose map is fetched",
     )
     add("--map", metavar="NAME", help="of the server (default: default)")
+    add_config(parser)
     add(
         "--at",
         metavar="EPOCH_OR_TIME",
@@ -120,8 +122,9 @@ def _check_usage(options: argparse.Namespace) -> None:
         "--slice needs --plot OUT.png": sliced and not plot,
         "--slice excludes --log, --diff, --verify and --json": sliced and other,
         "--box and --cell go with --slice": (options.box or options.cell) and not sliced,
-        "--map is of a server, and none is given": (
-            options.map and not any(is_endpoint(str(path)) for path in options.files)
+        "--map and --config are of a server, and none is given": (
+            (options.map or options.config)
+            and not any(is_endpoint(str(path)) for path in options.files)
         ),
         "--plot is for map files, not for --log": options.log and plot,
         f"--plot {plot}: its name must end in {_PICTURE_SUFFIX}": (
@@ -144,10 +147,14 @@ def _inspect(options: argparse.Namespace) -> int:
     return _diff(options) if options.diff else _show(options)
 
 
+def _access(options: argparse.Namespace) -> Access:
+    return Access(options.map or DEFAULT_MAP, options.config)
+
+
 def _show(options: argparse.Namespace) -> int:
     """One map."""
     target = str(options.files[0])
-    with map_file(target, options.map or _MAP, options.at) as path:
+    with map_file(target, _access(options), options.at) as path:
         name = target if is_endpoint(target) else str(path)
         file = read_whole(path)
         summary = summarise(file)
@@ -172,7 +179,7 @@ def _slice(options: argparse.Namespace) -> int:
     target = str(options.files[0])
     if not is_endpoint(target):
         target = str(chosen_file(Path(target), options.at))
-    draw_slice(target, options.map or _MAP, wanted, path=options.plot)
+    draw_slice(target, _access(options), wanted, path=options.plot)
     return OK
 
 
@@ -198,7 +205,7 @@ def _diff(options: argparse.Namespace) -> int:
 
     files, titles = [], []
     for letter, target in zip("AB", map(str, options.files), strict=True):
-        with map_file(target, options.map or _MAP) as path:
+        with map_file(target, _access(options)) as path:
             files.append(read_whole(path))
             name = target if is_endpoint(target) else str(path)
         titles.append(f"{letter}  {_title(name, files[-1])}")

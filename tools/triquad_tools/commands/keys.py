@@ -10,6 +10,7 @@ from triquad_format.wire.roles import Holder, Role
 
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import OK, run
+from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 from triquad_tools.credentials.key_folder import LISTENING, KeyFolder
 
@@ -19,8 +20,8 @@ _LAST_DOMAIN = 232  # of ROS 2
 _ROLES = {
     Role.VIEWER: "may question the map and follow it",
     Role.ROBOT: "may publish scans, as the sources named, and what a viewer may",
-    Role.ADMIN: "may reset, restore and pin the map and have checkpoints written, and what a "
-    "viewer may; with --source, publish scans too",
+    Role.ADMIN: "may reset the map and have checkpoints written, and what a viewer may; with "
+    "--source, publish scans too",
 }
 _RESTART = "start servers and routers anew, for they read their file when they start"
 
@@ -40,7 +41,7 @@ def _init(options: argparse.Namespace) -> int:
     folder = KeyFolder.create(options.folder, options.host, options.days)
     for holder in first:
         folder.add(holder, options.days)
-    print(
+    print_line(
         f"{options.folder} is ready; keep it to yourself, {options.folder / 'authority'} above all."
         f"\n  triquad-server --config {options.folder / 'server.json5'}\n"
         f"  triquad-top --config {options.folder / 'viewer.json5'}"
@@ -52,21 +53,21 @@ def _add(options: argparse.Namespace) -> int:
     sources = tuple(dict.fromkeys(options.source or ()))
     holder = Holder(options.name, options.role, sources, options.ros2_domain)
     file = KeyFolder(options.folder).add(holder, options.days)
-    print(f"{file}: move it to where {options.name} runs; {_RESTART}")
+    print_line(f"{file}: move it to where {options.name} runs; {_RESTART}")
     return OK
 
 
 def _renew(options: argparse.Namespace) -> int:
     folder = KeyFolder(options.folder)
     for name in options.name:
-        print(folder.renew(name, options.days))
-    print("the old ones are valid until they expire; put the new files in their place")
+        print_line(str(folder.renew(name, options.days)))
+    print_line("the old ones are valid until they expire; put the new files in their place")
     return OK
 
 
 def _remove(options: argparse.Namespace) -> int:
     KeyFolder(options.folder).remove(options.name)
-    print(f"{options.name} has no role any more; {_RESTART}")
+    print_line(f"{options.name} has no role any more; {_RESTART}")
     return OK
 
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 
 from triquad_client import Client, FlushReport, connect
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import Speed, progress
+from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
 from triquad_tools.recordings.arguments import add_recording, flags_of, options_of
 from triquad_tools.recordings.listing import print_contents
 from triquad_tools.recordings.opening import open_recording
@@ -78,7 +78,7 @@ def _replay(options: argparse.Namespace) -> int:
         mappable = print_contents(options.recording, recording, flags_of(options))
         return OK if mappable else FAILED
     selection = open_selected(options)
-    with connect(options.connect, options.map) as client:
+    with connect(options.connect, options.map or DEFAULT_MAP, config=options.config) as client:
         report = _publish_all(client, selection, options)
         print_line(_summary(report))
         if options.settle:
@@ -193,13 +193,7 @@ def _parser() -> argparse.ArgumentParser:
     add_recording(parser)
     add = parser.add_argument
     add("--list", action="store_true", help="tell what the recording holds, and publish nothing")
-    add(
-        "--connect",
-        default=DEFAULT_ENDPOINT,
-        metavar="ENDPOINT",
-        help=f"of the server (default: {DEFAULT_ENDPOINT})",
-    )
-    add("--map", default="default", metavar="NAME", help="default: default")
+    add_server(parser)
     add("--source", metavar="NAME", help="publish as this sensor (default: as the recording says)")
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(

@@ -4,15 +4,14 @@ import argparse
 import time
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
 from triquad_client import connect
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import OK, run
 from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.lines import print_line
+from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, server_name
 from triquad_tools.top.page import Page
 from triquad_tools.top.report import json_line
 from triquad_tools.top.screen import is_screen, print_page, show
@@ -29,8 +28,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _top(options: argparse.Namespace) -> int:
-    target = Target(options.connect, options.map)
-    reached = connect(options.connect, options.map, timeout_s=_TIMEOUT_S, config=options.config)
+    name = options.map or DEFAULT_MAP
+    target = Target(server_name(options), name)
+    reached = connect(options.connect, name, timeout_s=_TIMEOUT_S, config=options.config)
     with sigterm_interrupts(), reached as client:
         watch = Watch(client, options.interval)
         if options.once or not (options.json or is_screen()):
@@ -62,16 +62,8 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit status: 0 done, 1 there is no such server or it failed, 2 wrong usage, "
         "130 ended by Ctrl-C.",
     )
+    add_server(parser)
     add = parser.add_argument
-    add(
-        "--connect",
-        "-e",
-        default=DEFAULT_ENDPOINT,
-        metavar="ENDPOINT",
-        help=f"of the server (default: {DEFAULT_ENDPOINT})",
-    )
-    add("--map", default="default", metavar="NAME", help="default: default")
-    add("--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5): TLS, credentials")
     add("--interval", type=_interval, default=1.0, metavar="S", help="seconds (default: 1)")
     add("--once", action="store_true", help="print one page as plain text, after one interval")
     add("--json", action="store_true", help="print an object of JSON a line, one each interval")

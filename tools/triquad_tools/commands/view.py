@@ -8,12 +8,12 @@ from functools import partial
 from pathlib import Path
 
 import triquad_client
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 from triquad_tools.console.arguments import add_version, port
 from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
+from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, server_name
 from triquad_tools.viewer.sources.file_source import FileSource
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.history_source import newest_of
@@ -33,7 +33,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _view(options: argparse.Namespace) -> int:
     _check_usage(options)
-    with _shown(options) as shown, closing(Viewer(shown, options.host, options.port)) as viewer:
+    with (
+        _shown(options) as shown,
+        closing(
+            Viewer(shown, options.host, options.port, allowed_hosts=options.allow_host)
+        ) as viewer,
+    ):
         print_line(f"open {viewer.url} in a browser; Ctrl-C ends it")
         threading.Event().wait()
     return OK
@@ -50,9 +55,9 @@ def _check_usage(options: argparse.Namespace) -> None:
 @contextmanager
 def _shown(options: argparse.Namespace) -> Iterator[MapSource | History]:
     if options.file is None:
-        endpoint, name = options.connect or DEFAULT_ENDPOINT, options.map or "default"
-        with triquad_client.connect(endpoint, name, config=options.config) as client:
-            yield LiveSource(client, endpoint)
+        name = options.map or DEFAULT_MAP
+        with triquad_client.connect(options.connect, name, config=options.config) as client:
+            yield LiveSource(client, server_name(options))
         return
     with closing(OpenMaps()) as maps:
         yield _store(options.file, maps) if options.file.is_dir() else _file(options.file, maps)
@@ -93,10 +98,16 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE_OR_STORE",
         help="a map file, or a store with its history, to be shown without a server",
     )
-    add("--connect", metavar="ENDPOINT", help=f"of the server (default: {DEFAULT_ENDPOINT})")
-    add("--map", metavar="NAME", help="of the server's map (default: default)")
-    add("--config", metavar="FILE", help="Zenoh configuration (JSON5), for TLS or credentials")
+    add_server(parser)
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="to serve the page at")
+    add(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also answer where the page is asked for under this name, as behind a proxy; repeat "
+        "for more (addresses and the machine's host name are)",
+    )
     add("--port", type=port, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
     add_version(parser)
     return parser

@@ -68,8 +68,9 @@ def _in_words(error: OSError) -> str:
 
 
 def complain(command: str, message: object, status: int) -> int:
-    """Print a line on standard error; returns ``status``."""
-    print_remark(f"{command}: {message}")
+    """Print a line on standard error, or several of which it begins one; returns ``status``."""
+    # Indented: a name with a line break in it cannot look like another message.
+    print_remark(f"{command}: {message}".replace("\n", "\n  "))
     return status
 
 

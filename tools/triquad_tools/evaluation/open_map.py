@@ -3,7 +3,7 @@
 import triquad_client
 from triquad_client import Client, OfflineMap
 
-from triquad_tools.mapfiles.source import is_endpoint
+from triquad_tools.mapfiles.source import Access, is_endpoint
 
 
 def newest_epoch(opened: Client | OfflineMap) -> int:
@@ -15,8 +15,8 @@ def newest_epoch(opened: Client | OfflineMap) -> int:
     return opened.epoch if isinstance(opened, OfflineMap) else opened.status().epoch
 
 
-def open_map(target: str, map_name: str) -> Client | OfflineMap:
-    """The map in the file ``target``, or ``map_name`` of the server at the endpoint ``target``.
+def open_map(target: str, access: Access) -> Client | OfflineMap:
+    """The map in the file ``target``, or that of the server at the endpoint ``target``.
 
     Raises:
         TriquadError: no server there has the map.
@@ -24,5 +24,5 @@ def open_map(target: str, map_name: str) -> Client | OfflineMap:
         OSError: it cannot be read at all.
     """
     if is_endpoint(target):
-        return triquad_client.connect(target, map_name)
+        return triquad_client.connect(target, access.map_name, config=access.config)
     return triquad_client.open_map(target)

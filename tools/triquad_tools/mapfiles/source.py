@@ -27,6 +27,14 @@ Box = Doubles
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
 
 
+@dataclass(frozen=True)
+class Access:
+    """What is asked for, and with what, where a target is a server."""
+
+    map_name: str
+    config: Path | None = None  # of Zenoh, with credentials
+
+
 class MissingFilesError(ToolError):
     """A map file whose parts lie in files that are not there."""
 
@@ -67,7 +75,7 @@ def is_endpoint(target: str) -> bool:
 
 
 @contextmanager
-def map_file(target: str, map_name: str, when: str | None = None) -> Iterator[Path]:
+def map_file(target: str, access: Access, when: str | None = None) -> Iterator[Path]:
     """A map as a file: ``target`` itself, a checkpoint of that folder, or a server's newest epoch.
 
     What a server has is downloaded, with its training state, and deleted afterwards. ``when`` says
@@ -88,7 +96,8 @@ def map_file(target: str, map_name: str, when: str | None = None) -> Iterator[Pa
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.triquad"
-        with progress("downloading"), triquad_client.connect(target, map_name) as client:
+        connected = triquad_client.connect(target, access.map_name, config=access.config)
+        with progress("downloading"), connected as client:
             client.download_map(path, training=True)
         yield path
 

@@ -1,5 +1,6 @@
 """The history of a map: the checkpoints of a folder, as their manifests tell of them."""
 
+import dataclasses
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from triquad_format.mapfile.index import FileBytes, MapIndex
 from triquad_format.mapfile.manifest import FileRef, Manifest
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.parts.part import REGION_TOPICS
+from triquad_format.mapfile.protections import read_protections
 from triquad_format.records.field_settings import RegionIndex
 
 from triquad_tools.console.lines import print_line
@@ -42,6 +44,7 @@ class LoggedCheckpoint:
     bytes: int
     parts: LoggedParts | None  # None: it has no index, or does not open
     problem: str | None  # why it does not open
+    protected: str | None = None  # why retention keeps it for a while, whatever its limits
 
 
 @dataclass(frozen=True)
@@ -65,12 +68,17 @@ def read_log(store: Path) -> StoreLog:
     Parts are not read: only indices and manifests are, of the checkpoints and of what they need.
 
     Raises:
-        MapFileError: there are no checkpoints, or those of several maps.
+        MapFileError: there are no checkpoints, or those of several maps; or the list of those that
+            are protected is damaged.
         OSError: the folder cannot be read.
     """
     folder = map_folder(store)
     indices = _Indices(folder)
-    checkpoints = tuple(_logged(file, indices) for file in checkpoint_files(folder))
+    protected = {one.epoch: one.why for one in read_protections(folder).checkpoints}
+    checkpoints = tuple(
+        dataclasses.replace(_logged(file, indices), protected=protected.get(file.epoch))
+        for file in checkpoint_files(folder)
+    )
     return StoreLog(
         str(folder),
         bytes=sum(checkpoint.bytes for checkpoint in checkpoints),
@@ -87,6 +95,8 @@ def print_log(log: StoreLog) -> None:
     for checkpoint in log.checkpoints:
         if checkpoint.problem is not None:
             print_line(f"  {checkpoint.file}: {checkpoint.problem}")
+        if checkpoint.protected is not None:
+            print_line(f"  {checkpoint.file}: protected, {checkpoint.protected}")
     for name in log.set_aside:
         print_line(f"  {name}: set aside as damaged; triquad-pack --recover saves what is intact")
 

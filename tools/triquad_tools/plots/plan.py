@@ -139,7 +139,7 @@ def save_sheet(path: Path, title: str, grid: PlanGrid, plans: Sequence[Plan]) ->
     height = shape[0] * (inches * grid.rows + _ROOM_IN[1])
     with rc_context({"font.size": _LETTERS_PT}):
         figure = Figure((width, height), _DPI, layout="constrained")
-        figure.suptitle(title, x=0.01, ha="left")
+        figure.suptitle(title, x=0.01, ha="left", parse_math=False)
         drawn = []
         for plan, part in zip(plans, figure.subfigures(*shape, squeeze=False).flat, strict=True):
             drawn.append(axes := part.subplots())

@@ -13,7 +13,7 @@ from triquad_format.records.seen_space import evidence_bounds
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.evaluation.open_map import open_map
-from triquad_tools.mapfiles.source import is_endpoint, read_whole
+from triquad_tools.mapfiles.source import Access, is_endpoint, read_whole
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
@@ -41,7 +41,7 @@ class SliceOptions:
     cell_m: float
 
 
-def draw_slice(target: str, map_name: str, options: SliceOptions, path: Path) -> None:
+def draw_slice(target: str, access: Access, options: SliceOptions, path: Path) -> None:
     """Draw a slice of the map in the file ``target``, or of a server at that endpoint.
 
     Raises:
@@ -53,9 +53,9 @@ def draw_slice(target: str, map_name: str, options: SliceOptions, path: Path) ->
     west, south, east, north = options.box_m or _seen_box(target)
     height = options.height_m
     bounds = ((west, south, height), (east, north, height))
-    with open_map(target, map_name) as opened:
+    with open_map(target, access) as opened:
         answer = opened.query_grid(bounds, options.cell_m, _MAX_DISTANCE_M)
-        name = opened.name if isinstance(opened, OfflineMap) else map_name
+        name = opened.name if isinstance(opened, OfflineMap) else access.map_name
     shape = answer.shape
     grid = PlanGrid(shape.corner[:2], shape.cell_m, rows=shape.counts[1], columns=shape.counts[0])
     plans = [

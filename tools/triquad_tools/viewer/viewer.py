@@ -4,6 +4,7 @@ import io
 import socket
 import threading
 import warnings
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 
 import viser
@@ -12,6 +13,7 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.browser_session import BrowserSession
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.map_source import MapSource
+from triquad_tools.viewer.visitors import Visitors, serving_only
 
 DEFAULT_PORT = 8080
 
@@ -30,8 +32,18 @@ class _OwnServer(viser.ViserServer):
 class Viewer:
     """Serves a page that shows a map, to several browsers, until it is closed."""
 
-    def __init__(self, shown: MapSource | History, host: str, port: int) -> None:
+    def __init__(
+        self,
+        shown: MapSource | History,
+        host: str,
+        port: int,
+        *,
+        allowed_hosts: Sequence[str] = (),
+    ) -> None:
         """Serve at an address of this machine, at ``port`` or the next one that is free.
+
+        Pages of other servers cannot use it, but for those of ``allowed_hosts``: names under which
+        this machine is reached beyond its host name and its addresses.
 
         Raises:
             ToolError: it is no such address.
@@ -44,7 +56,8 @@ class Viewer:
         self._opened = threading.Event()
         for message in _OF_ONE_WHO_LEFT:
             warnings.filterwarnings("ignore", message, UserWarning)
-        with redirect_stdout(io.StringIO()):  # it has announcements of its own
+        # The library has announcements of its own.
+        with redirect_stdout(io.StringIO()), serving_only(Visitors(allowed_hosts)):
             self._server = _OwnServer(host, port, label="triquad", verbose=False)
         self._server.on_client_connect(self._enter)
         self._server.on_client_disconnect(self._leave)

@@ -38,6 +38,7 @@ MAX_WINDOW_BYTES = 8 * 2**20
 _MAX_BLOCK_BYTES = 2**17  # of a zstd block, decompressed
 _RLE_BLOCK, _COMPRESSED_BLOCK = 1, 2
 _CHECKSUM_BYTES = 4
+_OUT_OF_MEMORY = "not enough memory"
 
 
 @dataclass(frozen=True)
@@ -276,6 +277,8 @@ def _decompress_zstd(where: str, stored: memoryview, size: int) -> memoryview:
             decompressor.decompress(stored, max_output_size=size, allow_extra_data=False)
         )
     except zstandard.ZstdError as error:
+        if _OUT_OF_MEMORY in str(error):  # zstd's, for buffers of its own: no damage
+            raise MemoryError(f"{where} cannot be decompressed") from error
         raise DamagedMapFileError(f"{where} cannot be decompressed: {error}") from error
 
 

@@ -57,7 +57,7 @@ def _inside(origin: float, direction: float, side: int) -> tuple[float, float]:
 
 
 @kernel(inline="always")
-def _part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[float, float]:
+def part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[float, float]:
     """Where the part of a ray begins and ends that lies in the region."""
     enters_x, leaves_x = _inside(at[0], way[0], side)
     enters_y, leaves_y = _inside(at[1], way[1], side)
@@ -137,7 +137,7 @@ def mark_crossed(
         if length <= reach.free:
             continue
         way = (dx / length, dy / length, dz / length)
-        first, last = _part_inside(at, way, length - reach.free, seen.side)
+        first, last = part_inside(at, way, length - reach.free, seen.side)
         if first > last:
             continue
         begin = (at[0] + first * way[0], at[1] + first * way[1], at[2] + first * way[2])

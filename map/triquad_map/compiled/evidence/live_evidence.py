@@ -16,6 +16,7 @@ from triquad_map.compiled.evidence.contradictions import (
     take_back,
 )
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
 from triquad_map.compiled.evidence.observations import Observations
 from triquad_map.compiled.evidence.ray_surfels import ray_surfels
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_ends
@@ -54,6 +55,20 @@ class LiveEvidence:
     def blocks(self) -> int:
         """Blocks in use."""
         return self._blocks.count
+
+    @property
+    def size(self) -> EvidenceSize:
+        """How much it holds."""
+        observed = self._observations
+        return EvidenceSize(self.blocks, observed.blocks, observed.voxels)
+
+    def new_ends(self, ends: Doubles) -> NewEnds:
+        """What rays that end at ``ends`` [N, 3] would add; nothing is recorded."""
+        return new_ends(ends, self._seen)
+
+    def new_blocks(self, origin: Doubles, ends: Doubles) -> int:
+        """About how many blocks rays from ``origin`` [3] to ``ends`` [N, 3] would add."""
+        return new_blocks(origin, ends, self._seen)
 
     def mark_surface(self, voxels: Doubles, sighting: Sighting | None = None) -> Marks:
         """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out.

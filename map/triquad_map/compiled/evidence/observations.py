@@ -64,6 +64,16 @@ class Observations:
         self._rows = 1
         self.arrays = _arrays(blocks, _MIN_CAPACITY, _MIN_ROWS)
 
+    @property
+    def blocks(self) -> int:
+        """Blocks in which rays ended."""
+        return self._places - 1
+
+    @property
+    def voxels(self) -> int:
+        """Voxels in which rays ended."""
+        return self._rows - 1
+
     def make_room(self, blocks: int) -> None:
         """Make room for so many blocks."""
         places = with_room(self.arrays.places, blocks)

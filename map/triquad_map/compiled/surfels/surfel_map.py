@@ -161,7 +161,7 @@ class _Fitted:
 
     places: SurfelPlaces
     surfels: Surfels
-    epochs: Ints  # [S] ``_NEVER`` where there is nothing yet
+    epochs: Longs  # [S] ``_NEVER`` where there is nothing yet
 
 
 class SurfelMap:
@@ -221,7 +221,7 @@ def _nothing_in(places: SurfelPlaces) -> _Fitted:
     count = len(places.voxels)
     offsets, normals = np.zeros((2, count, 3), np.float32)
     surfels = Surfels(offsets, normals, np.zeros(count, np.uint8))
-    return _Fitted(places, surfels, np.full(count, _NEVER, np.int32))
+    return _Fitted(places, surfels, np.full(count, _NEVER, np.int64))
 
 
 def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:

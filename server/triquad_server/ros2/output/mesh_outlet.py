@@ -34,6 +34,11 @@ class _Request:
         self._asks = asks
         self.reply: queue.SimpleQueue[TileUpdates | None] = queue.SimpleQueue()
 
+    @property
+    def size(self) -> int:
+        """No bytes of a message."""
+        return 0
+
     def read(self, _kind: type[TileUpdatesRequest]) -> TileUpdatesRequest:
         return self._asks
 

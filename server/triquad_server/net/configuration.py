@@ -1,0 +1,140 @@
+"""The Zenoh configuration of a server: its options, above a file, above what is safe."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from triquad_format.wire.access_control import Grant, access_control
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, is_of_this_machine
+from triquad_format.wire.zenoh_config import QUIET, fill, is_set, put
+
+from triquad_server.errors import ServerError
+
+_CONNECT_MS = 5000  # a router that was started together with the server may need a moment
+
+_LINKS: Mapping[str, Any] = {
+    # A link that is opened and then says nothing holds a place among those that are pending.
+    "transport/unicast/accept_timeout": 2000,
+    "transport/unicast/accept_pending": 1000,
+    "transport/unicast/max_sessions": 500,
+}
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Options that are given to the Zenoh session; what is left out is as the file has it."""
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    mode: str | None = None
+    config_file: Path | None = None
+    multicast_scouting: bool | None = None
+
+
+@dataclass(frozen=True)
+class Protection:
+    """What a server lets in, where a file does not say otherwise."""
+
+    grants: tuple[Grant, ...]  # who may do what
+    max_message_bytes: int
+    gossip: bool = False  # whether programs that are connected hear of each other
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A configuration to open a session with."""
+
+    zenoh: zenoh.Config
+    protection_is_own: bool  # whether access control is the server's own, not that of a file
+
+    @property
+    def mode(self) -> str:
+        """``router``, ``peer`` or ``client``."""
+        return str(json.loads(self.zenoh.get_json("mode")))
+
+    @property
+    def listen(self) -> tuple[str, ...]:
+        """The endpoints that are listened on."""
+        return self._endpoints("listen/endpoints")
+
+    @property
+    def connect(self) -> tuple[str, ...]:
+        """The endpoints that are connected to."""
+        return self._endpoints("connect/endpoints")
+
+    @property
+    def listens_beyond(self) -> bool:
+        """Whether others than programs of this machine can connect."""
+        return not all(map(is_of_this_machine, self.listen))
+
+    def _endpoints(self, path: str) -> tuple[str, ...]:
+        """A list of endpoints, which Zenoh lets differ by mode."""
+        endpoints = json.loads(self.zenoh.get_json(path))
+        if isinstance(endpoints, dict):
+            endpoints = endpoints.get(self.mode) or []
+        return tuple(endpoints)
+
+
+def configuration(options: NetworkOptions, protection: Protection) -> Configuration:
+    """The configuration of a server.
+
+    What the options leave out is as the file has it; and what both leave out, as is safe: a router
+    that only this machine reaches, that neither looks for others nor is found, and that takes no
+    more than it needs.
+
+    Raises:
+        ServerError: the file cannot be read, or a value is not valid.
+    """
+    try:
+        return _configuration(options, protection)
+    except (zenoh.ZError, ValueError, OSError) as error:
+        raise ServerError(f"Zenoh configuration: {first_line(error)}") from error
+
+
+def _configuration(options: NetworkOptions, protection: Protection) -> Configuration:
+    unset = zenoh.Config()
+    file = options.config_file
+    config = zenoh.Config() if file is None else zenoh.Config.from_file(str(file))
+    put(config, _of_options(options))
+    fill(config, {"mode": "router"}, unset)
+    is_own = not is_set(config, "access_control", unset)
+    fill(config, _safe(protection), unset)
+    found = Configuration(config, protection_is_own=is_own)
+    if found.mode != "client":
+        fill(config, {"listen/endpoints": [DEFAULT_ENDPOINT]}, unset)
+    return found
+
+
+def _of_options(options: NetworkOptions) -> dict[str, Any]:
+    given: dict[str, Any] = {}
+    if options.mode is not None:
+        given["mode"] = options.mode
+    if options.multicast_scouting is not None:
+        given["scouting/multicast/enabled"] = options.multicast_scouting
+    if options.listen:
+        given["listen/endpoints"] = options.listen
+        given["listen/exit_on_failure"] = True
+    if options.connect:
+        given["connect/endpoints"] = options.connect
+        # By default a router goes on without, and says nothing.
+        given["connect/timeout_ms"] = _CONNECT_MS
+        given["connect/exit_on_failure"] = True
+    return given
+
+
+def _safe(protection: Protection) -> dict[str, Any]:
+    return {
+        **QUIET,
+        **_LINKS,
+        "scouting/gossip/enabled": protection.gossip,
+        "transport/link/rx/max_message_size": protection.max_message_bytes,
+        "access_control": access_control(protection.grants),
+    }
+
+
+def first_line(error: Exception) -> str:
+    """The text of an error without Zenoh's source locations."""
+    return str(error).split(" at /", 1)[0].strip()

@@ -1,0 +1,90 @@
+"""Resets: what the map was before stays on disk, so that nothing is lost by mistake."""
+
+import logging
+
+from triquad_format.errors import RefusedError
+from triquad_format.wire.messages import ResetReply, ResetRequest
+
+from triquad_server.errors import StoreError
+from triquad_server.mapping.mapper import MapChanges
+from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.mesh.mesher import check_box
+from triquad_server.store.checkpoint_thread import CheckpointThread
+from triquad_server.store.store import Store
+
+_log = logging.getLogger(__name__)
+
+_WHY = "before a reset"
+
+
+class Resets:
+    """Answers resets: each first has a checkpoint written that retention must keep."""
+
+    def __init__(
+        self,
+        mapper: MapperThread,
+        checkpoints: CheckpointThread,
+        store: Store | None,
+        protect_h: float,
+    ) -> None:
+        """Without a ``store``, or with ``protect_h`` = 0, nothing is kept."""
+        self._mapper = mapper
+        self._checkpoints = checkpoints
+        self._store = store
+        self._protect_h = protect_h
+
+    def answer(self, request: ResetRequest) -> ResetReply:
+        """Forget what lies in the request's box; answered once an epoch shows it.
+
+        Raises:
+            RefusedError: it is not a box; or the map as it is could not be kept, and was not reset.
+        """
+        check_box(request.minimum, request.maximum)
+        store = self._store
+        if store is None or self._protect_h == 0:
+            return self._unkept(request, store)
+        try:
+            reply = self._checkpoints.call(lambda: self._keep_and_reset(store, request))
+        except StoreError as error:
+            raise RefusedError(
+                "store", f"nothing was reset, for the map as it is could not be kept: {error}"
+            ) from error
+        if reply.kept_epoch is not None:
+            _log.warning("the map was reset as of epoch %d: %s", reply.epoch, reply.undo)
+        return reply
+
+    def _unkept(self, request: ResetRequest, store: Store | None) -> ResetReply:
+        reply = self._mapper.reset(request)
+        why = "the server has no store" if store is None else "store.protect_h = 0"
+        undo = f"the map before was not kept: {why}"
+        _log.warning("the map was reset as of epoch %d: %s", reply.epoch, undo)
+        return ResetReply(reply.epoch, undo=undo)
+
+    def _keep_and_reset(self, store: Store, request: ResetRequest) -> ResetReply:
+        kept = None
+        if self._mapper.epochs.newest.regions > 0:
+            kept = self._checkpoints.write().epoch
+            store.protect(kept, _WHY)
+        forgotten = self._mapper.reset_after(request, store.base_epoch)
+        kept = self._keep_the_rest(store, forgotten.before, kept)
+        if kept is None:
+            return ResetReply(forgotten.epoch, undo="the map was empty before")
+        undo = (
+            f"epoch {kept}, the map before, is kept for {self._protect_h:g} h; to go back to it, "
+            f"stop the server and start it with --restore {kept}"
+        )
+        return ResetReply(forgotten.epoch, kept, undo)
+
+    def _keep_the_rest(self, store: Store, before: MapChanges, kept: int | None) -> int | None:
+        """Keep what was learnt while the checkpoint was written, too; returns the epoch kept."""
+        if not before.regions or before.epoch.number == kept:
+            return kept
+        try:
+            written = self._checkpoints.write_changes(before).epoch
+            if written != before.epoch.number:  # all was needed, and is no longer there
+                return kept
+            store.protect(written, _WHY, instead_of=kept)
+            return written
+        except StoreError as error:
+            _log.error("what was learnt while the map was being kept is lost: %s", error)
+            return kept

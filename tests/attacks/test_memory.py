@@ -1,0 +1,98 @@
+"""Who wants the server's memory does not get it: real processes, measured by the system."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from support.servers import RawPeer, ServerProcess
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import TileUpdatesRequest
+
+MAP_BYTES = 400_000_000
+EPOCHS_BYTES = 100_000_000
+BESIDE = 250_000_000  # for code that is compiled late, replay samples and what is in between
+SPHERES, POINTS, RADIUS_M = 8, 60_000, 48.0
+
+
+def resident(server: ServerProcess) -> int:
+    pages = int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1])
+    return pages * 4096
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ServerProcess]:
+    limits = [f"memory.max_bytes={MAP_BYTES}", f"memory.epochs_bytes={EPOCHS_BYTES}"]
+    arguments = [text for limit in limits for text in ("--set", limit)]
+    with servers.server_process(arguments) as process:
+        yield process
+
+
+def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> None:
+    rng = np.random.default_rng(0)
+    before = resident(server)
+    with triquad_client.connect(server.endpoint) as client:
+        for number in range(SPHERES):
+            directions = rng.normal(size=(POINTS, 3))
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            pose = np.eye(4)
+            pose[0, 3] = 20.0 * number
+            client.publish_scan((RADIUS_M * directions).astype(np.float32), pose, source="liar")
+            report = client.flush(servers.WAIT_S)
+        grown = resident(server) - before
+        print(f"grown by {grown / 1e6:.0f} MB")
+        assert grown < MAP_BYTES + EPOCHS_BYTES + BESIDE
+        status = client.status()
+        assert status.scans_dropped["map_full"] == report.refused > 0
+        assert "map_full" not in str(status.warnings)
+        assert "memory.max_bytes" in str(report.last_refusal)
+        assert 0 < status.map_bytes <= status.map_max_bytes == MAP_BYTES
+        assert client.query_distance(np.zeros((10, 3)), max_distance_m=1.0).epoch > 0
+        client.publish_scan(servers.sphere(500, 10.0), np.eye(4), source="honest")
+        assert client.flush(servers.WAIT_S).taken >= 1, "what is small still finds room"
+
+
+def updates(known: int) -> TileUpdatesRequest:
+    return TileUpdatesRequest(
+        minimum=np.full(3, 1000.0),
+        maximum=np.full(3, 1001.0),
+        level=0,
+        server="",
+        revision=0,
+        known=np.zeros((known, 3), np.int32) + np.arange(known, dtype=np.int32)[:, None],
+        known_versions=np.ones(known, np.int64),
+        max_bytes=1_000_000,
+        timeout_s=20.0,
+        client="stranger",
+        max_bytes_per_s=0,
+    )
+
+
+def test_junk_in_a_request_that_is_held_is_refused(server: ServerProcess) -> None:
+    body = codec.encode(updates(0))
+    assert body[0] == 0xDE or body[0] & 0xF0 == 0x80
+    junk = b"\xa1j\xc6" + (12_000_000).to_bytes(4, "big") + bytes(12_000_000)
+    fields = body[0] & 0x0F
+    payload = bytes([0x80 | (fields + 1)]) + body[1:] + junk
+    with servers.raw_session(connect=server.endpoint) as session:
+        assert RawPeer(session).refusal(keys.TILE_UPDATES, payload) == "too_large"
+
+
+def test_followers_that_are_held_take_little(server: ServerProcess) -> None:
+    """Each of 64 names as many tiles as it may, and waits."""
+    before = resident(server)
+    payload = codec.encode(updates(100_000))
+    with servers.raw_session(connect=server.endpoint) as session:
+        done = threading.Semaphore(0)
+        key = keys.operation_key(servers.MAP, keys.TILE_UPDATES)
+
+        for _ in range(64):
+            session.get(key, lambda _: done.release(), payload=payload, timeout=30)
+        for _ in range(60):
+            assert done.acquire(timeout=servers.WAIT_S)
+        grown = resident(server) - before
+    print(f"grown by {grown / 1e6:.0f} MB")
+    assert grown < 250_000_000

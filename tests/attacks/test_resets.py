@@ -1,0 +1,110 @@
+"""Whoever may reset the map, on purpose or by mistake, does not destroy it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from triquad_client import Client, RefusedError
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files
+from triquad_format.mapfile.reader import read_map
+
+ATTACKS = 20
+PROBES = servers.sphere(200)
+
+
+@contextmanager
+def served(folder: Path, *more: str) -> Iterator[tuple[servers.ServerProcess, Client]]:
+    settings = folder / "server.toml"
+    settings.write_text(servers.SMALL_TOML)
+    arguments = ["--settings", settings, "--store", folder / "store", *more]
+    with (
+        servers.server_process(arguments) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        yield server, client
+
+
+def stop(server: servers.ServerProcess) -> None:
+    server.process.terminate()
+    assert server.wait() == 0, server.log
+
+
+def test_the_map_of_before_outlives_resets_and_checkpoints_without_end(tmp_path: Path) -> None:
+    """Retention keeps the newest 20 checkpoints: 20 of an empty map pushed out all others."""
+    with served(tmp_path, "--set", "store.keep=3") as (server, client):
+        servers.learn(client)
+        client.settle(servers.WAIT_S)
+        before = client.query_sdf(PROBES)
+        replies = []
+        for number in range(ATTACKS):
+            replies.append(client.reset())
+            client.checkpoint()
+            if number % 5 == 4:  # with something in it, which is kept in turn
+                client.publish_scan(servers.sphere(300, 2.0), np.eye(4))
+                client.flush(servers.WAIT_S)
+                client.checkpoint()
+        first = replies[0]
+        assert first.kept_epoch is not None
+        assert f"--restore {first.kept_epoch}" in (first.undo or "")
+        assert f"--restore {first.kept_epoch}" in server.log
+        assert client.status().regions in (0, 1)
+        stop(server)
+    with served(tmp_path, "--restore", str(first.kept_epoch)) as (server, client):
+        after = client.query_sdf(PROBES)
+        assert np.array_equal(after.status, before.status)
+        assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)
+        assert client.status().epoch > replies[-1].epoch
+        learnt_since = client.status().epoch
+        servers.learn(client)
+        server.process.kill()  # a restart with the same arguments must not undo what follows
+        server.wait()
+    with served(tmp_path, "--restore", str(first.kept_epoch)) as (server, client):
+        assert "was taken back to epoch" in server.log
+        assert client.status().epoch >= learnt_since
+        assert np.array_equal(client.query_sdf(PROBES).status, before.status)
+
+
+def test_what_was_learnt_while_the_map_is_being_kept_is_kept_too(tmp_path: Path) -> None:
+    """Scans stream in all the while: each is in the kept map, or in the new one."""
+    with served(tmp_path) as (server, client):
+        for _ in range(3):
+            servers.learn(client, scans=1)
+            for _ in range(10):
+                client.publish_scan(servers.sphere(3000), np.eye(4))
+            reply = client.reset()
+            assert reply.kept_epoch is not None
+            # No epoch lies between the one that is kept and the one that is empty.
+            assert reply.epoch == reply.kept_epoch + 1
+            client.flush(servers.WAIT_S)
+        stop(server)
+
+
+def test_a_reset_is_refused_where_the_map_cannot_be_kept(tmp_path: Path) -> None:
+    with served(tmp_path, "--set", "store.protect_bytes=30000") as (server, client):
+        servers.learn(client)
+        kept = client.reset().kept_epoch
+        servers.learn(client)
+        with pytest.raises(RefusedError, match="nothing was reset.*store.protect_bytes = 30,000"):
+            client.reset()
+        assert client.status().regions == 1
+        assert kept is not None
+        stop(server)
+    (folder,) = (tmp_path / "store").iterdir()
+    (file,) = (file for file in checkpoint_files(folder) if file.epoch == kept)
+    assert len(read_map(file.path).regions) == 1
+
+
+def test_epochs_that_are_not_there_are_named_with_those_that_are(tmp_path: Path) -> None:
+    with served(tmp_path) as (server, client):
+        servers.learn(client)
+        epoch = client.checkpoint().epoch
+        stop(server)
+    settings = tmp_path / "server.toml"
+    arguments = ["--settings", settings, "--store", tmp_path / "store", "--restore", str(epoch + 7)]
+    with servers.server_process(arguments, ready=False) as server:
+        assert server.wait() == 4
+        assert f"holds no checkpoint of epoch {epoch + 7}; there are: " in server.log

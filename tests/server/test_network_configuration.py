@@ -1,0 +1,107 @@
+"""What of a Zenoh configuration a server sets, and what it leaves as a file has it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import triquad_server.net.configuration as network
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
+from triquad_server.errors import ServerError
+from triquad_server.net.configuration import Configuration, NetworkOptions
+from triquad_server.protection import protection
+from triquad_server.ros2_settings import Ros2Settings
+from triquad_server.settings import Settings
+
+SAFE = {
+    "mode": "router",
+    "listen/endpoints": [DEFAULT_ENDPOINT],
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/shared_memory/enabled": False,
+    "transport/unicast/max_sessions": 500,
+    "transport/unicast/accept_pending": 1000,
+    "transport/unicast/accept_timeout": 2000,
+    "transport/link/rx/max_message_size": 24_008_192,
+    "access_control/enabled": True,
+    "access_control/default_permission": "deny",
+}
+
+
+def of_file(folder: Path, text: str, **options: Any) -> Configuration:
+    file = folder / "zenoh.json5"
+    file.write_text(text)
+    return network.configuration(
+        NetworkOptions(config_file=file, **options), protection("lab", Settings())
+    )
+
+
+def values(config: Configuration) -> dict[str, Any]:
+    return {path: json.loads(config.zenoh.get_json(path)) for path in SAFE}
+
+
+def test_what_is_not_set_is_safe(tmp_path):
+    plain = network.configuration(NetworkOptions(), protection("lab", Settings()))
+    assert values(plain) == SAFE
+    assert not plain.listens_beyond
+    assert values(of_file(tmp_path, "{ timestamping: { enabled: true } }")) == SAFE
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "value"),
+    [
+        ('{ mode: "peer" }', "mode", "peer"),
+        (
+            '{ listen: { endpoints: ["tcp/[::]:7448"] } }',
+            "listen/endpoints",
+            ["tcp/[::]:7448"],
+        ),
+        (
+            "{ scouting: { multicast: { enabled: true } } }",
+            "scouting/multicast/enabled",
+            True,
+        ),
+        (
+            '{ transport: { shared_memory: { enabled: true, mode: "init" } } }',
+            "transport/shared_memory/enabled",
+            True,
+        ),
+        (
+            "{ transport: { unicast: { max_sessions: 7 } } }",
+            "transport/unicast/max_sessions",
+            7,
+        ),
+    ],
+)
+def test_a_file_has_the_say_in_what_it_sets_and_in_nothing_else(tmp_path, text, path, value):
+    assert values(of_file(tmp_path, text)) == {**SAFE, path: value}
+
+
+def test_options_go_before_the_file(tmp_path):
+    text = '{ mode: "peer", listen: { endpoints: ["tcp/[::]:1"] } }'
+    config = of_file(tmp_path, text, mode="router", listen=("tcp/0.0.0.0:2",))
+    assert (config.mode, config.listen) == ("router", ("tcp/0.0.0.0:2",))
+    assert config.listens_beyond
+
+
+def test_access_control_of_a_file_is_taken_as_it_is(tmp_path):
+    config = of_file(tmp_path, '{ access_control: { enabled: true, default_permission: "allow" } }')
+    assert not config.protection_is_own
+    assert json.loads(config.zenoh.get_json("access_control/default_permission")) == "allow"
+
+
+def test_a_client_listens_nowhere(tmp_path):
+    config = of_file(tmp_path, "{}", mode="client", connect=("tcp/router:7447",))
+    assert (config.listen, config.connect) == ((), ("tcp/router:7447",))
+
+
+def test_nodes_of_ros_find_each_other_and_their_clouds_get_in():
+    settings = Settings(ros2=Ros2Settings(enabled=True))
+    found = values(network.configuration(NetworkOptions(), protection("lab", settings)))
+    assert found["scouting/gossip/enabled"] is True
+    assert found["transport/link/rx/max_message_size"] > 500_000 * 64
+
+
+def test_a_file_that_is_none_is_an_error(tmp_path):
+    with pytest.raises(ServerError, match="Zenoh configuration"):
+        of_file(tmp_path, "{ mode: 3 }")
