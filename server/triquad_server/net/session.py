@@ -7,12 +7,13 @@ import zenoh
 from triquad_server.errors import ListenError
 from triquad_server.net.configuration import Configuration, first_line
 
-_ZENOH_THREADS = "(tx: (worker_threads: 4))"
+_ZENOH_THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 8))"
 """Of Zenoh's threads, as its environment variable ``ZENOH_RUNTIME`` has them.
 
 Zenoh gives up a client that takes nothing after five seconds, and the thread that sends to it then
 waits for whoever else has something for it. By default all clients share one such thread: replies
-to others were late as well, and their links were closed in turn.
+to others were late as well, and their links were closed in turn. Those that receive are more than
+the usual two for the same reason: many megabytes of one client must not come before all others.
 """
 
 
