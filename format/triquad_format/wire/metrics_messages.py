@@ -141,4 +141,5 @@ def _quantile(bounds: NDArray[np.float64], counts: NDArray[np.int64], share: flo
         return math.inf
     low = bounds[bucket - 1] if bucket else 0.0
     within = (wanted - (reached[bucket] - counts[bucket])) / counts[bucket]
-    return float(low + within * (bounds[bucket] - low))
+    # Rounding must not take it beyond its bucket.
+    return float(min(low + within * (bounds[bucket] - low), bounds[bucket]))

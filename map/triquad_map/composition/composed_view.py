@@ -122,8 +122,12 @@ class ComposedView(FieldView):
 
     def _improve_unknown(self, found: NearestUnknown, points: Doubles) -> None:
         """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""
-        homes, owners = np.unique(self._cells_of(points), axis=0, return_inverse=True)
-        owners = owners.reshape(-1)
+        cells = self._cells_of(points)
+        if (cells == cells[:1]).all():  # mostly: to sort many rows takes long, and the interpreter
+            homes, owners = cells[:1], np.zeros(len(cells), np.int64)
+        else:
+            homes, owners = np.unique(cells, axis=0, return_inverse=True)
+            owners = owners.reshape(-1)
         known = np.array([tuple(home) in self._by_index for home in homes.tolist()], np.bool_)
         # Most points that are far from the map need nothing more, however many cells they lie in.
         nowhere = np.flatnonzero(~known[owners])

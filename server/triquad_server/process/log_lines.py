@@ -12,8 +12,9 @@ import traceback
 from datetime import datetime, timezone
 from types import FrameType
 
-_LINE_BYTES = 65_536
-"""What is longer and not ours becomes several lines."""
+_LINE_BYTES = 3_000
+"""What is longer and not ours becomes several lines. A pipe takes up to 4096 bytes at once: so no
+line of the server's own comes in between."""
 
 _INDENT = "    "
 
