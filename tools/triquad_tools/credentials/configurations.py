@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from triquad_format.wire.endpoints import DEFAULT_PORT
+from triquad_format.wire.zenoh_config import QUIET
 
 from triquad_tools.credentials.certificate import Certificate
 
@@ -24,41 +25,35 @@ _WARNING = """\
 
 def listening(title: str, own: Certificate, authority: Certificate, access: Section) -> bytes:
     """That of a server or router which ``access`` controls; ``title`` tells people whose it is."""
-    configuration = {
+    values = {
         **_common("router", _tls(own, authority, "listen", "connect"), access),
-        "listen": {
-            "endpoints": [_endpoint(_EVERYWHERE)],
-            "exit_on_failure": True,
-        },
+        "listen/endpoints": [_endpoint(_EVERYWHERE)],
+        "listen/exit_on_failure": True,
     }
-    return _text(title, configuration)
+    return _text(title, values)
 
 
 def connecting(
     title: str, own: Certificate, authority: Certificate, access: Section, hosts: Sequence[str]
 ) -> bytes:
     """That of a client, which finds the server at one of ``hosts``."""
-    configuration = {
+    values = {
         **_common("client", _tls(own, authority, "connect"), access),
-        "connect": {
-            "endpoints": [_endpoint(host) for host in hosts],
-            "timeout_ms": 0,  # one attempt at each
-            "exit_on_failure": True,
-        },
+        "connect/endpoints": [_endpoint(host) for host in hosts],
+        "connect/timeout_ms": 0,  # one attempt at each
+        "connect/exit_on_failure": True,
         # ROS 2 keeps the last messages of some topics, which needs their times.
-        "timestamping": {"enabled": True},
+        "timestamping/enabled": True,
     }
-    return _text(title, configuration)
+    return _text(title, values)
 
 
 def _common(mode: str, tls: Section, access: Section) -> Section:
     return {
         "mode": mode,
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {
-            "shared_memory": {"enabled": False},
-            "link": {"protocols": ["tls"], "tls": tls},
-        },
+        **QUIET,
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": tls,
         "access_control": access,
     }
 
@@ -85,5 +80,18 @@ def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
 
 
-def _text(title: str, configuration: Section) -> bytes:
-    return (_WARNING.format(title=title) + json.dumps(configuration, indent=2) + "\n").encode()
+def _text(title: str, values: Section) -> bytes:
+    configuration = json.dumps(_nested(values), indent=2)
+    return (_WARNING.format(title=title) + configuration + "\n").encode()
+
+
+def _nested(values: Section) -> Section:
+    """Values by path as sections within sections."""
+    outermost: Section = {}
+    for path, value in values.items():
+        *names, last = path.split("/")
+        section = outermost
+        for name in names:
+            section = section.setdefault(name, {})
+        section[last] = value
+    return outermost
