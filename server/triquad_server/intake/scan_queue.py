@@ -12,6 +12,9 @@ from triquad_server.intake.source_ledger import SourceLedger
 MAX_SOURCES_WAITING = 64
 """Sources that may each have as many scans wait as one may; more share that."""
 
+_BEHIND = 0.25
+"""A source falls behind of whose scans more than this share of its limit wait."""
+
 _SCAN_BYTES = 2_000  # that a scan takes beside its points
 
 
@@ -64,14 +67,20 @@ class ScanQueue:
             self.dropped.add(backwards or reason)
 
     def take(self, passed_over: Collection[str] = ()) -> Scan | None:
-        """The oldest scan of the next source, not one that is ``passed_over``.
+        """The oldest scan of the next source, not of one that is ``passed_over``.
 
-        It counts as waiting until another is asked for.
+        Of a source that falls behind it may be, nevertheless. It counts as waiting until another
+        is asked for.
         """
         with self._lock:
-            scan = self._scans.take(lambda scan: scan.source not in passed_over)
+            scan = self._scans.take(
+                lambda scan: scan.source not in passed_over or self._falls_behind(scan.source)
+            )
             self._in_hand = scan is not None
             return scan
+
+    def _falls_behind(self, source: str) -> bool:
+        return self._scans.count(Owner(source)) > _BEHIND * self.limit
 
 
 def _bytes_of(scan: Scan) -> int:

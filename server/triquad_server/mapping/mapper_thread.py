@@ -29,7 +29,10 @@ _log = logging.getLogger(__name__)
 
 _GIVE_WAY_S = 0.1
 _SCANS_S = 0.05
-"""Scans of several sources are taken in for so long before training goes on."""
+"""Scans are taken in for so long before training goes on, at least."""
+
+_SCANS_SHARE = 2.0
+"""How many times as long as all else took, where scans wait for so long."""
 
 _MIN_PUBLISH_SHARE = 5
 """Publishing takes at most one part in so many of the thread's time."""
@@ -101,6 +104,7 @@ class MapperThread:
         self._scans_taken = 0
         self._loss = 0.0  # as of the newest epoch
         self._step_s = _GIVE_WAY_S  # what the last step of training took
+        self._else_s = 0.0  # what all but scans took in the last round
         first = mapper.publish()
         older_bytes = (memory or MemorySettings()).epochs_bytes
         self.epochs = EpochHistory(first, settings, older_bytes=older_bytes)
@@ -204,6 +208,7 @@ class MapperThread:
             self._wake.wait()
             return
         took_scans = self._ingest_scans()
+        ingested_s = time.monotonic()
         if not self._mapper.settled:
             self.time.begin(Activity.GIVING_WAY)
             # However many ask, training waits a third of its time at most.
@@ -220,6 +225,7 @@ class MapperThread:
             self._publish_soon.clear()
             self._publish()
         self._record_progress()
+        self._else_s = time.monotonic() - ingested_s
         if self._mapper.settled and not took_scans:
             self.time.begin(Activity.IDLE)
             self._wake.wait(self._rest_s())
@@ -249,8 +255,11 @@ class MapperThread:
             command.result.set_exception(MapperStoppedError(why))
 
     def _ingest_scans(self) -> bool:
-        """Take in the oldest scan of each source, for a moment; False where none waits."""
-        ends_s = time.monotonic() + _SCANS_S
+        """Take in the oldest scan of each source, for a moment; False where none waits.
+
+        More are taken of sources of which so many wait that scans may soon be lost.
+        """
+        ends_s = time.monotonic() + max(_SCANS_S, _SCANS_SHARE * self._else_s)
         sources: set[str] = set()
         while (scan := self._scans.take(sources)) is not None:
             sources.add(scan.source)

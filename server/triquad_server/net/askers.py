@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import zenoh
@@ -17,6 +18,7 @@ any name can be invented."""
 _LATELY_S = 1.0
 _GRACE_S = 0.5  # a client's own time-out comes first
 _EVENTS = 1024  # that wait to be heard of
+_GONE = 1024  # sessions that were linked and are not any more, of which is known
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,6 @@ class Asker:
     """Who asked, and until when the answer is waited for."""
 
     owner: Owner  # of the request
-    linked: bool  # whether it is the session at the other end of a link
     deadline_s: float  # monotonic
 
 
@@ -39,9 +40,10 @@ class Askers:
     def __init__(self, session: zenoh.Session) -> None:
         """Begin to watch who is linked to ``session``."""
         self._lock = threading.Lock()
-        self._latest = Owner(_UNLINKED)  # of all requests
+        self._latest = Owner(_UNLINKED)  # who was heard of
         self._others_s = -math.inf  # when it last was another one, monotonic
         self._links: dict[str, int] = {}  # transports by the Zenoh id at their other end
+        self._gone: OrderedDict[str, None] = OrderedDict()  # ids of sessions, latest last
         self._listener = session.info.declare_transport_events_listener(
             zenoh.handlers.FifoChannel(_EVENTS), history=True
         )
@@ -55,30 +57,36 @@ class Askers:
 
     @property
     def are_several(self) -> bool:
-        """Whether more than one asked lately: whoever asks much then leaves time to others."""
+        """Whether more than one was heard of lately: who asks much then leaves time to others."""
         return time.monotonic() - self._others_s < _LATELY_S
 
     def asker(self, query: zenoh.Query, longest_s: float) -> Asker:
         """Who asks; nobody is believed to wait for more than ``longest_s``."""
         asker = self._identify(_origin(query), longest_s)
+        self.hear_of(asker)
+        return asker
+
+    def hear_of(self, asker: Asker) -> None:
+        """Somebody asks, or what somebody asked is worked at."""
         with self._lock:
             if asker.owner != self._latest:
                 self._latest, self._others_s = asker.owner, time.monotonic()
-        return asker
 
     def has_left(self, asker: Asker) -> bool:
-        """Whether the link to one who asked is gone."""
-        return asker.linked and asker.owner.group not in self._links
+        """Whether the link to one who asked is gone.
+
+        A request may be heard of before its link is, so that what it was then does not count.
+        """
+        return asker.owner.name in self._gone
 
     def _identify(self, origin: RequestOrigin | None, longest_s: float) -> Asker:
         now = time.monotonic()
         if origin is None:
-            return Asker(Owner(_UNLINKED), linked=False, deadline_s=now + longest_s)
+            return Asker(Owner(_UNLINKED), deadline_s=now + longest_s)
         # Written so that NaN counts as not given.
         wait_s = origin.timeout_s if 0 <= origin.timeout_s <= longest_s else longest_s
-        linked = origin.client in self._links
-        group = origin.client if linked else _UNLINKED
-        return Asker(Owner(group, origin.client), linked, deadline_s=now + wait_s + _GRACE_S)
+        group = origin.client if origin.client in self._links else _UNLINKED
+        return Asker(Owner(group, origin.client), deadline_s=now + wait_s + _GRACE_S)
 
     def _watch(self) -> None:
         for event in self._listener:
@@ -86,8 +94,12 @@ class Askers:
             count = self._links.get(client, 0) + (1 if event.kind == zenoh.SampleKind.PUT else -1)
             if count > 0:
                 self._links[client] = count
+                self._gone.pop(client, None)
             else:
                 self._links.pop(client, None)
+                self._gone[client] = None
+                while len(self._gone) > _GONE:
+                    self._gone.popitem(last=False)
 
 
 def _origin(query: zenoh.Query) -> RequestOrigin | None:

@@ -22,13 +22,11 @@ RequestT = TypeVar("RequestT", bound=Message)
 _SLICE_POINTS = 1024
 """Points of a slice of a long request while others ask as well: some milliseconds of one core."""
 
+_SHORT_SLICES = 4
+"""A planner's request has no more of them; it does not pause between them."""
+
 _QUICK_SLICES = 16
-"""So many slices of a request follow each other; then it rests, while others ask as well."""
-
-_REST = 2.0
-"""How many times as long as a slice took: mapping and the network need the cores, too."""
-
-_LONGEST_REST_S = 0.1
+"""A request of more is long: it rests after each slice, while others ask as well."""
 
 _SLICE_ALONE_POINTS = 65_536
 
@@ -38,6 +36,7 @@ class Turns:
     """When a request is worked at, as its group has it."""
 
     pause: Callable[[], None]  # returns when it is the request's turn again
+    rest: Callable[[float], None]  # as pause, some time after a slice that took so long, seconds
     send: Callable[[], None]  # its reply is on its way
     problem: Callable[[], str | None]  # why nobody is answered any more
 
@@ -84,12 +83,13 @@ class Request:
         Raises:
             RefusedError: nobody waits for the answer any more, or the server is stopping.
         """
+        self._askers.hear_of(self.asker)
         several = self._askers.are_several
-        if several and self._slices > _QUICK_SLICES:
-            took_s = time.monotonic() - self._slice_began_s
-            time.sleep(min(_REST * took_s, _LONGEST_REST_S))
-        if self._turns is not None:
-            self._turns.pause()
+        if self._turns is not None and self._slices >= _SHORT_SLICES:
+            if several and self._slices >= _QUICK_SLICES:
+                self._turns.rest(time.monotonic() - self._slice_began_s)
+            else:
+                self._turns.pause()
         self._check()
         self._slices += 1
         self._slice_began_s = time.monotonic()

@@ -13,6 +13,7 @@ from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.net.askers import Askers
 from triquad_server.net.asking_client import asking_client
+from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.request import Request, RequestT, Turns
 from triquad_server.net.request_queue import MOST_BEGUN, MOST_SENDING, Job, RequestQueue
@@ -58,13 +59,18 @@ class RequestHandlers:
         session: zenoh.Session,
         operations: Mapping[str, Operation],
         askers: Askers,
+        long_work: LongWork,
         *,
         workers: int,
         limits: RequestLimits,
     ) -> None:
-        """Begin to serve ``operations``, by key, with so many ``workers``."""
+        """Begin to serve ``operations``, by key, with so many ``workers``.
+
+        ``askers`` and ``long_work`` are those of all groups.
+        """
         self._operations = operations
         self._askers = askers
+        self._long_work = long_work
         self._limits = limits
         self._queue: RequestQueue[Request] = RequestQueue(
             self._begin,
@@ -141,6 +147,7 @@ class RequestHandlers:
         request = job.request
         turns = Turns(
             pause=lambda: self._queue.pause(job),
+            rest=lambda took_s: self._queue.rest(job, self._long_work.rest_s(took_s)),
             send=lambda: self._queue.send(job),
             problem=lambda: _STOPPING if self._stopping else None,
         )

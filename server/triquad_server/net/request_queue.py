@@ -1,6 +1,7 @@
 """Requests that wait and requests that are worked at: those who ask take turns."""
 
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -91,6 +92,18 @@ class RequestQueue(Generic[RequestT]):
             job.may_go_on.clear()
             self._paused.append(job)
             self._start(other)
+        job.may_go_on.wait()
+
+    def rest(self, job: Job[RequestT], rest_s: float) -> None:
+        """As :meth:`pause`, after a time in which others may be worked at."""
+        with self._lock:
+            self._free += 1
+            self._fill()
+        time.sleep(rest_s)
+        with self._lock:
+            job.may_go_on.clear()
+            self._paused.append(job)
+            self._fill()
         job.may_go_on.wait()
 
     def send(self, job: Job[RequestT]) -> None:

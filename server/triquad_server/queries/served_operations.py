@@ -8,6 +8,7 @@ from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.net.askers import Askers
+from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.payload_limit import payload_limit
 from triquad_server.net.request_handlers import (
@@ -45,6 +46,7 @@ class ServedOperations:
         self._session = session
         self._map_name = map_name
         self._askers = Askers(session)
+        self._long_work = LongWork()
         self._groups: list[RequestHandlers] = []
         self._limits = limits
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
@@ -62,7 +64,12 @@ class ServedOperations:
             counts = self.counts[name] = OperationCounts()
             operations[keys.operation_key(self._map_name, name)] = Operation(handler, counts)
         group = RequestHandlers(
-            self._session, operations, self._askers, workers=workers, limits=self._limits_of(queue)
+            self._session,
+            operations,
+            self._askers,
+            self._long_work,
+            workers=workers,
+            limits=self._limits_of(queue),
         )
         self._groups.append(group)
         self.queues[queue] = lambda: group.queue

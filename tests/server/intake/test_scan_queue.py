@@ -199,6 +199,16 @@ def test_sources_take_turns_and_the_busiest_loses_alone():
     assert queue.ledger.lost() == {"busy": 7}
 
 
+def test_a_source_is_passed_over_until_it_falls_behind():
+    queue = ScanQueue(8)
+    for sequence in range(4):
+        queue.put(servers.scan(sequence))
+    taken = [queue.take({"lidar"}).sequence, queue.take({"lidar"}).sequence]
+    assert taken == [0, 1]
+    assert queue.take({"lidar"}) is None
+    assert queue.take().sequence == 2
+
+
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():
     nbytes = servers.scan().points.nbytes
     queue = ScanQueue(100, 10 * nbytes)

@@ -70,6 +70,23 @@ def test_a_request_that_pauses_lets_others_begin_and_goes_on_after_them():
     assert goes_on.wait(WAIT_S)
 
 
+def test_a_request_that_rests_leaves_its_worker_to_others_and_goes_on_by_itself():
+    work = Work(workers=1)
+    work.put(A, "long")
+    work.put(B, "b1")
+    rests = threading.Thread(target=work.queue.rest, args=(work.begun["long"], 0.05))
+    rests.start()
+    while "b1" not in work.begun:
+        pass
+    rests.join(0.1)
+    assert rests.is_alive(), "it went on while all workers were at work"
+    work.queue.finish(work.begun["b1"])
+    rests.join(WAIT_S)
+    assert not rests.is_alive()
+    work.put(C, "c1")
+    assert "c1" not in work.begun, "the one worker is at work again"
+
+
 def test_where_nobody_waits_a_pause_is_none():
     work = Work(workers=1)
     work.put(A, "long", "another")

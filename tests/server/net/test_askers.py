@@ -1,0 +1,36 @@
+import time
+from contextlib import closing
+
+import pytest
+import zenoh
+from triquad_format.wire.zenoh_config import QUIET, put
+from triquad_server.fair_queue import Owner
+from triquad_server.net import askers as module
+from triquad_server.net.askers import Asker, Askers
+
+A, B = (Asker(Owner(name), deadline_s=0.0) for name in "ab")
+
+
+@pytest.fixture
+def askers():
+    config = zenoh.Config()
+    put(config, QUIET)
+    with zenoh.open(config) as session, closing(Askers(session)) as askers:
+        yield askers
+
+
+def test_one_who_asks_again_and_again_is_alone(askers):
+    askers.hear_of(A)  # after nobody, which may count as another
+    time.sleep(module._LATELY_S)
+    askers.hear_of(A)
+    assert not askers.are_several
+
+
+def test_whoever_asked_much_is_not_forgotten_while_it_is_worked_at(askers):
+    askers.hear_of(A)  # whose requests wait from now on
+    askers.hear_of(B)
+    time.sleep(module._LATELY_S)
+    askers.hear_of(B)
+    assert not askers.are_several
+    askers.hear_of(A)  # a slice of them begins
+    assert askers.are_several
