@@ -1,5 +1,7 @@
 """Work that is shared among threads is all done, once, whatever happens."""
 
+import threading
+
 import numpy as np
 import pytest
 from triquad_map.compiled.team import THREADS, Team
@@ -47,3 +49,41 @@ def test_what_runs_beside_has_ended_when_the_context_does(team, is_closed):
         for number in range(5):
             hand_over(lambda number=number: ended.append(number))
     assert sorted(ended) == [0, 1, 2, 3, 4]
+
+
+def test_work_is_done_once_where_no_thread_can_be_started(team, monkeypatch):
+    done = np.zeros(10_000, int)
+    beside = []
+
+    def work(first, last):
+        done[first:last] += 1
+
+    def refuse(_):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched, team.beside() as hand_over:
+        patched.setattr(threading.Thread, "start", refuse)
+        hand_over(lambda: beside.append("done"))
+        team.split(len(done), work)
+    assert (done == 1).all()
+    team.split(len(done), work)
+    team.close()  # what the pool still had waits no more
+    assert (done == 2).all()
+    assert beside == ["done"]
+
+
+def test_the_caller_waits_for_no_thread_that_has_other_work(team):
+    busy, go_on = threading.Barrier(THREADS + 1), threading.Event()
+
+    def work():
+        busy.wait()
+        go_on.wait()
+
+    with team.beside() as hand_over:
+        for _ in range(THREADS):
+            hand_over(work)
+        busy.wait()
+        done = np.zeros(10_000, int)
+        team.split(len(done), lambda first, last: done.__setitem__(slice(first, last), 1))
+        go_on.set()
+    assert done.all()

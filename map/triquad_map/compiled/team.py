@@ -4,8 +4,9 @@ import contextlib
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
 
 THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
 """Threads that share the work: one per core that this process may use."""
@@ -14,8 +15,32 @@ _MIN_SHARE = 2048
 """Points of a field below which splitting work costs more than it gains."""
 
 
+class _Part:
+    """A part of some work, which whoever comes to it first does: a thread, or the caller."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self._work = work
+        self._begun = threading.Lock()
+        self.done: Future[None] = Future()
+
+    def do(self) -> None:
+        """Do it, unless somebody has begun."""
+        if not self._begun.acquire(blocking=False):
+            return
+        try:
+            self._work()
+        except BaseException as error:
+            self.done.set_exception(error)
+        else:
+            self.done.set_result(None)
+
+
 class Team:
-    """Threads that share work with the caller. Who makes a team closes it."""
+    """Threads that share work with the caller. Who makes a team closes it.
+
+    What no thread has begun, since all have other work, or none could be started, or the team is
+    closed, the caller does.
+    """
 
     def __init__(self, name: str, niceness: int = 0) -> None:
         """Threads start with the first work; for ``niceness`` see :func:`lower_priority`."""
@@ -24,7 +49,7 @@ class Team:
         )
 
     def close(self) -> None:
-        """End the threads once their work is done; later work is left to the caller."""
+        """End the threads once their work is done."""
         self._pool.shutdown()
 
     def each(self, work: Callable[[int], None]) -> None:
@@ -42,35 +67,40 @@ class Team:
     @contextlib.contextmanager
     def beside(self) -> Iterator[Callable[[Callable[[], None]], None]]:
         """Run work beside the caller: each that is handed over has ended when the context does."""
-        handed_over: list[Future[None]] = []
+        handed_over: list[_Part] = []
 
         def hand_over(work: Callable[[], None]) -> None:
-            try:
-                handed_over.append(self._pool.submit(work))
-            except RuntimeError:  # closed, or the program ends
-                work()
+            handed_over.append(self._offer(work))
 
         try:
             yield hand_over
         finally:
-            wait(handed_over)
-        for work in handed_over:
-            work.result()
+            _finish(handed_over)
+        for part in handed_over:
+            part.done.result()
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
-        others: list[Future[None]] = []
-        try:
-            for part in range(1, parts):
-                others.append(self._pool.submit(work, part))
-        except RuntimeError:  # closed, or the program ends
-            for part in range(1, parts):
-                work(part)
+        others = [self._offer(partial(work, part)) for part in range(1, parts)]
         try:
             work(0)
         finally:
-            wait(others)  # whatever happens, nobody goes on with what the caller has left
+            _finish(others)
         for other in others:
-            other.result()
+            other.done.result()
+
+    def _offer(self, work: Callable[[], None]) -> _Part:
+        """Let a thread do some work, if one comes to it before the caller."""
+        part = _Part(work)
+        with contextlib.suppress(RuntimeError):  # closed, or no thread can be started
+            self._pool.submit(part.do)
+        return part
+
+
+def _finish(parts: Sequence[_Part]) -> None:
+    """Whatever happens, nobody goes on with what the caller has left."""
+    for part in parts:
+        part.do()
+    wait([part.done for part in parts])
 
 
 def share(count: int, part: int, parts: int = THREADS) -> tuple[int, int]:

@@ -163,11 +163,16 @@ class GradientSums:
         known = self.features[0].shape if self.features else (0, 0)
         if known[0] < rows or known[1] != size or self.step == _LAST_STEP:
             room = rows + rows // 4
-            self.step = 1
-            self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
-            self.touched = tuple(
+            self.clear()  # first: memory may be short
+            touched = [
                 Touched(np.zeros(room, np.int32), np.zeros(room, np.int32)) for _ in range(THREADS)
-            )
+            ]
+            self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
+            self.touched = tuple(touched)
+
+    def clear(self) -> None:
+        """Forget a step that failed midway."""
+        self.features, self.touched, self.step = (), (), 1
 
 
 @kernel(fastmath=True)
@@ -253,6 +258,13 @@ class CompiledTrainer:
         """One optimiser step; returns the loss before it."""
         points = batch.points.numpy()
         targets = torch.sigmoid(batch.labels / self._field.settings.logit_scale_m).numpy()
+        try:
+            return self._train(points, targets, rates)
+        except BaseException:
+            self._sums.clear()
+            raise
+
+    def _train(self, points: Floats, targets: Floats, rates: Rates) -> float:
         field = make_field(self._field.settings, self._field.tree, self._field.arrays)
         sums = self._sums
         sums.begin(*field.features.shape)

@@ -1,5 +1,6 @@
 """The live map: takes in scans, trains, publishes epochs. Owned by one thread."""
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ from triquad_server.mapping.regions_around import regions_around
 from triquad_server.mapping.replay_pool import shared_limit
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ANY_SOURCE, Settings
+
+_log = logging.getLogger(__name__)
 
 _LOSS_MEMORY = 0.95
 
@@ -54,7 +57,7 @@ class Mapper:
         if self._device.type == "cpu":
             # Its threads spin between operations, and would take the cores from the kernels.
             torch.set_num_threads(1)
-        self._normals = SurfaceNormals(self._field_settings.leaf_m, self._teams.mapping)
+        self._normals = self._no_normals()
         self._setup = RegionSetup(
             field=self._field_settings,
             scan=settings.scan,
@@ -69,16 +72,21 @@ class Mapper:
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
         self._structure_changed = True
+        # Regions of the newest epoch that a failed scan took, and for which memory is short.
+        self._missing: dict[RegionIndex, FrozenRegion] = {}
         self.samples_trained = 0
         self._loss: float | Tensor | None = None
         for region in record.regions if record else ():
             self._regions[region.index] = LiveRegion.restore(region, self._setup)
         self._share_pool()
 
+    def _no_normals(self) -> SurfaceNormals:
+        return SurfaceNormals(self._field_settings.leaf_m, self._teams.mapping)
+
     @property
     def settled(self) -> bool:
         """Whether nothing is left to learn from the scans so far."""
-        return self.samples_left == 0
+        return self.samples_left == 0 and not self._missing
 
     @property
     def samples_left(self) -> int:
@@ -134,27 +142,31 @@ class Mapper:
                 are as in the newest epoch.
         """
         of_source = self._settings.sources.get(source, ANY_SOURCE)
-        rays = usable_rays(
-            points,
-            world_from_sensor,
-            self._settings.scan_of(of_source),
-            source=of_source,
-            no_return=no_return,
-        )
-        around = regions_around(rays, self._regions, self._field_settings)
-        self._check_regions(around)
-        self._check_memory(rays, around)
+        try:
+            self._restore_missing()
+            rays = usable_rays(
+                points,
+                world_from_sensor,
+                self._settings.scan_of(of_source),
+                source=of_source,
+                no_return=no_return,
+            )
+            around = regions_around(rays, self._regions, self._field_settings)
+            self._check_regions(around)
+            self._check_memory(rays, around)
+            self._take_in_all(rays, around, stamp_s)
+        except MemoryError as error:
+            text = "the system gives the server no more memory"
+            raise ScanRefusedError("out_of_memory", text) from error
+        return rays
+
+    def _take_in_all(self, rays: ScanRays, around: list[RegionIndex], stamp_s: int) -> None:
+        """Take in a scan, all or nothing of it."""
         try:
             self._take_in(rays, around, stamp_s)
-        except MemoryError as error:
-            self._go_back(rays, around)
-            raise ScanRefusedError(
-                "out_of_memory", "the system gives the server no more memory"
-            ) from error
         except Exception:
-            self._go_back(rays, around)
+            self._go_back(around)
             raise
-        return rays
 
     def _take_in(self, rays: ScanRays, around: list[RegionIndex], stamp_s: int) -> None:
         regions = [self._region(index) for index in around]
@@ -168,10 +180,11 @@ class Mapper:
         for region in regions:
             region.set_normals(normals)
 
-    def _go_back(self, rays: ScanRays, touched: list[RegionIndex]) -> None:
+    def _go_back(self, touched: list[RegionIndex]) -> None:
         """Undo a scan that failed midway: what it touched is again as it was published last.
 
         What those regions had learnt since, and what training needs beyond the field, goes too.
+        Where memory is short, that is made up for before anything else happens to the map.
 
         Raises:
             MapLostError: that fails as well.
@@ -180,19 +193,26 @@ class Mapper:
         for index in touched:
             self._regions.pop(index, None)  # first: memory may be what is short
         self._structure_changed = True
+        self._missing = {index: published[index] for index in published.keys() & set(touched)}
         try:
-            for index in published.keys() & set(touched):
-                region = LiveRegion.restore(published[index].record(), self._setup)
-                self._regions[index] = region
-            if len(rays.ends):
-                self._normals.forget(rays.ends.min(axis=0), rays.ends.max(axis=0))
-            self._share_pool()
+            self._normals = self._no_normals()
+            self._restore_missing()
+        except MemoryError as error:
+            _log.warning("no memory to undo a scan that failed, tried again soon: %s", error)
         except Exception as error:
             text = f"a scan failed, and the map before it is lost: {error!r}"
             raise MapLostError(text) from error
 
+    def _restore_missing(self) -> None:
+        """Have all regions again; MemoryError: not yet."""
+        for index, frozen in list(self._missing.items()):
+            self._regions[index] = LiveRegion.restore(frozen.record(), self._setup)
+            del self._missing[index]
+            self._share_pool()
+
     def train(self) -> None:
         """One optimiser step where the training budget is largest; nothing once all is settled."""
+        self._restore_missing()
         region = max(self._regions.values(), key=lambda r: r.budget_samples, default=None)
         if region is None or region.budget_samples == 0:
             return
@@ -203,6 +223,7 @@ class Mapper:
 
     def publish(self) -> Epoch:
         """The newest epoch: a new one where the map changed since the last."""
+        self._restore_missing()
         changed = self._structure_changed or any(r.changed for r in self._regions.values())
         if self._epoch is not None and not changed:
             return self._epoch
@@ -230,6 +251,7 @@ class Mapper:
 
         Regions wholly between them disappear.
         """
+        self._restore_missing()
         half = self._field_settings.region_side_m / 2
         for index, region in list(self._regions.items()):
             low, high = region.centre - half, region.centre + half

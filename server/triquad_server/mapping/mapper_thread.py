@@ -28,6 +28,10 @@ from triquad_server.settings import MemorySettings, ServiceSettings
 _log = logging.getLogger(__name__)
 
 _GIVE_WAY_S = 0.1
+
+_NO_MEMORY_S = 1.0
+"""How long the map waits for memory where it does not suffice."""
+
 _SCANS_S = 0.05
 """Scans are taken in for so long before training goes on, at least."""
 
@@ -189,7 +193,7 @@ class MapperThread:
         ended = "the mapper has stopped"
         try:
             while not self._stopping.is_set():
-                self._turn()
+                self._turn_safely()
             self._run_commands()
             self._publish()
         except Exception:
@@ -198,6 +202,16 @@ class MapperThread:
             self._failed()
         finally:
             self._refuse_commands(ended)
+
+    def _turn_safely(self) -> None:
+        """As :meth:`_turn`; too little memory to train or publish holds it up for a while only."""
+        try:
+            self._turn()
+        except MemoryError as error:
+            _log.warning("too little memory to go on mapping, tried again soon: %s", error)
+            self.time.begin(Activity.IDLE)
+            self._unpublished = True
+            self._wake.wait(_NO_MEMORY_S)
 
     def _turn(self) -> None:
         """One round: commands, scans, a slice of training, an epoch where one is due."""

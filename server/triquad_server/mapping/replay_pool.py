@@ -241,18 +241,19 @@ class ReplayPool:
         return torch.randint(below, (count,), generator=self._generator, device=self._device)
 
     def _keep(self, places: Longs) -> None:
-        self._intervals = self._intervals[places]
-        self._bins = self._bins[places]
-        self._occupancy = np.bincount(self._bins, minlength=_BINS).astype(np.int32)
+        # Both or none, where memory is short; so below.
+        self._intervals, self._bins = self._intervals[places], self._bins[places]
         self._size = len(places)
+        self._occupancy = np.bincount(self._bins, minlength=_BINS).astype(np.int32)
         self._fresh = self._fresh[:0]
         self._copy_to_device()
 
     def _extend(self, size: int) -> None:
         if size > len(self._intervals):
             room = min(self._capacity, max(size, 2 * len(self._intervals)))
-            self._intervals = with_room(self._intervals[: self._size], room)
-            self._bins = with_room(self._bins[: self._size], room)
+            self._intervals, self._bins = (
+                with_room(rows[: self._size], room) for rows in (self._intervals, self._bins)
+            )
             self._copy_to_device()
         self._size = size
 

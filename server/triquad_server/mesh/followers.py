@@ -22,7 +22,7 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.mesh.mesher import TileIndex, TileLattice, check_box, check_level
 from triquad_server.mesh.tile_cache import CachedTile
-from triquad_server.process.threads import NICENESS
+from triquad_server.process.threads import NICENESS, submit
 from triquad_server.settings import MeshSettings
 
 _log = logging.getLogger(__name__)
@@ -263,7 +263,7 @@ class TileSenders:
         )
         with self._lock:
             self.sending += 1
-        self._threads.submit(self._answer, follower, reply)
+        submit(self._threads, self._answer, follower, reply)
 
     def close(self) -> None:
         """Send what is left, and end."""

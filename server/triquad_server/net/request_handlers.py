@@ -1,5 +1,6 @@
 """Groups of operations, each with a queue and workers; every request is answered exactly once."""
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,9 @@ from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.request import Request, RequestT, Turns
 from triquad_server.net.request_queue import MOST_BEGUN, MOST_SENDING, Job, RequestQueue
+from triquad_server.process.threads import submit
+
+_log = logging.getLogger(__name__)
 
 _REFUSALS = 2  # threads that send them
 _STOPPING = "the server is stopping"
@@ -123,25 +127,31 @@ class RequestHandlers:
             if str(query.key_expr) != key:
                 query.drop()  # unanswered: who means it names it
                 continue
-            asker = self._askers.asker(query, self._limits.longest_s)
-            request = Request(query, key, self._operations[key].counts, asker, self._askers)
-            if request.size > self._limits.max_bytes:
-                limit = self._limits.max_bytes
-                text = f"{request.size} bytes exceed the limit of {limit}: split it"
-                self._refuse_aside(request, "too_large", text)
-            elif self._stopping:
-                self._refuse_aside(request, "busy", _STOPPING)
-            else:
-                for excess in self._queue.put(asker.owner, request, request.size):
-                    text = f"{self._limits.waiting} requests wait already; try later"
-                    self._refuse_aside(excess, "busy", text)
+            try:
+                self._take(query, key)
+            except Exception:  # such as too little memory: the next one may be answered
+                _log.exception("a request on %s could not be received", key)
+
+    def _take(self, query: zenoh.Query, key: str) -> None:
+        asker = self._askers.asker(query, self._limits.longest_s)
+        request = Request(query, key, self._operations[key].counts, asker, self._askers)
+        if request.size > self._limits.max_bytes:
+            limit = self._limits.max_bytes
+            text = f"{request.size} bytes exceed the limit of {limit}: split it"
+            self._refuse_aside(request, "too_large", text)
+        elif self._stopping:
+            self._refuse_aside(request, "busy", _STOPPING)
+        else:
+            for excess in self._queue.put(asker.owner, request, request.size):
+                text = f"{self._limits.waiting} requests wait already; try later"
+                self._refuse_aside(excess, "busy", text)
 
     def _refuse_aside(self, request: Request, code: str, text: str) -> None:
         """Refuse a request in another thread: its client may not take the reply."""
-        self._refusals.submit(request.refuse, code, text)
+        submit(self._refusals, request.refuse, code, text)
 
     def _begin(self, job: Job[Request]) -> None:
-        self._workers.submit(self._work, job)
+        submit(self._workers, self._work, job)
 
     def _work(self, job: Job[Request]) -> None:
         request = job.request

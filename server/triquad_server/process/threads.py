@@ -1,8 +1,16 @@
-"""The teams of threads between which the server's work is split."""
+"""The teams of threads between which the server's work is split, and pools of others."""
 
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import ParamSpec
 
 from triquad_map.compiled.team import Team
+
+_log = logging.getLogger(__name__)
+
+Arguments = ParamSpec("Arguments")
 
 NICENESS = 5
 """How much later than queries, for which somebody waits, the system schedules all other work."""
@@ -22,3 +30,17 @@ class Teams:
         """End the threads; work that still comes is left to the callers."""
         for team in (self.answers, self.mapping, self.meshing):
             team.close()
+
+
+def submit(
+    pool: ThreadPoolExecutor,
+    work: Callable[Arguments, None],
+    *args: Arguments.args,
+    **kwargs: Arguments.kwargs,
+) -> None:
+    """Have a thread of a pool do some work; while none can be started, it waits for one."""
+    try:
+        pool.submit(work, *args, **kwargs)
+    except RuntimeError as error:
+        # The pool has put it among what waits before it started a thread.
+        _log.warning("%s: work in the background waits for one that ends", error)

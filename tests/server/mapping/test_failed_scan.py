@@ -74,6 +74,26 @@ def test_a_map_that_cannot_be_restored_is_told_as_lost(
         mapper.ingest(sphere(), THERE)
 
 
+def test_a_map_for_which_memory_is_short_comes_back_when_there_is_some(
+    mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = mapper.publish()
+    with monkeypatch.context() as patched:
+        fail_midway(patched, MemoryError())
+        patched.setattr(LiveRegion, "restore", lambda *_: bytes(2**60))
+        for _ in range(2):
+            with pytest.raises(ScanRefusedError, match="memory"):
+                mapper.ingest(sphere(), THERE)
+        assert not mapper.settled
+        with pytest.raises(MemoryError):
+            mapper.publish()
+    after = mapper.publish()
+    then, now = (epoch.query(PROBES, gradient=False) for epoch in (before, after))
+    assert np.array_equal(now.sdf, then.sdf, equal_nan=True)
+    mapper.ingest(sphere(), THERE)
+    assert (mapper.publish().query(PROBES, gradient=False).status == Status.SURFACE).all()
+
+
 def test_an_epoch_that_fails_midway_is_made_up_for_by_the_next(
     mapper: Mapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,8 +10,10 @@ from support import servers
 from support.small_world import settings, world
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.mapping import mapper_thread
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.settings import ServiceSettings, StoreSettings
@@ -66,6 +68,37 @@ def test_commands_of_a_thread_that_failed_are_refused_with_the_cause() -> None:
         assert failed.wait(servers.WAIT_S)
         with pytest.raises(MapperStoppedError, match="internal error"):
             thread.call(lambda mapper: mapper.settled)
+
+
+class ShortOfMemory(Mapper):
+    """There is too little memory, now to train and then to publish, once it is told."""
+
+    shortages = ("train", "publish")
+
+    def train(self) -> None:
+        self._run_short("train")
+        super().train()
+
+    def publish(self) -> Epoch:
+        self._run_short("publish")
+        return super().publish()
+
+    def _run_short(self, activity: str) -> None:
+        if self.shortages and self.samples_trained and self.shortages[0] == activity:
+            self.shortages = self.shortages[1:]
+            raise MemoryError
+
+
+def test_too_little_memory_for_a_moment_does_not_end_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapper_thread, "_NO_MEMORY_S", 0.0)
+    mapper = learning_mapper(ShortOfMemory)
+    with running(mapper) as thread:
+        while mapper.shortages:
+            thread.publish_soon()
+        trained = thread.call(lambda mapper: mapper.samples_trained)
+        while thread.call(lambda mapper: mapper.samples_trained) == trained:
+            pass
+        assert thread.epochs.newest.number > 0
 
 
 def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:

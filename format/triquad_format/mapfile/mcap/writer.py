@@ -200,7 +200,17 @@ def _compress(data: bytes, seams: Sequence[int], level: int) -> bytes:
     """One zstd frame in which a block ends at each seam.
 
     A block has one Huffman table: noise and numbers in one block compress badly.
+
+    Raises:
+        MemoryError: zstd needs memory of its own, and nothing else can fail.
     """
+    try:
+        return _compressed(data, seams, level)
+    except zstandard.ZstdError as error:
+        raise MemoryError(str(error)) from error
+
+
+def _compressed(data: bytes, seams: Sequence[int], level: int) -> bytes:
     compressor = zstandard.ZstdCompressor(level=level).compressobj(size=len(data))
     cuts = [0, *seams, len(data)]
     pieces: list[bytes] = []
