@@ -60,6 +60,12 @@ class FairQueue(Generic[ItemT]):
         lane.items.append((item, nbytes))
         self._grew(lane, nbytes)
 
+    def put_first(self, owner: Owner, item: ItemT, nbytes: int) -> None:
+        """As :meth:`put`, before what waits of its owner."""
+        lane = self._lane(owner)
+        lane.items.appendleft((item, nbytes))
+        self._grew(lane, nbytes)
+
     def take(self, may: Callable[[ItemT], bool] = lambda _: True) -> ItemT | None:
         """The oldest item of the owner whose turn it is; it then comes last.
 

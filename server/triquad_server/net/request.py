@@ -68,13 +68,15 @@ class Request:
         return 0 if payload is None else len(payload)
 
     def begin(self, turns: Turns) -> None:
-        """It is its turn.
+        """It is its turn; not for the first time, maybe.
 
         Raises:
             RefusedError: nobody waits for the answer any more, or the server is stopping.
         """
+        if self._turns is None:
+            self._counts.begin(self._arrived_s)
         self._turns = turns
-        self._counts.begin(self._arrived_s)
+        self._slices = 0
         self._check()
 
     def turn(self) -> int:

@@ -17,7 +17,14 @@ from triquad_server.net.asking_client import asking_client
 from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.request import Request, RequestT, Turns
-from triquad_server.net.request_queue import MOST_BEGUN, MOST_SENDING, Job, RequestQueue
+from triquad_server.net.request_queue import (
+    MOST_LONG,
+    MOST_SENDING,
+    MOST_SHORT,
+    Job,
+    RequestQueue,
+    SetAsideError,
+)
 from triquad_server.process.threads import submit
 
 _log = logging.getLogger(__name__)
@@ -85,7 +92,8 @@ class RequestHandlers:
         )
         self._stopping = False
         # As many as ever work or send at a time; they are started when they are needed.
-        self._workers = ThreadPoolExecutor(max(MOST_BEGUN, workers) + MOST_SENDING, "worker")
+        most_begun = max(MOST_SHORT, workers) + MOST_LONG
+        self._workers = ThreadPoolExecutor(most_begun + MOST_SENDING, "worker")
         self._refusals = ThreadPoolExecutor(_REFUSALS, "refusals")
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._receivers: list[threading.Thread] = []
@@ -165,6 +173,10 @@ class RequestHandlers:
         try:
             request.begin(turns)
             self._operations[request.key].handle(request)
+        except SetAsideError:
+            self._queue.put_back(job)
+            if self._stopping:  # since it did not wait until now
+                self.stop()
         except RefusedError as error:
             request.refuse(error.code, error.message)
         except Exception as error:
