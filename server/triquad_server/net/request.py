@@ -12,6 +12,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 
+from triquad_server.fair_queue import Owner
 from triquad_server.net.askers import Asker, Askers
 from triquad_server.net.operation_counts import OperationCounts
 
@@ -66,6 +67,11 @@ class Request:
         """Bytes of the payload."""
         payload = self._query.payload
         return 0 if payload is None else len(payload)
+
+    @property
+    def owner(self) -> Owner:
+        """Whose it is."""
+        return self.asker.owner
 
     def begin(self, turns: Turns) -> None:
         """It is its turn; not for the first time, maybe.

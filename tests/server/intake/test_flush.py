@@ -7,6 +7,7 @@ import pytest
 from support import servers
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import FlushReply, FlushRequest
+from triquad_server.fair_queue import Owner
 from triquad_server.intake import flush, source_ledger
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.source_ledger import SourceLedger
@@ -15,7 +16,8 @@ from triquad_server.intake.source_ledger import SourceLedger
 class PendingRequest:
     """Stands for a Zenoh query; keeps its one answer."""
 
-    def __init__(self, asks, defect=None):
+    def __init__(self, asks, defect=None, owner=""):
+        self.owner = Owner(owner)
         self._asks = asks
         self._defect = defect
         self._replies: queue.SimpleQueue[object] = queue.SimpleQueue()
@@ -105,6 +107,31 @@ def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
         assert asked.wait(servers.WAIT_S)
         ledger.publish()
         assert request.reply == FlushReply(1, 0, 0, None)
+
+
+def test_who_flushes_too_much_is_refused_and_no_other(ledger):
+    ledger.arrive(servers.scan(0))
+    with closing(FlushHandler(ledger, lambda: None, 600.0, limit=8)) as handler:
+        greedy = [PendingRequest(asks(), owner="greedy") for _ in range(8)]
+        honest = PendingRequest(asks(), owner="honest")
+        for request in (*greedy, honest):
+            handler.add(request)
+        assert greedy[-1].reply == "busy"
+        ledger.take(servers.scan(0))
+        ledger.publish()
+        assert honest.reply == FlushReply(1, 0, 0, None)
+
+
+def test_a_client_that_does_not_read_its_reply_holds_up_no_other(ledger, monkeypatch):
+    monkeypatch.setattr(flush, "ARRIVAL_GRACE_S", 0.0)
+    reads = threading.Event()
+    stuck, other = PendingRequest(asks()), PendingRequest(asks(1))
+    stuck.answer = lambda _: reads.wait(servers.WAIT_S)
+    with closing(FlushHandler(ledger, lambda: None, 600.0, limit=8)) as handler:
+        for request in (stuck, other):
+            handler.add(request)
+        assert other.reply == FlushReply(0, 0, 2, None)
+        reads.set()
 
 
 def test_pending_requests_are_refused_when_the_server_stops(ledger):
