@@ -137,7 +137,8 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
         stack.enter_context(monitoring.showing(service.metrics))
     _log_who_gets_in(network)
     _log_ready(options, network, service.epoch, device)
-    phases.serving(service.health, SelfQuestion(session, options.map_name))
+    question = SelfQuestion(session, options.map_name, service.own_name)
+    phases.serving(service.health, question)
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> MonitoringServer | None:

@@ -16,6 +16,7 @@ from triquad_server.net.askers import Askers
 from triquad_server.net.asking_client import asking_client
 from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
+from triquad_server.net.reply_memory import ReplyMemory
 from triquad_server.net.request import Request, RequestT, Turns
 from triquad_server.net.request_queue import (
     MOST_LONG,
@@ -71,17 +72,19 @@ class RequestHandlers:
         operations: Mapping[str, Operation],
         askers: Askers,
         long_work: LongWork,
+        memory: ReplyMemory,
         *,
         workers: int,
         limits: RequestLimits,
     ) -> None:
         """Begin to serve ``operations``, by key, with so many ``workers``.
 
-        ``askers`` and ``long_work`` are those of all groups.
+        ``askers``, ``long_work`` and ``memory`` are those of all groups.
         """
         self._operations = operations
         self._askers = askers
         self._long_work = long_work
+        self._memory = memory
         self._limits = limits
         self._queue: RequestQueue[Request] = RequestQueue(
             self._begin,
@@ -142,7 +145,8 @@ class RequestHandlers:
 
     def _take(self, query: zenoh.Query, key: str) -> None:
         asker = self._askers.asker(query, self._limits.longest_s)
-        request = Request(query, key, self._operations[key].counts, asker, self._askers)
+        counts = self._operations[key].counts
+        request = Request(query, key, counts, asker, self._askers, self._memory)
         if request.size > self._limits.max_bytes:
             limit = self._limits.max_bytes
             text = f"{request.size} bytes exceed the limit of {limit}: split it"
