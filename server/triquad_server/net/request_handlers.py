@@ -31,6 +31,12 @@ from triquad_server.process.threads import submit
 _log = logging.getLogger(__name__)
 
 _REFUSALS = 2  # threads that send them
+
+_REFUSED_BYTES = 16_000_000
+"""Of requests that are refused in these threads: beyond, large ones are refused by the receiver,
+so that the network waits for it and not they in memory."""
+
+_LARGE_BYTES = 65_536
 _STOPPING = "the server is stopping"
 
 Handler = Callable[[Request], None]
@@ -98,6 +104,8 @@ class RequestHandlers:
         most_begun = max(MOST_SHORT, workers) + MOST_LONG
         self._workers = ThreadPoolExecutor(most_begun + MOST_SENDING, "worker")
         self._refusals = ThreadPoolExecutor(_REFUSALS, "refusals")
+        self._refused_bytes = 0  # of requests that wait for these threads
+        self._refused_lock = threading.Lock()
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._receivers: list[threading.Thread] = []
         for key in operations:
@@ -159,8 +167,22 @@ class RequestHandlers:
                 self._refuse_aside(excess, "busy", text)
 
     def _refuse_aside(self, request: Request, code: str, text: str) -> None:
-        """Refuse a request in another thread: its client may not take the reply."""
-        submit(self._refusals, request.refuse, code, text)
+        """Refuse a request, in another thread mostly: its client may not take the reply."""
+        with self._refused_lock:
+            self._refused_bytes += request.size
+            is_much = self._refused_bytes > _REFUSED_BYTES
+        if is_much and request.size > _LARGE_BYTES:
+            self._refuse(request, code, text)
+        else:
+            submit(self._refusals, self._refuse, request, code, text)
+
+    def _refuse(self, request: Request, code: str, text: str) -> None:
+        size = request.size
+        try:
+            request.refuse(code, text)
+        finally:
+            with self._refused_lock:
+                self._refused_bytes -= size
 
     def _begin(self, job: Job[Request]) -> None:
         submit(self._workers, self._work, job)
