@@ -49,7 +49,8 @@ class _Pending:
             if isinstance(outcome, RefusedError):
                 self.request.refuse(outcome.code, str(outcome))
             else:
-                self.request.answer(replace(outcome, warnings=warnings(self.asks.source)))
+                lines = filter(None, (outcome.warnings, warnings(self.asks.source)))
+                self.request.answer(replace(outcome, warnings="\n".join(lines) or None))
         except Exception as error:
             self.request.fail(error)
 
