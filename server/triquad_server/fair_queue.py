@@ -1,7 +1,7 @@
 """A bounded queue of what many owners send, who are served in turn."""
 
-from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
@@ -13,6 +13,24 @@ class Owner(NamedTuple):
 
     group: str
     name: str = ""
+
+
+def first_to_go(items: Sequence[tuple[Owner, int]]) -> int:
+    """Which of items with their sizes, oldest first, goes where they are too many.
+
+    It is the newest of whoever has most.
+    """
+    groups: Counter[str] = Counter()
+    names: Counter[Owner] = Counter()
+    for owner, size in items:
+        groups[owner.group] += size
+        names[owner] += size
+
+    def share(number: int) -> tuple[int, int, int]:
+        owner, _ = items[number]
+        return groups[owner.group], names[owner], number
+
+    return max(range(len(items)), key=share)
 
 
 @dataclass
@@ -58,6 +76,12 @@ class FairQueue(Generic[ItemT]):
         """Add an item at the end of its owner's; the caller then drops what is too much."""
         lane = self._lane(owner)
         lane.items.append((item, nbytes))
+        self._grew(lane, nbytes)
+
+    def put_first(self, owner: Owner, item: ItemT, nbytes: int) -> None:
+        """As :meth:`put`, before what waits of its owner."""
+        lane = self._lane(owner)
+        lane.items.appendleft((item, nbytes))
         self._grew(lane, nbytes)
 
     def take(self, may: Callable[[ItemT], bool] = lambda _: True) -> ItemT | None:

@@ -137,7 +137,8 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
         stack.enter_context(monitoring.showing(service.metrics))
     _log_who_gets_in(network)
     _log_ready(options, network, service.epoch, device)
-    phases.serving(service.health, SelfQuestion(session, options.map_name))
+    question = SelfQuestion(session, options.map_name, service.own_name)
+    phases.serving(service.health, question)
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> MonitoringServer | None:
@@ -274,7 +275,8 @@ def _log_who_gets_in(network: Configuration) -> None:
         _log.info(
             "access: without credentials, whoever reaches this server from beyond this machine may "
             "question and follow the map and publish scans; only programs of this machine may "
-            "reset it or write checkpoints"
+            "reset it or write checkpoints; triquad-keys gives others that right, and encrypts "
+            "(docs/security.md)"
         )
     else:
         _log.info("access: programs of this machine; --listen tcp/0.0.0.0:7447 lets others connect")

@@ -5,16 +5,19 @@ import zenoh
 from triquad_format.errors import WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ErrorReply, SdfRequest
+from triquad_format.wire.origin import RequestOrigin
 
 
 class SelfQuestion:
     """Asks for the field at one point, which goes the way of the questions of others."""
 
-    def __init__(self, session: zenoh.Session, map_name: str) -> None:
+    def __init__(self, session: zenoh.Session, map_name: str, own_name: str) -> None:
+        """``own_name`` has turns of its own, as any client: no other comes before."""
         self._session = session
         self._key = keys.operation_key(map_name, keys.SDF)
         request = SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), gradient=False, epoch=0)
         self._payload = codec.encode(request)
+        self._own_name = own_name
 
     def problem(self, timeout_s: float) -> str | None:
         """That no answer came in time; ``None`` where one came.
@@ -24,6 +27,7 @@ class SelfQuestion:
         replies = self._session.get(
             self._key,
             payload=self._payload,
+            attachment=codec.encode(RequestOrigin(self._own_name, timeout_s)),
             timeout=timeout_s,
             allowed_destination=zenoh.Locality.SESSION_LOCAL,
         )

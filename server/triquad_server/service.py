@@ -100,6 +100,11 @@ class Service:
         """Number of the newest epoch."""
         return self._mapper.epochs.newest.number
 
+    @property
+    def own_name(self) -> str:
+        """By which the server names itself in requests to itself."""
+        return self._operations.own_name
+
     def close(self) -> None:
         """Refuse what still waits, stop mapping, and write a last checkpoint.
 

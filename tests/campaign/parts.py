@@ -1,6 +1,6 @@
-"""The nine parts of the campaign."""
+"""The ten parts of the campaign."""
 
-from campaign import clock, cuts, disk, driving, files, kills, memory, messages, stops
+from campaign import clock, crowd, cuts, disk, driving, files, kills, memory, messages, stops
 from campaign.turn import Part
 
 PARTS = (
@@ -72,6 +72,15 @@ PARTS = (
         run=memory.run,
         promise="what does not fit is refused; where the server ends, all that was acknowledged is "
         "restored; no valid file counts as damaged",
+    ),
+    Part(
+        "crowd",
+        "seconds of a crowd",
+        goal=3_600,
+        per_turn=60,
+        run=crowd.run,
+        promise="clients that ask and send too much, read nothing or invent names take at most 200 "
+        "MB of memory; an honest client is served after them",
     ),
     Part(
         "driving",

@@ -23,6 +23,7 @@ _FEW = {
     "cuts": 3,
     "stops": 1,
     "memory": 1,
+    "crowd": 10,
     "driving": 2,
 }
 

@@ -19,6 +19,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import FlushRequest
 from triquad_format.wire.source_messages import SourcesReply, SourcesRequest, SourceState
 from triquad_server.intake.source_trails import MAX_SOURCES
+from triquad_server.queries import source_queries
 
 BOX = ((2.5, -1, -1), (3.5, 1, 1))
 
@@ -122,6 +123,15 @@ def test_as_many_points_come_as_are_wanted_of_all_that_are_used(client):
     assert none.points_used == everything.points_used
 
 
+def test_the_points_of_very_many_sources_are_bounded(client, monkeypatch):
+    monkeypatch.setattr(source_queries, "MOST_POINTS", 100)
+    for source in ("one", "other"):
+        client.publish_scan(servers.sphere(500), np.eye(4), source=source)
+    client.flush(servers.WAIT_S)
+    report = client.sources(max_points=1000)
+    assert [len(source.newest.points) for source in report.sources.values()] == [50, 50]
+
+
 def test_refused_scans_leave_no_trace(client):
     drive(client, [1])
     before = client.sources()
@@ -195,17 +205,19 @@ def test_the_sources_that_are_remembered_are_bounded(client, endpoint):
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
 
-        def take(source: str, sequence: int = 0) -> None:
-            scan = servers.scan(sequence, source=source, points=servers.sphere(20))
-            peer.put(source, codec.encode(scan))
-            assert peer.flush(scan).taken == sequence + 1
+        def take(*sources: str, sequence: int = 0) -> None:
+            points = servers.sphere(20)
+            scans = [servers.scan(sequence, source=source, points=points) for source in sources]
+            for scan in scans:
+                peer.put(scan.source, codec.encode(scan))
+            for scan in scans:
+                assert peer.flush(scan).taken == sequence + 1
 
-        for name in names:
-            take(name)
+        take(*names)
         first = client.sources()
         assert sorted(first.sources) == sorted(names[10:])
-        take(names[10], 1)
-        take(names[0], 1)
+        take(names[10], sequence=1)
+        take(names[0], sequence=1)
     report = client.sources(first)
     assert sorted(report.sources) == sorted([names[0], names[10], *names[12:]])
 

@@ -33,7 +33,7 @@ _LENGTHS_M = st.floats(1e-3, 100.0)
 def answers():
     """Of a settled street."""
     world = small_world.world()
-    epoch = small_world.settled_mapper(small_world.settings(), world).publish()
+    epoch = small_world.settled_epoch()
     limits = QuestionLimits(points=10**6, searches=10**6)
     return Answers(lambda _: nullcontext(epoch), limits), world.hits
 

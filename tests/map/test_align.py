@@ -8,7 +8,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.exact_view import ExactView
-from support.small_world import settings, settled_mapper, world
+from support.small_world import settled_epoch, world
 from triquad_format.records.status import Status
 from triquad_map.questions.align import Alignment, AlignOptions, align, thinned
 from triquad_tools.benchmarks.align import Offset, attempts, displaced, recorded
@@ -239,7 +239,7 @@ def test_points_of_another_shape_are_refused() -> None:
 
 def test_a_scan_is_put_back_into_a_map_that_was_learnt() -> None:
     drive = world()
-    epoch = settled_mapper(settings(), drive).publish()
+    epoch = settled_epoch()
     rng = np.random.default_rng(5)
     middle = drive.scans[2].world_from_sensor
     for _ in range(5):

@@ -63,6 +63,12 @@ def settled_mapper(chosen: Settings, drive_through: World, device: str = "cpu") 
     return mapper
 
 
+@cache
+def settled_epoch(scans: int = 6) -> Epoch:
+    """All that can be learnt of a drive of a few scans: an epoch never changes, so all share it."""
+    return settled_mapper(settings(), world(scans)).publish()
+
+
 def settle(mapper: Mapper) -> None:
     """Train until nothing is left to learn."""
     while not mapper.settled:

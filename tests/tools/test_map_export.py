@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from support.exact_maps import exact_map, table
 from support.map_records import random_record
 from support.mapfile_edit import file_bytes
-from support.small_world import settings, settled_mapper, world
+from support.small_world import settings, settled_epoch
 from triquad_client import Mesh
 from triquad_client.mesh.mesh import joined
 from triquad_format.mapfile.reader import read_map
@@ -31,7 +31,7 @@ LOW, HIGH = np.array([0.1, -4.7, -2]), np.array([12.3, 4.1, 3])
 @pytest.fixture(scope="module")
 def map_file(tmp_path_factory):
     """A street; its regions are learnt, and a part of them is kept."""
-    record = settled_mapper(settings(), world(4)).publish().record()
+    record = settled_epoch(4).record()
     path = tmp_path_factory.mktemp("street") / "street.triquad"
     path.write_bytes(file_bytes(crop_record(record, [-5, -10, -3], [40, 10, 5])))
     return path

@@ -15,7 +15,10 @@ def figures() -> list[Figure]:
     scene = street(2, 20.0)
     made = driven_street(SimulatedDrive(scene, Lidar(columns=128), drive(scene, 10, 1.0), seed=2))
     visible = made.drive.true_hits(0.1)
-    return measure_tradeoffs(BenchStreet(made.drive, made.scans, made.probes, visible=visible))
+    few = 300_000  # samples of a mesh, where all would be a million and a half
+    return measure_tradeoffs(
+        BenchStreet(made.drive, made.scans, made.probes, visible=visible, samples_max=few)
+    )
 
 
 def curve_of(figures: list[Figure], curve: str, measure: str) -> list[tuple[float, float]]:

@@ -27,6 +27,7 @@ from triquad_client.errors import (
     UnknownMapError,
 )
 from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
+from triquad_client.net.diagnosis import why_no_link
 
 _HERE = "127.0.0.1"
 _LIVELINESS_TIMEOUT_S = 3.0
@@ -140,8 +141,9 @@ class Connection:
         if ask.operation.startswith("admin/"):
             return NoReplyError(
                 f"no reply on {self._key(ask)} although the map is there: access control forbids "
-                "it (by default to all but programs of the server's machine that connect to "
-                "127.0.0.1), or the server is stopping or older than this operation"
+                "it (without roles to all but programs of the server's machine that connect to "
+                "127.0.0.1, with roles to all but those of an admin), or the server is stopping or "
+                "older than this operation"
             )
         return NoReplyError(
             f"no reply on {self._key(ask)} although the map is there: the server is stopping "
@@ -247,17 +249,22 @@ def open_connection(
     """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
     timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
     most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
+    where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
     try:
         keys.check_name("map", map_name)
-        session = zenoh.open(_configuration(endpoint, timeout_s, config))
+        configured = _configuration(endpoint, timeout_s, config)
     except FormatError as error:
         raise InvalidInputError(str(error)) from error
     except zenoh.ZError as error:
-        where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
-        raise ConnectError(
-            f"cannot connect {where}: {_reason(error)} Start triquad-server there, or check the "
-            "endpoint and the credentials."
-        ) from error
+        raise ConnectError(f"cannot connect {where}: {_reason(error)}") from error
+    try:
+        session = zenoh.open(configured)
+    except zenoh.ZError as error:
+        why = why_no_link(configured, timeout_s) or (
+            f"{_reason(error)} Start triquad-server there, or check the endpoint and the "
+            "credentials."
+        )
+        raise ConnectError(f"cannot connect {where}: {why}") from error
     connection = Connection(session, map_name, timeout_s, max_download_bytes=most)
     try:
         # Asked for by name first: there may be any number of others.

@@ -12,6 +12,7 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_map.asked import asked
+from triquad_map.questions.joined import joined
 from triquad_map.surface import DISC_RADIUS
 from triquad_map.view import MapView, NearestSurface
 
@@ -24,6 +25,9 @@ _SURFEL_VOXELS = 1.5
 _WIDENED_VOXELS = float(np.sqrt(0.5)) - DISC_RADIUS
 """From the rim of a disc to where it meets those of the voxels beside it, at their corners."""
 
+
+_PART_POINTS = 1 << 15
+"""Points that are answered together: meanwhile each takes ten times the bytes of its answer."""
 
 Rows = NDArray[np.intp]
 
@@ -103,6 +107,11 @@ class Distances:
 
 def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
     """Distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface."""
+    firsts = range(0, max(1, len(points)), _PART_POINTS)
+    return joined([_distances(view, points[at : at + _PART_POINTS], options) for at in firsts])
+
+
+def _distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
     nearest = view.nearest_surface(points, options.max_distance_m)
     status = view.status(points)
     gradient = np.where(nearest.found[:, None], _unit(points - nearest.mean, 0.0), 0.0)

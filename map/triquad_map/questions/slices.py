@@ -1,15 +1,12 @@
 """Long questions in slices, between which others have their turn."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
-from typing import Any, TypeVar
 
 import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles
 
+from triquad_map.questions.joined import joined
 from triquad_map.view import FieldAnswer, MapView, NearestSurface, NearestUnknown
-
-AnswerT = TypeVar("AnswerT", FieldAnswer, NearestSurface, NearestUnknown)
 
 
 class SlicedView:
@@ -35,7 +32,7 @@ class SlicedView:
 
     def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
         """As of the view."""
-        return _joined([self._view.query(part, gradient) for part in self._slices(points)])
+        return joined([self._view.query(part, gradient) for part in self._slices(points)])
 
     def status(self, points: Doubles, reach_m: float | None = None) -> Bytes:
         """As of the view."""
@@ -44,12 +41,12 @@ class SlicedView:
     def nearest_surface(self, points: Doubles, max_distance_m: float) -> NearestSurface:
         """As of the view."""
         slices = self._slices(points)
-        return _joined([self._view.nearest_surface(part, max_distance_m) for part in slices])
+        return joined([self._view.nearest_surface(part, max_distance_m) for part in slices])
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
         """As of the view."""
         slices = self._slices(points)
-        return _joined([self._view.nearest_unknown(part, max_distance_m) for part in slices])
+        return joined([self._view.nearest_unknown(part, max_distance_m) for part in slices])
 
     def _slices(self, points: Doubles) -> Iterator[Doubles]:
         """The points [N, 3], as many at a time as may be; no points are one slice."""
@@ -58,14 +55,3 @@ class SlicedView:
             last = first + self._turn()
             yield points[first:last]
             first = last
-
-
-def _joined(answers: list[AnswerT]) -> AnswerT:
-    """Answers to consecutive points as one."""
-    if len(answers) == 1:
-        return answers[0]
-    columns: dict[str, Any] = {}
-    for field in fields(answers[0]):
-        parts = [getattr(answer, field.name) for answer in answers]
-        columns[field.name] = None if parts[0] is None else np.concatenate(parts)
-    return replace(answers[0], **columns)

@@ -39,7 +39,7 @@ class EpochHistory:
     """The newest epochs, and older ones while they are asked for by number.
 
     Older ones have a share of the memory, of which those that are pinned have at most half. A pin
-    that is held goes for no other client's; each client has a few.
+    that is held goes for no other client's first; each client has a few.
     """
 
     def __init__(
@@ -157,18 +157,20 @@ class EpochHistory:
     def _pinned(self) -> Iterator[int]:
         """The epochs that clients may have pinned, those first that are to stay.
 
-        Of each client the ones that it asked for last, and first those of whom came first. Who has
-        no name may be many, and comes after all others.
+        Of each client the ones that it asked for last: first one of each, and first those of whom
+        came first. Who has no name may be many, and comes after all others.
         """
         since = self._clock() - self._settings.pin_s
         by_client: dict[str, list[_Pin]] = {}
         for pin in self._pins:
             if pin.asked_s >= since:
                 by_client.setdefault(pin.client, []).append(pin)
-        for client in sorted(by_client, key=lambda client: not client):
-            newest_first = sorted(by_client[client], key=lambda pin: -pin.asked_s)
-            most = self._settings.client_pins if client else len(newest_first)
-            yield from (pin.number for pin in newest_first[:most])
+        for pins in by_client.values():
+            pins.sort(key=lambda pin: -pin.asked_s)
+        unnamed = by_client.pop("", [])
+        for rank in range(self._settings.client_pins):
+            yield from (pins[rank].number for pins in by_client.values() if rank < len(pins))
+        yield from (pin.number for pin in unnamed)
 
 
 class _Room:

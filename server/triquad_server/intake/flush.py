@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from triquad_format.errors import FormatError, RefusedError
@@ -10,12 +11,19 @@ from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
 
+from triquad_server.fair_queue import first_to_go
 from triquad_server.intake.source_ledger import MAX_SEQUENCE, SourceLedger
 from triquad_server.net.request import Request
+from triquad_server.process.threads import submit
 
 ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived so long after the flush request, which travels the same way behind
 it, is lost."""
+
+_SENDERS = 16
+"""Replies on their way at a time: clients that do not read them hold up no others."""
+
+_STOPPING = "the server is stopping"
 
 Outcome = FlushReply | RefusedError
 """What a request is answered with: a reply, or why there is none."""
@@ -41,7 +49,8 @@ class _Pending:
             if isinstance(outcome, RefusedError):
                 self.request.refuse(outcome.code, str(outcome))
             else:
-                self.request.answer(replace(outcome, warnings=warnings(self.asks.source)))
+                lines = filter(None, (outcome.warnings, warnings(self.asks.source)))
+                self.request.answer(replace(outcome, warnings="\n".join(lines) or None))
         except Exception as error:
             self.request.fail(error)
 
@@ -62,7 +71,8 @@ class FlushHandler:
     ) -> None:
         """Begin to answer; ``publish_soon`` asks the mapper for an epoch.
 
-        At most ``limit`` requests are pending. ``warnings`` are those about a source.
+        At most ``limit`` requests are pending; of more, the newest of the client that has most of
+        them is refused. ``warnings`` are those about a source.
         """
         self._ledger = ledger
         self._publish_soon = publish_soon
@@ -70,6 +80,9 @@ class FlushHandler:
         self._limit = limit
         self._warnings = warnings
         self._pending: list[_Pending] = []
+        self._excess: list[_Pending] = []  # to be refused
+        self._sending = 0
+        self._senders = ThreadPoolExecutor(_SENDERS, "flush-sender")
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="flush")
         self._thread.start()
@@ -77,7 +90,7 @@ class FlushHandler:
     @property
     def queue(self) -> QueueMetrics:
         """What is pending."""
-        return QueueMetrics(len(self._pending), self._limit)
+        return QueueMetrics(len(self._pending) + self._sending, self._limit)
 
     def close(self) -> None:
         """Refuse what is pending, and end."""
@@ -85,22 +98,25 @@ class FlushHandler:
             self._stopping = True
             self._ledger.changed.notify_all()
         self._thread.join()
+        self._senders.shutdown()
 
     def add(self, request: Request) -> None:
         """Take over a flush request; it is answered once its scan is settled.
 
         Raises:
-            RefusedError: it cannot be decoded, a field is out of range, or too many are pending.
+            RefusedError: it cannot be decoded, a field is out of range, or the server is stopping.
         """
         asks = request.read(FlushRequest)
         self._check(asks)
         now = time.monotonic()
         with self._ledger.changed:
-            if self._stopping or len(self._pending) >= self._limit:
-                text = f"{len(self._pending)} flush requests are pending already; try later"
-                raise RefusedError("busy", text)
+            if self._stopping:
+                raise RefusedError("timeout", _STOPPING)
             times = now + ARRIVAL_GRACE_S, now + asks.timeout_s
             self._pending.append(_Pending(request, asks, *times))
+            if len(self._pending) + self._sending > self._limit:
+                owners = [(entry.request.owner, 1) for entry in self._pending]
+                self._excess.append(self._pending.pop(first_to_go(owners)))
             self._ledger.changed.notify_all()
 
     def _check(self, asks: FlushRequest) -> None:
@@ -128,19 +144,30 @@ class FlushHandler:
                     self._ledger.changed.wait(self._time_left_s())
                 stopping = self._stopping
                 if stopping:
-                    why = RefusedError("timeout", "the server is stopping")
-                    decided = [(entry, why) for entry in self._pending]
+                    why = RefusedError("timeout", _STOPPING)
+                    decided = [(entry, why) for entry in (*self._pending, *self._excess)]
+                self._sending += len(decided)
             for entry, outcome in decided:
-                entry.send(outcome, self._warnings)
+                submit(self._senders, self._send, entry, outcome)
+
+    def _send(self, entry: _Pending, outcome: Outcome) -> None:
+        try:
+            entry.send(outcome, self._warnings)
+        finally:
+            with self._ledger.changed:
+                self._sending -= 1
 
     def _decided(self) -> list[tuple[_Pending, Outcome]]:
         """The requests that can be answered now, and how; they are no longer pending."""
         now = time.monotonic()
+        busy = RefusedError("busy", f"{self._limit} flush requests are pending already; try later")
+        refused: list[tuple[_Pending, Outcome]] = [(entry, busy) for entry in self._excess]
+        self._excess = []
         outcomes = [(entry, self._outcome(entry, now)) for entry in self._pending]
         self._pending = [entry for entry, outcome in outcomes if outcome is None]
         if any(self._ledger.settled(*entry.scan) for entry in self._pending):
             self._publish_soon()
-        return [(entry, outcome) for entry, outcome in outcomes if outcome is not None]
+        return refused + [(entry, outcome) for entry, outcome in outcomes if outcome is not None]
 
     def _outcome(self, entry: _Pending, now: float) -> Outcome | None:
         """What a request is answered with; ``None`` where it stays pending."""

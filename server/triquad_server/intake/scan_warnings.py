@@ -118,11 +118,18 @@ class ScanWarnings:
     def _check_scans(self) -> None:
         ledger = self._scans.ledger
         thin_m, leaf_m = self._settings.scan.thin_m, self._settings.field.leaf_m
-        for source, lost in ledger.lost().items():
+        for source, lost in ledger.losses().items():
+            self._count(
+                source,
+                "never arrived",
+                lost.never_arrived,
+                "of its scans never arrived: the link broke, or they were published before this "
+                "server started",
+            )
             self._count(
                 source,
                 "lost",
-                lost,
+                lost.pushed_out,
                 f"of its scans were lost, since the server does not keep up: publish fewer, or "
                 f"fewer points a scan, or set a larger scan.thin_m (it is {thin_m:g}) or, for a "
                 f"new map, field.leaf_m (it is {leaf_m:g})",

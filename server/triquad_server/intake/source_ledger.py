@@ -34,6 +34,13 @@ class Refusals(NamedTuple):
     last: str  # why the last of them was
 
 
+class Losses(NamedTuple):
+    """Lost scans of one source."""
+
+    pushed_out: int  # of the full queue
+    never_arrived: int
+
+
 @dataclass
 class _Track:
     """Counts of one session of one source. Scans of one session stay in order all the way."""
@@ -46,13 +53,19 @@ class _Track:
     stamp_ns: int = -(2**63)
     taken: int = 0
     refused: int = 0
-    lost: int = 0
+    pushed_out: int = 0  # of the full queue
+    never_arrived: int = 0
     last_refusal: str | None = None
     heard_s: float = field(default_factory=time.monotonic)  # of it last, monotonic
 
+    @property
+    def lost(self) -> int:
+        """Scans lost, one way or the other."""
+        return self.pushed_out + self.never_arrived
+
     def lose_up_to(self, sequence: int) -> None:
         """Count what did not arrive, up to and with ``sequence``, as lost."""
-        self.lost += max(0, sequence - self.arrived)
+        self.never_arrived += max(0, sequence - self.arrived)
         self.arrived = max(self.arrived, sequence)
 
     def is_ahead(self, sequence: int) -> bool:
@@ -81,7 +94,7 @@ class SourceLedger:
     def __init__(self) -> None:
         self.changed = threading.Condition()  # notified when the outcome of a scan may be known
         self._tracks: OrderedDict[tuple[str, int], _Track] = OrderedDict()
-        self._forgotten_lost = 0
+        self._forgotten = Losses(0, 0)
 
     def arrive(self, scan: Scan) -> str | None:
         """Record a scan's arrival; the reason where its sequence or stamp refuses it."""
@@ -136,7 +149,7 @@ class SourceLedger:
     def push_out(self, scan: Scan) -> None:
         """Record that a scan was pushed out of the full queue."""
         with self.changed:
-            self._leave_queue(scan).lost += 1
+            self._leave_queue(scan).pushed_out += 1
 
     def take_back(self, why: str) -> int:
         """Record that scans which no epoch shows yet are not in the map after all; how many."""
@@ -171,7 +184,15 @@ class SourceLedger:
         with self.changed:
             track = self._tracks.get((source, session))
             if track is None:
-                return FlushReply(taken=0, refused=0, lost=sequence + 1, last_refusal=None)
+                return FlushReply(
+                    taken=0,
+                    refused=0,
+                    lost=sequence + 1,
+                    last_refusal=None,
+                    warnings=f"source {source!r}: none of this client's scans arrived: access "
+                    "control does not let it publish as this source (a role names its sources), "
+                    "or the server was started again since",
+                )
             if track.is_ahead(sequence):
                 lost = track.lost + sequence - track.arrived
                 return FlushReply(track.taken, track.refused, lost, track.last_refusal)
@@ -202,12 +223,16 @@ class SourceLedger:
 
     def lost(self) -> dict[str, int]:
         """Scans lost, by source."""
+        return {source: min(_MAX_COUNT, sum(lost)) for source, lost in self.losses().items()}
+
+    def losses(self) -> dict[str, Losses]:
+        """Scans lost, by source and by how."""
         with self.changed:
-            counts = {FORGOTTEN: self._forgotten_lost} if self._forgotten_lost else {}
+            found = {FORGOTTEN: self._forgotten} if any(self._forgotten) else {}
             for (source, _), track in self._tracks.items():
                 if track.lost:
-                    counts[source] = min(_MAX_COUNT, counts.get(source, 0) + track.lost)
-            return counts
+                    found[source] = _with_losses(found.get(source, Losses(0, 0)), track)
+            return found
 
     def sources(self) -> dict[str, SourceMetrics]:
         """The scans of each source; those heard of longest ago are put together where many are."""
@@ -242,8 +267,16 @@ class SourceLedger:
         self._tracks.move_to_end((source, session))
         if len(self._tracks) > MAX_SESSIONS:
             _, forgotten = self._tracks.popitem(last=False)
-            self._forgotten_lost = min(_MAX_COUNT, self._forgotten_lost + forgotten.lost)
+            self._forgotten = _with_losses(self._forgotten, forgotten)
         return track
+
+
+def _with_losses(before: Losses, track: _Track) -> Losses:
+    """The losses of a source, with those of one more session."""
+    return Losses(
+        pushed_out=min(_MAX_COUNT, before.pushed_out + track.pushed_out),
+        never_arrived=min(_MAX_COUNT, before.never_arrived + track.never_arrived),
+    )
 
 
 def _with_track(before: SourceMetrics | None, track: _Track, age_s: float) -> SourceMetrics:

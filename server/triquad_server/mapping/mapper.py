@@ -11,6 +11,7 @@ from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord
 
 from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.shortage import shortages
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
@@ -168,6 +169,7 @@ class Mapper:
             self._go_back(around)
             raise
 
+    @shortages()
     def _take_in(self, rays: ScanRays, around: list[RegionIndex], stamp_s: int) -> None:
         regions = [self._region(index) for index in around]
         with self._teams.mapping.beside() as beside:
@@ -203,6 +205,7 @@ class Mapper:
             text = f"a scan failed, and the map before it is lost: {error!r}"
             raise MapLostError(text) from error
 
+    @shortages()
     def _restore_missing(self) -> None:
         """Have all regions again; MemoryError: not yet."""
         for index, frozen in list(self._missing.items()):
@@ -210,6 +213,7 @@ class Mapper:
             del self._missing[index]
             self._share_pool()
 
+    @shortages()
     def train(self) -> None:
         """One optimiser step where the training budget is largest; nothing once all is settled."""
         self._restore_missing()
@@ -221,6 +225,7 @@ class Mapper:
         self._loss = _LOSS_MEMORY * before + (1 - _LOSS_MEMORY) * loss
         self.samples_trained += self._settings.training.batch
 
+    @shortages()
     def publish(self) -> Epoch:
         """The newest epoch: a new one where the map changed since the last."""
         self._restore_missing()
@@ -263,6 +268,7 @@ class Mapper:
         self._share_pool()
         self._structure_changed = True
 
+    @shortages()
     def changes_since(self, epoch: int | None) -> MapChanges:
         """The newest epoch, with training state, of the regions that changed after ``epoch``.
 

@@ -41,6 +41,10 @@ _SCANS_SHARE = 2.0
 _MIN_PUBLISH_SHARE = 5
 """Publishing takes at most one part in so many of the thread's time."""
 
+_SOONEST_PUBLISH_S = 0.1
+"""An epoch that a flush waits for comes so long after the one before, at the earliest: however much
+is flushed, an epoch that was just asked stays for a moment."""
+
 ResultT = TypeVar("ResultT")
 
 
@@ -103,7 +107,7 @@ class MapperThread:
         self._publish_soon = threading.Event()
         self._resting = threading.Event()
         self._stopping = threading.Event()
-        self._next_publish = 0.0
+        self._next_publish = self._soonest_publish = 0.0
         self._unpublished = False
         self._scans_taken = 0
         self._loss = 0.0  # as of the newest epoch
@@ -141,7 +145,7 @@ class MapperThread:
         self._wake.set()
 
     def publish_soon(self) -> None:
-        """Publish once the current slice is over, without waiting for the period."""
+        """Publish once the current slice is over, without waiting for the whole period."""
         self._publish_soon.set()
         self._wake.set()
 
@@ -233,9 +237,7 @@ class MapperThread:
                 self._mapper.train()
             self._step_s = time.monotonic() - started
             self._unpublished = True
-        if self._publish_soon.is_set() or (
-            self._unpublished and time.monotonic() >= self._next_publish
-        ):
+        if self._is_publish_due():
             self._publish_soon.clear()
             self._publish()
         self._record_progress()
@@ -243,6 +245,12 @@ class MapperThread:
         if self._mapper.settled and not took_scans:
             self.time.begin(Activity.IDLE)
             self._wake.wait(self._rest_s())
+
+    def _is_publish_due(self) -> bool:
+        now = time.monotonic()
+        if self._publish_soon.is_set():
+            return now >= self._soonest_publish
+        return self._unpublished and now >= self._next_publish
 
     def _run_commands(self) -> None:
         while (command := self._next_command()) is not None:
@@ -334,10 +342,13 @@ class MapperThread:
         self._unpublished = False
         now = time.monotonic()
         self._next_publish = now + max(self._period_s, _MIN_PUBLISH_SHARE * (now - started))
+        self._soonest_publish = now + min(self._period_s, _SOONEST_PUBLISH_S)
         self._scans.ledger.publish()
 
     def _rest_s(self) -> float | None:
         """How long there is nothing to do; None: until woken."""
+        if self._publish_soon.is_set():
+            return max(0.0, self._soonest_publish - time.monotonic())
         return max(0.0, self._next_publish - time.monotonic()) if self._unpublished else None
 
     def _record_progress(self) -> None:

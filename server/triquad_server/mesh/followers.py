@@ -7,7 +7,7 @@ import logging
 import math
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -20,6 +20,7 @@ from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_map.compiled.team import lower_priority
 
+from triquad_server.fair_queue import Owner
 from triquad_server.mesh.mesher import TileIndex, TileLattice, check_box, check_level
 from triquad_server.mesh.tile_cache import CachedTile
 from triquad_server.process.threads import NICENESS, submit
@@ -27,7 +28,8 @@ from triquad_server.settings import MeshSettings
 
 _log = logging.getLogger(__name__)
 
-_SENDERS = 2
+_SENDERS = 16
+"""Replies on their way at a time: clients that do not read them hold up no others."""
 
 MAX_CLIENTS = 1024
 """Of more, those heard of longest ago are forgotten."""
@@ -36,7 +38,7 @@ BURST_S = 1.0
 """A client that asked for nothing for so long may be sent as many seconds' worth at once."""
 
 MAX_HELD_BYTES = 64_000_000
-"""Of all requests that are held together; more are refused."""
+"""Of all requests that are held together; more are refused, of the client that has most."""
 
 _FOLLOWER_BYTES, _KNOWN_BYTES = 4096, 300
 """Of one that is held, and of each tile that it names as known."""
@@ -48,6 +50,10 @@ class PendingRequest(Protocol):
     @property
     def size(self) -> int:
         """Bytes that it takes while it is held."""
+
+    @property
+    def owner(self) -> Owner:
+        """Whose it is."""
 
     def read(self, kind: type[TileUpdatesRequest]) -> TileUpdatesRequest:
         """What is asked for."""
@@ -62,7 +68,7 @@ class PendingRequest(Protocol):
         """Say that an internal error, which is being handled, is why there is none."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Follower:
     """A pending request for what changed."""
 
@@ -245,10 +251,21 @@ class TileSenders:
     def __init__(self) -> None:
         self._bandwidth = Bandwidth()
         self._lock = threading.Lock()
-        self.sending = 0  # replies that are not sent yet
+        self._sending: Counter[Owner] = Counter()  # replies that are not sent yet
         self._threads = ThreadPoolExecutor(
             _SENDERS, "tile-sender", initializer=lower_priority, initargs=(NICENESS,)
         )
+
+    @property
+    def sending(self) -> int:
+        """Replies that are not sent yet."""
+        with self._lock:
+            return self._sending.total()
+
+    def is_sending_to(self, follower: Follower) -> bool:
+        """Whether a reply to the same client is on its way: the next waits until it has arrived."""
+        with self._lock:
+            return self._sending[follower.request.owner] > 0
 
     def may_send(self, follower: Follower) -> bool:
         """Whether it is time to send to a follower's client again. For one thread."""
@@ -262,8 +279,12 @@ class TileSenders:
             follower.asks.client, len(reply.data), follower.bytes_per_s, now_s=time.monotonic()
         )
         with self._lock:
-            self.sending += 1
+            self._sending[follower.request.owner] += 1
         submit(self._threads, self._answer, follower, reply)
+
+    def refuse(self, follower: Follower, code: str, text: str) -> None:
+        """Refuse a request, in the background."""
+        submit(self._threads, follower.request.refuse, code, text)
 
     def close(self) -> None:
         """Send what is left, and end."""
@@ -276,4 +297,4 @@ class TileSenders:
             _log.exception("a reply to a follower of the mesh could not be sent")
         finally:
             with self._lock:
-                self.sending -= 1
+                self._sending -= Counter([follower.request.owner])

@@ -11,6 +11,7 @@ from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.history import EpochHistory
+from triquad_server.fair_queue import first_to_go
 from triquad_server.mesh.followers import (
     BURST_S,
     MAX_HELD_BYTES,
@@ -28,6 +29,7 @@ from triquad_server.settings import MeshSettings
 
 _log = logging.getLogger(__name__)
 
+_STOPPING = "the server is stopping"
 _PAUSE_S = 0.1
 _SLICE_S = 0.2  # tiles are made so long for one follower, then for the next
 _GIVE_WAY_S = 0.1
@@ -58,7 +60,8 @@ class TileFeed:
     ) -> None:
         """Begin to answer; ``server`` is the name that replies carry.
 
-        At most ``limit`` requests are pending.
+        At most ``limit`` requests are pending; of more, the newest of the client that has most of
+        them is refused.
         """
         self._cache = cache
         self._epochs = epochs
@@ -101,7 +104,7 @@ class TileFeed:
         """Take over a request for updates; it is answered once there are some, or in time.
 
         Raises:
-            RefusedError: it cannot be decoded, a field is out of range, or too many are pending.
+            RefusedError: it cannot be decoded, a field is out of range, or the server is stopping.
         """
         asks = request.read(TileUpdatesRequest)
         check_updates(asks, self._server, self._cache.revision)
@@ -113,17 +116,24 @@ class TileFeed:
             settings=self._settings,
         )
         with self._changed:
-            waiting = len(self._pending) + self._senders.sending
-            if self._stopping or waiting >= self._limit:
-                raise RefusedError("busy", f"{waiting} followers of the mesh wait already")
-            if self._held_bytes() + follower.nbytes > MAX_HELD_BYTES:
-                raise RefusedError(
-                    "busy",
-                    f"followers of the mesh that wait take {self._held_bytes()} bytes already, and "
-                    f"this one would take {follower.nbytes}: name fewer known tiles",
-                )
+            if self._stopping:
+                raise RefusedError("timeout", _STOPPING)
             self._pending.append(follower)
+            self._refuse_excess()
             self._changed.notify_all()
+
+    def _refuse_excess(self) -> None:
+        """Refuse what is too much, of whoever has most."""
+        while self._pending:
+            if len(self._pending) + self._senders.sending > self._limit:
+                sizes = [(follower.request.owner, 1) for follower in self._pending]
+                text = f"{self._limit} followers of the mesh wait already; try later"
+            elif (held := self._held_bytes()) > MAX_HELD_BYTES:
+                sizes = [(follower.request.owner, follower.nbytes) for follower in self._pending]
+                text = f"followers of the mesh take {held} bytes already: name fewer known tiles"
+            else:
+                return
+            self._senders.refuse(self._pending.pop(first_to_go(sizes)), "busy", text)
 
     def _run(self) -> None:
         lower_priority(NICENESS)
@@ -141,7 +151,7 @@ class TileFeed:
                     if len(self._pending) == len(pending) and not self._stopping:
                         self._changed.wait(_PAUSE_S)
         for follower in self._pending:
-            follower.request.refuse("timeout", "the server is stopping")
+            self._senders.refuse(follower, "timeout", _STOPPING)
 
     def _refresh(self) -> None:
         """Find out what changed, where there may be something and it is time."""
@@ -164,12 +174,16 @@ class TileFeed:
             return self._serve(follower)
         except Exception as error:
             with self._changed:
+                if follower not in self._pending:  # it was refused
+                    return True
                 self._pending.remove(follower)
             follower.request.fail(error)
             return True
 
     def _serve(self, follower: Follower) -> bool:
         """Whether anything was done for a follower: it was answered, or tiles were made for it."""
+        if self._senders.is_sending_to(follower):
+            return False
         state = (self._cache.epoch, self._cache.revision)
         if follower.nothing_at == state or not self._senders.may_send(follower):
             return self._answer_if_late(follower, knows_all=follower.nothing_at == state)
@@ -271,5 +285,6 @@ class TileFeed:
             lattice=self._cache.lattice(follower.asks.level),
         )
         with self._changed:  # it counts as pending or as being sent, never as neither
-            self._senders.send(follower, message)
-            self._pending.remove(follower)
+            if follower in self._pending:  # it was not refused meanwhile
+                self._senders.send(follower, message)
+                self._pending.remove(follower)

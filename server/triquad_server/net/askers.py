@@ -1,6 +1,7 @@
 """Who asks: of which of the linked sessions a request is, and whether others ask as well."""
 
 import math
+import secrets
 import threading
 import time
 from collections import OrderedDict
@@ -39,6 +40,7 @@ class Askers:
 
     def __init__(self, session: zenoh.Session) -> None:
         """Begin to watch who is linked to ``session``."""
+        self.own_name = secrets.token_hex(16)  # in what the server asks itself, and known to none
         self._lock = threading.Lock()
         self._latest = Owner(_UNLINKED)  # who was heard of
         self._others_s = -math.inf  # when it last was another one, monotonic
@@ -85,7 +87,8 @@ class Askers:
             return Asker(Owner(_UNLINKED), deadline_s=now + longest_s)
         # Written so that NaN counts as not given.
         wait_s = origin.timeout_s if 0 <= origin.timeout_s <= longest_s else longest_s
-        group = origin.client if origin.client in self._links else _UNLINKED
+        is_known = origin.client in self._links or origin.client == self.own_name
+        group = origin.client if is_known else _UNLINKED
         return Asker(Owner(group, origin.client), deadline_s=now + wait_s + _GRACE_S)
 
     def _watch(self) -> None:

@@ -91,7 +91,8 @@ def configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Configu
     try:
         return _configuration(options, defaults)
     except (zenoh.ZError, ValueError, OSError) as error:
-        raise ServerError(f"Zenoh configuration: {first_line(error)}") from error
+        file = "" if options.config_file is None else f" {options.config_file}"
+        raise ServerError(f"Zenoh configuration{file}: {first_line(error)}") from error
 
 
 def _configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Configuration:
@@ -137,4 +138,4 @@ def _safe(defaults: NetworkDefaults) -> dict[str, Any]:
 
 def first_line(error: Exception) -> str:
     """The text of an error without Zenoh's source locations."""
-    return str(error).split(" at /", 1)[0].strip()
+    return " ".join(str(error).split(" at /", 1)[0].split())

@@ -12,8 +12,10 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply
 
+from triquad_server.fair_queue import Owner
 from triquad_server.net.askers import Asker, Askers
 from triquad_server.net.operation_counts import OperationCounts
+from triquad_server.net.reply_memory import ReplyMemory
 
 _log = logging.getLogger(__name__)
 
@@ -45,17 +47,24 @@ class Request:
     """A query that waits for its answer."""
 
     def __init__(
-        self, query: zenoh.Query, key: str, counts: OperationCounts, asker: Asker, askers: Askers
+        self,
+        query: zenoh.Query,
+        key: str,
+        counts: OperationCounts,
+        asker: Asker,
+        askers: Askers,
+        memory: ReplyMemory,
     ) -> None:
         """``key`` is the key of the operation, whose ``counts`` tell what becomes of it.
 
-        ``asker`` is whose it is, of all ``askers``.
+        ``asker`` is whose it is, of all ``askers``; ``memory`` is that of the replies to all.
         """
         self.key = key
         self.asker = asker
         self._query = query
         self._counts = counts
         self._askers = askers
+        self._memory = memory
         self._turns: Turns | None = None
         self._slices = 0  # that have begun
         self._slice_began_s = 0.0  # monotonic
@@ -67,14 +76,21 @@ class Request:
         payload = self._query.payload
         return 0 if payload is None else len(payload)
 
+    @property
+    def owner(self) -> Owner:
+        """Whose it is."""
+        return self.asker.owner
+
     def begin(self, turns: Turns) -> None:
-        """It is its turn.
+        """It is its turn; not for the first time, maybe.
 
         Raises:
             RefusedError: nobody waits for the answer any more, or the server is stopping.
         """
+        if self._turns is None:
+            self._counts.begin(self._arrived_s)
         self._turns = turns
-        self._counts.begin(self._arrived_s)
+        self._slices = 0
         self._check()
 
     def turn(self) -> int:
@@ -120,11 +136,19 @@ class Request:
             raise RefusedError("bad_request", str(error)) from error
 
     def answer(self, message: Message) -> None:
-        """Reply with ``message``."""
+        """Reply with ``message``; refuse to, where it is large and others that are on their way
+        take the memory.
+        """
         payload = codec.encode(message)
-        self._finish(
-            lambda: self._query.reply(self.key, payload, encoding=keys.encoding(type(message)))
-        )
+        if not self._memory.take(len(payload)):
+            self.refuse("busy", "too many large replies are on their way; ask for less, or later")
+            return
+        try:
+            self._finish(
+                lambda: self._query.reply(self.key, payload, encoding=keys.encoding(type(message)))
+            )
+        finally:
+            self._memory.give_back(len(payload))
         self._counts.answer(self._arrived_s, len(payload))
 
     def refuse(self, code: str, text: str) -> None:

@@ -16,13 +16,27 @@ from triquad_server.net.askers import Askers
 from triquad_server.net.asking_client import asking_client
 from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
+from triquad_server.net.reply_memory import ReplyMemory
 from triquad_server.net.request import Request, RequestT, Turns
-from triquad_server.net.request_queue import MOST_BEGUN, MOST_SENDING, Job, RequestQueue
+from triquad_server.net.request_queue import (
+    MOST_LONG,
+    MOST_SENDING,
+    MOST_SHORT,
+    Job,
+    RequestQueue,
+    SetAsideError,
+)
 from triquad_server.process.threads import submit
 
 _log = logging.getLogger(__name__)
 
 _REFUSALS = 2  # threads that send them
+
+_REFUSED_BYTES = 16_000_000
+"""Of requests that are refused in these threads: beyond, large ones are refused by the receiver,
+so that the network waits for it and not they in memory."""
+
+_LARGE_BYTES = 65_536
 _STOPPING = "the server is stopping"
 
 Handler = Callable[[Request], None]
@@ -64,17 +78,19 @@ class RequestHandlers:
         operations: Mapping[str, Operation],
         askers: Askers,
         long_work: LongWork,
+        memory: ReplyMemory,
         *,
         workers: int,
         limits: RequestLimits,
     ) -> None:
         """Begin to serve ``operations``, by key, with so many ``workers``.
 
-        ``askers`` and ``long_work`` are those of all groups.
+        ``askers``, ``long_work`` and ``memory`` are those of all groups.
         """
         self._operations = operations
         self._askers = askers
         self._long_work = long_work
+        self._memory = memory
         self._limits = limits
         self._queue: RequestQueue[Request] = RequestQueue(
             self._begin,
@@ -85,8 +101,11 @@ class RequestHandlers:
         )
         self._stopping = False
         # As many as ever work or send at a time; they are started when they are needed.
-        self._workers = ThreadPoolExecutor(max(MOST_BEGUN, workers) + MOST_SENDING, "worker")
+        most_begun = max(MOST_SHORT, workers) + MOST_LONG
+        self._workers = ThreadPoolExecutor(most_begun + MOST_SENDING, "worker")
         self._refusals = ThreadPoolExecutor(_REFUSALS, "refusals")
+        self._refused_bytes = 0  # of requests that wait for these threads
+        self._refused_lock = threading.Lock()
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._receivers: list[threading.Thread] = []
         for key in operations:
@@ -134,7 +153,8 @@ class RequestHandlers:
 
     def _take(self, query: zenoh.Query, key: str) -> None:
         asker = self._askers.asker(query, self._limits.longest_s)
-        request = Request(query, key, self._operations[key].counts, asker, self._askers)
+        counts = self._operations[key].counts
+        request = Request(query, key, counts, asker, self._askers, self._memory)
         if request.size > self._limits.max_bytes:
             limit = self._limits.max_bytes
             text = f"{request.size} bytes exceed the limit of {limit}: split it"
@@ -147,8 +167,22 @@ class RequestHandlers:
                 self._refuse_aside(excess, "busy", text)
 
     def _refuse_aside(self, request: Request, code: str, text: str) -> None:
-        """Refuse a request in another thread: its client may not take the reply."""
-        submit(self._refusals, request.refuse, code, text)
+        """Refuse a request, in another thread mostly: its client may not take the reply."""
+        with self._refused_lock:
+            self._refused_bytes += request.size
+            is_much = self._refused_bytes > _REFUSED_BYTES
+        if is_much and request.size > _LARGE_BYTES:
+            self._refuse(request, code, text)
+        else:
+            submit(self._refusals, self._refuse, request, code, text)
+
+    def _refuse(self, request: Request, code: str, text: str) -> None:
+        size = request.size
+        try:
+            request.refuse(code, text)
+        finally:
+            with self._refused_lock:
+                self._refused_bytes -= size
 
     def _begin(self, job: Job[Request]) -> None:
         submit(self._workers, self._work, job)
@@ -165,6 +199,10 @@ class RequestHandlers:
         try:
             request.begin(turns)
             self._operations[request.key].handle(request)
+        except SetAsideError:
+            self._queue.put_back(job)
+            if self._stopping:  # since it did not wait until now
+                self.stop()
         except RefusedError as error:
             request.refuse(error.code, error.message)
         except Exception as error:

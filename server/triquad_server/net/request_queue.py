@@ -11,8 +11,11 @@ from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.fair_queue import FairQueue, Owner
 
-MOST_BEGUN = 8
-"""Requests that are worked at in turn: the arrays of each take memory."""
+MOST_SHORT = 8
+"""Requests that are worked at in turn and may be short: the arrays of each take memory."""
+
+MOST_LONG = 4
+"""Requests, beside these, that turned out to be long: more begin anew later."""
 
 MOST_SENDING = 32
 """Replies that are on their way, to clients that may not read them."""
@@ -27,12 +30,18 @@ RequestT = TypeVar("RequestT")
 CountedT = TypeVar("CountedT")
 
 
+class SetAsideError(Exception):
+    """A request is long, and so many are worked at already: it begins anew when one has ended."""
+
+
 @dataclass(eq=False)
 class Job(Generic[RequestT]):
     """A request on its way through the queue."""
 
     request: RequestT
     owner: Owner
+    nbytes: int
+    is_long: bool = False
     may_go_on: threading.Event = field(default_factory=threading.Event)  # after a pause
     is_worked_at: bool = False
 
@@ -56,16 +65,19 @@ class RequestQueue(Generic[RequestT]):
         """``begin`` has a thread begin with a request, and returns at once.
 
         As many are worked at as there are ``workers``, but while several ask (``are_several``) one
-        of each group. At most ``limit`` wait, of ``limit_bytes`` together.
+        of each group. At most ``limit`` wait, of ``limit_bytes`` together. Long ones have places of
+        their own, so that one that is short begins however many of them there are.
         """
         self._begin = begin
         self._are_several = are_several
         self._workers = self._free = workers
+        self._most_short = max(MOST_SHORT, workers)
         self._lock = threading.Lock()
         self._waiting: FairQueue[Job[RequestT]] = FairQueue(limit, limit_bytes)
         self._paused: deque[Job[RequestT]] = deque()
         self._overtaking = 0  # requests that began since one of the paused went on
         self._begun: Counter[str] = Counter()  # worked at or paused, by group
+        self._long: set[Job[RequestT]] = set()  # of these
         self._sending: Counter[Owner] = Counter()
 
     @property
@@ -77,7 +89,7 @@ class RequestQueue(Generic[RequestT]):
     def put(self, owner: Owner, request: RequestT, nbytes: int) -> list[RequestT]:
         """Have a request wait; returns those that are too many now, this one maybe among them."""
         with self._lock:
-            self._waiting.put(owner, Job(request, owner), nbytes)
+            self._waiting.put(owner, Job(request, owner, nbytes), nbytes)
             self._fill()
             return [job.request for job in self._waiting.excess(newest=True)]
 
@@ -95,8 +107,15 @@ class RequestQueue(Generic[RequestT]):
         job.may_go_on.wait()
 
     def rest(self, job: Job[RequestT], rest_s: float) -> None:
-        """As :meth:`pause`, after a time in which others may be worked at."""
+        """As :meth:`pause`, after a time in which others may be worked at.
+
+        Raises:
+            SetAsideError: too many rest by turns; the request is to be :meth:`put_back`.
+        """
         with self._lock:
+            if job not in self._long and len(self._long) >= MOST_LONG:
+                raise SetAsideError
+            self._long.add(job)
             self._free += 1
             self._fill()
         time.sleep(rest_s)
@@ -106,12 +125,19 @@ class RequestQueue(Generic[RequestT]):
             self._fill()
         job.may_go_on.wait()
 
+    def put_back(self, job: Job[RequestT]) -> None:
+        """Have a request begin anew, before others of its owner, once it may be worked at."""
+        again = Job(job.request, job.owner, job.nbytes, is_long=True)
+        with self._lock:
+            self._waiting.put_first(job.owner, again, job.nbytes)
+
     def send(self, job: Job[RequestT]) -> None:
         """The reply of a request is made: it is on its way from now on. Twice does no harm."""
         with self._lock:
             if not job.is_worked_at:
                 return
             job.is_worked_at = False
+            self._long.discard(job)
             _count(self._begun, job.owner.group, -1)
             _count(self._sending, job.owner, 1)
             self._free += 1
@@ -148,10 +174,12 @@ class RequestQueue(Generic[RequestT]):
     def _may_begin(self, job: Job[RequestT]) -> bool:
         group = job.owner.group
         most = 1 if self._are_several() else self._workers
+        short = self._begun.total() - len(self._long)
+        is_room = len(self._long) < MOST_LONG if job.is_long else short < self._most_short
         sending = sum(count for owner, count in self._sending.items() if owner.group == group)
         return (
-            self._begun[group] < most
-            and self._begun.total() < max(MOST_BEGUN, self._workers)
+            is_room
+            and self._begun[group] < most
             and self._sending[job.owner] < _SENDING_EACH
             and sending < MOST_SENDING // 2
             and self._sending.total() < MOST_SENDING
@@ -162,6 +190,8 @@ class RequestQueue(Generic[RequestT]):
             job.may_go_on.set()
             return
         job.is_worked_at = True
+        if job.is_long:
+            self._long.add(job)
         _count(self._begun, job.owner.group, 1)
         self._begin(job)
 

@@ -34,8 +34,9 @@ def _what_failed(config: Configuration, reason: str) -> str:
     if reason.startswith("Unable to connect"):
         endpoints = ", ".join(config.connect)
         return f"cannot connect to {endpoints}: {reason} Start a router there first."
-    endpoints = ", ".join(config.listen)
-    return (
-        f"cannot open {endpoints}: {reason} (is another server running there? "
-        "choose another endpoint with --listen)"
-    )
+    remedy = "is another server running there? choose another endpoint with --listen"
+    if "TLS" in reason and "in use" not in reason:
+        remedy = "check the credentials of the Zenoh configuration: triquad-keys makes them"
+    elif "not supported" in reason:
+        remedy = "write --listen tcp/HOST:PORT"
+    return f"cannot open {', '.join(config.listen)}: {reason} ({remedy})"

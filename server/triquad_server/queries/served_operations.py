@@ -11,6 +11,7 @@ from triquad_server.net.askers import Askers
 from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.payload_limit import payload_limit
+from triquad_server.net.reply_memory import ReplyMemory
 from triquad_server.net.request_handlers import (
     Handler,
     Operation,
@@ -47,10 +48,16 @@ class ServedOperations:
         self._map_name = map_name
         self._askers = Askers(session)
         self._long_work = LongWork()
+        self._memory = ReplyMemory()
         self._groups: list[RequestHandlers] = []
         self._limits = limits
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
         self.queues: dict[str, ReadQueue] = {}  # by name
+
+    @property
+    def own_name(self) -> str:
+        """By which the server names itself in a request, to have turns of its own."""
+        return self._askers.own_name
 
     def serve(
         self, queue: str, handlers: Mapping[str, Handler], workers: int = 1
@@ -68,6 +75,7 @@ class ServedOperations:
             operations,
             self._askers,
             self._long_work,
+            self._memory,
             workers=workers,
             limits=self._limits_of(queue),
         )

@@ -12,6 +12,9 @@ from triquad_format.wire.source_messages import (
 
 from triquad_server.intake.source_trails import SourceDelta, SourceTrails, TakenScan, evenly
 
+MOST_POINTS = 100_000
+"""Of the newest scans of all sources together, in one reply."""
+
 
 class SourceQueries:
     """Answers what is new of the sources of scans."""
@@ -40,7 +43,9 @@ class SourceQueries:
                 f"revision = {request.revision} is not one that this server told: use that of the "
                 "reply before, or 0",
             )
-        sources = {name: _state(source, request.max_points) for name, source in deltas.items()}
+        new = sum(source.newest is not None for source in deltas.values())
+        most = min(request.max_points, MOST_POINTS // max(1, new))
+        sources = {name: _state(source, most) for name, source in deltas.items()}
         return SourcesReply(self._server, revision, sources)
 
 

@@ -45,6 +45,7 @@ from triquad_server.store.restore import (
 _log = logging.getLogger(__name__)
 
 _FEATURE_DTYPE = "<f2"
+_MAPS_NAMED = 8  # of a store, where an epoch is looked for in vain
 
 
 class Store:
@@ -183,11 +184,25 @@ class Store:
             self._write_whole(anew, "restored", stopping=lambda: False)
             self._files.protect_restored(Restored(epoch, number), f"epoch {epoch}, restored")
         except (MapFileError, OSError) as error:
-            raise StoreError(f"epoch {epoch} cannot be restored: {error}") from error
+            raise StoreError(
+                f"epoch {epoch} cannot be restored: {error}{self._maps_beside()}"
+            ) from error
         _log.warning(
             "the map is that of epoch %d again, as epoch %d; what it was is kept as epoch %d",
             *(epoch, number, newest[0].epoch),
         )
+
+    def _maps_beside(self) -> str:
+        """Where this map has no checkpoints, which others of the store have some."""
+        try:
+            if checkpoint_files(self.folder):
+                return ""
+            folders = sorted(path for path in self.folder.parent.iterdir() if path.is_dir())
+            names = [path.name for path in folders if checkpoint_files(path)]
+        except OSError:
+            return ""
+        listed = ", ".join(names[:_MAPS_NAMED]) + (", ..." if len(names) > _MAPS_NAMED else "")
+        return f"; the store has checkpoints of {listed}: name the map by --map" if names else ""
 
     def _write_whole(
         self, known: KnownParts, verb: str, stopping: Callable[[], bool]

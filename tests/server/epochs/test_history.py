@@ -130,6 +130,19 @@ def test_who_pins_every_epoch_takes_no_other_clients_pin(stranger):
         assert len(epochs.kept().epochs) <= 2 + 4
 
 
+def test_few_clients_with_many_pins_leave_one_to_whoever_comes_later():
+    epochs = history(kept=1, pinned=4, client_pins=3)
+    for number in range(1, 7):
+        epochs.add(epoch(number))
+        of_client(epochs, f"stranger-{number % 2}", number)
+    assert not of_client(epochs, "late", 6)
+    for number in range(7, 20):
+        epochs.add(epoch(number))
+        for client in range(2):
+            of_client(epochs, f"stranger-{client}", number)
+        assert not of_client(epochs, "late", 6)
+
+
 class LargeEpoch(Epoch):
     """One with memory of its own, and some that all share."""
 

@@ -7,6 +7,7 @@ import pytest
 from support import servers
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import FlushReply, FlushRequest
+from triquad_server.fair_queue import Owner
 from triquad_server.intake import flush, source_ledger
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.source_ledger import SourceLedger
@@ -15,7 +16,8 @@ from triquad_server.intake.source_ledger import SourceLedger
 class PendingRequest:
     """Stands for a Zenoh query; keeps its one answer."""
 
-    def __init__(self, asks, defect=None):
+    def __init__(self, asks, defect=None, owner=""):
+        self.owner = Owner(owner)
         self._asks = asks
         self._defect = defect
         self._replies: queue.SimpleQueue[object] = queue.SimpleQueue()
@@ -57,6 +59,15 @@ def asks(sequence=0, **changes):
     )
 
 
+def none_arrived(scans):
+    """The reply about a session of which the server never heard."""
+    why = (
+        "source 'lidar': none of this client's scans arrived: access control does not let it "
+        "publish as this source (a role names its sources), or the server was started again since"
+    )
+    return FlushReply(0, 0, scans, None, why)
+
+
 @pytest.mark.parametrize(
     "request_",
     [
@@ -77,7 +88,7 @@ def test_requests_out_of_range_are_refused_and_others_are_answered(handler, requ
     assert caught.value.code == "bad_request"
     good = PendingRequest(asks(2))
     handler.add(good)
-    assert good.reply == FlushReply(0, 0, 3, None)
+    assert good.reply == none_arrived(3)
 
 
 def test_an_internal_error_ends_one_request_and_no_other(handler):
@@ -85,7 +96,7 @@ def test_an_internal_error_ends_one_request_and_no_other(handler):
     handler.add(bad)
     assert bad.reply == "internal"
     handler.add(good)
-    assert good.reply == FlushReply(0, 0, 1, None)
+    assert good.reply == none_arrived(1)
 
 
 def test_a_scan_that_stays_out_of_the_map_ends_in_a_timeout(handler, ledger):
@@ -107,6 +118,32 @@ def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
         assert request.reply == FlushReply(1, 0, 0, None)
 
 
+def test_who_flushes_too_much_is_refused_and_no_other(ledger):
+    ledger.arrive(servers.scan(0))
+    with closing(FlushHandler(ledger, lambda: None, 600.0, limit=8)) as handler:
+        greedy = [PendingRequest(asks(), owner="greedy") for _ in range(8)]
+        honest = PendingRequest(asks(), owner="honest")
+        for request in (*greedy, honest):
+            handler.add(request)
+        assert greedy[-1].reply == "busy"
+        ledger.take(servers.scan(0))
+        ledger.publish()
+        assert honest.reply == FlushReply(1, 0, 0, None)
+
+
+def test_a_client_that_does_not_read_its_reply_holds_up_no_other(ledger, monkeypatch):
+    monkeypatch.setattr(flush, "ARRIVAL_GRACE_S", 0.0)
+    reads = threading.Event()
+    stuck, other = PendingRequest(asks()), PendingRequest(asks(1))
+    stuck.answer = lambda _: reads.wait(servers.WAIT_S)
+    with closing(FlushHandler(ledger, lambda: None, 600.0, limit=8)) as handler:
+        for request in (stuck, other):
+            handler.add(request)
+        lost = other.reply.lost
+        reads.set()
+    assert lost == 2
+
+
 def test_pending_requests_are_refused_when_the_server_stops(ledger):
     request = PendingRequest(asks())
     with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
@@ -121,6 +158,6 @@ def test_questions_about_strangers_push_nobody_out(handler, ledger, monkeypatch)
     for session in range(100, 110):
         stranger = PendingRequest(asks(4, session=session))
         handler.add(stranger)
-        assert stranger.reply == FlushReply(0, 0, 5, None)
+        assert stranger.reply == none_arrived(5)
     assert ledger.arrived("lidar", 7, 0)
     assert ledger.lost() == {}

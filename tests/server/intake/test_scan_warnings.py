@@ -132,6 +132,16 @@ def test_lost_scans_are_told_once_in_a_while_with_those_since() -> None:
     assert warnings.of("lidar") is None
 
 
+def test_scans_that_never_arrived_are_not_blamed_on_a_slow_server() -> None:
+    scans = ScanQueue(2)
+    warnings = ScanWarnings(scans, SETTINGS, Clock())
+    scans.put(servers.scan(10))
+    text = warnings.of("lidar")
+    assert text is not None
+    assert text.startswith("source 'lidar': 10 of its scans never arrived")
+    assert "keep up" not in text
+
+
 def test_refused_scans_are_told_with_the_reason() -> None:
     scans = ScanQueue(2)
     warnings = ScanWarnings(scans, SETTINGS, Clock())

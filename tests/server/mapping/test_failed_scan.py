@@ -1,7 +1,10 @@
 """A scan that fails midway leaves nothing of itself in the map."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+import torch
 from support.servers import SMALL, scan, sphere
 from triquad_format.records.status import Status
 from triquad_server.errors import MapLostError, ScanRefusedError
@@ -74,13 +77,14 @@ def test_a_map_that_cannot_be_restored_is_told_as_lost(
         mapper.ingest(sphere(), THERE)
 
 
+@pytest.mark.parametrize("take", [lambda: bytes(2**60), lambda: torch.empty(2**58)])
 def test_a_map_for_which_memory_is_short_comes_back_when_there_is_some(
-    mapper: Mapper, monkeypatch: pytest.MonkeyPatch
+    mapper: Mapper, monkeypatch: pytest.MonkeyPatch, take: Callable[[], object]
 ) -> None:
     before = mapper.publish()
     with monkeypatch.context() as patched:
         fail_midway(patched, MemoryError())
-        patched.setattr(LiveRegion, "restore", lambda *_: bytes(2**60))
+        patched.setattr(LiveRegion, "restore", lambda *_: take())
         for _ in range(2):
             with pytest.raises(ScanRefusedError, match="memory"):
                 mapper.ingest(sphere(), THERE)

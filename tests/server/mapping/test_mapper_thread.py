@@ -55,6 +55,18 @@ def test_commands_of_a_thread_that_ended_are_refused() -> None:
         thread.call(lambda mapper: mapper.settled)
 
 
+def test_however_much_is_flushed_epochs_keep_a_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapper_thread, "_SOONEST_PUBLISH_S", NEVER_S)
+    with running(learning_mapper()) as thread:
+        thread.call(lambda mapper: mapper.settled)
+        before = thread.epochs.newest
+        thread.publish_soon()
+        trained = thread.progress.samples_trained
+        while thread.progress.samples_trained < trained + 10:
+            pass
+        assert thread.epochs.newest is before
+
+
 class FailingMapper(Mapper):
     """Its training meets an internal error."""
 

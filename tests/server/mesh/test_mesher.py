@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from support.small_world import settings, settled_mapper, world
+from support.small_world import settings, settled_epoch, world
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import TileMesh, mesh_tile, tile_lattice
@@ -12,7 +12,7 @@ LATTICE = tile_lattice(settings().mesh, 0)
 
 @pytest.fixture(scope="module")
 def epoch() -> Epoch:
-    return settled_mapper(settings(), world(4)).publish()
+    return settled_epoch(4)
 
 
 @pytest.fixture(scope="module")

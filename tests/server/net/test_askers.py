@@ -3,6 +3,8 @@ from contextlib import closing
 
 import pytest
 import zenoh
+from triquad_format.wire import codec
+from triquad_format.wire.origin import RequestOrigin
 from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_server.fair_queue import Owner
 from triquad_server.net import askers as module
@@ -34,3 +36,16 @@ def test_whoever_asked_much_is_not_forgotten_while_it_is_worked_at(askers):
     assert not askers.are_several
     askers.hear_of(A)  # a slice of them begins
     assert askers.are_several
+
+
+class Query:
+    """One whose attachment names somebody."""
+
+    def __init__(self, name):
+        self.attachment = zenoh.ZBytes(codec.encode(RequestOrigin(name, 1.0)))
+
+
+def test_what_the_server_asks_itself_has_turns_that_nobody_else_can_take(askers):
+    own = askers.asker(Query(askers.own_name), longest_s=60.0).owner
+    assert own.group == askers.own_name
+    assert askers.asker(Query("invented"), longest_s=60.0).owner.group == ""

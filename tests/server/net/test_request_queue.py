@@ -4,7 +4,7 @@ import pytest
 from support.servers import WAIT_S
 from triquad_server.fair_queue import Owner
 from triquad_server.net import request_queue
-from triquad_server.net.request_queue import RequestQueue
+from triquad_server.net.request_queue import MOST_LONG, MOST_SHORT, RequestQueue, SetAsideError
 
 A, B, C = Owner("a"), Owner("b"), Owner("c")
 
@@ -85,6 +85,42 @@ def test_a_request_that_rests_leaves_its_worker_to_others_and_goes_on_by_itself(
     assert not rests.is_alive()
     work.put(C, "c1")
     assert "c1" not in work.begun, "the one worker is at work again"
+
+
+def test_a_short_request_begins_however_many_long_ones_there_are():
+    work = Work(workers=MOST_LONG + 1, limit=100)
+    greedy = [Owner(f"greedy-{number}") for number in range(2 * MOST_SHORT)]
+    for owner in greedy:
+        work.put(owner, owner)
+        job = work.begun[owner]
+        if owner in greedy[:MOST_LONG]:
+            work.queue.rest(job, 0.0)
+            continue
+        with pytest.raises(SetAsideError):
+            work.queue.rest(job, 0.0)
+        work.queue.put_back(job)
+        work.queue.finish(job)
+    work.put(A, "short")
+    assert "short" in work.begun
+    first, again = greedy[0], greedy[MOST_LONG]
+    before = work.begun[again]
+    work.queue.finish(work.begun[first])
+    assert work.begun[again] is not before, "there is a place for one that was set aside"
+
+
+def test_a_request_that_was_set_aside_is_the_next_of_its_owner():
+    work = Work(workers=MOST_LONG + 1)
+    for number in range(MOST_LONG + 1):
+        work.put(Owner(str(number)), number)
+    for number in range(MOST_LONG):
+        work.queue.rest(work.begun[number], 0.0)
+    last = Owner(str(MOST_LONG))
+    work.put(last, "later")
+    set_aside = work.begun[MOST_LONG]
+    work.queue.put_back(set_aside)
+    work.queue.finish(set_aside)
+    assert "later" not in work.begun
+    assert list(work.queue.clear()) == [MOST_LONG, "later"]
 
 
 def test_where_nobody_waits_a_pause_is_none():

@@ -171,6 +171,17 @@ def test_a_failed_write_leaves_the_older_checkpoints(store):
     assert store.newest().record.epoch == 1
 
 
+def test_an_epoch_of_another_map_is_told_with_the_maps_there_are(store, tmp_path):
+    store.write(record(3))
+    with (
+        closing(Store(tmp_path, "default", StoreSettings())) as forgotten,
+        pytest.raises(StoreError, match="the store has checkpoints of lab: name the map by --map"),
+    ):
+        forgotten.restore(3)
+    with pytest.raises(StoreError, match="there are: 3$"):
+        store.restore(4)
+
+
 def test_a_checkpoint_under_a_wrong_number_does_not_pass_for_a_later_one(store, caplog):
     store.write(record(3))
     valid = store.folder / "epoch-000000003.triquad"

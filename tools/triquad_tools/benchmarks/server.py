@@ -2,6 +2,7 @@
 
 import statistics
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ _REPEATS = 15
 
 def measure_server(made: BenchStreet) -> list[Figure]:
     """Figures of a whole server: what a robot would meet."""
+    made = replace(made, samples_max=_MESH_SAMPLES)
     with served() as server:
         client = server.client
         met = stream_beside_planner(server, made)
@@ -47,7 +49,7 @@ def _early(client: Client, made: BenchStreet) -> list[Figure]:
     trained = client.status().samples_trained / 1e6
     mesh = client.mesh(made.drive.scene.box)
     lost = client.flush(FLUSH_TIMEOUT_S)
-    scores = made.mesh_scores(mesh, _MESH_SAMPLES)
+    scores = made.mesh_scores(mesh)
     return [
         Figure("scans dropped of 100", lost.lost + lost.refused, "", at_most=0),
         Figure("samples trained 2 s after the last scan", trained, "M"),
@@ -60,7 +62,7 @@ def _converged(client: Client, made: BenchStreet) -> list[Figure]:
     street = score_street(client.query_sdf, made.probes)
     mesh = client.mesh(made.drive.scene.box)
     times = [seconds(lambda: client.mesh(made.drive.scene.box)) for _ in range(3)]
-    scores = made.mesh_scores(mesh, _MESH_SAMPLES)
+    scores = made.mesh_scores(mesh)
     return [
         Figure("converged: F-score", 100 * scores.f_score, "%", at_least=98),
         Figure("converged: accuracy, mean", 100 * scores.accuracy_m, "cm", at_most=0.9),

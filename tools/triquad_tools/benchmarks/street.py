@@ -36,10 +36,11 @@ class BenchStreet(DrivenStreet):
     """A drive of 10 s, and the truth about it."""
 
     visible: Doubles  # [M, 3] exact surface points that the lidar hit
+    samples_max: int = STREET_SAMPLES_MAX  # of a mesh, to score it
 
-    def mesh_scores(self, mesh: Mesh, samples_max: int = STREET_SAMPLES_MAX) -> MeshScores:
-        """Scores of a mesh within the scene's bounds, from so many samples at most."""
-        settings = ScoreSettings(samples_max=samples_max)
+    def mesh_scores(self, mesh: Mesh) -> MeshScores:
+        """Scores of a mesh within the scene's bounds."""
+        settings = ScoreSettings(samples_max=self.samples_max)
         return score_against_scene(mesh, self.drive.scene, self.visible, settings=settings)
 
 

@@ -31,17 +31,22 @@ _EVERY = (1, 2, 5, 10)  # scans
 
 def measure_tradeoffs(made: BenchStreet) -> list[Figure]:
     """Figures along three curves, each with its place on them."""
-    figures = _by_time(made)
+    figures, settled = _by_time(made)
+    figures += _by_bytes(settled, made)
     for every in _EVERY:
-        epoch = settled_mapper(f"one scan of {every}", made.scans[::every]).publish()
-        figures += _scores(epoch.record(), made, curve=SPACING, cost=every)
         if every == 1:
-            figures += _by_bytes(epoch, made)
+            epoch = settled
+        else:
+            epoch = settled_mapper(f"one scan of {every}", made.scans[::every]).publish()
+        figures += _scores(epoch.record(), made, curve=SPACING, cost=every)
     return figures
 
 
-def _by_time(made: BenchStreet) -> list[Figure]:
-    """Scores after so many seconds of taking scans in and training, of all cores together."""
+def _by_time(made: BenchStreet) -> tuple[list[Figure], Epoch]:
+    """Scores after so many seconds of taking scans in and training, of all cores together.
+
+    The epoch is that of the settled map, of all scans.
+    """
     settings = Settings()
     warm_up(settings, "cpu")
     mapper = Mapper("bench", settings, "cpu")
@@ -60,9 +65,10 @@ def _by_time(made: BenchStreet) -> list[Figure]:
                 mapper.train()
                 trained_s = time.process_time() - began_s
             cost = taken_s + trained_s
-            figures += _scores(mapper.publish().record(), made, curve=TIME, cost=cost)
+            epoch = mapper.publish()
+            figures += _scores(epoch.record(), made, curve=TIME, cost=cost)
             report(number + 1, f"{cost:.1f} s")
-    return figures
+    return figures, epoch
 
 
 def _by_bytes(epoch: Epoch, made: BenchStreet) -> list[Figure]:

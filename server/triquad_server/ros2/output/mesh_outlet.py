@@ -12,6 +12,7 @@ from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_map.compiled.team import lower_priority
 
+from triquad_server.fair_queue import Owner
 from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.process.threads import NICENESS
@@ -38,6 +39,11 @@ class _Request:
     def size(self) -> int:
         """No bytes of a message."""
         return 0
+
+    @property
+    def owner(self) -> Owner:
+        """Nobody beyond this process."""
+        return Owner(_CLIENT)
 
     def read(self, _kind: type[TileUpdatesRequest]) -> TileUpdatesRequest:
         return self._asks

@@ -1,0 +1,60 @@
+"""A crowd of clients that want too much, come and go, and invent names."""
+
+import time
+from contextlib import ExitStack
+
+import numpy as np
+import triquad_client
+from campaign.server_under_test import (
+    MAX_GROWTH_BYTES,
+    expect,
+    expect_honest_service,
+    resident_bytes,
+    server_under_test,
+)
+from campaign.turn import Turn
+from support import servers
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import Scan
+from triquad_tools.benchmarks.noisy_neighbours import KINDS, neighbour
+
+_ROUND_S = 10
+_MOST_AT_ONCE = 4
+_SOURCES_A_SECOND = 50
+
+
+def run(turn: Turn) -> None:
+    """Let others come and go, round after round; an honest client comes after each."""
+    with server_under_test(turn) as server:
+        _round(turn, server.endpoint)
+        before = _beside_the_map(server)
+        while not turn.over:
+            _round(turn, server.endpoint)
+            expect_honest_service(server.endpoint)
+            turn.did("seconds", _ROUND_S)
+            growth = _beside_the_map(server) - before
+            turn.measured("growth MB", growth / 2**20)
+            expect(growth < MAX_GROWTH_BYTES, f"memory grew by {growth} bytes")
+
+
+def _beside_the_map(server: servers.ServerProcess) -> int:
+    """Memory of the server without that of the map, which the crowd's scans make larger."""
+    with triquad_client.connect(server.endpoint) as client:
+        counted = sum(client.metrics().memory_bytes.values())
+    return resident_bytes(server.process.pid) - counted
+
+
+def _round(turn: Turn, endpoint: str) -> None:
+    """Some neighbours at once, and scans of sources that were never heard of."""
+    count = turn.random.randint(1, _MOST_AT_ONCE)
+    kinds = [turn.random.choice(sorted(KINDS)) for _ in range(count)]
+    with ExitStack() as stack, servers.raw_session(connect=endpoint) as session:
+        for kind in kinds:
+            stack.enter_context(neighbour(kind, endpoint, servers.MAP))
+        ends_s = time.monotonic() + _ROUND_S
+        while time.monotonic() < ends_s:
+            name = f"invented-{turn.random.getrandbits(60):x}"
+            points = np.array([[turn.random.gauss(0, 4) for _ in range(3)]], np.float32)
+            scan = Scan(points, np.eye(4), time.time_ns(), name, turn.random.getrandbits(60), 0)
+            session.put(keys.scan_key(servers.MAP, name), codec.encode(scan))
+            time.sleep(1 / _SOURCES_A_SECOND)
