@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
+from support.requests import held_tile_updates
 from support.servers import RawPeer, ServerProcess
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import TileUpdatesRequest
 
 MAP_BYTES = 400_000_000
 EPOCHS_BYTES = 100_000_000
 BESIDE = 250_000_000  # for code that is compiled late, replay samples and what is in between
 SPHERES, POINTS, RADIUS_M = 8, 60_000, 48.0
+HELD_S = 20.0
 
 
 def resident(server: ServerProcess) -> int:
@@ -55,24 +56,8 @@ def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> N
         assert client.flush(servers.WAIT_S).taken >= 1, "what is small still finds room"
 
 
-def updates(known: int) -> TileUpdatesRequest:
-    return TileUpdatesRequest(
-        minimum=np.full(3, 1000.0),
-        maximum=np.full(3, 1001.0),
-        level=0,
-        server="",
-        revision=0,
-        known=np.zeros((known, 3), np.int32) + np.arange(known, dtype=np.int32)[:, None],
-        known_versions=np.ones(known, np.int64),
-        max_bytes=1_000_000,
-        timeout_s=20.0,
-        client="stranger",
-        max_bytes_per_s=0,
-    )
-
-
 def test_junk_in_a_request_that_is_held_is_refused(server: ServerProcess) -> None:
-    body = codec.encode(updates(0))
+    body = codec.encode(held_tile_updates(0, timeout_s=HELD_S))
     assert body[0] == 0xDE or body[0] & 0xF0 == 0x80
     junk = b"\xa1j\xc6" + (12_000_000).to_bytes(4, "big") + bytes(12_000_000)
     fields = body[0] & 0x0F
@@ -84,7 +69,7 @@ def test_junk_in_a_request_that_is_held_is_refused(server: ServerProcess) -> Non
 def test_followers_that_are_held_take_little(server: ServerProcess) -> None:
     """Each of 64 names as many tiles as it may, and waits."""
     before = resident(server)
-    payload = codec.encode(updates(100_000))
+    payload = codec.encode(held_tile_updates(100_000, timeout_s=HELD_S))
     with servers.raw_session(connect=server.endpoint) as session:
         done = threading.Semaphore(0)
         key = keys.operation_key(servers.MAP, keys.TILE_UPDATES)

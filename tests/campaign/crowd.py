@@ -9,7 +9,6 @@ from campaign.server_under_test import (
     MAX_GROWTH_BYTES,
     expect,
     expect_honest_service,
-    resident_bytes,
     server_under_test,
 )
 from campaign.turn import Turn
@@ -27,21 +26,21 @@ def run(turn: Turn) -> None:
     """Let others come and go, round after round; an honest client comes after each."""
     with server_under_test(turn) as server:
         _round(turn, server.endpoint)
-        before = _beside_the_map(server)
+        before = _beside_the_map(server.endpoint)
         while not turn.over:
             _round(turn, server.endpoint)
             expect_honest_service(server.endpoint)
             turn.did("seconds", _ROUND_S)
-            growth = _beside_the_map(server) - before
+            growth = _beside_the_map(server.endpoint) - before
             turn.measured("growth MB", growth / 2**20)
             expect(growth < MAX_GROWTH_BYTES, f"memory grew by {growth} bytes")
 
 
-def _beside_the_map(server: servers.ServerProcess) -> int:
+def _beside_the_map(endpoint: str) -> int:
     """Memory of the server without that of the map, which the crowd's scans make larger."""
-    with triquad_client.connect(server.endpoint) as client:
-        counted = sum(client.metrics().memory_bytes.values())
-    return resident_bytes(server.process.pid) - counted
+    with triquad_client.connect(endpoint) as client:
+        metrics = client.metrics()
+    return metrics.resident_bytes - sum(metrics.memory_bytes.values())
 
 
 def _round(turn: Turn, endpoint: str) -> None:

@@ -26,6 +26,8 @@ from triquad_format.records.region import MapRecord
 from triquad_format.recovery.recovered_map import recover
 from triquad_tools.commands import inspect
 
+_START_S = 120.0
+"""Time for a child to import all that reads files, and to make valid ones."""
 _HANG_S = 20.0
 _LIMIT_BYTES = 64 * 2**20
 """Memory that a reader may take beside the size of the file."""
@@ -45,12 +47,14 @@ def run(turn: Turn) -> None:
 
 def _run_child(turn: Turn, part: int) -> None:
     """One child's files, until it has ended in whatever way."""
-    context = multiprocessing.get_context("fork")
+    # A forked child would wait for ever for the threads that compute in this process.
+    context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     child = context.Process(target=_read_mutants, args=(turn, part, theirs))
     child.start()
     theirs.close()
     try:
+        ours.poll(_START_S)
         while ours.poll(_HANG_S):
             what, text = ours.recv()
             if what == _ENDED:

@@ -15,6 +15,7 @@ import pytest
 import triquad_client
 import zenoh
 from support import servers
+from support.requests import tile_updates
 from triquad_client import Client, InvalidInputError, MeshWatch
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
@@ -25,7 +26,6 @@ from triquad_format.wire.messages import (
     TileListRequest,
     TileRequest,
     TileUpdates,
-    TileUpdatesRequest,
 )
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_server.settings import MeshSettings, ServiceSettings
@@ -61,24 +61,6 @@ def endpoint() -> Iterator[str]:
 def client(endpoint: str) -> Iterator[Client]:
     with triquad_client.connect(endpoint) as client:
         yield client
-
-
-def request(**changes: object) -> TileUpdatesRequest:
-    """A good request, but for ``changes``."""
-    good = TileUpdatesRequest(
-        minimum=np.full(3, -np.inf),
-        maximum=np.full(3, np.inf),
-        level=0,
-        server="",
-        revision=0,
-        known=np.zeros((0, 3), np.int32),
-        known_versions=np.zeros(0, np.int64),
-        max_bytes=1_000_000,
-        timeout_s=0.0,
-        client="test",
-        max_bytes_per_s=0,
-    )
-    return replace(good, **changes)  # type: ignore[arg-type]
 
 
 def test_a_watch_holds_the_mesh_and_follows_it(client: Client) -> None:
@@ -234,8 +216,8 @@ def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: 
 def test_bad_requests_are_refused(endpoint: str, changes: dict[str, object], code: str) -> None:
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
-        assert peer.refusal(keys.TILE_UPDATES, request(**changes)) == code
-        assert isinstance(peer.ask(keys.TILE_UPDATES, codec.encode(request())), bytes)
+        assert peer.refusal(keys.TILE_UPDATES, tile_updates(**changes)) == code
+        assert isinstance(peer.ask(keys.TILE_UPDATES, codec.encode(tile_updates())), bytes)
 
 
 @pytest.mark.parametrize("level", [-1, 3, 2**62])
@@ -289,7 +271,7 @@ def test_bad_arguments_are_refused_before_anything_is_sent(
 def held_by(session: zenoh.Session) -> "zenoh.handlers.FifoChannel":
     """A request that waits at the server once this returns."""
     key = keys.operation_key(servers.MAP, keys.TILE_UPDATES)
-    payload = codec.encode(request(timeout_s=50.0))
+    payload = codec.encode(tile_updates(timeout_s=50.0))
     answers = session.get(key, payload=payload, timeout=servers.WAIT_S)
     assert servers.RawPeer(session).refusal(keys.FLUSH, b"") == "bad_request"  # it went later
     return answers
@@ -299,7 +281,7 @@ def test_too_many_followers_are_told_to_come_back() -> None:
     few = SETTINGS.model_copy(update={"service": ServiceSettings(request_queue=2)})
     with servers.running_service(few) as endpoint, servers.raw_session(connect=endpoint) as session:
         held = [held_by(session) for _ in range(2)]
-        assert servers.RawPeer(session).refusal(keys.TILE_UPDATES, request()) == "busy"
+        assert servers.RawPeer(session).refusal(keys.TILE_UPDATES, tile_updates()) == "busy"
         assert len(held) == 2
 
 
@@ -313,7 +295,7 @@ def test_a_server_that_stops_says_so() -> None:
 
 
 def tiles_by_hand(peer: servers.RawPeer, **changes: object) -> TileUpdates:
-    answer = peer.ask(keys.TILE_UPDATES, codec.encode(request(**changes)))
+    answer = peer.ask(keys.TILE_UPDATES, codec.encode(tile_updates(**changes)))
     assert not isinstance(answer, ErrorReply)
     assert answer is not None
     return codec.decode(TileUpdates, answer)

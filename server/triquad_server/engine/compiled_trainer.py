@@ -164,11 +164,11 @@ class GradientSums:
         if known[0] < rows or known[1] != size or self.step == _LAST_STEP:
             room = rows + rows // 4
             self.clear()  # first: memory may be short
-            touched = [
+            self.touched = tuple(
                 Touched(np.zeros(room, np.int32), np.zeros(room, np.int32)) for _ in range(THREADS)
-            ]
+            )
+            # Last: by these it is known that there is room.
             self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
-            self.touched = tuple(touched)
 
     def clear(self) -> None:
         """Forget a step that failed midway."""

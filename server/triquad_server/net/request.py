@@ -14,8 +14,8 @@ from triquad_format.wire.messages import ErrorReply
 
 from triquad_server.fair_queue import Owner
 from triquad_server.net.askers import Asker, Askers
+from triquad_server.net.byte_budget import ByteBudget
 from triquad_server.net.operation_counts import OperationCounts
-from triquad_server.net.reply_memory import ReplyMemory
 
 _log = logging.getLogger(__name__)
 
@@ -53,18 +53,19 @@ class Request:
         counts: OperationCounts,
         asker: Asker,
         askers: Askers,
-        memory: ReplyMemory,
+        replies: ByteBudget,
     ) -> None:
         """``key`` is the key of the operation, whose ``counts`` tell what becomes of it.
 
-        ``asker`` is whose it is, of all ``askers``; ``memory`` is that of the replies to all.
+        ``asker`` is whose it is, of all ``askers``; ``replies`` is that of
+        the replies to all that are on their way.
         """
         self.key = key
         self.asker = asker
         self._query = query
         self._counts = counts
         self._askers = askers
-        self._memory = memory
+        self._replies = replies
         self._turns: Turns | None = None
         self._slices = 0  # that have begun
         self._slice_began_s = 0.0  # monotonic
@@ -140,7 +141,7 @@ class Request:
         take the memory.
         """
         payload = codec.encode(message)
-        if not self._memory.take(len(payload)):
+        if not self._replies.take(len(payload)):
             self.refuse("busy", "too many large replies are on their way; ask for less, or later")
             return
         try:
@@ -148,7 +149,7 @@ class Request:
                 lambda: self._query.reply(self.key, payload, encoding=keys.encoding(type(message)))
             )
         finally:
-            self._memory.give_back(len(payload))
+            self._replies.give_back(len(payload))
         self._counts.answer(self._arrived_s, len(payload))
 
     def refuse(self, code: str, text: str) -> None:

@@ -14,9 +14,9 @@ from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.net.askers import Askers
 from triquad_server.net.asking_client import asking_client
+from triquad_server.net.byte_budget import ByteBudget
 from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
-from triquad_server.net.reply_memory import ReplyMemory
 from triquad_server.net.request import Request, RequestT, Turns
 from triquad_server.net.request_queue import (
     MOST_LONG,
@@ -78,19 +78,19 @@ class RequestHandlers:
         operations: Mapping[str, Operation],
         askers: Askers,
         long_work: LongWork,
-        memory: ReplyMemory,
+        replies: ByteBudget,
         *,
         workers: int,
         limits: RequestLimits,
     ) -> None:
         """Begin to serve ``operations``, by key, with so many ``workers``.
 
-        ``askers``, ``long_work`` and ``memory`` are those of all groups.
+        ``askers``, ``long_work`` and ``replies`` are those of all groups.
         """
         self._operations = operations
         self._askers = askers
         self._long_work = long_work
-        self._memory = memory
+        self._replies = replies
         self._limits = limits
         self._queue: RequestQueue[Request] = RequestQueue(
             self._begin,
@@ -104,8 +104,7 @@ class RequestHandlers:
         most_begun = max(MOST_SHORT, workers) + MOST_LONG
         self._workers = ThreadPoolExecutor(most_begun + MOST_SENDING, "worker")
         self._refusals = ThreadPoolExecutor(_REFUSALS, "refusals")
-        self._refused_bytes = 0  # of requests that wait for these threads
-        self._refused_lock = threading.Lock()
+        self._refused = ByteBudget(_REFUSED_BYTES, small=_LARGE_BYTES)
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._receivers: list[threading.Thread] = []
         for key in operations:
@@ -154,7 +153,7 @@ class RequestHandlers:
     def _take(self, query: zenoh.Query, key: str) -> None:
         asker = self._askers.asker(query, self._limits.longest_s)
         counts = self._operations[key].counts
-        request = Request(query, key, counts, asker, self._askers, self._memory)
+        request = Request(query, key, counts, asker, self._askers, self._replies)
         if request.size > self._limits.max_bytes:
             limit = self._limits.max_bytes
             text = f"{request.size} bytes exceed the limit of {limit}: split it"
@@ -168,21 +167,17 @@ class RequestHandlers:
 
     def _refuse_aside(self, request: Request, code: str, text: str) -> None:
         """Refuse a request, in another thread mostly: its client may not take the reply."""
-        with self._refused_lock:
-            self._refused_bytes += request.size
-            is_much = self._refused_bytes > _REFUSED_BYTES
-        if is_much and request.size > _LARGE_BYTES:
-            self._refuse(request, code, text)
-        else:
+        if self._refused.take(request.size):
             submit(self._refusals, self._refuse, request, code, text)
+        else:
+            request.refuse(code, text)
 
     def _refuse(self, request: Request, code: str, text: str) -> None:
         size = request.size
         try:
             request.refuse(code, text)
         finally:
-            with self._refused_lock:
-                self._refused_bytes -= size
+            self._refused.give_back(size)
 
     def _begin(self, job: Job[Request]) -> None:
         submit(self._workers, self._work, job)

@@ -8,10 +8,10 @@ from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.net.askers import Askers
+from triquad_server.net.byte_budget import ByteBudget
 from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
 from triquad_server.net.payload_limit import payload_limit
-from triquad_server.net.reply_memory import ReplyMemory
 from triquad_server.net.request_handlers import (
     Handler,
     Operation,
@@ -26,6 +26,12 @@ ReadQueue = Callable[[], QueueMetrics]
 
 _OF_POINTS = frozenset({"field", "distances", "places", "poses"})
 """The groups of operations that ask about points."""
+
+_REPLY_BYTES = 64_000_000
+"""Of all replies on their way, to clients that may not read them; a large one beyond is refused."""
+
+_SMALL_REPLY_BYTES = 262_144
+"""A reply of no more, such as a planner's, always is."""
 
 _KNOWN_TILE_BYTES = 20
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
@@ -48,7 +54,7 @@ class ServedOperations:
         self._map_name = map_name
         self._askers = Askers(session)
         self._long_work = LongWork()
-        self._memory = ReplyMemory()
+        self._replies = ByteBudget(_REPLY_BYTES, small=_SMALL_REPLY_BYTES)
         self._groups: list[RequestHandlers] = []
         self._limits = limits
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
@@ -75,7 +81,7 @@ class ServedOperations:
             operations,
             self._askers,
             self._long_work,
-            self._memory,
+            self._replies,
             workers=workers,
             limits=self._limits_of(queue),
         )

@@ -1,44 +1,15 @@
 import math
-import queue
 import threading
 from contextlib import closing
 
 import pytest
 from support import servers
+from support.requests import PendingRequest
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import FlushReply, FlushRequest
-from triquad_server.fair_queue import Owner
 from triquad_server.intake import flush, source_ledger
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.source_ledger import SourceLedger
-
-
-class PendingRequest:
-    """Stands for a Zenoh query; keeps its one answer."""
-
-    def __init__(self, asks, defect=None, owner=""):
-        self.owner = Owner(owner)
-        self._asks = asks
-        self._defect = defect
-        self._replies: queue.SimpleQueue[object] = queue.SimpleQueue()
-
-    def read(self, _kind):
-        return self._asks
-
-    def answer(self, message):
-        if self._defect:
-            raise self._defect
-        self._replies.put(message)
-
-    def refuse(self, code, text):
-        self._replies.put(code)
-
-    def fail(self, error):
-        self.refuse("internal", str(error))
-
-    @property
-    def reply(self):
-        return self._replies.get(timeout=servers.WAIT_S)
 
 
 @pytest.fixture
@@ -92,7 +63,7 @@ def test_requests_out_of_range_are_refused_and_others_are_answered(handler, requ
 
 
 def test_an_internal_error_ends_one_request_and_no_other(handler):
-    bad, good = PendingRequest(asks(), RuntimeError("a defect")), PendingRequest(asks())
+    bad, good = PendingRequest(asks(), defect=RuntimeError("a defect")), PendingRequest(asks())
     handler.add(bad)
     assert bad.reply == "internal"
     handler.add(good)

@@ -3,9 +3,9 @@ from contextlib import closing
 
 import pytest
 import zenoh
+from support.servers import raw_session
 from triquad_format.wire import codec
 from triquad_format.wire.origin import RequestOrigin
-from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_server.fair_queue import Owner
 from triquad_server.net import askers as module
 from triquad_server.net.askers import Asker, Askers
@@ -15,9 +15,7 @@ A, B = (Asker(Owner(name), deadline_s=0.0) for name in "ab")
 
 @pytest.fixture
 def askers():
-    config = zenoh.Config()
-    put(config, QUIET)
-    with zenoh.open(config) as session, closing(Askers(session)) as askers:
+    with raw_session("peer") as session, closing(Askers(session)) as askers:
         yield askers
 
 

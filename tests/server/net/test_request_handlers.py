@@ -3,13 +3,11 @@
 import threading
 from contextlib import closing
 
-import zenoh
-from support.servers import WAIT_S
-from triquad_format.wire.zenoh_config import QUIET, put
+from support.servers import WAIT_S, raw_session
 from triquad_server.net import request_handlers as module
 from triquad_server.net.askers import Askers
+from triquad_server.net.byte_budget import ByteBudget
 from triquad_server.net.long_work import LongWork
-from triquad_server.net.reply_memory import ReplyMemory
 from triquad_server.net.request_handlers import RequestHandlers, RequestLimits
 
 
@@ -27,13 +25,12 @@ class Request:
 
 
 def test_large_requests_that_are_refused_do_not_pile_up_behind_who_reads_nothing():
-    config, reads, at_once = zenoh.Config(), threading.Event(), threading.Event()
+    reads, at_once = threading.Event(), threading.Event()
     at_once.set()
-    put(config, QUIET)
     limits = RequestLimits(waiting=1, waiting_bytes=1, max_bytes=1, longest_s=1.0)
-    with zenoh.open(config) as session, closing(Askers(session)) as askers:
+    with raw_session("peer") as session, closing(Askers(session)) as askers:
         handlers = RequestHandlers(
-            session, {}, askers, LongWork(), ReplyMemory(), workers=1, limits=limits
+            session, {}, askers, LongWork(), ByteBudget(1, small=1), workers=1, limits=limits
         )
         stuck = [Request(100, reads) for _ in range(module._REFUSALS)]
         large = [Request(module._REFUSED_BYTES // 2, at_once) for _ in range(10)]
