@@ -77,7 +77,7 @@ PARTS = (
         "crowd",
         "seconds of a crowd",
         goal=3_600,
-        per_turn=60,
+        per_turn=600,
         run=crowd.run,
         promise="clients that ask and send too much, read nothing or invent names take at most 200 "
         "MB of memory; an honest client is served after them",
