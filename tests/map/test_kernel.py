@@ -18,6 +18,13 @@ def caller(x):
 print(caller(2), sum(caller.stats.cache_hits.values()))
 """
 
+ON_A_FULL_DISK = """
+import resource, signal, sys
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))
+"""
+
 CALLEE = """
 from triquad_map.compiled.kernel import kernel
 
@@ -43,13 +50,13 @@ def run(package, **variables):
     return int(result), int(found)
 
 
-def run_process(package, **variables):
+def run_process(package, before="", **variables):
     unset = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
     environment = {name: value for name, value in os.environ.items() if name not in unset}
     environment["HOME"] = str(package.parents[1] / "home")
     code = f"import sys; sys.path.append({str(package.parent)!r}); import triquad_toy.caller"
     return subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", before + code],
         env=environment | variables,
         capture_output=True,
         text=True,
@@ -118,3 +125,24 @@ def test_a_temporary_folder_of_others_is_not_trusted(package, tmp_path):
     for _ in range(2):
         assert run(package, TMPDIR=str(tmp_path / "temporary")) == (33, 0)
     assert list(planted.iterdir()) == []
+
+
+def test_a_full_disk_keeps_no_kernel_from_running(package):
+    process = run_process(package, before=ON_A_FULL_DISK)
+    assert process.stdout.split() == ["33", "0"]
+    assert "cannot be kept: [Errno 27] File too large" in process.stderr
+    assert run(package) == (33, 0)
+    assert run(package) == (33, 1)
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("left", [0, 100])
+def test_compiled_code_that_is_damaged_is_made_anew(package, suffix, left):
+    run(package)
+    kernels = package.parents[1] / "home" / ".cache" / "triquad" / "kernels"
+    for file in kernels.rglob(f"*.{suffix}"):
+        file.write_bytes(file.read_bytes()[:left])
+    process = run_process(package)
+    assert process.stdout.split() == ["33", "0"]
+    assert "damaged" in process.stderr
+    assert run(package) == (33, 1)

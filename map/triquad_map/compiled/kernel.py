@@ -17,12 +17,13 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from numba.core import event
+from numba.core import caching, event
 
 _OURS = "triquad_"
 """What the names of the packages begin with whose modules count."""
@@ -30,6 +31,7 @@ _OURS = "triquad_"
 _log = logging.getLogger(__name__)
 
 _numba_config: Any = numba.config
+_FunctionCache: Any = caching.FunctionCache
 _choosing_folder = threading.Lock()
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
@@ -48,13 +50,36 @@ def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
             folder = _code_folder(function.__module__, chosen)
             _numba_config.CACHE_DIR = str(folder or chosen)
             try:
-                jit = numba.njit(cache=folder is not None, nogil=True, **options)
-                done: FunctionT = jit(function)
+                jit: Any = numba.njit(nogil=True, **options)(function)
+                if folder is not None:
+                    jit._cache = _KeptCode(function)  # as its enable_caching() does
             finally:
                 _numba_config.CACHE_DIR = chosen
+        done: FunctionT = jit
         return done
 
     return compiled
+
+
+class _KeptCode(_FunctionCache):  # type: ignore[misc]
+    """The compiled code of a kernel on disk, without which the kernel works as well."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Compiled code, if there is some; what cannot be read is compiled and kept anew."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # whatever comes of a file that a power cut left half written
+            _log.warning("%s: its compiled code on disk is damaged: %r", self._name, error)
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep compiled code for other processes, where the disk has room for it."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _log.warning("%s: its compiled code cannot be kept: %s", self._name, error)
 
 
 class _CompilingIsTold(event.Listener):
