@@ -3,6 +3,7 @@
 import functools
 import logging
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -61,10 +62,22 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     give_back_early()
     allow_open_files()
+    _stop_where_a_thread_ends(stops)
     if options.store is None:
         _log.warning("no --store: the map is not kept when the server stops")
     with closing(Supervision(ServiceManager())) as supervision:
         return serve_until_stopped(options, stops, supervision)
+
+
+def _stop_where_a_thread_ends(stops: Stops) -> None:
+    """Ask to stop where an exception ends a thread: without any of them this serves but in part."""
+    tell = threading.excepthook
+
+    def tell_and_stop(args: threading.ExceptHookArgs) -> None:
+        tell(args)
+        stops.put(Stop.INTERNAL_ERROR)
+
+    threading.excepthook = tell_and_stop
 
 
 def serve_until_stopped(options: LaunchOptions, stops: Stops, phases: Phases) -> Stop:

@@ -272,3 +272,29 @@ def test_a_zenoh_configuration_file_is_used(tmp_path, settings):
         triquad_client.connect(server.endpoint) as client,
     ):
         assert client.status().map_name == servers.MAP
+
+
+A_THREAD_ENDS = """
+import zenoh
+from triquad_server.net.askers import Askers
+
+def watch(askers):
+    for event in askers._listener:
+        if event.kind == zenoh.SampleKind.DELETE:
+            raise RuntimeError("a defect")
+
+Askers._watch = watch
+"""
+
+
+def test_a_thread_that_ends_by_a_defect_stops_the_server_after_a_last_checkpoint(
+    tmp_path, arguments
+):
+    (tmp_path / "sitecustomize.py").write_text(A_THREAD_ENDS)
+    with servers.server_process(arguments, environment={"PYTHONPATH": str(tmp_path)}) as server:
+        before = learn(server.endpoint)
+        assert server.wait() == 1
+    assert "RuntimeError: a defect" in server.log
+    assert "stopping, by an internal error" in server.log
+    with servers.server_process(arguments) as server:
+        assert_same_map(before, ask(server.endpoint))
