@@ -1,6 +1,7 @@
 """The campaign from the command line: all of it, or one turn of one part.
 
-``python -m campaign`` goes on with the campaign in ``campaign-out/``, or begins one;
+``python -m campaign`` goes on with the campaign in ``campaign-out/``, or begins one; with
+``--part``, as often as wanted, it runs these parts alone;
 ``python -m campaign --part kills --seed 17`` repeats one turn.
 """
 
@@ -24,11 +25,11 @@ _TRACEBACK = 2000  # characters of it that are kept
 def main(argv: Sequence[str] | None = None) -> int:
     """Run what the arguments say: 0 where nothing broke, 1 where something did."""
     options = _parser().parse_args(argv)
-    if options.seed is not None and options.part is None:
+    if options.seed is not None and len(options.part) != 1:
         _parser().error("--seed is of one turn: name its --part")
     if options.seed is not None:
         return _one_turn(options)
-    parts = PARTS if options.part is None else (BY_NAME[options.part],)
+    parts = [BY_NAME[name] for name in options.part] or PARTS
     if options.afresh:
         shutil.rmtree(options.out, ignore_errors=True)
     campaign = Campaign(options.out, parts)
@@ -44,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m campaign", description=__doc__)
     add = parser.add_argument
-    add("--part", choices=sorted(BY_NAME), help="this one alone")
+    add("--part", choices=sorted(BY_NAME), action="append", default=[], help="this one alone")
     add("--seed", type=int, help="repeat the turn of --part with this seed, and nothing else")
     add("--minutes", type=float, default=5.0, help="how long (default: 5)")
     add("--lanes", type=int, default=2, help="turns at a time (default: 2)")
@@ -57,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _one_turn(options: argparse.Namespace) -> int:
     """Run a turn in this process, and tell what it did."""
-    part = BY_NAME[options.part]
+    part = BY_NAME[options.part[0]]
     folder = options.out / f"{part.name}-{options.seed}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
