@@ -15,7 +15,7 @@ from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.net.operation_counts import OperationCounts
-from triquad_server.process.memory import resident_bytes
+from triquad_server.process.memory import give_back_free, resident_bytes
 from triquad_server.store.checkpoint_thread import CheckpointThread
 
 _log = logging.getLogger(__name__)
@@ -29,6 +29,7 @@ ENDLESS_S = 1800.0
 """Nothing that it computes takes longer, neither code to compile nor a large checkpoint."""
 
 _BEATS_PER_LOG_LINE = 5
+_BEATS_PER_TRIM = 10  # of the memory
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class Health:
 
 
 class Heartbeat:
-    """Tells the network and the log how the server is doing."""
+    """Tells the network and the log how the server is doing, and keeps its memory small."""
 
     def __init__(self, session: zenoh.Session, health: Health) -> None:
         self._health = health
@@ -162,6 +163,8 @@ class Heartbeat:
         beat = 0
         while not self._stopping.wait(STATUS_PERIOD_S):
             beat += 1
+            if beat % _BEATS_PER_TRIM == 0:
+                give_back_free()
             try:
                 self._health.mapper.wake()  # for a sign of life, even where nothing is to do
                 self._health.warnings.check()

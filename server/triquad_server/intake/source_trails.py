@@ -8,6 +8,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.messages import Scan
+from triquad_map.compiled.voxel_index import with_room
 
 from triquad_server.intake.rays import ScanRays
 
@@ -17,6 +18,8 @@ MAX_SOURCES = 256
 MAX_POSITIONS = 8192
 """Of a trail. Once it has so many, every second one is dropped, and from then on they are twice as
 far apart: all of the way remains visible."""
+
+_LEAST_ROOM = 16  # positions: whoever invents sources gets no more of each
 
 _JUMP_LEAVES = 250.0
 """A sensor that is farther away than this from one scan to the next has not moved there: 50 m with
@@ -58,12 +61,17 @@ class _Trail:
     """Where a sensor has been: a bounded number of positions, oldest first."""
 
     count: int = 0
-    positions: Doubles = field(default_factory=lambda: np.empty((MAX_POSITIONS, 3)))
-    pieces: Longs = field(default_factory=lambda: np.empty(MAX_POSITIONS, np.int64))
-    revisions: Longs = field(default_factory=lambda: np.empty(MAX_POSITIONS, np.int64))
+    positions: Doubles = field(default_factory=lambda: np.empty((0, 3)))
+    pieces: Longs = field(default_factory=lambda: np.empty(0, np.int64))
+    revisions: Longs = field(default_factory=lambda: np.empty(0, np.int64))
 
     def add(self, position: Doubles, piece: int, revision: int) -> None:
-        """Add a position; there must be room."""
+        """Add a position."""
+        if self.count == len(self.positions):
+            room = max(_LEAST_ROOM, 2 * self.count)
+            self.positions = with_room(self.positions, room)
+            self.pieces = with_room(self.pieces, room)
+            self.revisions = with_room(self.revisions, room)
         self.positions[self.count] = position
         self.pieces[self.count] = piece
         self.revisions[self.count] = revision

@@ -17,7 +17,7 @@ _CONNECT_MS = 5000  # a router that was started together with the server may nee
 
 _LINKS: Mapping[str, Any] = {
     # A link that is opened and then says nothing holds a place among those that are pending.
-    "transport/unicast/accept_timeout": 2000,
+    "transport/unicast/accept_timeout": 5000,
     "transport/unicast/accept_pending": 1000,
     "transport/unicast/max_sessions": 500,
 }

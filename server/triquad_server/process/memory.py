@@ -40,6 +40,17 @@ def give_back_early() -> None:
         options(_M_TRIM_THRESHOLD, 2 * _LARGE_BYTES)
 
 
+def give_back_free() -> None:
+    """Give memory that is free between what is in use back to the system: some milliseconds.
+
+    Small arrays of many threads lie side by side, and those that stay longest hold the others'
+    room: where much was asked of the server, it would keep a fifth of its memory for nothing.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)
+
+
 def spare_from_collection() -> None:
     """Leave all objects that are there now out of every later garbage collection.
 

@@ -1,10 +1,17 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.wire.messages import Scan
 from triquad_server.intake.rays import ScanRays
-from triquad_server.intake.source_trails import MAX_POSITIONS, SourceTrails, evenly
+from triquad_server.intake.source_trails import (
+    MAX_POSITIONS,
+    MAX_SOURCES,
+    SourceTrails,
+    evenly,
+)
 
 LEAF_M = 0.2
 
@@ -115,3 +122,16 @@ def test_points_are_drawn_from_equal_runs_none_twice(count):
     assert (np.diff(rows) > 0).all()
     if count:
         assert (np.diff(rows) <= 2 * np.ceil(100 / count)).all()
+
+
+def test_sources_that_somebody_invents_take_little_memory():
+    trails = SourceTrails(LEAF_M)
+    tracemalloc.start()
+    try:
+        for number in range(2 * MAX_SOURCES):
+            add(trails, (0, 0, 0), source=f"invented-{number}")
+        used, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(trails.since(0)[1]) == MAX_SOURCES
+    assert used < 4096 * MAX_SOURCES

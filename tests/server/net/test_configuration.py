@@ -20,7 +20,7 @@ SAFE = {
     "transport/shared_memory/enabled": False,
     "transport/unicast/max_sessions": 500,
     "transport/unicast/accept_pending": 1000,
-    "transport/unicast/accept_timeout": 2000,
+    "transport/unicast/accept_timeout": 5000,
     "transport/link/rx/max_message_size": 24_008_192,
     "access_control/enabled": True,
     "access_control/default_permission": "deny",
