@@ -11,6 +11,7 @@ from torch import Tensor
 from triquad_format.records.arrays import Floats, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
+from triquad_format.records.replay_rays import ReplayRays
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
@@ -209,7 +210,7 @@ def region_record(
 
 
 def training_state(
-    field: LiveField, *, points: Tensor, labels: Tensor, budget_samples: int
+    field: LiveField, *, rays: ReplayRays, samples: Batch, budget_samples: int
 ) -> TrainingState:
     """What training needs beyond the field itself, sharing nothing with it.
 
@@ -218,8 +219,8 @@ def training_state(
 
     Args:
         field: whose optimiser state is copied.
-        points: [S, 3] and
-        labels: [S], samples that are to be trained on again.
+        rays: that are to be trained on again.
+        samples: likewise, of what no ray tells.
         budget_samples: how many samples are still to be trained on.
     """
     features, size = field.features, field.settings.feature_size
@@ -236,9 +237,10 @@ def training_state(
         mlp_means=tuple(_array(part.means[0]) for part in mlp),
         mlp_variances=tuple(_array(part.variances[0]) for part in mlp),
         mlp_steps=int(mlp[0].steps[0]),
-        sample_points=_array(points),
-        sample_labels=_array(labels).astype(np.float16),
+        sample_points=_array(samples.points),
+        sample_labels=_array(samples.labels).astype(np.float16),
         budget_samples=budget_samples,
+        rays=rays,
     )
 
 

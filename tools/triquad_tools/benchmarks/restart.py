@@ -1,7 +1,7 @@
-"""``triquad-bench`` of a restart: what a checkpoint keeps of what was learnt, and in how many bytes.
+"""``triquad-bench`` of a restart: what a checkpoint keeps of what was learnt, in how many bytes.
 
-A street is learnt, and then another part of it from which the first is out of sight: by the map that
-stayed in memory, and by the one that was restored from a checkpoint of the first.
+A street is learnt, and then another part of it from which the first is out of sight: by the map
+that stayed in memory, and by the one that was restored from a checkpoint of the first.
 """
 
 import tempfile
