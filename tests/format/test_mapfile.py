@@ -128,7 +128,7 @@ def test_regions_may_differ_in_their_features():
 
 
 def test_rays_of_a_cube_that_fill_several_parts(monkeypatch):
-    monkeypatch.setattr("triquad_format.mapfile.parts.pack.RAYS_PER_PART", 40)
+    monkeypatch.setattr("triquad_format.mapfile.parts.pack.RAYS_PER_PART", 80)
     record = with_rays(random_record(2))
     data = file_bytes(record)
     assert sum(part.topic == "/triquad/rays" for part in parts_of(data)) > 1

@@ -88,7 +88,7 @@ def test_crop_keeps_the_training_budget_of_the_samples_it_keeps():
 def test_crop_keeps_the_rays_that_end_in_the_box():
     record = with_rays(random_record(4, points=100))
     before = record.regions[0].training
-    low, high = [0.0, 0.0, 0.0], [0.3, 0.3, 0.3]
+    low, high = [0.0] * 3, [3 * SMALL.leaf_m] * 3
     after = crop_record(record, low, high).regions[0].training
     ends = before.rays.ends_m(SMALL)
     inside = ((ends >= low) & (ends <= high)).all(axis=1)
