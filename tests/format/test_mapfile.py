@@ -19,6 +19,7 @@ from support.map_records import (
     with_integers,
     with_levels,
     with_outcomes,
+    with_rays,
 )
 from support.mapfile_edit import (
     edited,
@@ -45,6 +46,7 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 GOLDEN_NAMES = ("map_v1.triquad", "map_v1_next.triquad")
 GOLDEN_LEVELS = "map_v1_levels.triquad"
 GOLDEN_OUTCOMES = "map_v1_outcomes.triquad"
+GOLDEN_RAYS = "map_v1_rays.triquad"
 GOLDEN_PRODUCER = "0.1.0"
 GOLDEN_ZSTD = (1, 5, 7)
 """The release of zstd that compressed the golden files: others may give other bytes."""
@@ -72,6 +74,11 @@ def golden_outcomes():
     return with_outcomes(golden_levels())
 
 
+def golden_rays():
+    """The record of the golden file with rays to train on."""
+    return with_rays(random_record(2026, points=12, name="golden", epoch=45))
+
+
 def write_golden(folder):
     """The golden files: a complete one, and what changed after it. None has a preview."""
     schema = preview_schema()
@@ -80,6 +87,7 @@ def write_golden(folder):
     previews = Previews(schema, {})
     write_map(golden_levels(), folder / GOLDEN_LEVELS, stamp_ns=stamps[0], previews=previews)
     write_map(golden_outcomes(), folder / GOLDEN_OUTCOMES, stamp_ns=stamps[0], previews=previews)
+    write_map(golden_rays(), folder / GOLDEN_RAYS, stamp_ns=stamps[0], previews=previews)
 
 
 # Round trips
@@ -117,6 +125,14 @@ def test_regions_may_differ_in_their_features():
     assert {table.scale is None for r in record.regions for table in r.tables} == {True, False}
     assert_same(read_bytes(file_bytes(record)), record)
     assert_same(read_bytes(file_bytes(base)), base)
+
+
+def test_rays_of_a_cube_that_fill_several_parts(monkeypatch):
+    monkeypatch.setattr("triquad_format.mapfile.parts.pack.RAYS_PER_PART", 80)
+    record = with_rays(random_record(2))
+    data = file_bytes(record)
+    assert sum(part.topic == "/triquad/rays" for part in parts_of(data)) > 1
+    assert_same(read_bytes(data), record)
 
 
 def test_empty_map():
@@ -226,6 +242,7 @@ def test_golden_files_read_back():
     assert_same(read_map(GOLDEN / GOLDEN_NAMES[1]), record)
     assert_same(read_map(GOLDEN / GOLDEN_LEVELS), golden_levels())
     assert_same(read_map(GOLDEN / GOLDEN_OUTCOMES), golden_outcomes())
+    assert_same(read_map(GOLDEN / GOLDEN_RAYS), golden_rays())
 
 
 @pytest.fixture
@@ -233,7 +250,7 @@ def golden_pairs(monkeypatch, tmp_path):
     """The golden files, and what the writer writes now, under the name that it had then."""
     monkeypatch.setattr("triquad_format.mapfile.metadata.__version__", GOLDEN_PRODUCER)
     write_golden(tmp_path)
-    names = (*GOLDEN_NAMES, GOLDEN_LEVELS, GOLDEN_OUTCOMES)
+    names = (*GOLDEN_NAMES, GOLDEN_LEVELS, GOLDEN_OUTCOMES, GOLDEN_RAYS)
     return [((GOLDEN / name).read_bytes(), (tmp_path / name).read_bytes()) for name in names]
 
 

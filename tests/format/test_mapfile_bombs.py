@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.writer import IndexType
-from support.map_records import SMALL, random_record, with_outcomes
+from support.map_records import SMALL, random_record, with_outcomes, with_rays
 from support.mapfile_edit import (
     RawPart,
     edited,
@@ -102,7 +102,14 @@ def bomb_of_evidence(field, shape):
     return edited(file_bytes(with_outcomes(random_record(12))), EVIDENCE, column)
 
 
+def bomb_of_rays():
+    """A file in which a few leaves hold so many rays."""
+    counts = set_array("counts", np.full((5, 1), 255, np.uint8))
+    return edited(file_bytes(with_rays(random_record(12))), "/triquad/rays", counts)
+
+
 BOMBS = {
+    "rays": bomb_of_rays,
     "lists": lambda: bomb_of(msgpack.packb([[[[[]] * 60] * 60] * 60] * 60)),
     "texts": lambda: bomb_of(msgpack.packb([[["ab"] * 60] * 60] * 60)),
     "zeros": lambda: bomb_of(bytes(11 * 2**20)),

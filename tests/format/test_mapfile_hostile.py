@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from support.map_records import random_record, with_integers, with_outcomes
+from support.map_records import random_record, with_integers, with_outcomes, with_rays
 from support.mapfile_edit import (
     RawPart,
     all_of,
@@ -186,6 +186,44 @@ def test_hostile_levels(case):
     data = edited(file_bytes(with_outcomes(random_record(12))), EVIDENCE, edit)
     assert_refused(data)
     with pytest.raises(DamagedMapFileError, match=re.escape(message).replace(r"\|", "|")):
+        read_bytes(data)
+
+
+def first_byte(key, value):
+    """Replace the first byte of an array."""
+
+    def edit(body):
+        body[key]["data"] = bytes([value]) + body[key]["data"][1:]
+
+    return edit
+
+
+RAYS = "/triquad/rays"
+HOSTILE_RAYS = {
+    "fewer than announced": (TRAINING, set_field("rays", 10), "rays, not 10"),
+    "announced, and not there": (TRAINING, lambda b: b.pop("rays"), "rays, not 0"),
+    "no origins": (TRAINING, set_array("origins", np.zeros((0, 3), "<f4")), "not among"),
+    "origins that are not finite": (
+        TRAINING,
+        set_array("origins", np.full((300, 3), np.nan, "<f4")),
+        "origins",
+    ),
+    "an end outside its leaf": (RAYS, first_byte("inside", 128), "outside its leaf"),
+    "a leaf without rays": (RAYS, first_byte("counts", 0), "out of range"),
+    "more rays in a leaf than ends": (RAYS, first_byte("counts", 255), "inside"),
+    "a slope less": (RAYS, shorten("slopes", 0), "slopes"),
+    "an origin less": (RAYS, shorten("origins", 1), "origins"),
+    "no bytes of a count": (RAYS, set_array("counts", np.zeros((0, 1), "u1")), "counts"),
+    "leaves of a cell that cannot be": (RAYS, too_far((4, 1)), "codes|counts|outside"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_RAYS)
+def test_hostile_rays(case):
+    topic, edit, message = HOSTILE_RAYS[case]
+    data = edited(file_bytes(with_rays(random_record(12))), topic, edit)
+    assert_refused(data)
+    with pytest.raises(FormatError, match=message):
         read_bytes(data)
 
 

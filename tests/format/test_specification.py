@@ -130,7 +130,7 @@ def write_variant(path: Path, name: str) -> Path:
     return path
 
 
-SAMPLES = ("map_v1", "map_v1_next", "map_v1_levels", "map_v1_outcomes")
+SAMPLES = ("map_v1", "map_v1_next", "map_v1_levels", "map_v1_outcomes", "map_v1_rays")
 
 
 @pytest.mark.parametrize("name", [f"{name}.triquad" for name in SAMPLES])
@@ -141,6 +141,19 @@ def test_the_samples(name: str) -> None:
     record = read_map(GOLDEN / name)
     assert_agree(answers, record, points)
     assert_same_support(answers, record)
+
+
+def test_rays_to_train_on() -> None:
+    path = GOLDEN / "map_v1_rays.triquad"
+    record = read_map(path)
+    (training,) = (region.training for region in record.regions)
+    assert training is not None
+    rays = training.rays
+    origins = rays.origins[rays.origin_of]
+    want = np.column_stack([rays.ends_m(record.settings), origins, rays.slopes / 255])
+    have = spec_reader.load_rays(path, spec_reader.load(path).settings)
+    order = [np.lexsort(table.round(6).T) for table in (have, want)]
+    np.testing.assert_allclose(have[order[0]], want[order[1]], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", VARIANTS)

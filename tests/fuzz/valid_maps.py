@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from support.map_records import random_record, with_integers, with_levels, with_outcomes
+from support.map_records import (
+    random_record,
+    with_integers,
+    with_levels,
+    with_outcomes,
+    with_rays,
+)
 from support.mapfile_edit import write_pair
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
@@ -62,6 +68,7 @@ def valid_maps(folder: Path) -> list[ValidMap]:
         "integers": with_integers(plain),
         "levels": with_levels(plain),
         "outcomes": with_outcomes(plain),
+        "rays": with_rays(random_record(settings=TINY, points=3), rays=12),
     }
     maps = [_written(folder / kind, record) for kind, record in complete.items()]
     maps.append(_written_pair(folder / "delta", plain))

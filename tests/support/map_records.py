@@ -18,6 +18,7 @@ from triquad_format.records.region import (
     TrainingState,
     VertexTable,
 )
+from triquad_format.records.replay_rays import STEPS, ReplayRays
 
 SMALL = FieldSettings(
     leaf_m=0.25, depth=6, feature_levels=2, feature_size=3, frequencies=4, hidden=5,
@@ -174,6 +175,27 @@ def _supported(rng: np.random.RandomState, evidence: Evidence) -> Evidence:
     seen_s = 1_700_000_000 + rng.randint(0, 400, len(counts), np.int64)
     seen_s *= (counts > 0) & (rng.randint(0, 4, len(counts), np.int64) > 0)
     return dataclasses.replace(evidence, levels=levels, seen_s=seen_s)
+
+
+def with_rays(record: MapRecord, rays: int = 200, seed: int = 0) -> MapRecord:
+    """The record, which has training state, with rays to train on; some end outside the region."""
+    rng = np.random.RandomState(seed)
+    regions = []
+    for region in record.regions:
+        assert region.training is not None
+        training = dataclasses.replace(region.training, rays=_rays(rng, record.settings, rays))
+        regions.append(dataclasses.replace(region, training=training))
+    return dataclasses.replace(record, regions=tuple(regions))
+
+
+def _rays(rng: np.random.RandomState, settings: FieldSettings, count: int) -> ReplayRays:
+    middle = STEPS << settings.depth
+    ends = rng.randint(0, 2 * middle, (count, 3), np.int64)
+    ends[: count // 2] = middle + rng.randint(0, 5 * STEPS, (count // 2, 3), np.int64)
+    ends = ends[np.argsort(morton.encode(ends // STEPS), kind="stable")].astype(np.int32)
+    origin_of = rng.randint(0, 300, count, np.int64).astype(np.int32)
+    slopes = rng.randint(0, 256, count, np.int64).astype(np.uint8)
+    return ReplayRays(ends, origin_of, slopes, origins=_floats(rng, 300, 3))
 
 
 def with_outcomes(record: MapRecord, seed: int = 0) -> MapRecord:

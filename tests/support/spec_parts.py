@@ -93,6 +93,21 @@ def codes_of(stored: dict[str, Any], cell: int, bits: int) -> NDArray[np.int64]:
     return (cell << bits) + codes
 
 
+def counts_of(stored: dict[str, Any]) -> NDArray[np.int64]:
+    """Section 5.5."""
+    return np.array(sum(row << 8 * k for k, row in enumerate(plain(stored).astype(np.int64))))
+
+
+def rays_of(part: Any, cell: int, training: Any, settings: Settings) -> Array:
+    """Section 5.5: ends and origins [R, 3] from the region's centre, metres, and slopes."""
+    leaves = demorton(codes_of(part["codes"], cell, 24), 3)
+    leaves = leaves.repeat(counts_of(part["counts"]), axis=0)
+    ends = leaves + (plain(part["inside"]).T + 0.5) / 128
+    ends = (ends - 2**settings.depth) * settings.leaf
+    origins = plain(training["origins"])[counts_of(part["origins"])]
+    return np.column_stack([ends, origins, plain(part["slopes"]) / 255])
+
+
 def integers_of(stored: dict[str, Any]) -> NDArray[np.float32]:
     data = plain(stored).astype(np.int64)
     return sum(row << 8 * k for k, row in enumerate(data)).T.astype(np.float32)

@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import numpy as np
 import zstandard
-from support.spec_parts import Array, Key, Map, Settings, check, plain
+from support.spec_parts import Array, Key, Map, Settings, check, plain, rays_of
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 2, 4, 5, 6, 8
 ATTACHMENT, METADATA, METADATA_INDEX, DATA_END = 9, 12, 13, 15
 FEATURES = {"", "base-files"}
-NAMES = "map region vertices evidence training moments samples manifest"
+NAMES = "map region vertices evidence training moments samples rays manifest"
 TOPICS = {f"/triquad/{name}" for name in NAMES.split()}
 
 
@@ -274,3 +275,14 @@ def load(path: Path) -> Map:
     """A map, all of whose files were read."""
     manifest, parts = read_whole(path)
     return Map(manifest.values, parts)
+
+
+def load_rays(path: Path, settings: Settings) -> Array:
+    """Rays of all regions [R, 7]: where they end, their origins, metres, and their slopes."""
+    _, parts = read_whole(path)
+    found = []
+    for (topic, index, _, cell), payload in parts.items():
+        if topic == "/triquad/rays":
+            training = msgpack.unpackb(parts["/triquad/training", index, 0, 0])
+            found.append(rays_of(msgpack.unpackb(payload), cell, training, settings))
+    return np.concatenate(found)

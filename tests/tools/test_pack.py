@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from support.checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoints
-from support.map_records import SMALL, assert_same, random_record
+from support.map_records import SMALL, assert_same, random_record, with_rays
 from support.mapfile_edit import file_bytes, with_metadata, without_index
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map, read_map_file
@@ -83,6 +83,24 @@ def test_crop_keeps_the_training_budget_of_the_samples_it_keeps():
     assert len(empty.sample_points) == empty.budget_samples == 0
     everything = crop_record(record, [-100] * 3, [100] * 3).regions[0].training
     assert everything.budget_samples == before.budget_samples
+
+
+def test_crop_keeps_the_rays_that_end_in_the_box():
+    record = with_rays(random_record(4, points=100))
+    before = record.regions[0].training
+    low, high = [0.0] * 3, [3 * SMALL.leaf_m] * 3
+    after = crop_record(record, low, high).regions[0].training
+    ends = before.rays.ends_m(SMALL)
+    inside = ((ends >= low) & (ends <= high)).all(axis=1)
+    assert 0 < inside.sum() < 100
+    np.testing.assert_array_equal(after.rays.ends, before.rays.ends[inside])
+    np.testing.assert_array_equal(
+        after.rays.origins[after.rays.origin_of],
+        before.rays.origins[before.rays.origin_of[inside]],
+    )
+    assert len(after.rays.origins) == len(np.unique(before.rays.origin_of[inside]))
+    kept = len(after.sample_points) + len(after.rays)
+    assert after.budget_samples == math.ceil(before.budget_samples * kept / 300)
 
 
 def test_crop_can_be_written_and_keeps_training_rows(tmp_path):

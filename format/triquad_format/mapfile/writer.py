@@ -34,6 +34,7 @@ from triquad_format.mapfile.parts.part import (
     PREVIEW,
     PREVIEW_ENCODING,
     PREVIEW_SCHEMA,
+    RAYS,
     REGION,
     SAMPLES,
     TRAINING,
@@ -55,12 +56,13 @@ _LEVELS = {
     TRAINING: 1,
     MOMENTS: 1,
     SAMPLES: 1,
+    RAYS: 1,
     PREVIEW: 19,
     MANIFEST: 3,
 }
 _PREVIEW_SCHEMA_ID = 1
-_CHANNELS = tuple(
-    Channel(
+_CHANNELS = {
+    topic: Channel(
         id=number,
         topic=topic,
         message_encoding=encoding,
@@ -68,7 +70,7 @@ _CHANNELS = tuple(
         schema_id=_PREVIEW_SCHEMA_ID if topic == PREVIEW else 0,
     )
     for number, (topic, encoding) in enumerate(ENCODINGS.items(), start=1)
-)
+}
 
 
 @dataclass(frozen=True)
@@ -203,12 +205,13 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _mcap_writer(file: BinaryIO, producer: str, preview_schema: bytes | None) -> McapWriter:
-    """A writer for a file's messages: previews are described only where there are any."""
-    if preview_schema is None:
-        channels = [channel for channel in _CHANNELS if channel.topic != PREVIEW]
-        return McapWriter(file, producer, schemas=[], channels=channels)
-    schema = Schema(_PREVIEW_SCHEMA_ID, preview_schema, PREVIEW_ENCODING, PREVIEW_SCHEMA)
-    return McapWriter(file, producer, schemas=[schema], channels=_CHANNELS)
+    """A writer for a file's messages: previews are described where their schema is given."""
+    unused = {RAYS} if preview_schema is not None else {RAYS, PREVIEW}
+    channels = [channel for topic, channel in _CHANNELS.items() if topic not in unused]
+    schemas = []
+    if preview_schema is not None:
+        schemas = [Schema(_PREVIEW_SCHEMA_ID, preview_schema, PREVIEW_ENCODING, PREVIEW_SCHEMA)]
+    return McapWriter(file, producer, schemas=schemas, channels=channels)
 
 
 class _PartsWriter:
@@ -273,6 +276,8 @@ class _PartsWriter:
 
     def _put(self, part: Part, stamp_ns: int) -> None:
         topic = part.key.topic
+        if topic == RAYS and topic not in self._mcap.topics:
+            self._mcap.add_channel(_CHANNELS[topic])
         if topic not in self._mcap.topics:
             raise FormatError(
                 f"the file has no channel for {part.key}; for previews give preview_schema as well"

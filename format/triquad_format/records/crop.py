@@ -20,6 +20,7 @@ from triquad_format.records.region import (
     VertexTable,
     masked,
 )
+from triquad_format.records.replay_rays import STEPS
 
 SLACK_LEAVES = 1 / 16
 """Kept around a box: points are rounded to float32, at depth 15 by up to 1/128 of a leaf."""
@@ -126,7 +127,10 @@ def _crop_training(
 ) -> TrainingState:
     leaves = settings.leaf_coordinates(training.sample_points)
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))
-    samples = training.budget_samples * len(inside)  # rounded up below, so that none is forgotten
+    ends = training.rays.ends / STEPS - (1 << settings.depth - 1)
+    rays = np.flatnonzero(((ends >= box.low) & (ends <= box.high)).all(axis=1))
+    # Rounded up below, so that none is forgotten.
+    samples = training.budget_samples * (len(inside) + len(rays))
     return dataclasses.replace(
         training,
         table_means=_rows(training.table_means, kept),
@@ -134,7 +138,8 @@ def _crop_training(
         table_steps=_rows(training.table_steps, kept),
         sample_points=training.sample_points[inside],
         sample_labels=training.sample_labels[inside],
-        budget_samples=-(-samples // max(len(leaves), 1)),
+        budget_samples=-(-samples // max(len(leaves) + len(ends), 1)),
+        rays=training.rays.chosen(rays),
     )
 
 

@@ -25,6 +25,7 @@ from triquad_format.records.region import (
     VertexTable,
     surface_counts,
 )
+from triquad_format.records.replay_rays import STEPS, ReplayRays
 from triquad_format.wire.codec import ArraySpec
 from triquad_format.wire.keys import check_name
 
@@ -140,6 +141,22 @@ def _check_training(settings: FieldSettings, region: Region, training: TrainingS
     if np.abs(training.sample_points).max(initial=0) > settings.region_side_m:
         raise FormatError("sample points: one lies far outside its region")
     _check_floats("sample labels", training.sample_labels, (samples,), dtypes=FLOATS)
+    _check_rays(settings, training.rays)
+
+
+def _check_rays(settings: FieldSettings, rays: ReplayRays) -> None:
+    _check_floats("ray origins", rays.origins, (len(rays.origins), 3))
+    ArraySpec("<i4", (len(rays), 3)).check("ray ends", rays.ends)
+    ArraySpec("<i4", (len(rays),)).check("ray origins of ends", rays.origin_of)
+    ArraySpec("|u1", (len(rays),)).check("ray slopes", rays.slopes)
+    if not len(rays):
+        return
+    if rays.ends.min() < 0 or rays.ends.max() >= STEPS << settings.depth + 1:
+        raise FormatError("ray ends: one lies far outside its region")
+    if rays.origin_of.min() < 0 or rays.origin_of.max() >= len(rays.origins):
+        raise FormatError("ray origins of ends: one is not among the origins")
+    if (np.diff(rays.leaf_codes) < 0).any():
+        raise FormatError("ray ends: they are not in the order of their leaves")
 
 
 def _check_count(name: str, count: int, limit: int = 2**63) -> None:

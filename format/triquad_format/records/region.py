@@ -5,7 +5,7 @@ level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a pl
 ``(a, b) * 2**(depth - l)``. Evidence voxels have the side of a leaf.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
+from triquad_format.records.replay_rays import ReplayRays, no_rays
 
 AXES = ((0, 1), (0, 2), (1, 2))
 """Coordinate axes of the planes XY, XZ and YZ."""
@@ -95,7 +96,8 @@ class Evidence:
 class TrainingState:
     """What training needs beyond the field, to go on as if it had not stopped.
 
-    Adam's moments follow the order of the tables' rows and of the MLP's arrays.
+    Adam's moments follow the order of the tables' rows and of the MLP's arrays. Samples are of what
+    no ray tells: that a surface is gone.
     """
 
     table_means: tuple[NDArray[np.floating], ...]  # per table [V, feature_size]
@@ -107,6 +109,7 @@ class TrainingState:
     sample_points: Floats  # [S, 3] replay samples, metres from the region's centre
     sample_labels: NDArray[np.floating]  # [S] signed distance, metres
     budget_samples: int  # training budget: samples still to be trained on; 0: all is learnt
+    rays: ReplayRays = field(default_factory=no_rays)
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,10 @@ from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.memory_budget import RegionSize
-from triquad_server.mapping.ray_intervals import Placement, ray_intervals, sample_intervals
+from triquad_server.mapping.ray_table import END, Placement, rays_through, samples_alone
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
+from triquad_server.mapping.replay_record import recorded_rays, restored_rays
 
 _CARVE_SHORT = 0.5  # voxels before its end a ray shows free space
 _CLEAR_SHORT = 2.5
@@ -46,7 +47,6 @@ _CLEAR_SHORT = 2.5
 _SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
 _VISITS = 4  # to each of them
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
-_CHECKPOINT_SAMPLES = 1_000_000
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
 _NEW_SCANS = 10
 """So long after it was first seen, the field has had time to learn a surface."""
@@ -73,6 +73,8 @@ class LiveRegion:
                 surface_share=setup.scan.surface_share,
                 spread_m=setup.scan.spread_m,
                 truncation_m=setup.scan.truncation_m,
+                free_from=setup.scan.free_from,
+                behind_m=setup.scan.behind_m,
                 half_side_m=setup.field.region_side_m / 2,
             ),
             leaf_m=setup.field.leaf_m,
@@ -114,9 +116,11 @@ class LiveRegion:
         region = cls(record.index, setup, field, evidence)
         region._restored = True
         state = record.training
-        if state is not None and len(state.sample_points):
-            region.pool.add(sample_intervals(state.sample_points, state.sample_labels))
-            region.budget_samples = min(state.budget_samples, setup.training.max_budget_samples)
+        if state is not None:
+            region.pool.add(restored_rays(state.rays, setup.field))
+            region.pool.add(samples_alone(state.sample_points, state.sample_labels))
+            most = setup.training.max_budget_samples if len(region.pool) else 0
+            region.budget_samples = min(state.budget_samples, most)
         return region
 
     @property
@@ -192,16 +196,20 @@ class LiveRegion:
 
         ``normals`` [N, 3] are those at the rays' ends, NaN where unknown.
         """
-        half_side_m = self._settings.region_side_m / 2
-        intervals = ray_intervals(
-            rays, normals, self.centre, half_side_m=half_side_m, settings=self._setup.scan
-        )
-        if len(intervals) == 0:
+        passing = rays_through(rays, normals, self.centre, self.pool.placement)
+        if len(passing) == 0:
             return
-        self.pool.add(intervals)
-        samples = int(len(intervals) * self._training.samples_per_ray)
+        self.pool.add(passing)
+        samples = int(len(passing) * self._training.samples_per_ray)
         self.budget_samples = min(self.budget_samples + samples, self._training.max_budget_samples)
         self._fresh_budget_samples = int(samples * self._training.fresh_share)
+
+    def ray_ends(self) -> Doubles:
+        """Where the rays end [N, 3] that are kept, those of the newest scans last."""
+        table = self.pool.table
+        rays = np.argsort(table.origin_of, kind="stable")[(table.origin_of < 0).sum() :]
+        ends: Doubles = table.rows[rays, END : END + 3] + self.centre
+        return ends
 
     def set_normals(self, normals: Doubles) -> None:
         """Keep the unit normals [N, 3] at the ends of the newest scan's rays; NaN where unknown.
@@ -270,11 +278,11 @@ class LiveRegion:
 
     def record(self) -> Region:
         """The region with its training state as plain arrays, sharing nothing with this one."""
-        samples = self.pool.sample(_CHECKPOINT_SAMPLES)
+        rays, others = recorded_rays(self.pool.table, self._settings)
         state = training_state(
             self.field,
-            points=samples.points,
-            labels=samples.labels,
+            rays=rays,
+            samples=self.pool.draw_on(others),
             budget_samples=self.budget_samples,
         )
         return region_record(self.index, self.field, self.evidence, training=state)
@@ -307,7 +315,7 @@ class LiveRegion:
         nearest = no_surfels(np.full(len(points), self._setup.scan.truncation_m / leaf_m))
         surfels.find_nearest(points, nearest)
         offsets = ((points - middle) * leaf_m).astype(np.float32)
-        self.pool.add(sample_intervals(offsets, nearest.distances * leaf_m), fresh=False)
+        self.pool.add(samples_alone(offsets, nearest.distances * leaf_m), fresh=False)
         if self.budget_samples:  # else a map that has settled would change once more
             self.budget_samples += _VISITS * len(points)
 

@@ -78,7 +78,8 @@ class Mapper:
         self.samples_trained = 0
         self._loss: float | Tensor | None = None
         for region in record.regions if record else ():
-            self._regions[region.index] = LiveRegion.restore(region, self._setup)
+            self._regions[region.index] = live = LiveRegion.restore(region, self._setup)
+            self._normals.restore(live.ray_ends())
         self._share_pool()
 
     def _no_normals(self) -> SurfaceNormals:

@@ -207,6 +207,13 @@ class SurfaceNormals:
                 grid.keep_nearest(sensor, self._max_cells // 2)
         return normals
 
+    def restore(self, points: Doubles) -> None:
+        """Go on from end points [N, 3] of earlier scans, the newest last, if any."""
+        for grid in self._grids:
+            grid.add(points)
+            if grid.cells > self._max_cells:
+                grid.keep_nearest(points[-1], self._max_cells // 2)
+
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget the surfaces between the corners ``low`` and ``high`` [3]."""
         for grid in self._grids:

@@ -1,6 +1,6 @@
 """Bounded memory of what rays have taught, spread over the map.
 
-While there is room, all intervals stay. Then each new one pushes out that of two candidates whose
+While there is room, all rays stay. Then each new one pushes out that of two candidates whose
 bin of space holds more, so that places seen long ago keep theirs and places seen for long do not
 take over.
 """
@@ -19,10 +19,13 @@ from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, pack, with_room
 
 from triquad_server.engine.live_field import Batch
-from triquad_server.mapping.ray_intervals import (
+from triquad_server.mapping.ray_table import (
     COLUMNS,
     END,
+    NO_ORIGIN,
     Placement,
+    RayTable,
+    TensorTable,
     draw_ordered_samples,
     draw_samples,
 )
@@ -34,10 +37,10 @@ _LIMIT_STEP = 1.1  # by which limits grow and shrink, since to lower one is expe
 
 
 @kernel()
-def _bin(interval: Floats, bin_m: float) -> int:
+def _bin(row: Floats, bin_m: float) -> int:
     mixed: int = np.int64(0)
     for axis, prime in enumerate((73856093, 19349663, 83492791)):
-        mixed ^= int(np.floor(interval[END + axis] / bin_m)) * prime
+        mixed ^= int(np.floor(row[END + axis] / bin_m)) * prime
     return mixed & (_BINS - 1)
 
 
@@ -45,7 +48,7 @@ def _bin(interval: Floats, bin_m: float) -> int:
 def _best_to_push_out(
     size: int, count: int, first: int, stride: int, offset: int, bins: Ints, occupancy: Ints
 ) -> Longs:
-    """Different places whose intervals are the best to push out, ``count <= size // 2`` of them.
+    """Different places whose rays are the best to push out, ``count <= size // 2`` of them.
 
     The pool is paired up, each place once, and of a pair the one goes whose bin holds more.
     """
@@ -60,22 +63,24 @@ def _best_to_push_out(
 
 @kernel()
 def _put(
-    new: Floats,
+    new: RayTable,
     bin_m: float,
     places: Longs,
     used: int,
-    intervals: Floats,
+    rows: Floats,
+    origin_of: Ints,
     bins: Ints,
     occupancy: Ints,
 ) -> None:
-    """Put new intervals into places; those below ``used`` hold one that is pushed out."""
+    """Put new rays into places; those below ``used`` hold one that is pushed out."""
     for i in range(len(places)):
-        prefetch_row(intervals, places[min(i + _AHEAD, len(places) - 1)])
+        prefetch_row(rows, places[min(i + _AHEAD, len(places) - 1)])
         place = places[i]
         if place < used:
             occupancy[bins[place]] -= 1
-        intervals[place] = new[i]
-        bins[place] = _bin(new[i], bin_m)
+        rows[place] = new.rows[i]
+        origin_of[place] = new.origin_of[i]
+        bins[place] = _bin(new.rows[i], bin_m)
         occupancy[bins[place]] += 1
 
 
@@ -100,29 +105,29 @@ def _remove_ending_in(
     leaf_m: float,
     middle: float,
     size: int,
-    intervals: Floats,
+    rows: Floats,
+    origin_of: Ints,
     bins: Ints,
     occupancy: Ints,
 ) -> int:
-    """Remove the intervals that end in voxels, and put the last ones there; returns the size."""
+    """Remove the rays that end in voxels, and put the last ones there; returns the size."""
     i = 0
     while i < size:
         if bins_of_gone[bins[i]]:
-            x = int(np.floor(intervals[i, END] / leaf_m + middle))
-            y = int(np.floor(intervals[i, END + 1] / leaf_m + middle))
-            z = int(np.floor(intervals[i, END + 2] / leaf_m + middle))
+            x = int(np.floor(rows[i, END] / leaf_m + middle))
+            y = int(np.floor(rows[i, END + 1] / leaf_m + middle))
+            z = int(np.floor(rows[i, END + 2] / leaf_m + middle))
             if find_row(gone, pack(x, y, z)) >= 0:
                 occupancy[bins[i]] -= 1
                 size -= 1
-                intervals[i] = intervals[size]
-                bins[i] = bins[size]
+                rows[i], origin_of[i], bins[i] = rows[size], origin_of[size], bins[size]
                 continue
         i += 1
     return size
 
 
 class ReplayPool:
-    """Ray intervals of one region; the newest can be drawn from apart from the others."""
+    """Rays of one region; the newest can be drawn from apart from the others."""
 
     def __init__(
         self,
@@ -133,19 +138,22 @@ class ReplayPool:
         seed: int,
         team: Team,
     ) -> None:
-        """Up to ``capacity`` intervals; ``team`` draws on the CPU, ``device`` does elsewhere."""
+        """Up to ``capacity`` rays; ``team`` draws on the CPU, ``device`` does elsewhere."""
         self._capacity = capacity
         self._bin_m = _BIN_LEAVES * leaf_m
         self._team = team
-        self._placement = placement
+        self.placement = placement
         self._device = device
         self._size = 0
-        self.offered = 0  # intervals so far, those included that were not kept
+        self.offered = 0  # rays so far, those included that were not kept
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator(device).manual_seed(seed)
-        self._intervals = np.zeros((0, COLUMNS), np.float32)
-        # Copies of the intervals, and of the newest places, where training is on another device.
-        self._on_device: Tensor | None = None
+        self._rows = np.zeros((0, COLUMNS), np.float32)
+        self._origin_of = np.zeros(0, np.int32)
+        self._origins = np.zeros((0, 3), np.float32)
+        self._origin_count = 0
+        # Copies of the rays, and of the newest places, where training is on another device.
+        self._on_device: TensorTable | None = None
         self._fresh_on_device = torch.zeros(0, dtype=torch.int64, device=device)
         self._bins = np.zeros(0, np.int32)
         self._occupancy = np.zeros(_BINS, np.int32)
@@ -154,43 +162,63 @@ class ReplayPool:
     def __len__(self) -> int:
         return self._size
 
-    def add(self, intervals: Floats, fresh: bool = True) -> None:
-        """Take in ``intervals`` [S, COLUMNS]; if ``fresh``, they become the newest."""
-        self.offered += len(intervals)
+    @property
+    def table(self) -> RayTable:
+        """All that is kept; it changes with the pool."""
+        used = slice(self._size)
+        return RayTable(self._rows[used], self._origin_of[used], self._origins)
+
+    def add(self, new: RayTable, fresh: bool = True) -> None:
+        """Take in rays; if ``fresh``, they become the newest."""
+        self.offered += len(new)
         used = self._size
-        room = min(len(intervals), self._capacity - used)
+        room = min(len(new), self._capacity - used)
         places = np.arange(used, used + room)
-        if room < len(intervals):
-            places = np.concatenate([places, self._best_to_push_out(len(intervals) - room)])
-        if len(places) < len(intervals):
+        if room < len(new):
+            places = np.concatenate([places, self._best_to_push_out(len(new) - room)])
+        rows, origin_of = new.rows, new.origin_of
+        if len(places) < len(new):
             # Any of them: the last rays of a scan are as good as the first.
-            intervals = intervals[self._rng.permutation(len(intervals))[: len(places)]]
+            chosen = self._rng.permutation(len(new))[: len(places)]
+            rows, origin_of = rows[chosen], origin_of[chosen]
+        first = self._add_origins(new.origins)
+        origin_of = np.where(origin_of >= 0, origin_of + first, NO_ORIGIN).astype(np.int32)
+        new = RayTable(rows, origin_of, self._origins)
         self._extend(used + room)
         _put(
-            intervals,
+            new,
             self._bin_m,
             places,
             used,
-            self._intervals,
+            self._rows,
+            self._origin_of,
             self._bins,
             self._occupancy,
         )
         if self._on_device is not None:
-            changed = torch.from_numpy(places).to(self._device)
-            self._on_device[changed] = torch.from_numpy(intervals).to(self._device)
+            changed, added = torch.from_numpy(places), TensorTable.of(new, self._device)
+            self._on_device.rows[changed] = added.rows
+            self._on_device.origin_of[changed] = added.origin_of
+            self._on_device = self._on_device._replace(origins=added.origins)
             if fresh:
-                self._fresh_on_device = changed
+                self._fresh_on_device = changed.to(self._device)
         if fresh:
             self._fresh = places
 
     def draw(self, count: int, fresh: int) -> Batch:
-        """``count`` samples on intervals at random, ``fresh`` of them on the newest."""
+        """``count`` samples on rays at random, ``fresh`` of them on the newest."""
         if self._on_device is not None:
-            return draw_samples(self._choose(count, fresh), self._placement, self._generator)
+            chosen = self._choose(count, fresh)
+            return draw_samples(self._on_device, chosen, self.placement, self._generator)
         places = self._rng.integers(self._size, size=count)
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
-        return self._draw_ordered(places)
+        return self.draw_on(places)
+
+    def draw_on(self, places: Longs) -> Batch:
+        """A sample on each of the rays of :attr:`table` at ``places`` [N]."""
+        table = self.table
+        return draw_ordered_samples(table, places, self.placement, rng=self._rng, team=self._team)
 
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
@@ -199,13 +227,13 @@ class ReplayPool:
             self._keep(self._rng.permutation(self._size)[:capacity])
 
     def forget(self, low: Doubles, high: Doubles) -> None:
-        """Drop the intervals that end between two corners [3], metres from the region's centre."""
-        ends = self._intervals[: self._size, END : END + 3]
+        """Drop the rays that end between two corners [3], metres from the region's centre."""
+        ends = self._rows[: self._size, END : END + 3]
         self._keep(np.flatnonzero(~((ends >= low) & (ends <= high)).all(axis=1)))
         self.offered = self._size
 
     def forget_ends(self, voxels: Longs, settings: FieldSettings) -> None:
-        """Drop the intervals that end in ``voxels`` [N, 3] of a region with these ``settings``."""
+        """Drop the rays that end in ``voxels`` [N, 3] of a region with these ``settings``."""
         middle = float(1 << (settings.depth - 1))
         self._size = _remove_ending_in(
             VoxelIndex.of_cells(voxels).arrays,
@@ -213,53 +241,62 @@ class ReplayPool:
             settings.leaf_m,
             middle,
             self._size,
-            self._intervals,
+            self._rows,
+            self._origin_of,
             self._bins,
             self._occupancy,
         )
         self._fresh = self._fresh[self._fresh < self._size]
         self._copy_to_device()
 
-    def sample(self, count: int) -> Batch:
-        """Samples on at most ``count`` intervals, one on each: what a checkpoint keeps."""
-        return self._draw_ordered(self._rng.permutation(self._size)[:count])
-
-    def _draw_ordered(self, places: Longs) -> Batch:
-        return draw_ordered_samples(
-            self._intervals, places, self._placement, rng=self._rng, team=self._team
-        )
-
     def _choose(self, count: int, fresh: int) -> Tensor:
-        """Intervals [count, COLUMNS] at random, on the device."""
-        assert self._on_device is not None
+        """Places [count] at random, on the device."""
         places = self._random(self._size, count)
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh_on_device[self._random(len(self._fresh), fresh)]
-        return self._on_device[places]
+        return places
 
     def _random(self, below: int, count: int) -> Tensor:
         return torch.randint(below, (count,), generator=self._generator, device=self._device)
 
     def _keep(self, places: Longs) -> None:
-        # Both or none, where memory is short; so below.
-        self._intervals, self._bins = self._intervals[places], self._bins[places]
+        # All or none, where memory is short; so below.
+        rows, origin_of, bins = self._rows[places], self._origin_of[places], self._bins[places]
+        self._rows, self._origin_of, self._bins = rows, origin_of, bins
         self._size = len(places)
         self._occupancy = np.bincount(self._bins, minlength=_BINS).astype(np.int32)
         self._fresh = self._fresh[:0]
         self._copy_to_device()
 
     def _extend(self, size: int) -> None:
-        if size > len(self._intervals):
-            room = min(self._capacity, max(size, 2 * len(self._intervals)))
-            self._intervals, self._bins = (
-                with_room(rows[: self._size], room) for rows in (self._intervals, self._bins)
+        if size > len(self._rows):
+            room = min(self._capacity, max(size, 2 * len(self._rows)))
+            used = slice(self._size)
+            self._rows, self._origin_of, self._bins = (
+                with_room(self._rows[used], room),
+                with_room(self._origin_of[used], room),
+                with_room(self._bins[used], room),
             )
             self._copy_to_device()
         self._size = size
 
+    def _add_origins(self, new: Floats) -> int:
+        """Add origins [K, 3], in place of those of no ray any more; returns the first one's row."""
+        if self._origin_count + len(new) > len(self._origins):
+            rays = self._origin_of[: self._size]
+            used, numbers = np.unique(rays[rays >= 0], return_inverse=True)
+            roomy = with_room(self._origins[used], 2 * (len(used) + len(new)))
+            rays[rays >= 0] = numbers
+            self._origins, self._origin_count = roomy, len(used)
+            self._copy_to_device()
+        first, self._origin_count = self._origin_count, self._origin_count + len(new)
+        self._origins[first : self._origin_count] = new
+        return first
+
     def _copy_to_device(self) -> None:
         if self._device.type != "cpu":
-            self._on_device = torch.from_numpy(self._intervals).to(self._device)
+            whole = RayTable(self._rows, self._origin_of, self._origins)
+            self._on_device = TensorTable.of(whole, self._device)
 
     def _best_to_push_out(self, count: int) -> Longs:
         half = self._size // 2

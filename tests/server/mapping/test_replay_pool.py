@@ -1,11 +1,19 @@
 import numpy as np
 import torch
-from triquad_server.mapping.ray_intervals import Placement, sample_intervals
+from triquad_server.engine.live_field import Batch
+from triquad_server.mapping.ray_table import Placement, RayTable, samples_alone
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.process.threads import Teams
 
 CPU = torch.device("cpu")
-PLACEMENT = Placement(surface_share=0.5, spread_m=0.08, truncation_m=0.3, half_side_m=400.0)
+PLACEMENT = Placement(
+    surface_share=0.5,
+    spread_m=0.08,
+    truncation_m=0.3,
+    free_from=0.3,
+    behind_m=0.8,
+    half_side_m=400.0,
+)
 TEAM = Teams().mapping
 RNG = np.random.default_rng(0)
 
@@ -18,8 +26,12 @@ def place(x: float, count: int) -> np.ndarray:
     return (RNG.random((count, 3)) * 4 + [x, 0.0, 0.0]).astype(np.float32)
 
 
-def labelled(points: np.ndarray, label: float = 0.0) -> np.ndarray:
-    return sample_intervals(points, np.full(len(points), label, np.float32))
+def labelled(points: np.ndarray, label: float = 0.0) -> RayTable:
+    return samples_alone(points, np.full(len(points), label, np.float32))
+
+
+def whole(pool: ReplayPool) -> Batch:
+    return pool.draw_on(np.arange(len(pool)))
 
 
 def test_it_is_bounded() -> None:
@@ -34,7 +46,7 @@ def test_it_is_bounded() -> None:
 def test_samples_come_back_as_they_were() -> None:
     pool = new_pool(10_000)
     points = place(0, 8000)
-    pool.add(sample_intervals(points, points[:, 0] * 3))
+    pool.add(samples_alone(points, points[:, 0] * 3))
     batch = pool.draw(500, 0)
     torch.testing.assert_close(batch.labels, batch.points[:, 0] * 3)
     assert len(torch.unique(batch.points[:, 0])) > 400
@@ -45,7 +57,7 @@ def test_a_place_left_long_ago_keeps_its_share() -> None:
     pool.add(labelled(place(-50, 5000), -1))
     for _ in range(100):
         pool.add(labelled(place(50, 5000), 1))
-    old = (pool.sample(20_000).labels < 0).sum()
+    old = (whole(pool).labels < 0).sum()
     assert old > 3000, "a hundred scans elsewhere must not push it out"
 
 
@@ -53,8 +65,8 @@ def test_of_a_scan_that_is_too_large_any_part_is_kept() -> None:
     pool = new_pool(3000)
     for _ in range(5):
         points = place(0, 6000)
-        pool.add(sample_intervals(points, np.arange(6000, dtype=np.float32)))
-    labels = pool.sample(3000).labels.numpy()
+        pool.add(samples_alone(points, np.arange(6000, dtype=np.float32)))
+    labels = whole(pool).labels.numpy()
     shares = np.histogram(labels, bins=6, range=(0, 6000))[0] / len(labels)
     assert shares.min() > 0.1
 
@@ -76,7 +88,7 @@ def test_forgetting_a_box() -> None:
     pool.forget(low, high)
     inside = ((points >= low) & (points <= high)).all(axis=1).sum()
     assert len(pool) == 6000 - inside
-    left = pool.sample(10_000).points.numpy()
+    left = whole(pool).points.numpy()
     assert not ((left >= low) & (left <= high)).all(axis=1).any()
     pool.add(labelled(place(1, 3000)))
     assert len(pool) == 9000 - inside
@@ -107,3 +119,18 @@ def test_neighbours_in_a_batch_are_neighbours_on_the_ground() -> None:
     points = pool.draw(8192, 0).points[:, :2]
     apart = (points[1:] - points[:-1]).norm(dim=1).median()
     assert apart < 5, "in any order they are some 50 m apart"
+
+
+def test_rays_keep_their_origins_however_many_scans_come_and_go() -> None:
+    pool = new_pool(2000)
+    for scan in range(300):
+        ends = place(0, 100)
+        ends[:, 2] = scan  # that of its origin, so that rays are level
+        origin = np.array([[-5.0, 0.0, scan]], np.float32)
+        rows = np.column_stack([ends, np.ones(100)]).astype(np.float32)
+        pool.add(RayTable(rows, np.zeros(100, np.int32), origin))
+    table = pool.table
+    np.testing.assert_array_equal(table.origins[table.origin_of][:, 2], table.rows[:, 2])
+    assert len(table.origins) < 600, "those that no ray has are dropped"
+    points = pool.draw(5000, 0).points.numpy()
+    np.testing.assert_allclose(points[:, 2], np.rint(points[:, 2]), atol=1e-3)

@@ -3,11 +3,13 @@ import pytest
 import torch
 from triquad_server.engine.live_field import Batch
 from triquad_server.intake.rays import ScanRays
-from triquad_server.mapping.ray_intervals import (
+from triquad_server.mapping.ray_table import (
     Placement,
+    RayTable,
+    TensorTable,
     draw_ordered_samples,
     draw_samples,
-    ray_intervals,
+    rays_through,
 )
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ScanSettings
@@ -25,14 +27,22 @@ def rays_to_ground(count: int = 500, height_m: float = 2.0) -> ScanRays:
 
 
 def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placement:
-    return Placement(settings.surface_share, settings.spread_m, settings.truncation_m, half_side_m)
+    return Placement(
+        settings.surface_share,
+        settings.spread_m,
+        settings.truncation_m,
+        settings.free_from,
+        settings.behind_m,
+        half_side_m,
+    )
 
 
-def draw(engine: str, intervals: np.ndarray, chosen: np.ndarray, placement: Placement) -> Batch:
+def draw(engine: str, table: RayTable, chosen: np.ndarray, placement: Placement) -> Batch:
     if engine == "compiled":
-        return draw_ordered_samples(intervals, chosen, placement, np.random.default_rng(1), TEAM)
+        return draw_ordered_samples(table, chosen, placement, np.random.default_rng(1), TEAM)
     generator = torch.Generator().manual_seed(1)
-    return draw_samples(torch.from_numpy(intervals[chosen]), placement, generator)
+    on_device = TensorTable.of(table, torch.device("cpu"))
+    return draw_samples(on_device, torch.from_numpy(chosen), placement, generator)
 
 
 ENGINES = pytest.mark.parametrize("engine", ["compiled", "tensors"])
@@ -43,8 +53,8 @@ def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> Non
     settings = ScanSettings()
     rays = rays_to_ground()
     down = np.tile([0.0, 0.0, -1.0], (500, 1))
-    intervals = ray_intervals(rays, down, CENTRE, HALF_SIDE_M, settings)
-    batch = draw(engine, intervals, np.arange(500).repeat(20), placed(settings))
+    table = rays_through(rays, down, CENTRE, placed(settings))
+    batch = draw(engine, table, np.arange(500).repeat(20), placed(settings))
     heights = batch.points[:, 2].numpy() + CENTRE[2]
     labels = batch.labels.numpy()
     assert abs(labels - heights).max() < 0.05, "up to the least cosine"
@@ -56,8 +66,8 @@ def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> Non
 def test_without_normals_the_label_is_the_distance_along_the_ray(engine: str) -> None:
     settings = ScanSettings()
     rays = rays_to_ground(1)
-    intervals = ray_intervals(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
-    batch = draw(engine, intervals, np.zeros(3000, np.int64), placed(settings))
+    table = rays_through(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
+    batch = draw(engine, table, np.zeros(3000, np.int64), placed(settings))
     points = batch.points.numpy() + CENTRE
     distance = np.linalg.norm(points - rays.ends[0], axis=1)
     np.testing.assert_allclose(np.abs(batch.labels.numpy()), distance, atol=1e-4)
@@ -69,8 +79,8 @@ def test_samples_lie_where_the_settings_say(engine: str) -> None:
     settings = ScanSettings(surface_share=0.7, spread_m=0.1)
     rays = rays_to_ground(1)
     range_m = np.linalg.norm(rays.ends[0] - rays.origin)
-    intervals = ray_intervals(rays, np.full((1, 3), np.nan), CENTRE, HALF_SIDE_M, settings)
-    batch = draw(engine, intervals, np.zeros(20_000, np.int64), placed(settings))
+    table = rays_through(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
+    batch = draw(engine, table, np.zeros(20_000, np.int64), placed(settings))
     reach = np.linalg.norm(batch.points.numpy() + CENTRE - rays.origin, axis=1)
     assert reach.min() >= 0.3 * range_m - 1e-4
     assert reach.max() <= range_m + 0.8 + 1e-4
@@ -85,15 +95,15 @@ def test_samples_stay_inside_the_cube(engine: str) -> None:
     settings = ScanSettings()
     half = 8.0
     rays = rays_to_ground()
-    intervals = ray_intervals(rays, np.full((500, 3), np.nan), np.zeros(3), half, settings)
+    table = rays_through(rays, np.full((500, 3), np.nan), np.zeros(3), placed(settings, half))
     ending = (np.abs(rays.ends) < half).all(axis=1).sum()
-    assert len(intervals) > ending, "rays that only pass through teach free space"
-    batch = draw(engine, intervals, np.arange(len(intervals)).repeat(10), placed(settings, half))
+    assert len(table) > ending, "rays that only pass through teach free space"
+    batch = draw(engine, table, np.arange(len(table)).repeat(10), placed(settings, half))
     assert np.abs(batch.points.numpy()).max() <= half + 1e-4
 
 
 def test_rays_that_miss_the_cube_teach_nothing() -> None:
     far = np.array([0.0, 500.0, 0.0])
     rays = rays_to_ground()
-    intervals = ray_intervals(rays, np.full((500, 3), np.nan), far, 20.0, ScanSettings())
-    assert len(intervals) == 0
+    table = rays_through(rays, np.full((500, 3), np.nan), far, placed(ScanSettings(), 20.0))
+    assert len(table) == 0

@@ -44,7 +44,16 @@ _USUAL_ON_STREET = (
     "neighbours",
 )
 _ON_STREET = (*_USUAL_ON_STREET, "tradeoffs", "viewer")
-USUAL_PARTS = (*_USUAL_ON_STREET, "growth", "air", "moving", "sweeps", "ros2", "presets")
+USUAL_PARTS = (
+    *_USUAL_ON_STREET,
+    "growth",
+    "restart",
+    "air",
+    "moving",
+    "sweeps",
+    "ros2",
+    "presets",
+)
 PARTS = (*USUAL_PARTS, "tradeoffs", "viewer", "ablation")
 
 
@@ -138,11 +147,13 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
     from triquad_tools.benchmarks.air import measure_air
     from triquad_tools.benchmarks.moving import measure_moving
     from triquad_tools.benchmarks.presets import measure_presets
+    from triquad_tools.benchmarks.restart import measure_restart
     from triquad_tools.benchmarks.ros2 import measure_ros2
     from triquad_tools.benchmarks.sweeps import measure_sweeps
 
     measures: dict[str, Callable[[int], list[Figure]]] = {
         "growth": _growth,
+        "restart": measure_restart,
         "air": measure_air,
         "moving": partial(measure_moving, folder=options.recorded),
         "sweeps": measure_sweeps,
@@ -205,12 +216,12 @@ def _part(name: str) -> str:
 
 _DESCRIPTION = (
     "Measure triquad on this machine, on a simulated street: a server under a "
-    "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, the map "
-    "file, checkpoints, mesh tiles, answers to planners, scans put back in place, maps "
-    "opened offline, a server whose metrics are read, one with roles, clients that want too much, "
-    "open air, things that move, a lidar that moves while it turns, clouds of ROS 2, rooms, tables "
-    "and streets with the presets that are for them, and, if asked for, the viewer in a browser "
-    "and the ablation. Takes over half an hour; nothing else should run meanwhile."
+    "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, one that is "
+    "restored, the map file, checkpoints, mesh tiles, answers to planners, scans put back, "
+    "maps opened offline, a server whose metrics are read, one with roles, clients that want too "
+    "much, open air, things that move, a lidar that moves while it turns, clouds of ROS 2, rooms, "
+    "tables and streets with the presets that are for them, and, if asked for, the viewer in a "
+    "browser and the ablation. Takes over half an hour; nothing else should run meanwhile."
 )
 
 

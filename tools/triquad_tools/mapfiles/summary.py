@@ -40,7 +40,8 @@ class RegionSummary:
     surface_m3: float  # voxels in which rays ended
     surface_levels: tuple[int, ...] | None  # number of such voxels by level; None: not known
     free_m3: float  # voxels through which rays only passed
-    samples: int | None  # for replay; None: no training state
+    rays: int | None  # for replay; None: no training state
+    samples: int | None  # likewise
     budget_samples: int | None
 
 
@@ -141,7 +142,8 @@ def _region_facts(region: RegionSummary) -> Iterator[Row]:
         yield Row("", f"surface by level of support: {shares}")
     if region.samples is not None:
         left = f"a training budget of {region.budget_samples:,}"
-        yield Row("training", f"{region.samples:,} samples, {left}")
+        kept = f"{region.rays:,} rays, {region.samples:,} samples"
+        yield Row("training", f"{kept}, {left}")
 
 
 def _evidence(summary: MapSummary | RegionSummary) -> str:
@@ -171,6 +173,7 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
         surface_m3=_bits(evidence.surface) * voxel_m3,
         surface_levels=None if levels is None else tuple(levels.tolist()),
         free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
+        rays=None if training is None else len(training.rays),
         samples=None if training is None else len(training.sample_points),
         budget_samples=None if training is None else training.budget_samples,
     )

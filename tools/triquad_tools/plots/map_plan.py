@@ -140,21 +140,26 @@ def _window(grid: PlanGrid, settings: FieldSettings, key: PartKey) -> Window | N
 
 @dataclass(frozen=True)
 class SampleErrors:
-    """Errors at replay samples near the surface."""
+    """Errors where rays end that are kept, and at replay samples near the surface."""
 
     points: Doubles  # [N, 3] metres, map frame
     errors_m: Doubles  # [N] |signed distance - label|
 
 
 def sample_errors(record: MapRecord) -> SampleErrors:
-    """Errors at the samples within half a leaf of the surface, or at an even share of them."""
+    """Errors where rays end, and at samples within half a leaf of the surface.
+
+    Or at an even share of them.
+    """
     points, labels = [np.empty((0, 3))], [np.empty(0)]
     for region in record.regions:
         if region.training is not None:
-            near = np.abs(region.training.sample_labels) <= record.settings.leaf_m / 2
+            training = region.training
+            ends = training.rays.ends_m(record.settings)
+            near = np.abs(training.sample_labels) <= record.settings.leaf_m / 2
             centre = record.settings.region_centre(region.index)
-            points.append(region.training.sample_points[near] + centre)
-            labels.append(region.training.sample_labels[near].astype(np.float64))
+            points += [ends + centre, training.sample_points[near] + centre]
+            labels += [np.zeros(len(ends)), training.sample_labels[near].astype(np.float64)]
     every = sum(map(len, points)) // _MOST_SAMPLES + 1
     asked = np.concatenate(points)[::every]
     answer = MapEvaluator(record).query(asked)

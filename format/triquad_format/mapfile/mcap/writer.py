@@ -34,7 +34,7 @@ from triquad_format.mapfile.mcap.records import MAGIC, chunk_limit
 
 
 class McapWriter:
-    """Writes one MCAP file; schemas and channels are known from the start."""
+    """Writes one MCAP file; schemas are known from the start."""
 
     def __init__(
         self,
@@ -50,13 +50,15 @@ class McapWriter:
         self._crc = 0
         self.size = 0
         self._schemas = schemas
-        self._channels = channels
-        self._numbers = {channel.topic: channel.id for channel in channels}
+        self._channels: list[Channel] = []
+        self._numbers: dict[str, int] = {}
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._write(MAGIC)
-        for record in (Header("", library), *schemas, *channels):
+        for record in (Header("", library), *schemas):
             self._record(record)
+        for channel in channels:
+            self.add_channel(channel)
 
     @property
     def topics(self) -> Collection[str]:
@@ -67,6 +69,12 @@ class McapWriter:
     def sha256(self) -> str:
         """Digest of all that was written, hexadecimal."""
         return self._digest.hexdigest()
+
+    def add_channel(self, channel: Channel) -> None:
+        """Describe a channel, before its first message."""
+        self._record(channel)
+        self._channels.append(channel)
+        self._numbers[channel.topic] = channel.id
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Write a metadata record."""

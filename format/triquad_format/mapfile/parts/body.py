@@ -15,6 +15,7 @@ from triquad_format.mapfile.parts.part import (
     join_integers,
     unshuffle,
     unshuffle_codes,
+    unshuffle_counts,
 )
 from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import RegionIndex
@@ -133,6 +134,14 @@ class PartBody:
         if not 1 <= len(planes) <= MAX_CODE_BYTES:
             raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per code")
         return unshuffle_codes(planes)
+
+    def counts(self, key: str, count: int | None, most: int) -> Longs:
+        """Numbers that are not negative: ``count`` of them, ``None``: any up to ``most``."""
+        planes = self.array(key, "|u1", (None, count))
+        self._limit(key, planes.shape[1], most)
+        if not 1 <= len(planes) <= MAX_CODE_BYTES:
+            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per number")
+        return unshuffle_counts(planes)
 
     def column(self, column: Column, count: int | None) -> NDArray[Any]:
         """A shuffled column of ``count`` rows; ``None``: of any number."""

@@ -16,6 +16,7 @@ from triquad_format.mapfile.parts.part import (
     LEVEL_BITS,
     MOMENTS,
     PREFIX,
+    RAYS,
     REGION,
     SAMPLE_COLUMNS,
     SAMPLES,
@@ -26,6 +27,7 @@ from triquad_format.mapfile.parts.part import (
     PartKey,
     cube_shift,
     feature_column,
+    leaf_shift,
     moment_columns,
     shuffle,
     shuffle_codes,
@@ -45,9 +47,11 @@ from triquad_format.records.region import (
     VertexTable,
     surface_counts,
 )
+from triquad_format.records.replay_rays import STEPS, ReplayRays
 from triquad_format.wire.codec import binary_offsets, pack_array
 
 SAMPLES_PER_PART = 1 << 17
+RAYS_PER_PART = 1 << 21
 
 _MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
@@ -211,6 +215,8 @@ def _pack_training(
         "training_budget": training.budget_samples,
         "samples": len(training.sample_points),
     }
+    if len(training.rays):
+        fields |= {"rays": len(training.rays), "origins": pack_array(training.rays.origins)}
     yield _region_part(PartKey(TRAINING, region.index), fields)
     moments = (training.table_means, training.table_variances, training.table_steps)
     columns = moment_columns(settings)
@@ -227,6 +233,25 @@ def _pack_training(
         samples = [training.sample_points[rows], training.sample_labels[rows]]
         key = PartKey(SAMPLES, region.index, cell=number)
         yield _region_part(key, _pack_columns(SAMPLE_COLUMNS, samples))
+    yield from _pack_rays(region, training.rays)
+
+
+def _pack_rays(region: Region, rays: ReplayRays) -> Iterator[Part]:
+    codes = rays.leaf_codes
+    cells = codes >> leaf_shift()
+    for cell in np.unique(cells).tolist():
+        of_cell = _rows_of(cells, cell)
+        for number, first in enumerate(range(of_cell.start, of_cell.stop, RAYS_PER_PART)):
+            rows = slice(first, min(first + RAYS_PER_PART, of_cell.stop))
+            leaves, counts = np.unique(codes[rows], return_counts=True)
+            fields = {
+                "codes": pack_array(shuffle_codes(leaves - (cell << leaf_shift()))),
+                "counts": pack_array(shuffle_counts(counts)),
+                "inside": pack_array((rays.ends[rows] % STEPS).astype(np.uint8).T.copy()),
+                "origins": pack_array(shuffle_counts(rays.origin_of[rows].astype(np.int64))),
+                "slopes": pack_array(rays.slopes[rows]),
+            }
+            yield _region_part(PartKey(RAYS, region.index, plane=number, cell=cell), fields)
 
 
 def seams(part: Part) -> list[int]:

@@ -24,11 +24,12 @@ EVIDENCE = "/triquad/evidence"
 TRAINING = "/triquad/training"
 MOMENTS = "/triquad/moments"
 SAMPLES = "/triquad/samples"
+RAYS = "/triquad/rays"
 MANIFEST = "/triquad/manifest"
 PREVIEW = "/preview/mesh"
 
 FIELD_TOPICS = (REGION, VERTICES, EVIDENCE)
-TRAINING_TOPICS = (TRAINING, MOMENTS, SAMPLES)
+TRAINING_TOPICS = (TRAINING, MOMENTS, SAMPLES, RAYS)
 REGION_TOPICS = (*FIELD_TOPICS, *TRAINING_TOPICS)
 TOPICS = (MAP, *REGION_TOPICS, MANIFEST)
 
@@ -37,9 +38,10 @@ PREVIEW_ENCODING = "protobuf"
 PREVIEW_SCHEMA = "foxglove.SceneUpdate"
 
 ENCODINGS = {
-    **dict.fromkeys((MAP, *REGION_TOPICS), MESSAGE_ENCODING),
+    **dict.fromkeys((MAP, *FIELD_TOPICS, TRAINING, MOMENTS, SAMPLES), MESSAGE_ENCODING),
     PREVIEW: PREVIEW_ENCODING,
     MANIFEST: MESSAGE_ENCODING,
+    RAYS: MESSAGE_ENCODING,
 }
 """How the messages of each topic are encoded; topics in the order of their channels' numbers."""
 
@@ -65,7 +67,7 @@ class PartKey:
 
     topic: str
     region: RegionIndex = NO_REGION  # also of what belongs to the whole map
-    plane: int = 0  # of vertices and moments
+    plane: int = 0  # of vertices and moments; number of a portion of the rays of a cube
     cell: int = 0  # Morton code of a square or cube; number of a portion of samples
 
 
@@ -85,6 +87,11 @@ def square_shift(settings: FieldSettings, level: int) -> int:
 def cube_shift() -> int:
     """Bits by which the code of a block is longer than that of its cube."""
     return 3 * (_LEAVES_LOG2 - (BLOCK_VOXELS.bit_length() - 1))
+
+
+def leaf_shift() -> int:
+    """Bits by which the code of a leaf is longer than that of its cube."""
+    return 3 * _LEAVES_LOG2
 
 
 def vertex_reach(settings: FieldSettings) -> int:

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
-from triquad_format.mapfile.parts.pack import SAMPLES_PER_PART
+from triquad_format.mapfile.parts.pack import RAYS_PER_PART, SAMPLES_PER_PART
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     LEVEL_BITS,
     MOMENTS,
+    RAYS,
     REGION,
     SAMPLE_COLUMNS,
     SAMPLES,
@@ -27,10 +28,12 @@ from triquad_format.mapfile.parts.part import (
     feature_column,
     join_bits,
     join_outcomes,
+    leaf_shift,
     moment_columns,
     square_shift,
     unshuffle_counts,
 )
+from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import (
@@ -46,6 +49,7 @@ from triquad_format.records.region import (
     VertexTable,
     surface_counts,
 )
+from triquad_format.records.replay_rays import STEPS, ReplayRays, no_rays
 
 _MAX_SEEN_BYTES = (MAX_SEEN_S.bit_length() + 7) // 8
 
@@ -83,6 +87,8 @@ class RegionParts:
             self._cubes[key.cell] = _read_evidence(body, key)
         elif key.topic == SAMPLES:
             self._rows[key] = (body.columns(SAMPLE_COLUMNS, SAMPLES_PER_PART),)
+        elif key.topic == RAYS:
+            self._rows[key] = (_read_rays(body, key),)
         elif key.topic in (VERTICES, MOMENTS):
             self._rows[key] = self._read_levels(body, key)
 
@@ -176,17 +182,50 @@ class RegionParts:
             sample_points=points,
             sample_labels=labels,
             budget_samples=head.count("training_budget"),
+            rays=self._rays(head),
         )
 
+    def _rays(self, head: PartBody) -> ReplayRays:
+        """The rays, of which older files have none."""
+        count = head.count("rays") if head.has("rays") else 0
+        keys = [key for key in self._rows if key.topic == RAYS]
+        keys.sort(key=lambda key: (key.cell, key.plane))
+        none = no_rays()
+        empty = (none.ends, none.origin_of, none.slopes)
+        ends, origin_of, slopes = _joined(RAYS, [self._rows[key][0] for key in keys], empty)
+        if len(ends) != count:
+            raise DamagedMapFileError(f"{RAYS}: {len(ends)} rays, not {count}")
+        origins = head.array("origins", "<f4", (None, 3)) if count else none.origins
+        return ReplayRays(ends, origin_of, slopes, origins=origins)
 
-def _read_codes(body: PartBody, key: PartKey, shift: int) -> Longs:
-    """Codes [V] within the region of those within a square or cube."""
-    codes = body.codes("codes", 1 << shift)
+
+def _read_codes(body: PartBody, key: PartKey, shift: int, most: int | None = None) -> Longs:
+    """Codes [V] within the region of those within a square or cube, ``most`` at most."""
+    codes = body.codes("codes", most or 1 << shift)
     if len(codes) and not 0 <= codes.max() < 1 << shift:
         raise DamagedMapFileError(f"{key.topic}: a code lies outside of cell {key.cell}")
     if key.cell >= 1 << 60 - shift:
         raise DamagedMapFileError(f"{key.topic}: cell {key.cell} is out of range")
     return codes + (key.cell << shift)
+
+
+def _read_rays(body: PartBody, key: PartKey) -> _Columns:
+    """Ends, numbers of origins and slopes of the rays that end in a cube."""
+    leaves = _read_codes(body, key, leaf_shift(), most=RAYS_PER_PART)
+    counts = body.counts("counts", len(leaves), RAYS_PER_PART)
+    count = int(counts.sum())
+    if count > RAYS_PER_PART or (counts < 1).any():
+        raise DamagedMapFileError(f"{RAYS}: counts of {count} rays are out of range")
+    inside = body.array("inside", "|u1", (3, count))
+    if inside.max(initial=0) >= STEPS:
+        raise DamagedMapFileError(f"{RAYS}: an end lies outside its leaf")
+    corners = STEPS * morton.decode(leaves, 3)
+    ends = corners.repeat(counts, axis=0) + inside.T
+    origin_of = body.counts("origins", count, RAYS_PER_PART)
+    if max(ends.max(initial=0), origin_of.max(initial=0)) >= 2**31:
+        raise DamagedMapFileError(f"{RAYS}: a ray of cell {key.cell} is out of range")
+    slopes = body.array("slopes", "|u1", (count,))
+    return ends.astype(np.int32), origin_of.astype(np.int32), slopes
 
 
 def _read_evidence(body: PartBody, key: PartKey) -> Evidence:

@@ -1,0 +1,66 @@
+"""Rays that training draws from again, as a record holds them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from triquad_format.records import morton
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
+from triquad_format.records.field_settings import FieldSettings
+
+STEPS = 128
+"""Steps of a leaf in which the ends of rays are told: 1.6 mm at the default leaf."""
+
+SLOPE_SCALE = 255
+
+
+@dataclass(frozen=True)
+class ReplayRays:
+    """Rays of a region, in the order of the leaves in which they end."""
+
+    ends: Ints
+    """[R, 3] in steps, from the lower corner of a cube with twice the region's side around its
+    centre: a ray may end outside of the region."""
+
+    origin_of: Ints  # [R] row of each ray's origin
+    slopes: Bytes
+    """[R] by how much the signed distance falls for each metre of the ray, ``1 / SLOPE_SCALE``:
+    the cosine of its angle to the surface's normal."""
+
+    origins: Floats  # [K, 3] where the sensor was, metres from the region's centre
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    @property
+    def leaf_codes(self) -> Longs:
+        """Morton codes [R] of the leaves in which they end, from the corner of the same cube."""
+        return morton.encode(self.ends // STEPS)
+
+    def ends_m(self, settings: FieldSettings) -> Doubles:
+        """Where they end [R, 3], metres from the region's centre: the middles of the steps."""
+        leaves = (self.ends + 0.5) / STEPS - (1 << settings.depth)
+        return np.asarray(leaves * settings.leaf_m, np.float64)
+
+    def chosen(self, rows: NDArray[np.intp]) -> "ReplayRays":
+        """Some of the rays, with the origins that they have."""
+        origin_of = self.origin_of[rows]
+        used = np.bincount(origin_of, minlength=len(self.origins)) > 0
+        numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        return ReplayRays(
+            self.ends[rows],
+            numbers[origin_of],
+            self.slopes[rows],
+            origins=self.origins[used],
+        )
+
+
+def no_rays() -> ReplayRays:
+    """No rays at all."""
+    return ReplayRays(
+        np.zeros((0, 3), np.int32),
+        np.zeros(0, np.int32),
+        np.zeros(0, np.uint8),
+        origins=np.zeros((0, 3), np.float32),
+    )

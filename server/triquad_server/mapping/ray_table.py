@@ -1,0 +1,289 @@
+"""Rays that are kept, what they teach of the signed distance, and samples drawn along them.
+
+A ray tells the signed distance all along itself: nothing at its end point, more before it, less
+behind it. The published label is the distance to the end point along the ray, which is too large
+where the ray meets the surface at an angle. Where the surface's normal is known, the label here is
+the distance to its plane, so it changes by the cosine of the angle of incidence for each metre.
+
+All is in metres, relative to the region's centre. Every draw (3QFP, section III-C) makes new
+samples: a ray that is trained on again teaches other points of itself.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from triquad_format.records.arrays import Doubles, Floats, Ints, Longs
+from triquad_map.compiled.field.feature_rows import prefetch_row
+from triquad_map.compiled.field.quadtree import morton_code
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.team import Team
+
+from triquad_server.engine.live_field import Batch
+from triquad_server.intake.rays import ScanRays
+
+END = 0  # and the two columns after it: the end point
+VALUE = 3
+COLUMNS = 4
+
+NO_ORIGIN = -1
+
+AnyFloats = NDArray[np.floating]
+
+_MIN_COSINE = 0.05
+
+_CELLS = 128
+"""Cells from the centre of the cube to its face, by which samples are put in order."""
+
+_AHEAD = 16  # rays that are brought into the cache before their turn
+
+
+class RayTable(NamedTuple):
+    """Rays, and single samples, which have no origin."""
+
+    rows: Floats
+    """[N, COLUMNS] The end point, and by how much the signed distance falls for each metre of the
+    ray; of a sample, the point and its signed distance."""
+
+    origin_of: Ints  # [N] row of a ray's origin; NO_ORIGIN of a sample
+    origins: Floats  # [K, 3] where the sensor was
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+class TensorTable(NamedTuple):
+    """A :class:`RayTable` on the device that trains."""
+
+    rows: Tensor
+    origin_of: Tensor  # int64
+    origins: Tensor
+
+    @classmethod
+    def of(cls, table: RayTable, device: torch.device) -> "TensorTable":
+        """A copy of a table."""
+        rows, origin_of, origins = (torch.from_numpy(part).to(device) for part in table)
+        return cls(rows, origin_of.long(), origins)
+
+
+class Placement(NamedTuple):
+    """Where on their rays samples lie."""
+
+    surface_share: float  # of the samples that lie around the end points
+    spread_m: float  # standard deviation of those
+    truncation_m: float  # and how far off they lie at most
+    free_from: float  # the others lie from this share of the ray
+    behind_m: float  # to so far behind its end
+    half_side_m: float  # of the region's cube: samples lie inside
+
+
+@kernel()
+def _set_direction(direction: Doubles, origin: AnyFloats, end: AnyFloats) -> float:
+    """Set the unit vector [3] from ``origin`` to ``end``; returns how far it is."""
+    squared = 0.0
+    for axis in range(3):
+        direction[axis] = end[axis] - origin[axis]
+        squared += direction[axis] * direction[axis]
+    reach_m: float = np.sqrt(squared)
+    if reach_m > 0:
+        for axis in range(3):
+            direction[axis] /= reach_m
+    return reach_m
+
+
+@kernel()
+def _clipped(
+    end: AnyFloats, direction: Doubles, half_side_m: float, first: float, last: float
+) -> tuple[float, float]:
+    """The part of an interval of a ray that lies in the cube; none where it begins after its end.
+
+    It is in metres behind the end point [3]. The cube is centred at the origin.
+    """
+    for axis in range(3):
+        if direction[axis] != 0:  # stay between both faces of the cube on this axis
+            a = (-half_side_m - end[axis]) / direction[axis]
+            b = (half_side_m - end[axis]) / direction[axis]
+            first, last = max(first, min(a, b)), min(last, max(a, b))
+        elif abs(end[axis]) >= half_side_m:
+            first, last = 1.0, 0.0
+    return first, last
+
+
+@kernel()
+def _fill(
+    origin: Doubles, ends: Doubles, normals: Doubles, placement: Placement, rows: Floats
+) -> int:
+    """Fill the rows with the rays that pass the cube; returns how many."""
+    count = 0
+    direction = np.empty(3)
+    for i in range(len(ends)):
+        reach_m = _set_direction(direction, origin, ends[i])
+        if reach_m == 0:
+            continue
+        nearest = (placement.free_from - 1) * reach_m
+        first, last = _clipped(
+            ends[i], direction, placement.half_side_m, nearest, placement.behind_m
+        )
+        if not first <= last:
+            continue
+        cosine = 0.0
+        for axis in range(3):
+            cosine += direction[axis] * normals[i, axis]
+            rows[count, END + axis] = ends[i, axis]
+        rows[count, VALUE] = 1.0 if np.isnan(cosine) else max(abs(cosine), _MIN_COSINE)
+        count += 1
+    return count
+
+
+def rays_through(
+    rays: ScanRays, normals: Doubles, centre: Doubles, placement: Placement
+) -> RayTable:
+    """The rays that pass a region's cube.
+
+    Args:
+        rays: N rays, map frame.
+        normals: [N, 3] unit normals at the end points, NaN where unknown.
+        centre: [3] of the region, map frame.
+        placement: where on them samples are to lie.
+    """
+    rows = np.empty((len(rays.ends), COLUMNS), np.float32)
+    origin = rays.origin - centre
+    rows = rows[: _fill(origin, rays.ends - centre, normals, placement, rows)]
+    return RayTable(rows, np.zeros(len(rows), np.int32), origin[None].astype(np.float32))
+
+
+def samples_alone(points: Floats, labels: NDArray[np.floating]) -> RayTable:
+    """Samples that teach the signed distances ``labels`` [N] at points [N, 3]."""
+    rows = np.column_stack([points, labels]).astype(np.float32)
+    no_origins = np.zeros((0, 3), np.float32)
+    return RayTable(rows, np.full(len(rows), NO_ORIGIN, np.int32), no_origins)
+
+
+def draw_samples(
+    table: TensorTable, chosen: Tensor, placement: Placement, generator: torch.Generator
+) -> Batch:
+    """One sample on each of the rays ``chosen`` [B], on their device."""
+    rows, origin_of = table.rows[chosen], table.origin_of[chosen]
+    ends, values = rows[:, END : END + 3], rows[:, VALUE]
+    count, device = len(chosen), rows.device
+    kinds, places = torch.rand((2, count), generator=generator, device=device)
+    near = torch.randn(count, generator=generator, device=device)
+    near = (near * placement.spread_m).clamp(-placement.truncation_m, placement.truncation_m)
+    is_ray = origin_of >= 0
+    origins = ends if len(table.origins) == 0 else table.origins[origin_of.clamp(min=0)]
+    ways = torch.where(is_ray[:, None], ends - origins, torch.zeros_like(ends))
+    reach_m = ways.norm(dim=1)
+    directions = ways / reach_m.clamp(min=1e-12)[:, None]
+    half_side_m = placement.half_side_m
+    outside = ((ends + near[:, None] * directions).abs() >= half_side_m).any(dim=1)
+    faces = torch.stack([(side - ends) / directions for side in (-half_side_m, half_side_m)])
+    unbounded = torch.tensor([-torch.inf, torch.inf], device=device)[:, None, None]
+    faces = torch.where(directions == 0, unbounded, faces)  # there they are infinite or NaN
+    first = torch.maximum((placement.free_from - 1) * reach_m, faces.amin(0).amax(1))
+    last = faces.amax(0).amin(1).clamp(max=placement.behind_m)
+    free = first + places * (last - first)
+    offsets = torch.where((kinds < placement.surface_share) & ~outside, near, free)
+    labels = torch.where(is_ray, -offsets * values, values)
+    return Batch(ends + torch.where(is_ray, offsets, 0.0)[:, None] * directions, labels)
+
+
+@kernel()
+def _free_offset(
+    end: AnyFloats, direction: Doubles, reach_m: float, place: float, placement: Placement
+) -> float:
+    """How far behind the end of a ray its free space is sampled, for a ``place`` in [0, 1)."""
+    first, last = (placement.free_from - 1) * reach_m, placement.behind_m
+    leaves_cube = False
+    for axis in range(3):
+        one, other = end[axis] + first * direction[axis], end[axis] + last * direction[axis]
+        leaves_cube = leaves_cube or max(abs(one), abs(other)) >= placement.half_side_m
+    if leaves_cube:
+        first, last = _clipped(end, direction, placement.half_side_m, first, last)
+    return first + place * (last - first)
+
+
+@kernel()
+def _draw(
+    table: RayTable,
+    chosen: Longs,
+    placement: Placement,
+    kinds: Floats,
+    places: Floats,
+    near: Floats,
+    samples: Floats,
+    cells: Longs,
+) -> None:
+    """Fill in the samples [B, 4], points and labels, and the cells [B] that hold them."""
+    per_m = _CELLS / placement.half_side_m
+    direction = np.zeros(3)
+    for i in range(len(chosen)):
+        prefetch_row(table.rows, chosen[min(i + _AHEAD, len(chosen) - 1)])
+        row, origin = table.rows[chosen[i]], table.origin_of[chosen[i]]
+        offset = 0.0
+        if origin >= 0:
+            reach_m = _set_direction(direction, table.origins[origin], row)
+            offset = near[i] * placement.spread_m
+            offset = min(max(offset, -placement.truncation_m), placement.truncation_m)
+            outside = False
+            for axis in range(3):
+                place = row[END + axis] + offset * direction[axis]
+                outside = outside or abs(place) >= placement.half_side_m
+            if outside or kinds[i] >= placement.surface_share:
+                offset = _free_offset(row, direction, reach_m, places[i], placement)
+        for axis in range(3):
+            samples[i, axis] = row[END + axis] + offset * direction[axis]
+        samples[i, 3] = -offset * row[VALUE] if origin >= 0 else row[VALUE]
+        u = min(max(int(samples[i, 0] * per_m + _CELLS), 0), 2 * _CELLS - 1)
+        v = min(max(int(samples[i, 1] * per_m + _CELLS), 0), 2 * _CELLS - 1)
+        cells[i] = morton_code(u, v)
+
+
+@kernel()
+def _in_order(samples: Floats, cells: Longs) -> tuple[Floats, Floats]:
+    """Points [B, 3] and labels [B] in the order of their cells (a counting sort)."""
+    starts = np.zeros((2 * _CELLS) ** 2 + 1, np.int32)
+    for cell in cells:
+        starts[cell + 1] += 1
+    for i in range(1, len(starts)):
+        starts[i] += starts[i - 1]
+    points, labels = np.empty((len(cells), 3), np.float32), np.empty(len(cells), np.float32)
+    for i in range(len(cells)):
+        place = starts[cells[i]]
+        starts[cells[i]] += 1
+        for axis in range(3):
+            points[place, axis] = samples[i, axis]
+        labels[place] = samples[i, 3]
+    return points, labels
+
+
+def draw_ordered_samples(
+    table: RayTable, chosen: Longs, placement: Placement, rng: np.random.Generator, team: Team
+) -> Batch:
+    """As :func:`draw_samples` for the rays ``chosen`` [B], in compiled code.
+
+    Neighbours in space follow each other, and find in the cache what the last one fetched.
+    """
+    count = len(chosen)
+    samples = np.empty((count, 4), np.float32)
+    cells = np.empty(count, np.int64)
+    kinds, places = rng.random((2, count), np.float32)
+    near = rng.standard_normal(count, np.float32)
+
+    def work(first: int, last: int) -> None:
+        part = slice(first, last)
+        _draw(
+            table,
+            chosen[part],
+            placement,
+            kinds[part],
+            places[part],
+            near[part],
+            samples[part],
+            cells[part],
+        )
+
+    team.split(count, work)
+    points, labels = _in_order(samples, cells)
+    return Batch(torch.from_numpy(points), torch.from_numpy(labels))
