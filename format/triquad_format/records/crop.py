@@ -20,7 +20,6 @@ from triquad_format.records.region import (
     VertexTable,
     masked,
 )
-from triquad_format.records.replay_rays import STEPS
 
 SLACK_LEAVES = 1 / 16
 """Kept around a box: points are rounded to float32, at depth 15 by up to 1/128 of a leaf."""
@@ -127,7 +126,7 @@ def _crop_training(
 ) -> TrainingState:
     leaves = settings.leaf_coordinates(training.sample_points)
     inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))
-    ends = training.rays.ends / STEPS - (1 << settings.depth - 1)
+    ends = settings.leaf_coordinates(training.rays.ends_m(settings))
     rays = np.flatnonzero(((ends >= box.low) & (ends <= box.high)).all(axis=1))
     # Rounded up below, so that none is forgotten.
     samples = training.budget_samples * (len(inside) + len(rays))
