@@ -61,7 +61,7 @@ class Terminal:
         """The exit code, once it ends."""
         end_s = time.monotonic() + WAIT_S
         while self._read(end_s):
-            pass
+            assert time.monotonic() < end_s, f"it has not ended:\n{self.page}"
         return os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
 
     def _read(self, end_s: float) -> bool:
