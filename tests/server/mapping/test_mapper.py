@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from support.small_world import settings, settle, settled_mapper, surface_error, world
+from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.errors import ScanRefusedError
@@ -226,7 +227,7 @@ def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
     assert after < before + 0.002, "what the scan did not see is not forgotten"
 
 
-def test_a_record_without_samples_has_no_training_budget() -> None:
+def test_a_record_with_nothing_to_train_on_has_no_training_budget() -> None:
     mapper = Mapper("test", settings(), "cpu")
     scan = world().scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
@@ -239,6 +240,7 @@ def test_a_record_without_samples_has_no_training_budget() -> None:
             state,
             sample_points=state.sample_points[:0],
             sample_labels=state.sample_labels[:0],
+            rays=no_rays(),
         )
         emptied.append(replace(region, training=state))
     restarted = Mapper("test", settings(), "cpu", replace(record, regions=tuple(emptied)))
