@@ -16,6 +16,7 @@ PARTS = {
     "replay_pools",
     "epochs",
     "surfels",
+    "normals",
     "surface_history",
     "tile_cache",
     "downloads",
@@ -93,7 +94,15 @@ def test_memory_and_time_are_told_by_part(client):
     client.mesh()
     metrics = client.metrics()
     assert set(metrics.memory_bytes) == PARTS
-    for part in ("field", "evidence", "replay_pools", "epochs", "surfels", "surface_history"):
+    for part in (
+        "field",
+        "evidence",
+        "replay_pools",
+        "epochs",
+        "surfels",
+        "normals",
+        "surface_history",
+    ):
         assert metrics.memory_bytes[part] > 0, part
     assert sum(metrics.memory_bytes.values()) < metrics.resident_bytes
     assert metrics.mapper_s["training"] > 0

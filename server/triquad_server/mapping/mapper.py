@@ -106,6 +106,11 @@ class Mapper:
         return self._budget.bytes_of(region.size for region in self._regions.values())
 
     @property
+    def normals_bytes(self) -> int:
+        """Memory of the moments of points, from which normals of coming scans are told."""
+        return self._normals.nbytes
+
+    @property
     def regions(self) -> list[LiveRegion]:
         """The regions; only the thread that owns the map may use them."""
         return list(self._regions.values())

@@ -58,6 +58,7 @@ class Progress:
     samples_left: int = 0
     rays_kept: int = 0
     map_bytes: int = 0  # that the map and its newest epoch take
+    normals_bytes: int = 0  # that moments of points take, for normals of coming scans
     loss: float = 0.0
 
 
@@ -359,5 +360,6 @@ class MapperThread:
             samples_left=self._mapper.samples_left,
             rays_kept=self._mapper.rays_kept,
             map_bytes=self._mapper.bytes_used,
+            normals_bytes=self._mapper.normals_bytes,
             loss=self._loss,
         )

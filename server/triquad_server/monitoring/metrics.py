@@ -68,6 +68,7 @@ class Metrics:
 
         The live map is as of the newest epoch.
         """
+        health = self.health
         regions = [region for epoch in epochs for region in epoch.frozen_regions]
         frozen = {
             "epochs": [(region.engine, region.evidence) for region in regions],
@@ -80,10 +81,11 @@ class Metrics:
         return {
             **live,
             **bytes_by_part(frozen),
-            "surface_history": self.health.mapper.surface.nbytes,
+            "normals": health.mapper.progress.normals_bytes,
+            "surface_history": health.mapper.surface.nbytes,
             "tile_cache": self.tiles.nbytes,
             "downloads": self.downloads.nbytes,
-            "scan_queue": self.health.scans.bytes_waiting,
+            "scan_queue": health.scans.bytes_waiting,
         }
 
     def _sessions(self) -> dict[str, str]:
