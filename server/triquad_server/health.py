@@ -78,6 +78,7 @@ class Health:
             samples_left=progress.samples_left,
             map_bytes=progress.map_bytes,
             map_max_bytes=self.map_max_bytes,
+            fit=progress.fit,
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
