@@ -292,9 +292,11 @@ class CompiledTrainer:
     def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
         """Adam on the MLP and on the rows that were touched, so many by each thread."""
         compiled = CompiledRates(*rates, *_corrections(rates.mean_decay, rates.variance_decay))
+        mlp_rate = self._field.next_mlp_rates(rates).learning_rate
+        of_mlp = compiled._replace(learning_rate=mlp_rate)
         for part, parameter in enumerate(self._field.mlp):
             gradient = np.sum([thread[part] for thread in mlp_sums], axis=0).reshape(1, -1)
-            _step_row(0, gradient, _parameter_rows(parameter), compiled)
+            _step_row(0, gradient, _parameter_rows(parameter), of_mlp)
         sums, features = self._sums, _parameter_rows(self._field.features)
         self._team.each(
             lambda part: _step_touched(

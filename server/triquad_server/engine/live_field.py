@@ -84,6 +84,12 @@ class Rates(NamedTuple):
     variance_decay: float
 
 
+_SOFT_STEPS, _HARDEST = 300, 0.02
+"""For so many steps the MLP learns at the full rate; after n times as many at an n-th of it, and at
+this share at least. All places of a region share it: what it learns of a new one, it does not
+unlearn of the others."""
+
+
 class LiveField:
     """Vertices with their feature vectors, the MLP and the Fourier frequencies of a region.
 
@@ -113,6 +119,7 @@ class LiveField:
         self.features = Parameter(torch.zeros((1, settings.feature_size), device=self.device))
         self.frequencies = frequencies
         self.mlp = [Parameter(part[None]) for part in mlp]
+        self.mlp_steps = 0  # that the MLP took; to read its own from a GPU would take a wait
         self._generator = generator
 
     @property
@@ -156,6 +163,12 @@ class LiveField:
         """Add the vertices ``codes`` [V] of one level with their ``features`` [V, d]."""
         self.tree.restore(plane, h, codes)
         self.features.append(features)
+
+    def next_mlp_rates(self, rates: Rates) -> Rates:
+        """The rates of the next step of the MLP, which hardens with its age."""
+        self.mlp_steps += 1
+        share = min(1.0, max(_HARDEST, _SOFT_STEPS / self.mlp_steps))
+        return rates._replace(learning_rate=share * rates.learning_rate)
 
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""
@@ -236,7 +249,7 @@ def training_state(
         table_steps=tuple(_array(features.steps[chosen]) for chosen in rows),
         mlp_means=tuple(_array(part.means[0]) for part in mlp),
         mlp_variances=tuple(_array(part.variances[0]) for part in mlp),
-        mlp_steps=int(mlp[0].steps[0]),
+        mlp_steps=field.mlp_steps,
         sample_points=_array(samples.points),
         sample_labels=_array(samples.labels).astype(np.float16),
         budget_samples=budget_samples,
@@ -275,6 +288,7 @@ def _restore_optimiser(field: LiveField, state: TrainingState) -> None:
         torch.cat([zero, *variances]),
         torch.cat([zero[:, 0].int(), *steps]),
     )
+    field.mlp_steps = state.mlp_steps
     mlp = field.mlp[0::2] + field.mlp[1::2]
     for part, mean, variance in zip(mlp, state.mlp_means, state.mlp_variances, strict=True):
         taken = torch.full((1,), state.mlp_steps, dtype=torch.int32, device=device)

@@ -32,9 +32,10 @@ class TensorTrainer:
             loss = F.binary_cross_entropy_with_logits(logits, target)
             torch.autograd.backward(loss)
         first_row = torch.zeros(1, dtype=torch.int64, device=field.device)
+        mlp_rates = self._field.next_mlp_rates(rates)
         for parameter, weight in zip(self._field.mlp, mlp, strict=True):
             assert weight.grad is not None
-            step_rows(parameter, first_row, weight.grad[None], rates=rates)
+            step_rows(parameter, first_row, weight.grad[None], rates=mlp_rates)
         if corners is not None and encoded is not None and encoded.grad is not None:
             self._step_features(corners, encoded.grad, rates)
         return loss.detach()
