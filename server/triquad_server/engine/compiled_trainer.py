@@ -9,7 +9,7 @@ changes by::
     value    -= learning_rate * m / (sqrt(v) + EPSILON)
 
 Steps are counted row by row, so that the moments of a row that is new or seldom touched are
-corrected for its own age.
+corrected for its own age. A row's learning rate falls with its age, too: what is learnt hardens.
 """
 
 from functools import lru_cache
@@ -33,7 +33,7 @@ from triquad_map.compiled.field.field import (
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import THREADS, Team, share
 
-from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import HARDEST, SOFT_STEPS, Batch, LiveField, Parameter, Rates
 
 EPSILON = 1e-10
 
@@ -65,7 +65,10 @@ class CompiledRates(NamedTuple):
     learning_rate: float
     mean_decay: float
     variance_decay: float
-    mean_scales: Floats  # [n] correction of the mean after 1, 2, ... steps; the last for more
+    mean_scales: Floats
+    """[n] Correction of the mean after 1, 2, ... steps, times the share of the rate; the last for
+    more."""
+
     variance_scales: Floats  # [n] and of the variance
 
 
@@ -82,12 +85,13 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
 
 @lru_cache(maxsize=4)
 def _corrections(mean_decay: float, variance_decay: float) -> tuple[Floats, Floats]:
-    """Scales of mean and variance by age, tabulated until they no longer matter."""
+    """Scales of mean and variance by age, tabulated until they no longer change."""
     slowest = max(mean_decay, variance_decay)
     count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
-    ages = np.arange(1, count + 1)
+    ages = np.arange(1, max(count, int(SOFT_STEPS / HARDEST)) + 1)
+    shares = np.clip(SOFT_STEPS / ages, HARDEST, 1)
     return (
-        (1 / (1 - mean_decay**ages)).astype(np.float32),
+        (shares / (1 - mean_decay**ages)).astype(np.float32),
         (1 / (1 - variance_decay**ages)).astype(np.float32),
     )
 

@@ -84,10 +84,12 @@ class Rates(NamedTuple):
     variance_decay: float
 
 
-_SOFT_STEPS, _HARDEST = 300, 0.02
-"""For so many steps the MLP learns at the full rate; after n times as many at an n-th of it, and at
-this share at least. All places of a region share it: what it learns of a new one, it does not
-unlearn of the others."""
+SOFT_STEPS, HARDEST = 800, 0.1
+"""For so many steps a row of features learns at the full rate; after n times as many at an n-th of
+it, and at this share at least. What is learnt hardens, and moves little where others are."""
+
+_MLP_SOFT_STEPS, _MLP_HARDEST = 300, 0.02
+"""The MLP does so, and in addition so: all places of a region share it."""
 
 
 class LiveField:
@@ -165,9 +167,9 @@ class LiveField:
         self.features.append(features)
 
     def next_mlp_rates(self, rates: Rates) -> Rates:
-        """The rates of the next step of the MLP, which hardens with its age."""
+        """The rates of the next step of the MLP, which hardens more than rows of features do."""
         self.mlp_steps += 1
-        share = min(1.0, max(_HARDEST, _SOFT_STEPS / self.mlp_steps))
+        share = min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
         return rates._replace(learning_rate=share * rates.learning_rate)
 
     def freeze(self) -> FrozenField:

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from triquad_server.engine.compiled_trainer import EPSILON
-from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import HARDEST, SOFT_STEPS, Batch, LiveField, Parameter, Rates
 from triquad_server.engine.tensor_field import Corners, TensorField
 
 
@@ -95,4 +95,4 @@ def _direction(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) ->
     age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
     mean = means / (1 - rates.mean_decay**age)
     deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()
-    return mean / (deviation + EPSILON)
+    return mean / (deviation + EPSILON) * (SOFT_STEPS / age).clamp(HARDEST, 1.0)

@@ -406,4 +406,4 @@ class LiveRegion:
     def _cooling(self) -> float:
         """Share of the learning rate: falls as the budget is used up, so that the field settles."""
         enough = self._training.cooldown * max(1, len(self.pool))
-        return min(1.0, max(_LEAST_RATE, self.budget_samples / enough))
+        return min(1.0, max(_LEAST_RATE, (self.budget_samples / enough) ** 2))
