@@ -342,4 +342,4 @@ class Mapper:
         offered = [region.pool.offered for region in self._regions.values()]
         limit = shared_limit(offered, self._settings.training.pool_rays)
         for region in self._regions.values():
-            region.pool.limit(limit)
+            region.limit_rays(limit)

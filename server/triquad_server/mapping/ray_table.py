@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from triquad_format.records.arrays import Doubles, Floats, Ints, Longs
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.quadtree import morton_code
 from triquad_map.compiled.kernel import kernel
@@ -52,6 +52,10 @@ class RayTable(NamedTuple):
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def of(self, chosen: Bools) -> "RayTable":
+        """The ``chosen`` [N] rays, with all origins."""
+        return RayTable(self.rows[chosen], self.origin_of[chosen], self.origins)
 
 
 class TensorTable(NamedTuple):
