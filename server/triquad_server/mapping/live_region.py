@@ -62,6 +62,12 @@ _SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
 _VISITS = 4  # to each of them
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
+
+_VERTICES_PER_SAMPLE = 14
+"""Of a region, for each sample of a step: each vertex takes about as many steps wherever it is."""
+
+_LEAST_BATCH = 2048  # what a step costs however few its samples are matters below
+
 _NEW_SCANS = 10
 """So long after it was first seen, the field has had time to learn a surface."""
 
@@ -231,19 +237,19 @@ class LiveRegion:
 
         ``normals`` [N, 3] are those at the rays' ends, NaN where unknown.
         """
-        passing = rays_through(rays, normals, self.centre, self.pool.placement)
+        passing = rays_through(rays, normals, self.centre, self.pool.placement, self._random)
         if len(passing) == 0:
             return
-        self._keep(passing)
-        samples = int(len(passing) * self._training.samples_per_ray)
+        samples = int(self._keep(passing) * self._training.samples_per_ray)
         self.budget_samples = min(self.budget_samples + samples, self._training.max_budget_samples)
         self._fresh_budget_samples = int(samples * self._training.fresh_share)
 
-    def _keep(self, rays: RayTable) -> None:
-        """Keep rays, some of which are held out."""
+    def _keep(self, rays: RayTable) -> int:
+        """Keep rays, some of which are held out; returns how many are to be trained on."""
         held = are_held_out(rays.rows, self._settings)
         self.held_out.add(rays.of(held))
         self.pool.add(rays.of(~held))
+        return len(rays) - int(held.sum())
 
     def limit_rays(self, limit: int) -> None:
         """Keep at most so many rays to train on, and the share of them that is held out."""
@@ -265,18 +271,30 @@ class LiveRegion:
         if self._marks is not None:
             self.evidence.set_normals(self._marks, normals)
 
+    @property
+    def owed(self) -> float:
+        """Samples that are still to be trained on for each vertex."""
+        return self.budget_samples / max(1, self.field.vertices)
+
+    @property
+    def batch(self) -> int:
+        """Samples of a step: fewer while the region is small, or it would take too few steps."""
+        wanted = self.field.vertices // _VERTICES_PER_SAMPLE
+        return min(self._training.batch, max(_LEAST_BATCH, wanted))
+
     def train(self) -> float | Tensor:
         """One optimiser step; returns the loss: to read it on a GPU waits for the step."""
         settings = self._training
-        fresh = min(self._fresh_budget_samples, int(settings.batch * settings.fresh_share))
-        repair = min(self._repair_budget_samples, int(settings.batch * _REPAIR_SHARE))
-        batch = self.pool.draw(settings.batch, fresh, repair)
+        count = self.batch
+        fresh = min(self._fresh_budget_samples, int(count * settings.fresh_share))
+        repair = min(self._repair_budget_samples, int(count * _REPAIR_SHARE))
+        batch = self.pool.draw(count, fresh, repair)
         rate = settings.learning_rate * self._cooling()
         loss = self._trainer.train(batch, Rates(rate, settings.beta1, settings.beta2))
         self._fresh_budget_samples -= fresh
         self._repair_budget_samples -= repair
-        self._unjudged_samples += settings.batch
-        self.budget_samples = max(0, self.budget_samples - settings.batch)
+        self._unjudged_samples += count
+        self.budget_samples = max(0, self.budget_samples - count)
         self.changed = True
         return loss
 
@@ -406,4 +424,4 @@ class LiveRegion:
     def _cooling(self) -> float:
         """Share of the learning rate: falls as the budget is used up, so that the field settles."""
         enough = self._training.cooldown * max(1, len(self.pool))
-        return min(1.0, max(_LEAST_RATE, self.budget_samples / enough))
+        return min(1.0, max(_LEAST_RATE, (self.budget_samples / enough) ** 2))
