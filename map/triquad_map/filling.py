@@ -187,10 +187,10 @@ def on_filled(
     That is up to ``reach_m`` beside a filled voxel on each axis, at most ``fill_m`` from the voxel
     with seen surface at which that began, and not in a ``FREE`` voxel.
     """
-    places = points / view.voxel_m
     found = np.zeros(len(points), np.bool_)
     if not len(filled.voxels):
         return found
+    places = points / view.voxel_m
     least = filled.voxels.min(axis=0) - 2
     names = cell_names(filled.voxels - least)
     reach, limit = reach_m / view.voxel_m, fill_m / view.voxel_m

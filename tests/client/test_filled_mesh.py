@@ -124,6 +124,13 @@ def test_without_filling_it_is_the_mesh_as_ever(tmp_path) -> None:
     assert area(plain, np.ones(len(plain.faces), np.bool_)) == pytest.approx(12.0, abs=0.2)
 
 
+def test_where_nothing_was_seen_nothing_is_filled() -> None:
+    with OfflineMap(GROUND) as offline:
+        mesh = offline.mesh(((50, 50, 50), (60, 60, 60)), fill_m=1.0)
+    assert mesh.faces.shape == (0, 3)
+    assert mesh.filled.shape == (0,)
+
+
 @pytest.mark.parametrize("fill_m", [-0.1, 6.0, float("nan")])
 def test_lengths_that_cannot_be_filled_are_refused(fill_m: float) -> None:
     with pytest.raises(InvalidInputError, match="fill_m = .*use 0 to 5"):

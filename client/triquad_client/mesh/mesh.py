@@ -18,7 +18,7 @@ from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRe
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import DownloadError
+from triquad_client.errors import BadReplyError, DownloadError
 from triquad_client.net.call import NEWEST, Ask, Call, Run, ask, ask_each, offload, retried
 
 if TYPE_CHECKING:
@@ -94,40 +94,53 @@ class Mesh:
         return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
 
 
-def fetch_tiles(bounds: Bounds | None, level: int) -> Call[TileList]:
+def fetch_tiles(bounds: Bounds | None, level: int, fill_m: float = 0.0) -> Call[TileList]:
     """The tiles that meet the bounds."""
     minimum, maximum = checks.box(bounds)
-    request = TileListRequest(minimum, maximum, NEWEST, level=checks.level_of_detail(level))
+    request = TileListRequest(
+        minimum,
+        maximum,
+        NEWEST,
+        level=checks.level_of_detail(level),
+        fill_m=checks.length_to_fill(fill_m),
+    )
     return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
 
 
 def fetch_tile(index: Sequence[int], level: int) -> Call[Mesh]:
     """The newest mesh of one tile."""
-    tile = yield from ask(_ask_tile(index, NEWEST, checks.level_of_detail(level)))
-    return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
+    tile = yield from ask(_ask_tile(index, NEWEST, checks.level_of_detail(level), fill_m=0.0))
+    return _mesh_of(tile)
 
 
-def fetch_mesh(bounds: Bounds | None, level: int, max_bytes: int) -> Call[Mesh]:
+def fetch_mesh(
+    bounds: Bounds | None, level: int, max_bytes: int, fill_m: float = 0.0
+) -> Call[Mesh]:
     """The faces whose centroids lie in the bounds, from one epoch.
 
     Raises:
+        BadReplyError: holes were to be filled, which a server of an earlier release does not do.
         DownloadError: its tiles take more than ``max_bytes``.
     """
     box = checks.box(bounds)
 
     def fetch() -> Call[Mesh]:
-        listed = yield from fetch_tiles(bounds, level)
+        listed = yield from fetch_tiles(bounds, level, fill_m)
         indices = listed.tiles.tolist()
         tiles: list[Tile] = []
         for start in range(0, len(indices), _TILES_AT_A_TIME):
             part = indices[start : start + _TILES_AT_A_TIME]
-            tiles += yield from ask_each(part, lambda at: _ask_tile(at, listed.epoch, level))
+            tiles += yield from ask_each(
+                part, lambda at: _ask_tile(at, listed.epoch, level, fill_m=fill_m)
+            )
+            if fill_m > 0 and any(tile.filled is None for tile in tiles):
+                raise BadReplyError("the reply lacks filled, which was asked for by fill_m")
             if sum(tile.vertices.nbytes + tile.faces.nbytes for tile in tiles) > max_bytes:
                 raise too_large_error(max_bytes)
 
         def join(_: Run) -> Mesh:
-            parts = [Mesh(tile.origin + tile.vertices, tile.faces, tile.epoch) for tile in tiles]
-            return joined(parts, listed.tile_side_m, box=box, epoch=listed.epoch)
+            parts = [_mesh_of(tile) for tile in tiles]
+            return joined(parts, listed.tile_side_m, box=box, epoch=listed.epoch, marked=fill_m > 0)
 
         return (yield from offload(join))
 
@@ -142,28 +155,42 @@ def too_large_error(max_bytes: int) -> DownloadError:
     )
 
 
-def _ask_tile(index: Sequence[int], epoch: int, level: int) -> Ask[Tile]:
+def _ask_tile(index: Sequence[int], epoch: int, level: int, fill_m: float) -> Ask[Tile]:
     x, y, z = index
-    return Ask(keys.TILE, TileRequest(x, y, z, epoch=epoch, level=level), Tile, background=True)
+    request = TileRequest(x, y, z, epoch=epoch, level=level, fill_m=fill_m)
+    return Ask(keys.TILE, request, Tile, background=True)
+
+
+def _mesh_of(tile: Tile) -> Mesh:
+    marks = None if tile.filled is None else tile.filled.astype(np.bool_)
+    return Mesh(tile.origin + tile.vertices, tile.faces, tile.epoch, filled=marks)
 
 
 def joined(
-    tiles: Sequence[Mesh], tile_side_m: float, *, box: tuple[Doubles, Doubles], epoch: int
+    tiles: Sequence[Mesh],
+    tile_side_m: float,
+    *,
+    box: tuple[Doubles, Doubles],
+    epoch: int,
+    marked: bool = False,
 ) -> Mesh:
-    """The tiles' faces whose centroids lie in a box, given by its corners [3], as one mesh."""
+    """The tiles' faces whose centroids lie in a box, given by its corners [3], as one mesh.
+
+    Where the tiles are ``marked``, all tell which faces fill holes.
+    """
     starts = np.cumsum([0, *(len(tile.vertices) for tile in tiles)])
     shifted = [tile.faces + int(start) for tile, start in zip(tiles, starts, strict=False)]
-    parts = [tile.filled for tile in tiles if tile.filled is not None]
+    marks = [tile.filled for tile in tiles if tile.filled is not None]
     whole = welded(
         np.concatenate([np.zeros((0, 3)), *(tile.vertices for tile in tiles)]),
         np.concatenate([np.zeros((0, 3), np.int32), *shifted]).astype(np.int32),
         tile_side_m,
-        filled=np.concatenate(parts) if parts else None,
+        filled=np.concatenate([np.zeros(0, np.bool_), *marks]) if marked else None,
     )
     centroids = whole.vertices[whole.faces].mean(axis=1)
     inside = ((centroids >= box[0]) & (centroids <= box[1])).all(axis=1)
-    marks = None if whole.filled is None else whole.filled[inside]
-    return compacted(whole.vertices, whole.faces[inside], epoch, marks)
+    filled = None if whole.filled is None else whole.filled[inside]
+    return compacted(whole.vertices, whole.faces[inside], epoch, filled)
 
 
 def welded(vertices: Doubles, faces: Ints, tile_side_m: float, filled: Bools | None = None) -> Mesh:

@@ -23,7 +23,6 @@ from triquad_client.checks import Bounds
 from triquad_client.mesh.mesh import Mesh, joined
 
 CELL_RANGE_M = (0.005, 10.0)
-FILL_MAX_M = 5.0
 MAX_FACES = 50_000_000
 
 BLOCK_CELLS = 64
@@ -148,8 +147,9 @@ def mesh_blocks(
     """
     chosen_m = _CELL_LEAVES * view.voxel_m if cell_m is None else cell_m
     checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
-    checked_fill_m = checks.within("fill_m", fill_m, FILL_MAX_M, least=0.0)
-    return MeshBlocks(view, seen, checked_m, checks.box(bounds), fill_m=checked_fill_m)
+    return MeshBlocks(
+        view, seen, checked_m, checks.box(bounds), fill_m=checks.length_to_fill(fill_m)
+    )
 
 
 def map_mesh(
@@ -174,7 +174,7 @@ def map_mesh(
             )
         if report is not None:
             report(number, len(blocks.indices))
-    return joined(parts, blocks.side_m, box=checks.box(bounds), epoch=view.epoch)
+    return joined(parts, blocks.side_m, box=checks.box(bounds), epoch=view.epoch, marked=fill_m > 0)
 
 
 def _marched(volume: Floats, cells: Bools) -> Mesh:

@@ -12,6 +12,7 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
 from triquad_format.records.field_settings import check_range
 from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
+from triquad_format.wire.limits import MAX_FILL_M
 
 from triquad_tools.console.arguments import add_version, error_limit, not_negative, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
@@ -35,7 +36,6 @@ _SUFFIXES = (_MAP, *_MESHES, _GRID, _PICTURE)
 _PLANES = ("XY", "XZ", "YZ")
 _GRID_CELL_M = 0.2
 _CELL_RANGE_M = (0.01, 10.0)
-_FILL_MAX_M = 5.0
 _MARGIN_CELLS = 16  # so far around its box a map is needed for a mesh or a grid
 
 _Add = Callable[..., argparse.Action]
@@ -106,7 +106,7 @@ def _add_target(add: _Add) -> None:
         default=0.0,
         metavar="M",
         help="of a mesh: continue surface into unknown space, where the field does, up to so far "
-        f"from what was seen, at most {_FILL_MAX_M:g} m; those faces are marked",
+        f"from what was seen, at most {MAX_FILL_M:g} m; those faces are marked",
     )
     add("--sparse", action="store_true", help=f"{_GRID}: only blocks around surface, not a box")
     add("--force", action="store_true", help="replace OUT where it exists")
@@ -190,7 +190,7 @@ def _export(options: argparse.Namespace, path: Path) -> int:
     if options.cell is not None:
         check_range("--cell", options.cell, *_CELL_RANGE_M)
     if options.fill:
-        check_range("--fill", options.fill, 0.0, _FILL_MAX_M)
+        check_range("--fill", options.fill, 0.0, MAX_FILL_M)
     margin_m = _MARGIN_CELLS * (options.cell or _GRID_CELL_M) + options.fill
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
