@@ -13,6 +13,7 @@ from triquad_format.errors import InvalidInputError, MapFileError, RefusedError,
 from triquad_format.records.status import Status
 from triquad_format.wire.messages import (
     CheckpointInfo,
+    FieldFit,
     MapInfo,
     ResetReply,
     ServerStatus,
@@ -117,6 +118,7 @@ __all__ = [
     "SdfResult",
     "Segments",
     "ServerMetrics",
+    "FieldFit",
     "ServerStatus",
     "SourceMetrics",
     "SourceReport",

@@ -30,6 +30,8 @@ ENDLESS_S = 1800.0
 
 _BEATS_PER_LOG_LINE = 5
 _BEATS_PER_TRIM = 10  # of the memory
+_TRIMMED_AT_BYTES = 32 << 20
+"""Where memory grew by so much, it is trimmed at once: much was asked."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ class Health:
             samples_left=progress.samples_left,
             map_bytes=progress.map_bytes,
             map_max_bytes=self.map_max_bytes,
+            fit=progress.fit,
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
@@ -160,11 +163,12 @@ class Heartbeat:
         self._publisher.undeclare()
 
     def _run(self) -> None:
-        beat = 0
+        beat, trimmed_to = 0, resident_bytes()
         while not self._stopping.wait(STATUS_PERIOD_S):
             beat += 1
-            if beat % _BEATS_PER_TRIM == 0:
+            if beat % _BEATS_PER_TRIM == 0 or resident_bytes() > trimmed_to + _TRIMMED_AT_BYTES:
                 give_back_free()
+                trimmed_to = resident_bytes()
             try:
                 self._health.mapper.wake()  # for a sign of life, even where nothing is to do
                 self._health.warnings.check()

@@ -84,7 +84,7 @@ def test_round_trip(message):
 
 def test_all_messages_are_frozen_records_with_known_fields():
     kinds = all_messages()
-    assert len(kinds) == 22
+    assert len(kinds) == 23
     for kind in kinds:
         assert kind.__dataclass_params__.frozen, kind
         assert list(kind.annotations()) == [part.name for part in dataclasses.fields(kind)]

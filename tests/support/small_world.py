@@ -75,13 +75,21 @@ def settle(mapper: Mapper) -> None:
         mapper.train()
 
 
-def surface_error(epoch: Epoch, drive_through: World, count: int = 20_000) -> float:
-    """Mean |SDF error| in metres at points within 0.1 m of the seen surface."""
+def surface_error(
+    epoch: Epoch,
+    drive_through: World,
+    count: int = 20_000,
+    offset: NDArray[np.float64] | float = 0.0,
+) -> float:
+    """Mean |SDF error| in metres at points within 0.1 m of the seen surface.
+
+    ``offset`` [3] is where the map has the world's origin.
+    """
     rng = np.random.default_rng(9)
     hits = drive_through.hits
     hits = hits[rng.choice(len(hits), count)]
     normals = drive_through.scene.gradient(hits)
     points = hits + normals * rng.uniform(-0.1, 0.1, (count, 1))
     points = points[drive_through.scene.is_exact(points)]
-    error = epoch.query(points, gradient=False).sdf - drive_through.scene.sdf(points)
+    error = epoch.query(points + offset, gradient=False).sdf - drive_through.scene.sdf(points)
     return float(np.abs(error).mean())

@@ -6,13 +6,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 
 STEPS = 128
 """Steps of a leaf in which the ends of rays are told: 1.6 mm at the default leaf."""
 
 SLOPE_SCALE = 255
+
+HELD_OUT = 32
+"""One ray in so many is held out: it is never trained on, and tells how good the field is."""
+
+AXIS_BITS = 21
+AXIS_MASK = (1 << AXIS_BITS) - 1
+MIXED = np.uint64(0x9E3779B97F4A7C15)  # 2**64 over the golden section
+MIXED_SHIFT = 59
+"""The five upper bits hang on all of an end; rays are held out where they are zero."""
+
+
+def ray_keys(ends: NDArray[np.integer]) -> Longs:
+    """A number for each ray that ends at so many steps [N, 3], from the lower corner of a cube with
+    twice the region's side around its centre.
+    """
+    x, y, z = (ends.astype(np.int64) & AXIS_MASK).T
+    keys: Longs = x << 2 * AXIS_BITS | y << AXIS_BITS | z
+    return keys
+
+
+def are_held_out(ends: NDArray[np.integer]) -> Bools:
+    """Which rays that end at so many steps [N, 3], counted as there, are held out.
+
+    It hangs on their ends alone: rays that are read back are held out as before.
+    """
+    mixed = ray_keys(ends).astype(np.uint64) * MIXED
+    chosen: Bools = mixed >> np.uint64(MIXED_SHIFT) == 0
+    return chosen
 
 
 @dataclass(frozen=True)

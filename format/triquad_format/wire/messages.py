@@ -41,6 +41,8 @@ Length = Annotated[float, Within(0)]  # metres
 Statuses = Annotated[StatusCodes, Within(0, 2)]  # triquad_format.records.status.Status
 FinitePoint = Annotated[Point, Within()]
 FinitePositions = Annotated[Positions, Within()]
+FinitePoints = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3)), Within()]
+Lengths = Annotated[Values, Within(0)]
 Name = Annotated[str, Text(256)]
 Digest = Annotated[str, Text(64, form="[0-9a-f]{64}")]  # SHA-256
 
@@ -191,6 +193,24 @@ class CheckpointInfo(Message):
 
 
 @dataclass(frozen=True)
+class FieldFit(Message):
+    """How well the field fits rays that it is never trained on, by place: a cube of 32 leaves.
+
+    The field should be zero where such a ray ends; medians are of how far it is from that, the
+    sensor's noise included.
+    """
+
+    rays: Count
+    median_m: Length  # of all these rays
+    upper_m: Length  # what 90 % of them keep below
+    worst: FinitePoints  # [K, 3] map frame, metres: centres of the places with the largest medians
+    worst_median_m: Lengths  # [K]
+    repairing: Count  # places that have forgotten and are being learnt again
+    repaired: Count  # places that were, since the server started
+    given_up: Count  # and places that training did not mend
+
+
+@dataclass(frozen=True)
 class ServerStatus(Message):
     """Answer to :class:`StatusRequest`; also put on ``triquad/<map>/status``."""
 
@@ -220,6 +240,7 @@ class ServerStatus(Message):
     samples_left: Count = 0  # training samples until nothing is left to learn
     map_bytes: Count = 0  # memory of the map with its newest epoch
     map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not told
+    fit: FieldFit | None = None  # as it was judged last, None: not yet
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,17 @@
 """One region of the live map: its field, its evidence and what it still has to learn."""
 
+import logging
 import math
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+import torch
 from torch import Tensor
 from triquad_format.records.arrays import Doubles, Ints, Longs
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
+from triquad_format.records.replay_rays import HELD_OUT
 from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
@@ -24,6 +27,7 @@ from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 from triquad_server.array_memory import buffers_of, bytes_by_part
 from triquad_server.engine.compiled_trainer import CompiledTrainer
 from triquad_server.engine.live_field import (
+    FrozenField,
     LiveField,
     Rates,
     field_from_record,
@@ -34,11 +38,21 @@ from triquad_server.engine.live_field import (
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.held_out import are_held_out, both_tables
+from triquad_server.mapping.judgement import Judgement, Places, Repairs
 from triquad_server.mapping.memory_budget import RegionSize
-from triquad_server.mapping.ray_table import END, Placement, rays_through, samples_alone
+from triquad_server.mapping.ray_table import (
+    END,
+    Placement,
+    RayTable,
+    rays_through,
+    samples_alone,
+)
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.mapping.replay_record import recorded_rays, restored_rays
+
+_log = logging.getLogger(__name__)
 
 _CARVE_SHORT = 0.5  # voxels before its end a ray shows free space
 _CLEAR_SHORT = 2.5
@@ -48,11 +62,30 @@ _SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
 _VISITS = 4  # to each of them
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
+
+_VERTICES_PER_SAMPLE = 14
+"""Of a region, for each sample of a step: each vertex takes about as many steps wherever it is."""
+
+_LEAST_BATCH = 2048  # what a step costs however few its samples are matters below
+
 _NEW_SCANS = 10
 """So long after it was first seen, the field has had time to learn a surface."""
 
 _SURFELS_REFITTED = 8_000
 """With each epoch while the field is being trained: some 10 ms."""
+
+
+_JUDGED_AFTER_SAMPLES = 8_000_000
+"""A field that is being trained is judged once in so many samples: a few seconds."""
+
+_REPAIR_SHARE = 0.5  # of a batch, that is drawn where the field has forgotten
+_REPAIR_VISITS = 16  # to each ray there
+
+_CPU = torch.device("cpu")
+
+
+def _held_out_limit(pool_rays: int) -> int:
+    return max(1, pool_rays // HELD_OUT)
 
 
 class LiveRegion:
@@ -67,8 +100,8 @@ class LiveRegion:
         self.evidence = evidence
         _, seed = setup.seeds(index)
         self._random = np.random.default_rng(seed)
-        self.pool = ReplayPool(
-            capacity=setup.training.pool_rays,
+        new_pool = partial(
+            ReplayPool,
             placement=Placement(
                 surface_share=setup.scan.surface_share,
                 spread_m=setup.scan.spread_m,
@@ -78,10 +111,18 @@ class LiveRegion:
                 half_side_m=setup.field.region_side_m / 2,
             ),
             leaf_m=setup.field.leaf_m,
-            device=setup.device,
             seed=seed,
             team=setup.team,
         )
+        self.pool = new_pool(setup.training.pool_rays, device=setup.device)
+        self.held_out = new_pool(_held_out_limit(setup.training.pool_rays), device=_CPU)
+        self.places: Places | None = None
+        """How well the field fits the rays that are held out, as it was judged last."""
+
+        self.repairs = Repairs()  # so far
+        self._judgement = Judgement(setup.field)
+        self._unjudged_samples = 0  # that were trained since
+        self._repair_budget_samples = 0  # that are to be from places that have forgotten
         self.budget_samples = 0  # the training budget: samples that are still to be trained on
         self._fresh_budget_samples = 0  # those of them that are to be from the newest scan
         self.changed = True  # since it was last published
@@ -117,7 +158,7 @@ class LiveRegion:
         region._restored = True
         state = record.training
         if state is not None:
-            region.pool.add(restored_rays(state.rays, setup.field))
+            region._keep(restored_rays(state.rays, setup.field))
             region.pool.add(samples_alone(state.sample_points, state.sample_labels))
             most = setup.training.max_budget_samples if len(region.pool) else 0
             region.budget_samples = min(state.budget_samples, most)
@@ -196,13 +237,24 @@ class LiveRegion:
 
         ``normals`` [N, 3] are those at the rays' ends, NaN where unknown.
         """
-        passing = rays_through(rays, normals, self.centre, self.pool.placement)
+        passing = rays_through(rays, normals, self.centre, self.pool.placement, self._random)
         if len(passing) == 0:
             return
-        self.pool.add(passing)
-        samples = int(len(passing) * self._training.samples_per_ray)
+        samples = int(self._keep(passing) * self._training.samples_per_ray)
         self.budget_samples = min(self.budget_samples + samples, self._training.max_budget_samples)
         self._fresh_budget_samples = int(samples * self._training.fresh_share)
+
+    def _keep(self, rays: RayTable) -> int:
+        """Keep rays, some of which are held out; returns how many are to be trained on."""
+        held = are_held_out(rays.rows, self._settings)
+        self.held_out.add(rays.of(held))
+        self.pool.add(rays.of(~held))
+        return len(rays) - int(held.sum())
+
+    def limit_rays(self, limit: int) -> None:
+        """Keep at most so many rays to train on, and the share of them that is held out."""
+        self.pool.limit(limit)
+        self.held_out.limit(_held_out_limit(limit))
 
     def ray_ends(self) -> Doubles:
         """Where the rays end [N, 3] that are kept, those of the newest scans last."""
@@ -219,22 +271,38 @@ class LiveRegion:
         if self._marks is not None:
             self.evidence.set_normals(self._marks, normals)
 
+    @property
+    def owed(self) -> float:
+        """Samples that are still to be trained on for each vertex."""
+        return self.budget_samples / max(1, self.field.vertices)
+
+    @property
+    def batch(self) -> int:
+        """Samples of a step: fewer while the region is small, or it would take too few steps."""
+        wanted = self.field.vertices // _VERTICES_PER_SAMPLE
+        return min(self._training.batch, max(_LEAST_BATCH, wanted))
+
     def train(self) -> float | Tensor:
         """One optimiser step; returns the loss: to read it on a GPU waits for the step."""
         settings = self._training
-        fresh = min(self._fresh_budget_samples, int(settings.batch * settings.fresh_share))
-        batch = self.pool.draw(settings.batch, fresh)
+        count = self.batch
+        fresh = min(self._fresh_budget_samples, int(count * settings.fresh_share))
+        repair = min(self._repair_budget_samples, int(count * _REPAIR_SHARE))
+        batch = self.pool.draw(count, fresh, repair)
         rate = settings.learning_rate * self._cooling()
         loss = self._trainer.train(batch, Rates(rate, settings.beta1, settings.beta2))
         self._fresh_budget_samples -= fresh
-        self.budget_samples = max(0, self.budget_samples - settings.batch)
+        self._repair_budget_samples -= repair
+        self._unjudged_samples += count
+        self.budget_samples = max(0, self.budget_samples - count)
         self.changed = True
         return loss
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget evidence and samples between two corners [3]."""
         self.evidence.clear(self.voxels(low[None])[0], self.voxels(high[None])[0])
-        self.pool.forget(low - self.centre, high - self.centre)
+        for pool in (self.pool, self.held_out):
+            pool.forget(low - self.centre, high - self.centre)
         if len(self.pool) == 0:
             self.budget_samples = 0
         self.changed = True
@@ -261,8 +329,13 @@ class LiveRegion:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)
             self._restored = False
         self._forget_gone(surfels)
+        self._judge(field)
         own = buffers_of((field, evidence, surfels))
-        live = {"field": self.field, "evidence": self.evidence, "replay_pools": self.pool}
+        live = {
+            "field": self.field,
+            "evidence": self.evidence,
+            "replay_pools": (self.pool, self.held_out),
+        }
         return FrozenRegion(
             index=self.index,
             centre=self.centre,
@@ -278,7 +351,9 @@ class LiveRegion:
 
     def record(self) -> Region:
         """The region with its training state as plain arrays, sharing nothing with this one."""
-        rays, others = recorded_rays(self.pool.table, self._settings)
+        table = both_tables(self.pool.table, self.held_out.table)
+        rays, others = recorded_rays(table, self._settings)
+        others = others[others < len(self.pool)]  # samples are for training
         state = training_state(
             self.field,
             rays=rays,
@@ -286,6 +361,32 @@ class LiveRegion:
             budget_samples=self.budget_samples,
         )
         return region_record(self.index, self.field, self.evidence, training=state)
+
+    def _judge(self, field: FrozenField) -> None:
+        """Find out where the field has forgotten what it knew, and have it learnt again."""
+        enough = _JUDGED_AFTER_SAMPLES if self.budget_samples else 1
+        if self._unjudged_samples < enough or len(self.held_out) == 0:
+            return
+        self._unjudged_samples = 0
+        rows = self.held_out.table.rows
+        sdf = field.evaluate(np.ascontiguousarray(rows[:, END : END + 3]), gradient=False).sdf
+        self.places = places = self._judgement.judge(rows, sdf)
+        self.repairs = self.repairs.after(places)
+        if len(places.forgotten_keys):
+            x, y, z = places.centres[places.forgotten][0] + self.centre
+            _log.info(
+                "%d places fit held-out rays worse than before, and are learnt again: one is at "
+                "%.1f, %.1f, %.1f",
+                len(places.forgotten_keys),
+                x,
+                y,
+                z,
+            )
+        attended = self.pool.attend(places.forgotten_keys, self._settings)
+        self._repair_budget_samples = _REPAIR_VISITS * attended
+        most = self._training.max_budget_samples
+        needed = int(self._repair_budget_samples / _REPAIR_SHARE)
+        self.budget_samples = max(self.budget_samples, min(needed, most))
 
     def _surfels(
         self, evidence: FrozenEvidence, field: SampleField, epoch: int, before: FrozenRegion | None
@@ -308,7 +409,8 @@ class LiveRegion:
         voxels = np.unique(np.concatenate(self._gone), axis=0)
         self._gone.clear()
         voxels = voxels[~self.evidence.freeze().ended_in(voxels)]  # nothing ended there since
-        self.pool.forget_ends(voxels, self._settings)
+        for pool in (self.pool, self.held_out):
+            pool.forget_ends(voxels, self._settings)
         inside = self._random.random((_SAMPLES_PER_VOXEL, len(voxels), 3))
         points = (voxels + inside).reshape(-1, 3)
         leaf_m, middle = self._settings.leaf_m, 1 << (self._settings.depth - 1)
@@ -322,4 +424,4 @@ class LiveRegion:
     def _cooling(self) -> float:
         """Share of the learning rate: falls as the budget is used up, so that the field settles."""
         enough = self._training.cooldown * max(1, len(self.pool))
-        return min(1.0, max(_LEAST_RATE, self.budget_samples / enough))
+        return min(1.0, max(_LEAST_RATE, (self.budget_samples / enough) ** 2))

@@ -221,15 +221,15 @@ class Mapper:
 
     @shortages()
     def train(self) -> None:
-        """One optimiser step where the training budget is largest; nothing once all is settled."""
+        """One optimiser step where most is owed for what is there; nothing once all is settled."""
         self._restore_missing()
-        region = max(self._regions.values(), key=lambda r: r.budget_samples, default=None)
+        region = max(self._regions.values(), key=lambda r: r.owed, default=None)
         if region is None or region.budget_samples == 0:
             return
         loss = region.train()
         before = loss if self._loss is None else self._loss
         self._loss = _LOSS_MEMORY * before + (1 - _LOSS_MEMORY) * loss
-        self.samples_trained += self._settings.training.batch
+        self.samples_trained += region.batch
 
     @shortages()
     def publish(self) -> Epoch:
@@ -342,4 +342,4 @@ class Mapper:
         offered = [region.pool.offered for region in self._regions.values()]
         limit = shared_limit(offered, self._settings.training.pool_rays)
         for region in self._regions.values():
-            region.pool.limit(limit)
+            region.limit_rays(limit)

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from triquad_format.wire.messages import ResetReply, ResetRequest, Scan
+from triquad_format.wire.messages import FieldFit, ResetReply, ResetRequest, Scan
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.counter import Counter
@@ -19,6 +19,7 @@ from triquad_server.errors import MapLostError, MapperStoppedError, ScanRefusedE
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mapping.map_fit import map_fit
 from triquad_server.mapping.mapper import MapChanges, Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
 from triquad_server.mesh.mesher import check_box
@@ -60,6 +61,7 @@ class Progress:
     map_bytes: int = 0  # that the map and its newest epoch take
     normals_bytes: int = 0  # that moments of points take, for normals of coming scans
     loss: float = 0.0
+    fit: FieldFit | None = None  # to the rays that are held out
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ class MapperThread:
         self._unpublished = False
         self._scans_taken = 0
         self._loss = 0.0  # as of the newest epoch
+        self._fit: FieldFit | None = None
         self._step_s = _GIVE_WAY_S  # what the last step of training took
         self._else_s = 0.0  # what all but scans took in the last round
         first = mapper.publish()
@@ -340,6 +343,7 @@ class MapperThread:
             self.surface.add(epoch)
             self.epochs.add(epoch)
         self._loss = self._mapper.loss
+        self._fit = map_fit(self._mapper.regions)
         self._unpublished = False
         now = time.monotonic()
         self._next_publish = now + max(self._period_s, _MIN_PUBLISH_SHARE * (now - started))
@@ -362,4 +366,5 @@ class MapperThread:
             map_bytes=self._mapper.bytes_used,
             normals_bytes=self._mapper.normals_bytes,
             loss=self._loss,
+            fit=self._fit,
         )

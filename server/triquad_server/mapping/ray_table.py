@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from triquad_format.records.arrays import Doubles, Floats, Ints, Longs
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.quadtree import morton_code
 from triquad_map.compiled.kernel import kernel
@@ -52,6 +52,10 @@ class RayTable(NamedTuple):
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def of(self, chosen: Bools) -> "RayTable":
+        """The ``chosen`` [N] rays, with all origins."""
+        return RayTable(self.rows[chosen], self.origin_of[chosen], self.origins)
 
 
 class TensorTable(NamedTuple):
@@ -112,21 +116,46 @@ def _clipped(
 
 
 @kernel()
+def _free_part(
+    end: AnyFloats, direction: Doubles, reach_m: float, placement: Placement
+) -> tuple[float, float, float]:
+    """Where the free space of a ray in the cube begins and ends, metres behind the end point [3],
+    and its share of that of the whole ray."""
+    first, last = (placement.free_from - 1) * reach_m, placement.behind_m
+    whole = last - first
+    leaves_cube = False
+    for axis in range(3):
+        one, other = end[axis] + first * direction[axis], end[axis] + last * direction[axis]
+        leaves_cube = leaves_cube or max(abs(one), abs(other)) >= placement.half_side_m
+    if not leaves_cube:
+        return first, last, 1.0
+    first, last = _clipped(end, direction, placement.half_side_m, first, last)
+    return first, last, max(last - first, 0.0) / whole if whole > 0 else 0.0
+
+
+@kernel()
 def _fill(
-    origin: Doubles, ends: Doubles, normals: Doubles, placement: Placement, rows: Floats
+    origin: Doubles,
+    ends: Doubles,
+    normals: Doubles,
+    placement: Placement,
+    chances: Doubles,
+    rows: Floats,
 ) -> int:
-    """Fill the rows with the rays that pass the cube; returns how many."""
+    """Fill the rows with rays that pass the cube; returns how many."""
     count = 0
     direction = np.empty(3)
     for i in range(len(ends)):
         reach_m = _set_direction(direction, origin, ends[i])
         if reach_m == 0:
             continue
-        nearest = (placement.free_from - 1) * reach_m
-        first, last = _clipped(
-            ends[i], direction, placement.half_side_m, nearest, placement.behind_m
-        )
-        if not first <= last:
+        _, _, free = _free_part(ends[i], direction, reach_m, placement)
+        ends_inside = True
+        for axis in range(3):
+            ends_inside = ends_inside and abs(ends[i, axis]) < placement.half_side_m
+        outside = (1 - placement.surface_share) * (1 - free)  # share of the ray's samples
+        outside += 0.0 if ends_inside else placement.surface_share
+        if chances[i] >= 1 - outside:
             continue
         cosine = 0.0
         for axis in range(3):
@@ -138,19 +167,27 @@ def _fill(
 
 
 def rays_through(
-    rays: ScanRays, normals: Doubles, centre: Doubles, placement: Placement
+    rays: ScanRays,
+    normals: Doubles,
+    centre: Doubles,
+    placement: Placement,
+    rng: np.random.Generator,
 ) -> RayTable:
-    """The rays that pass a region's cube.
+    """The rays in a region's cube; of those that are partly there, as many as is their part.
+
+    So what regions draw from their rays is, of all together, what one would draw.
 
     Args:
         rays: N rays, map frame.
         normals: [N, 3] unit normals at the end points, NaN where unknown.
         centre: [3] of the region, map frame.
         placement: where on them samples are to lie.
+        rng: chooses among rays that are partly in the cube.
     """
     rows = np.empty((len(rays.ends), COLUMNS), np.float32)
     origin = rays.origin - centre
-    rows = rows[: _fill(origin, rays.ends - centre, normals, placement, rows)]
+    chances = rng.random(len(rows))
+    rows = rows[: _fill(origin, rays.ends - centre, normals, placement, chances, rows)]
     return RayTable(rows, np.zeros(len(rows), np.int32), origin[None].astype(np.float32))
 
 
@@ -181,27 +218,17 @@ def draw_samples(
     faces = torch.stack([(side - ends) / directions for side in (-half_side_m, half_side_m)])
     unbounded = torch.tensor([-torch.inf, torch.inf], device=device)[:, None, None]
     faces = torch.where(directions == 0, unbounded, faces)  # there they are infinite or NaN
-    first = torch.maximum((placement.free_from - 1) * reach_m, faces.amin(0).amax(1))
+    begin = (placement.free_from - 1) * reach_m
+    first = torch.maximum(begin, faces.amin(0).amax(1))
     last = faces.amax(0).amin(1).clamp(max=placement.behind_m)
     free = first + places * (last - first)
-    offsets = torch.where((kinds < placement.surface_share) & ~outside, near, free)
+    # Of a ray that leaves the cube, free space is as much less.
+    inside = ((last - first) / (placement.behind_m - begin).clamp(min=1e-12)).clamp(0, 1)
+    surface_share = placement.surface_share
+    kinds = kinds * (surface_share + (1 - surface_share) * inside)
+    offsets = torch.where((kinds < surface_share) & ~outside, near, free)
     labels = torch.where(is_ray, -offsets * values, values)
     return Batch(ends + torch.where(is_ray, offsets, 0.0)[:, None] * directions, labels)
-
-
-@kernel()
-def _free_offset(
-    end: AnyFloats, direction: Doubles, reach_m: float, place: float, placement: Placement
-) -> float:
-    """How far behind the end of a ray its free space is sampled, for a ``place`` in [0, 1)."""
-    first, last = (placement.free_from - 1) * reach_m, placement.behind_m
-    leaves_cube = False
-    for axis in range(3):
-        one, other = end[axis] + first * direction[axis], end[axis] + last * direction[axis]
-        leaves_cube = leaves_cube or max(abs(one), abs(other)) >= placement.half_side_m
-    if leaves_cube:
-        first, last = _clipped(end, direction, placement.half_side_m, first, last)
-    return first + place * (last - first)
 
 
 @kernel()
@@ -231,7 +258,11 @@ def _draw(
                 place = row[END + axis] + offset * direction[axis]
                 outside = outside or abs(place) >= placement.half_side_m
             if outside or kinds[i] >= placement.surface_share:
-                offset = _free_offset(row, direction, reach_m, places[i], placement)
+                first, last, free = _free_part(row, direction, reach_m, placement)
+                # Of a ray that leaves the cube, free space is as much less.
+                share = placement.surface_share + (1 - placement.surface_share) * free
+                if outside or kinds[i] * share >= placement.surface_share:
+                    offset = first + places[i] * (last - first)
         for axis in range(3):
             samples[i, axis] = row[END + axis] + offset * direction[axis]
         samples[i, 3] = -offset * row[VALUE] if origin >= 0 else row[VALUE]

@@ -19,6 +19,7 @@ from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, pack, with_room
 
 from triquad_server.engine.live_field import Batch
+from triquad_server.mapping.places import place_keys
 from triquad_server.mapping.ray_table import (
     COLUMNS,
     END,
@@ -158,6 +159,7 @@ class ReplayPool:
         self._bins = np.zeros(0, np.int32)
         self._occupancy = np.zeros(_BINS, np.int32)
         self._fresh = np.zeros(0, np.int64)
+        self._attended = np.zeros(0, np.int64)
 
     def __len__(self) -> int:
         return self._size
@@ -205,14 +207,29 @@ class ReplayPool:
         if fresh:
             self._fresh = places
 
-    def draw(self, count: int, fresh: int) -> Batch:
-        """``count`` samples on rays at random, ``fresh`` of them on the newest."""
+    def attend(self, places: Longs, settings: FieldSettings) -> int:
+        """From now on, some samples are drawn in ``places`` [P] on request; returns their rays."""
+        if len(places) == 0:
+            self._attended = self._attended[:0]
+        else:
+            rows = self._rows[: self._size]
+            self._attended = np.flatnonzero(np.isin(place_keys(rows, settings), places))
+        return len(self._attended)
+
+    def draw(self, count: int, fresh: int, attended: int = 0) -> Batch:
+        """``count`` samples on rays at random.
+
+        ``fresh`` of them are on the newest, and ``attended`` in the places that are attended to.
+        """
         if self._on_device is not None:
-            chosen = self._choose(count, fresh)
+            chosen = self._choose(count, fresh, attended)
             return draw_samples(self._on_device, chosen, self.placement, self._generator)
         places = self._rng.integers(self._size, size=count)
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
+        if attended and len(self._attended):
+            rows = self._rng.integers(len(self._attended), size=min(attended, count - fresh))
+            places[fresh : fresh + attended] = self._attended[rows]
         return self.draw_on(places)
 
     def draw_on(self, places: Longs) -> Batch:
@@ -247,13 +264,18 @@ class ReplayPool:
             self._occupancy,
         )
         self._fresh = self._fresh[self._fresh < self._size]
+        self._attended = self._attended[self._attended < self._size]
         self._copy_to_device()
 
-    def _choose(self, count: int, fresh: int) -> Tensor:
+    def _choose(self, count: int, fresh: int, attended: int) -> Tensor:
         """Places [count] at random, on the device."""
         places = self._random(self._size, count)
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh_on_device[self._random(len(self._fresh), fresh)]
+        if attended and len(self._attended):
+            rows = self._rng.integers(len(self._attended), size=min(attended, count - fresh))
+            drawn = torch.from_numpy(self._attended[rows]).to(self._device)
+            places[fresh : fresh + attended] = drawn
         return places
 
     def _random(self, below: int, count: int) -> Tensor:
@@ -266,6 +288,7 @@ class ReplayPool:
         self._size = len(places)
         self._occupancy = np.bincount(self._bins, minlength=_BINS).astype(np.int32)
         self._fresh = self._fresh[:0]
+        self._attended = self._attended[:0]
         self._copy_to_device()
 
     def _extend(self, size: int) -> None:

@@ -6,7 +6,8 @@ from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
 
-from triquad_server.mapping.ray_table import END, VALUE, RayTable
+from triquad_server.mapping.held_out import ends_in_steps
+from triquad_server.mapping.ray_table import VALUE, RayTable
 
 _MOST_RAYS = 6_000_000  # of a region: so many fit into the parts of a single cube
 
@@ -16,8 +17,7 @@ _ORIGIN_BITS = 15  # beside 48 of a leaf's code
 def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays, Longs]:
     """The rays of a table, and the places of all else in it: samples, and what ends far away."""
     side = 1 << settings.depth
-    ends = table.rows[:, END : END + 3].astype(np.float64) / settings.leaf_m + side
-    steps = np.floor(ends * STEPS).astype(np.int64)
+    steps = ends_in_steps(table.rows, settings)
     fits = (table.origin_of >= 0) & ((steps >= 0) & (steps < 2 * side * STEPS)).all(axis=1)
     places = np.flatnonzero(fits)
     if len(places) > _MOST_RAYS:

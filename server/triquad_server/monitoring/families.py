@@ -209,6 +209,16 @@ _TRAINING = (
         single(lambda f: f.status.samples_left),
     ),
     gauge(
+        "triquad_held_out_median_metres",
+        "Median of how far from zero the field is where rays end that it is not trained on",
+        single(lambda f: f.status.fit.median_m if f.status.fit else None),
+    ),
+    gauge(
+        "triquad_places_repairing",
+        "Places that fit such rays worse than they did, and that are being learnt again",
+        single(lambda f: f.status.fit.repairing if f.status.fit else None),
+    ),
+    gauge(
         "triquad_settled",
         "1 where nothing is left to learn and the newest epoch shows all; else 0",
         single(lambda f: float(f.status.settled)),

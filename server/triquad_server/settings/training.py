@@ -13,7 +13,8 @@ class TrainingSettings(BaseModel):
     model_config = SECTION
 
     batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
-    """Samples per step."""
+    """Samples per step, at most: it is one for each 14 vertices of a region, and at least 2048, so
+    that a street learns alike in one region and across several."""
 
     learning_rate: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Learning rate of Adam, before it cools."""

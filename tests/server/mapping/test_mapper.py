@@ -3,9 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support.small_world import settings, settle, settled_mapper, surface_error, world
+from support.small_world import World, settings, settle, settled_mapper, surface_error, world
+from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
+from triquad_sensors.pose import moved
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.live_region import LiveRegion
@@ -97,6 +99,46 @@ def test_regions_meet_without_hole_or_step() -> None:
         assert np.abs(answer.sdf).max() < 0.1
         assert np.abs(np.diff(answer.sdf)).max() < 0.01, "samples are 1 cm apart"
         assert (answer.status == Status.SURFACE).all(), "no hole"
+
+
+def test_a_street_across_a_corner_of_regions_is_as_right_as_in_the_middle_of_one() -> None:
+    chosen = Settings.model_validate({"training": {"samples_per_ray": 18.0}})
+    block_m = BLOCK_VOXELS * chosen.field.leaf_m
+    corner = np.round(chosen.field.region_pitch_m / 2 / block_m) * block_m
+    errors = [
+        surface_error_at(np.array(place), chosen, world(4))
+        for place in ((0.0, 0.0, 0.0), (corner, corner, 0.0))
+    ]
+    assert errors[1] < 1.15 * errors[0]
+
+
+def surface_error_at(place: np.ndarray, chosen: Settings, drive_through: World) -> float:
+    """The error of a settled map of a drive that begins at ``place`` [3]."""
+    shift = np.eye(4)
+    shift[:3, 3] = place
+    mapper = Mapper("test", chosen, "cpu")
+    for scan in drive_through.scans:
+        mapper.ingest(scan.points, shift @ scan.world_from_sensor)
+    settle(mapper)
+    return surface_error(mapper.publish(), drive_through, offset=place)
+
+
+def test_a_region_that_was_just_entered_is_trained_like_one_that_is_owed_much() -> None:
+    chosen = Settings.model_validate({"training": {"batch": 4096}})
+    drive_through = world(4)
+    mapper = Mapper("test", chosen, "cpu")
+    for scan in drive_through.scans:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    for _ in range(40):
+        mapper.train()
+    far = np.eye(4)
+    far[0, 3] = 2 * chosen.field.region_pitch_m
+    first = drive_through.scans[0]
+    mapper.ingest(first.points, far @ first.world_from_sensor)
+    for _ in range(40):
+        mapper.train()
+    ends = moved(first.points, far @ first.world_from_sensor)
+    assert np.abs(mapper.publish().query(ends).sdf).mean() < 0.03
 
 
 def test_free_space_is_seen_in_all_regions_that_rays_pass() -> None:

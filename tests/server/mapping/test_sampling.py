@@ -37,6 +37,10 @@ def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placemen
     )
 
 
+def kept(rays: ScanRays, normals: np.ndarray, centre: np.ndarray, placement: Placement) -> RayTable:
+    return rays_through(rays, normals, centre, placement, np.random.default_rng(2))
+
+
 def draw(engine: str, table: RayTable, chosen: np.ndarray, placement: Placement) -> Batch:
     if engine == "compiled":
         return draw_ordered_samples(table, chosen, placement, np.random.default_rng(1), TEAM)
@@ -53,7 +57,7 @@ def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> Non
     settings = ScanSettings()
     rays = rays_to_ground()
     down = np.tile([0.0, 0.0, -1.0], (500, 1))
-    table = rays_through(rays, down, CENTRE, placed(settings))
+    table = kept(rays, down, CENTRE, placed(settings))
     batch = draw(engine, table, np.arange(500).repeat(20), placed(settings))
     heights = batch.points[:, 2].numpy() + CENTRE[2]
     labels = batch.labels.numpy()
@@ -66,7 +70,7 @@ def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> Non
 def test_without_normals_the_label_is_the_distance_along_the_ray(engine: str) -> None:
     settings = ScanSettings()
     rays = rays_to_ground(1)
-    table = rays_through(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
+    table = kept(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
     batch = draw(engine, table, np.zeros(3000, np.int64), placed(settings))
     points = batch.points.numpy() + CENTRE
     distance = np.linalg.norm(points - rays.ends[0], axis=1)
@@ -79,7 +83,7 @@ def test_samples_lie_where_the_settings_say(engine: str) -> None:
     settings = ScanSettings(surface_share=0.7, spread_m=0.1)
     rays = rays_to_ground(1)
     range_m = np.linalg.norm(rays.ends[0] - rays.origin)
-    table = rays_through(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
+    table = kept(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
     batch = draw(engine, table, np.zeros(20_000, np.int64), placed(settings))
     reach = np.linalg.norm(batch.points.numpy() + CENTRE - rays.origin, axis=1)
     assert reach.min() >= 0.3 * range_m - 1e-4
@@ -95,7 +99,7 @@ def test_samples_stay_inside_the_cube(engine: str) -> None:
     settings = ScanSettings()
     half = 8.0
     rays = rays_to_ground()
-    table = rays_through(rays, np.full((500, 3), np.nan), np.zeros(3), placed(settings, half))
+    table = kept(rays, np.full((500, 3), np.nan), np.zeros(3), placed(settings, half))
     ending = (np.abs(rays.ends) < half).all(axis=1).sum()
     assert len(table) > ending, "rays that only pass through teach free space"
     batch = draw(engine, table, np.arange(len(table)).repeat(10), placed(settings, half))
@@ -105,5 +109,31 @@ def test_samples_stay_inside_the_cube(engine: str) -> None:
 def test_rays_that_miss_the_cube_teach_nothing() -> None:
     far = np.array([0.0, 500.0, 0.0])
     rays = rays_to_ground()
-    table = rays_through(rays, np.full((500, 3), np.nan), far, placed(ScanSettings(), 20.0))
+    table = kept(rays, np.full((500, 3), np.nan), far, placed(ScanSettings(), 20.0))
     assert len(table) == 0
+
+
+@ENGINES
+def test_two_regions_draw_together_what_one_would(engine: str) -> None:
+    """Of rays across a border, neither more free space nor less of the surface."""
+    settings = ScanSettings()
+    rays = rays_to_ground(20_000)
+    whole, half_m = np.array([16.0, 0.0, 0.0]), 16.0
+    counts = []
+    for centre, half_side_m in (
+        (whole, 2 * half_m),
+        (whole - (half_m, 0, 0), half_m),
+        (whole + (half_m, 0, 0), half_m),
+    ):
+        placement = placed(settings, half_side_m)
+        unknown = np.full((len(rays.ends), 3), np.nan)
+        table = kept(rays, unknown, centre, placement)
+        batch = draw(engine, table, np.arange(len(table)), placement)
+        points = batch.points.numpy() + centre
+        near = np.abs(batch.labels.numpy()) < settings.truncation_m
+        free, _ = np.histogram(points[~near, 0], np.arange(0, 25, 4))
+        surface, _ = np.histogram(points[near, 0], np.arange(0, 25, 4))
+        counts.append(np.array([free, surface]))
+    one, left, right = counts
+    assert one.min() > 500, "enough to compare"
+    np.testing.assert_allclose(left + right, one, rtol=0.2)

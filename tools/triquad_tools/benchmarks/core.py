@@ -85,13 +85,13 @@ def _training(region: LiveRegion, settings: Settings) -> list[Figure]:
     rng = np.random.default_rng(0)
 
     def baseline() -> None:
-        batch = region.pool.draw(training.batch, 0)
-        order = torch.from_numpy(rng.permutation(training.batch))  # tensors do not put it in order
+        batch = region.pool.draw(region.batch, 0)
+        order = torch.from_numpy(rng.permutation(region.batch))  # tensors do not put it in order
         trainer.train(Batch(batch.points[order], batch.labels[order]), rates)
 
     step = compare(region.train, baseline, _ROUNDS, repeats=15)
     return [
-        Figure("training", training.batch / step.seconds / 1e6, "M samples/s", at_least=1.0),
+        Figure("training", region.batch / step.seconds / 1e6, "M samples/s", at_least=1.0),
         Figure("training, times eager torch", step.ratio, "", at_least=8),
     ]
 

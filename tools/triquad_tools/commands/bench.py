@@ -43,12 +43,14 @@ _USUAL_ON_STREET = (
     "metrics",
     "security",
     "neighbours",
+    "borders",
 )
 _ON_STREET = (*_USUAL_ON_STREET, "tradeoffs", "viewer")
 USUAL_PARTS = (
     *_USUAL_ON_STREET,
     "growth",
     "restart",
+    "far-scan",
     "air",
     "moving",
     "sweeps",
@@ -98,6 +100,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
     if not parts:
         return []
     from triquad_tools.benchmarks.align import measure_align  # slow to import
+    from triquad_tools.benchmarks.borders import measure_borders
     from triquad_tools.benchmarks.core import measure_core
     from triquad_tools.benchmarks.file import measure_file, measure_offline
     from triquad_tools.benchmarks.fill import measure_fill
@@ -125,6 +128,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
         "metrics": measure_scraping,
         "security": measure_security,
         "neighbours": measure_neighbours,
+        "borders": measure_borders,
         "viewer": _viewer,
     }
     made = bench_street(options.seed)
@@ -148,6 +152,7 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
         return []
     from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
     from triquad_tools.benchmarks.air import measure_air
+    from triquad_tools.benchmarks.far_scan import measure_far_scan
     from triquad_tools.benchmarks.moving import measure_moving
     from triquad_tools.benchmarks.presets import measure_presets
     from triquad_tools.benchmarks.restart import measure_restart
@@ -157,6 +162,7 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
     measures: dict[str, Callable[[int], list[Figure]]] = {
         "growth": _growth,
         "restart": measure_restart,
+        "far-scan": measure_far_scan,
         "air": measure_air,
         "moving": partial(measure_moving, folder=options.recorded),
         "sweeps": measure_sweeps,
@@ -222,9 +228,10 @@ _DESCRIPTION = (
     "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, one that is "
     "restored, the map file, checkpoints, mesh tiles, filled holes, answers to planners, scans put "
     "back, maps opened offline, a server whose metrics are read, one with roles, clients that want "
-    "too much, open air, things that move, a lidar that moves while it turns, clouds of ROS 2, "
-    "rooms, tables and streets with the presets that are for them, and, if asked for, the viewer "
-    "in a browser and the ablation. Takes over half an hour; nothing else should run meanwhile."
+    "too much, a street across borders of regions, open air, things that move, a lidar that moves "
+    "while it turns, clouds of ROS 2, rooms, tables and streets with the presets that are for "
+    "them, and, if asked for, the viewer in a browser and the ablation. Takes over half an hour; "
+    "nothing else should run meanwhile."
 )
 
 

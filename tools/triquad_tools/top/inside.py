@@ -1,6 +1,6 @@
 """What the page tells of the map: how it learns, whether it is kept, and what waits for it."""
 
-from triquad_format.wire.messages import CheckpointInfo, ServerStatus
+from triquad_format.wire.messages import CheckpointInfo, FieldFit, ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
 
 from triquad_tools.top.amounts import count, duration, rate, size
@@ -28,8 +28,20 @@ def _map(seen: Interval) -> Section:
         Row("loss", (f"{status.loss:.4f}",)),
         Row("regions", (count(status.regions),)),
         Row("parameters", (count(status.parameters),)),
+        *_fit(status.fit),
     ]
     return Section("MAP", ("",), tuple(rows))
+
+
+def _fit(fit: FieldFit | None) -> list[Row]:
+    """How well the field fits rays that it is not trained on."""
+    if fit is None:
+        return []
+    within = f"{1e3 * fit.median_m:.0f} mm, 90 % in {1e3 * fit.upper_m:.0f} mm"
+    rows = [Row("held-out rays within", (within,))]
+    if fit.repairing:
+        rows.append(Row("learnt again", (f"{count(fit.repairing)} places",), Grade.WARNING))
+    return rows
 
 
 def _left(status: ServerStatus, samples_per_s: float) -> str:

@@ -1,0 +1,160 @@
+"""A region's judgement of its own field, place by place, by the rays that it is not trained on.
+
+The field should be zero where such a ray ends. How far it is off tells the sensor's noise as well
+as the field's error, but the noise of a ray does not change: where the same rays fit worse than
+they did, the field has forgotten.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
+from triquad_format.records.field_settings import FieldSettings
+
+from triquad_server.mapping.held_out import ray_keys
+from triquad_server.mapping.places import place_centres, place_keys
+
+_LEAST_RAYS = 24  # of a place that is judged
+_SURE = 5.0
+"""By so many standard errors of the mean a place must fit worse to have forgotten."""
+
+_LEAST_RISE = 0.02
+"""And as if by so much more error, in leaves: 4 mm at the default leaf."""
+
+_SEEN_ANEW = 0.1
+"""Where this share of the rays is new, the place is being learnt."""
+
+_REPAIRS = 3  # of a place in a row; then it is taken as it is
+
+
+@dataclass(frozen=True)
+class Places:
+    """How well a field fits the held-out rays of each of P places."""
+
+    centres: Doubles  # [P, 3] metres from the region's centre
+    rays: Longs  # [P]
+    medians_m: Doubles  # [P] of how far from zero the field is at the rays' ends
+    errors_m: Doubles  # [N] how far it is, for each ray
+    forgotten: Bools  # [P] where the same rays fit worse than they did
+    forgotten_keys: Longs  # of these, as of :func:`triquad_server.mapping.places.place_keys`
+    repaired: int  # places that had forgotten before, and have not any more
+    given_up: int  # places that had, and that training did not mend
+
+
+@dataclass(frozen=True)
+class Repairs:
+    """What became of places that had forgotten, so far."""
+
+    done: int = 0  # places that were learnt again
+    given_up: int = 0  # places that training did not mend
+
+    def after(self, places: Places) -> "Repairs":
+        """With what was found now."""
+        return Repairs(self.done + places.repaired, self.given_up + places.given_up)
+
+
+class Judgement:
+    """Compares a region's field with what it was, at the ends of the rays that are held out."""
+
+    def __init__(self, settings: FieldSettings) -> None:
+        """Nothing is judged yet."""
+        self._settings = settings
+        # By ray, in the order of the keys: what the field said when it was best in that place.
+        self._keys = np.zeros(0, np.int64)
+        self._best = np.zeros(0)
+        self._repairs: dict[int, int] = {}  # in a row, of places that have forgotten
+
+    def judge(self, rows: Floats, sdf: NDArray[np.floating]) -> Places:
+        """Judge the field by held-out rays.
+
+        Args:
+            rows: [N, COLUMNS] of the rays' table.
+            sdf: [N] what the field says where they end, metres.
+        """
+        keys = ray_keys(rows, self._settings)
+        best = self._best_of(keys)
+        places, place_of, counts = np.unique(
+            place_keys(rows, self._settings), return_inverse=True, return_counts=True
+        )
+        changes = _Changes.of(sdf, best, place_of, counts)
+        seen_anew = changes.known < (1 - _SEEN_ANEW) * counts
+        worse = changes.are_sure(_LEAST_RISE * self._settings.leaf_m) & ~seen_anew
+        before = len(self._repairs)
+        forgotten = worse & self._may_be_repaired(places, worse)
+        given_up = int((worse & ~forgotten).sum())
+        still = sum(count > 1 for count in self._repairs.values())
+        is_best = ((changes.means < 0) | seen_anew | worse) & ~forgotten
+        now_best = is_best[place_of] | np.isnan(best)
+        self._remember(keys, np.where(now_best, sdf, best))
+        return Places(
+            place_centres(places, self._settings),
+            counts,
+            _medians(np.abs(sdf), place_of, counts),
+            np.abs(sdf).astype(np.float64),
+            forgotten,
+            places[forgotten],
+            repaired=before - still - given_up,
+            given_up=given_up,
+        )
+
+    def _best_of(self, keys: Longs) -> Doubles:
+        """What is remembered of rays; NaN where nothing is."""
+        if len(self._keys) == 0:
+            return np.full(len(keys), np.nan)
+        rows = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return np.where(self._keys[rows] == keys, self._best[rows], np.nan)
+
+    def _remember(self, keys: Longs, best: Doubles) -> None:
+        order = np.argsort(keys)
+        self._keys, self._best = keys[order], best[order]
+
+    def _may_be_repaired(self, places: Longs, worse: Bools) -> Bools:
+        """Which places were not yet repaired in vain too often; counts the repairs."""
+        tried = [self._repairs.get(place, 0) for place in places.tolist()]
+        fine = np.array(tried, np.int64) < _REPAIRS
+        again = zip(places.tolist(), tried, (worse & fine).tolist(), strict=True)
+        self._repairs = {place: count + 1 for place, count, repaired in again if repaired}
+        return fine
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """By how much the squares of the field at the same rays' ends rose, for each of P places."""
+
+    known: Longs  # [P] rays of which it is known
+    means: Doubles  # [P] metres squared
+    errors: Doubles  # [P] standard errors of the means
+
+    @classmethod
+    def of(
+        cls,
+        sdf: NDArray[np.floating],
+        best: Doubles,
+        place_of: NDArray[np.intp],
+        counts: Longs,
+    ) -> "_Changes":
+        rises = sdf.astype(np.float64) ** 2 - best**2
+        is_known = ~np.isnan(rises)
+        rises, places = rises[is_known], place_of[is_known]
+
+        def sums(of: Doubles | None = None) -> Doubles:
+            return np.bincount(places, of, minlength=len(counts)).astype(np.float64)
+
+        known = sums()
+        least = np.maximum(known, 1)
+        means = sums(rises) / least
+        variances = sums((rises - means[places]) ** 2) / least
+        return cls(known.astype(np.int64), means, np.sqrt(variances / least))
+
+    def are_sure(self, rise_m: float) -> Bools:
+        """Where the field is worse for sure, as if by an error of ``rise_m`` beside the noise."""
+        sure = self.means > np.maximum(_SURE * self.errors, rise_m**2)
+        return sure & (self.known >= _LEAST_RAYS)
+
+
+def _medians(values: NDArray[np.floating], group_of: NDArray[np.intp], counts: Longs) -> Doubles:
+    """The median of the values of each group, of which none is empty."""
+    ordered = values[np.lexsort([values, group_of])]
+    medians: Doubles = ordered[np.cumsum(counts) - counts + counts // 2].astype(np.float64)
+    return medians

@@ -1,0 +1,151 @@
+"""Where a map has forgotten what it knew: told by rays that it was never trained on."""
+
+import numpy as np
+import pytest
+from support.small_world import settings, settle, settled_mapper, surface_error, world
+from triquad_format.records import replay_rays
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.replay_rays import HELD_OUT
+from triquad_server.mapping.held_out import are_held_out, ends_in_steps
+from triquad_server.mapping.judgement import Judgement, Places
+from triquad_server.mapping.map_fit import map_fit
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.places import place_keys
+
+FIELD = FieldSettings()
+NOISE_M = 0.02
+RNG = np.random.default_rng(0)
+# Of two places, a hundred metres apart.
+ROWS = np.concatenate([RNG.uniform(0.1, 6.3, (400, 4)), RNG.uniform(100, 102, (300, 4))]).astype(
+    np.float32
+)
+NOISE = RNG.normal(0, NOISE_M, len(ROWS))
+FIRST, SECOND = np.arange(len(ROWS)) < 400, np.arange(len(ROWS)) >= 400
+
+
+def judged(judgement: Judgement, error_m: np.ndarray) -> Places:
+    """A field that is off by ``error_m`` where noisy rays end."""
+    return judgement.judge(ROWS, (NOISE + error_m).astype(np.float32))
+
+
+def off(at: np.ndarray, by_m: float) -> np.ndarray:
+    """Off by so much, to either side of the surface."""
+    return np.where(at, by_m, 0.0) * np.where(np.arange(len(at)) % 2, 1, -1)
+
+
+def test_what_fits_worse_than_it_did_is_forgotten() -> None:
+    judgement = Judgement(FIELD)
+    assert not judged(judgement, off(FIRST, 0.005)).forgotten.any()
+    places = judged(judgement, off(SECOND, 0.02))
+    (gone,) = places.centres[places.forgotten]
+    assert np.linalg.norm(gone - 101) < 10
+    assert places.forgotten_keys == place_keys(ROWS[-1:], FIELD)
+
+
+def test_the_medians_are_those_of_each_place() -> None:
+    places = judged(Judgement(FIELD), off(SECOND, 0.1))
+    order = np.argsort(places.centres[:, 0])
+    of_first, of_second = (
+        np.median(np.abs(NOISE + off(SECOND, 0.1))[at]) for at in (FIRST, SECOND)
+    )
+    assert places.medians_m[order] == pytest.approx([of_first, of_second], rel=0.02)
+    assert places.rays[order].tolist() == [400, 300]
+
+
+def test_a_little_worse_is_noise() -> None:
+    judgement = Judgement(FIELD)
+    judged(judgement, off(FIRST, 0.0))
+    for _ in range(20):
+        assert not judged(judgement, RNG.normal(0, 0.002, len(ROWS))).forgotten.any()
+
+
+def test_a_little_worse_again_and_again_is_forgotten_in_the_end() -> None:
+    judgement = Judgement(FIELD)
+    forgotten = [judged(judgement, off(SECOND, 0.001 * n)).forgotten.any() for n in range(20)]
+    assert not forgotten[1]
+    assert any(forgotten)
+
+
+def test_what_fits_again_was_repaired() -> None:
+    judgement = Judgement(FIELD)
+    judged(judgement, off(FIRST, 0.0))
+    assert judged(judgement, off(FIRST, 0.03)).repaired == 0
+    places = judged(judgement, off(FIRST, 0.001))
+    assert (places.repaired, places.given_up, places.forgotten.any()) == (1, 0, False)
+
+
+def test_what_cannot_be_repaired_is_taken_as_it_is() -> None:
+    judgement = Judgement(FIELD)
+    judged(judgement, off(FIRST, 0.0))
+    tries = [judged(judgement, off(FIRST, 0.03)) for _ in range(5)]
+    assert [int(places.forgotten.sum()) for places in tries] == [1, 1, 1, 0, 0]
+    assert [places.given_up for places in tries] == [0, 0, 0, 1, 0]
+    assert sum(places.repaired for places in tries) == 0
+
+
+def test_a_place_that_is_seen_anew_may_change() -> None:
+    judgement = Judgement(FIELD)
+    judgement.judge(ROWS[FIRST][:300], NOISE[:300].astype(np.float32))
+    moved = (NOISE + off(FIRST, 0.05)).astype(np.float32)[FIRST]
+    assert not judgement.judge(ROWS[FIRST], moved).forgotten.any()
+
+
+def test_one_ray_in_some_dozens_is_held_out() -> None:
+    share = are_held_out(RNG.uniform(-300, 300, (100_000, 4)).astype(np.float32), FIELD).mean()
+    assert share == pytest.approx(1 / HELD_OUT, rel=0.1)
+
+
+def test_compiled_code_holds_out_the_same_rays() -> None:
+    rows = RNG.uniform(-900, 900, (100_000, 4)).astype(np.float32)
+    steps = ends_in_steps(rows, FIELD)
+    assert (are_held_out(rows, FIELD) == replay_rays.are_held_out(steps)).all()
+
+
+def test_rays_are_held_out_from_training_and_after_a_restart() -> None:
+    mapper = Mapper("test", settings(), "cpu")
+    for scan in world().scans:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    restarted = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
+    for region, again in zip(mapper.regions, restarted.regions, strict=True):
+        assert are_held_out(region.held_out.table.rows, settings().field).all()
+        for kept in (region, again):
+            table = kept.pool.table
+            trained = table.rows[table.origin_of >= 0]
+            assert not are_held_out(trained, settings().field).any()
+        assert len(again.held_out) == pytest.approx(len(region.held_out), rel=0.01)
+    assert sum(len(region.held_out) for region in mapper.regions) > 50
+
+
+def test_forgetting_is_found_told_and_repaired() -> None:
+    mapper = settled_mapper(settings(), world())
+    before_m = surface_error(mapper.publish(), world())
+    fit = map_fit(mapper.regions)
+    assert fit is not None
+    assert fit.repairing == 0
+    for region in mapper.regions:
+        values = region.field.features.values.numpy()
+        values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
+        region.budget_samples = 1  # for a step, since what was not trained was not judged
+    settle(mapper)
+    assert surface_error(mapper.publish(), world()) > 1.2 * before_m
+    assert map_fit(mapper.regions).repairing > 0
+    assert not mapper.settled
+    while not mapper.settled:
+        settle(mapper)
+        after = mapper.publish()
+    assert surface_error(after, world()) < 1.1 * before_m
+    assert map_fit(mapper.regions).repaired > 0
+
+
+def test_where_all_rays_are_held_out_there_is_nothing_to_train_on() -> None:
+    """Scans of a single point: some are held out, and nothing else is known."""
+    alone = 0
+    for shift_m in np.arange(0, 0.2, 0.002):
+        mapper = Mapper("test", settings(), "cpu")
+        mapper.ingest(np.array([[5.0 + shift_m, 0.1, 0.1]], np.float32), np.eye(4))
+        held = sum(len(region.held_out) for region in mapper.regions)
+        alone += held
+        assert mapper.settled == (held == 1)
+        mapper.train()
+        mapper.publish()
+    assert alone > 0
