@@ -20,7 +20,8 @@ HELD_OUT = 32
 AXIS_BITS = 21
 AXIS_MASK = (1 << AXIS_BITS) - 1
 MIXED = np.uint64(0x9E3779B97F4A7C15)  # 2**64 over the golden section
-MIXED_SHIFT = 40
+MIXED_SHIFT = 59
+"""The five upper bits hang on all of an end; rays are held out where they are zero."""
 
 
 def ray_keys(ends: NDArray[np.integer]) -> Longs:
@@ -37,8 +38,8 @@ def are_held_out(ends: NDArray[np.integer]) -> Bools:
 
     It hangs on their ends alone: rays that are read back are held out as before.
     """
-    mixed = ray_keys(ends).astype(np.uint64) * MIXED >> np.uint64(MIXED_SHIFT)
-    chosen: Bools = mixed % np.uint64(HELD_OUT) == 0
+    mixed = ray_keys(ends).astype(np.uint64) * MIXED
+    chosen: Bools = mixed >> np.uint64(MIXED_SHIFT) == 0
     return chosen
 
 

@@ -9,7 +9,7 @@ changes by::
     value    -= learning_rate * m / (sqrt(v) + EPSILON)
 
 Steps are counted row by row, so that the moments of a row that is new or seldom touched are
-corrected for its own age.
+corrected for its own age. A row's learning rate falls with its age, too: what is learnt hardens.
 """
 
 from functools import lru_cache
@@ -33,7 +33,7 @@ from triquad_map.compiled.field.field import (
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import THREADS, Team, share
 
-from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import HARDEST, SOFT_STEPS, Batch, LiveField, Parameter, Rates
 
 EPSILON = 1e-10
 
@@ -65,7 +65,10 @@ class CompiledRates(NamedTuple):
     learning_rate: float
     mean_decay: float
     variance_decay: float
-    mean_scales: Floats  # [n] correction of the mean after 1, 2, ... steps; the last for more
+    mean_scales: Floats
+    """[n] Correction of the mean after 1, 2, ... steps, times the share of the rate; the last for
+    more."""
+
     variance_scales: Floats  # [n] and of the variance
 
 
@@ -82,12 +85,13 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
 
 @lru_cache(maxsize=4)
 def _corrections(mean_decay: float, variance_decay: float) -> tuple[Floats, Floats]:
-    """Scales of mean and variance by age, tabulated until they no longer matter."""
+    """Scales of mean and variance by age, tabulated until they no longer change."""
     slowest = max(mean_decay, variance_decay)
     count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
-    ages = np.arange(1, count + 1)
+    ages = np.arange(1, max(count, int(SOFT_STEPS / HARDEST)) + 1)
+    shares = np.clip(SOFT_STEPS / ages, HARDEST, 1)
     return (
-        (1 / (1 - mean_decay**ages)).astype(np.float32),
+        (shares / (1 - mean_decay**ages)).astype(np.float32),
         (1 / (1 - variance_decay**ages)).astype(np.float32),
     )
 
@@ -292,9 +296,11 @@ class CompiledTrainer:
     def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
         """Adam on the MLP and on the rows that were touched, so many by each thread."""
         compiled = CompiledRates(*rates, *_corrections(rates.mean_decay, rates.variance_decay))
+        mlp_rate = self._field.next_mlp_rates(rates).learning_rate
+        of_mlp = compiled._replace(learning_rate=mlp_rate)
         for part, parameter in enumerate(self._field.mlp):
             gradient = np.sum([thread[part] for thread in mlp_sums], axis=0).reshape(1, -1)
-            _step_row(0, gradient, _parameter_rows(parameter), compiled)
+            _step_row(0, gradient, _parameter_rows(parameter), of_mlp)
         sums, features = self._sums, _parameter_rows(self._field.features)
         self._team.each(
             lambda part: _step_touched(

@@ -84,6 +84,14 @@ class Rates(NamedTuple):
     variance_decay: float
 
 
+SOFT_STEPS, HARDEST = 800, 0.1
+"""For so many steps a row of features learns at the full rate; after n times as many at an n-th of
+it, and at this share at least. What is learnt hardens, and moves little where others are."""
+
+_MLP_SOFT_STEPS, _MLP_HARDEST = 300, 0.02
+"""The MLP does so, and in addition so: all places of a region share it."""
+
+
 class LiveField:
     """Vertices with their feature vectors, the MLP and the Fourier frequencies of a region.
 
@@ -113,6 +121,7 @@ class LiveField:
         self.features = Parameter(torch.zeros((1, settings.feature_size), device=self.device))
         self.frequencies = frequencies
         self.mlp = [Parameter(part[None]) for part in mlp]
+        self.mlp_steps = 0  # that the MLP took; to read its own from a GPU would take a wait
         self._generator = generator
 
     @property
@@ -156,6 +165,12 @@ class LiveField:
         """Add the vertices ``codes`` [V] of one level with their ``features`` [V, d]."""
         self.tree.restore(plane, h, codes)
         self.features.append(features)
+
+    def next_mlp_rates(self, rates: Rates) -> Rates:
+        """The rates of the next step of the MLP, which hardens more than rows of features do."""
+        self.mlp_steps += 1
+        share = min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
+        return rates._replace(learning_rate=share * rates.learning_rate)
 
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""
@@ -236,7 +251,7 @@ def training_state(
         table_steps=tuple(_array(features.steps[chosen]) for chosen in rows),
         mlp_means=tuple(_array(part.means[0]) for part in mlp),
         mlp_variances=tuple(_array(part.variances[0]) for part in mlp),
-        mlp_steps=int(mlp[0].steps[0]),
+        mlp_steps=field.mlp_steps,
         sample_points=_array(samples.points),
         sample_labels=_array(samples.labels).astype(np.float16),
         budget_samples=budget_samples,
@@ -275,6 +290,7 @@ def _restore_optimiser(field: LiveField, state: TrainingState) -> None:
         torch.cat([zero, *variances]),
         torch.cat([zero[:, 0].int(), *steps]),
     )
+    field.mlp_steps = state.mlp_steps
     mlp = field.mlp[0::2] + field.mlp[1::2]
     for part, mean, variance in zip(mlp, state.mlp_means, state.mlp_variances, strict=True):
         taken = torch.full((1,), state.mlp_steps, dtype=torch.int32, device=device)

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from triquad_server.engine.compiled_trainer import EPSILON
-from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import HARDEST, SOFT_STEPS, Batch, LiveField, Parameter, Rates
 from triquad_server.engine.tensor_field import Corners, TensorField
 
 
@@ -32,9 +32,10 @@ class TensorTrainer:
             loss = F.binary_cross_entropy_with_logits(logits, target)
             torch.autograd.backward(loss)
         first_row = torch.zeros(1, dtype=torch.int64, device=field.device)
+        mlp_rates = self._field.next_mlp_rates(rates)
         for parameter, weight in zip(self._field.mlp, mlp, strict=True):
             assert weight.grad is not None
-            step_rows(parameter, first_row, weight.grad[None], rates=rates)
+            step_rows(parameter, first_row, weight.grad[None], rates=mlp_rates)
         if corners is not None and encoded is not None and encoded.grad is not None:
             self._step_features(corners, encoded.grad, rates)
         return loss.detach()
@@ -94,4 +95,4 @@ def _direction(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) ->
     age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
     mean = means / (1 - rates.mean_decay**age)
     deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()
-    return mean / (deviation + EPSILON)
+    return mean / (deviation + EPSILON) * (SOFT_STEPS / age).clamp(HARDEST, 1.0)

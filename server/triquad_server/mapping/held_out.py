@@ -33,8 +33,7 @@ def _held_out(rows: Floats, leaf_m: float, corner: float) -> Bools:
             leaves = np.float64(rows[i, END + axis]) / leaf_m + corner
             step = np.int64(np.floor(leaves * replay_rays.STEPS)) & replay_rays.AXIS_MASK
             key = key << np.uint64(replay_rays.AXIS_BITS) | np.uint64(step)
-        mixed = (key * replay_rays.MIXED) >> np.uint64(replay_rays.MIXED_SHIFT)
-        held[i] = mixed % np.uint64(replay_rays.HELD_OUT) == 0
+        held[i] = (key * replay_rays.MIXED) >> np.uint64(replay_rays.MIXED_SHIFT) == 0
     return held
 
 

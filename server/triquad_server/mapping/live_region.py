@@ -242,16 +242,16 @@ class LiveRegion:
         passing = rays_through(rays, normals, self.centre, self.pool.placement, self._ray_random)
         if len(passing) == 0:
             return
-        self._keep(passing)
-        samples = int(len(passing) * self._training.samples_per_ray)
+        samples = int(self._keep(passing) * self._training.samples_per_ray)
         self.budget_samples = min(self.budget_samples + samples, self._training.max_budget_samples)
         self._fresh_budget_samples = int(samples * self._training.fresh_share)
 
-    def _keep(self, rays: RayTable) -> None:
-        """Keep rays, some of which are held out."""
+    def _keep(self, rays: RayTable) -> int:
+        """Keep rays, some of which are held out; returns how many are to be trained on."""
         held = are_held_out(rays.rows, self._settings)
         self.held_out.add(rays.of(held))
         self.pool.add(rays.of(~held))
+        return len(rays) - int(held.sum())
 
     def limit_rays(self, limit: int) -> None:
         """Keep at most so many rays to train on, and the share of them that is held out."""
@@ -426,4 +426,4 @@ class LiveRegion:
     def _cooling(self) -> float:
         """Share of the learning rate: falls as the budget is used up, so that the field settles."""
         enough = self._training.cooldown * max(1, len(self.pool))
-        return min(1.0, max(_LEAST_RATE, self.budget_samples / enough))
+        return min(1.0, max(_LEAST_RATE, (self.budget_samples / enough) ** 2))

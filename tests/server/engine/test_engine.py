@@ -98,6 +98,22 @@ def test_training_goes_on_after_growth(compiled: bool) -> None:
     assert field.features.steps[before:].min() > 0
 
 
+@pytest.mark.parametrize("compiled", [False, True], ids=["tensors", "compiled"])
+def test_an_old_decoder_moves_less_than_a_young_one(compiled: bool) -> None:
+    settings = CASES[0]
+    moved = []
+    for age in (0, 100_000):
+        field = trained(settings)
+        field.mlp_steps = age
+        before = [part.values.clone() for part in field.mlp]
+        trainer = CompiledTrainer(field, GradientSums(), TEAM) if compiled else TensorTrainer(field)
+        trainer.train(samples(settings, 4000, seed=2), RATES)
+        pairs = zip(before, field.mlp, strict=True)
+        moved.append(sum(float((old - new.values).abs().sum()) for old, new in pairs))
+    young, old = moved
+    assert 0.01 * young < old < 0.05 * young
+
+
 def test_points_outside_the_cube_get_values_without_features() -> None:
     settings = FieldSettings(depth=8, frequencies=4)
     field = trained(settings)

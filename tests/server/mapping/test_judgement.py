@@ -135,3 +135,17 @@ def test_forgetting_is_found_told_and_repaired() -> None:
         after = mapper.publish()
     assert surface_error(after, world()) < 1.1 * before_m
     assert map_fit(mapper.regions).repaired > 0
+
+
+def test_where_all_rays_are_held_out_there_is_nothing_to_train_on() -> None:
+    """Scans of a single point: some are held out, and nothing else is known."""
+    alone = 0
+    for shift_m in np.arange(0, 0.2, 0.002):
+        mapper = Mapper("test", settings(), "cpu")
+        mapper.ingest(np.array([[5.0 + shift_m, 0.1, 0.1]], np.float32), np.eye(4))
+        held = sum(len(region.held_out) for region in mapper.regions)
+        alone += held
+        assert mapper.settled == (held == 1)
+        mapper.train()
+        mapper.publish()
+    assert alone > 0

@@ -69,7 +69,9 @@ def _learn(name: str, mapper: Mapper, scans: Sequence[PosedScan]) -> None:
             mapper.ingest(scan.points, scan.world_from_sensor)
             report(number, f"scan {number}")
         while not mapper.settled:
-            mapper.train()
+            while not mapper.settled:
+                mapper.train()
+            mapper.publish()  # what was forgotten is found then, and learnt again
         report(len(scans) + 1, "settled")
 
 

@@ -49,6 +49,7 @@ USUAL_PARTS = (
     *_USUAL_ON_STREET,
     "growth",
     "restart",
+    "far-scan",
     "air",
     "moving",
     "sweeps",
@@ -148,6 +149,7 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
         return []
     from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
     from triquad_tools.benchmarks.air import measure_air
+    from triquad_tools.benchmarks.far_scan import measure_far_scan
     from triquad_tools.benchmarks.moving import measure_moving
     from triquad_tools.benchmarks.presets import measure_presets
     from triquad_tools.benchmarks.restart import measure_restart
@@ -157,6 +159,7 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
     measures: dict[str, Callable[[int], list[Figure]]] = {
         "growth": _growth,
         "restart": measure_restart,
+        "far-scan": measure_far_scan,
         "air": measure_air,
         "moving": partial(measure_moving, folder=options.recorded),
         "sweeps": measure_sweeps,
