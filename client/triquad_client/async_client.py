@@ -113,8 +113,9 @@ class AsyncClient(AsyncMapQueries):
     async def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
         return await self._run(fetch_tile((x, y, z), level))
 
-    async def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
-        return await self._run(fetch_mesh(bounds, level, self._connection.max_download_bytes))
+    async def mesh(self, bounds: Bounds | None = None, level: int = 0, fill_m: float = 0.0) -> Mesh:
+        limit = self._connection.max_download_bytes
+        return await self._run(fetch_mesh(bounds, level, limit, fill_m))
 
     def watch_mesh(
         self,

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
-from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MIN_LENGTH_M
+from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MAX_FILL_M, MIN_LENGTH_M
 from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
 from triquad_sensors.errors import NO_NUMBER, InvalidScanError
@@ -157,6 +157,11 @@ def level_of_detail(level: int) -> int:
     if type(level) is not int or not 0 <= level < LEVELS:
         raise InvalidInputError(f"level = {_shown(level)}: use 0 to {LEVELS - 1}")
     return level
+
+
+def length_to_fill(fill_m: float) -> float:
+    """How far from seen surface a mesh is continued, metres."""
+    return within("fill_m", fill_m, MAX_FILL_M, least=0.0)
 
 
 def count(name: str, value: int, most: int) -> int:

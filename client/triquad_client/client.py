@@ -190,14 +190,17 @@ class Client(MapQueries):
         """The newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
         return self._run(fetch_tile((x, y, z), level))
 
-    def mesh(self, bounds: Bounds | None = None, level: int = 0) -> Mesh:
+    def mesh(self, bounds: Bounds | None = None, level: int = 0, fill_m: float = 0.0) -> Mesh:
         """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
+            fill_m: also the surface up to so far from what was seen, 0 to 5 m, where the field
+                continues it into ``UNKNOWN`` space; those faces are marked in ``Mesh.filled``.
         """
-        return self._run(fetch_mesh(bounds, level, self._connection.max_download_bytes))
+        limit = self._connection.max_download_bytes
+        return self._run(fetch_mesh(bounds, level, limit, fill_m))
 
     def watch_mesh(
         self,

@@ -1,3 +1,4 @@
+import dataclasses
 import io
 import struct
 import sys
@@ -38,6 +39,41 @@ def test_glb_puts_the_vertices_back_with_y_upwards(tmp_path):
     placed = local @ matrix[:3, :3].T + matrix[:3, 3]
     np.testing.assert_allclose(placed, np.stack([x, z, -y], axis=1), rtol=0, atol=1e-6)
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
+
+
+MARKED = dataclasses.replace(MESH, filled=np.array([False, True, False, True]))
+
+
+def test_ply_marks_the_faces_that_fill_holes():
+    data = MARKED.file_bytes(".ply")
+    assert b"uchar int vertex_indices\nproperty uchar filled\nend_header\n" in data
+    faces = np.frombuffer(data[-4 * 14 :], np.uint8).reshape(4, 14)
+    assert faces[:, -1].tolist() == [0, 1, 0, 1]
+    read = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
+    np.testing.assert_array_equal(read.faces, MESH.faces)
+
+
+def test_glb_holds_two_meshes():
+    scene = trimesh.load_scene(io.BytesIO(MARKED.file_bytes(".glb")), file_type="glb")
+    assert {name: len(part.faces) for name, part in scene.geometry.items()} == {
+        "seen": 2,
+        "filled": 2,
+    }
+    y_up = FAR[[0, 2, 1]] * (1, 1, -1)
+    np.testing.assert_allclose(scene.bounds - y_up, [(0, 0, -2), (1, 3, 0)], rtol=0, atol=1e-6)
+
+
+def test_obj_holds_two_objects():
+    _, seen, filled = MARKED.file_bytes(".obj").decode().split("\no ")
+    for name, part in (("seen", seen), ("filled", filled)):
+        lines = part.splitlines()
+        assert lines[0] == name
+        assert sum(line.startswith("f ") for line in lines) == 2
+
+
+def test_an_stl_cannot_mark_them():
+    with pytest.raises(InvalidInputError, match=r"use \.ply, \.glb or \.obj"):
+        MARKED.file_bytes(".stl")
 
 
 def test_what_is_done_to_a_copy_does_not_change_the_mesh():

@@ -219,6 +219,8 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
         (keys.GROUND, ground(1, 1.0, z=np.inf), "bad_request"),
         (keys.GROUND, ground(100_000, 100.0), "too_large"),
         (keys.TILE, TileRequest(2**62, 0, 0, 0), "bad_request"),
+        (keys.TILE, TileRequest(0, 0, 0, 0, fill_m=float("nan")), "bad_request"),
+        (keys.TILE, TileRequest(0, 0, 0, 0, fill_m=1e9), "bad_request"),
         (keys.TILE, TileRequest(0, -(2**63), 0, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN * np.nan, ORIGIN, 0), "bad_request"),

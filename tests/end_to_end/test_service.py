@@ -5,9 +5,10 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pytest
 import triquad_client
 from support import servers
-from triquad_client import Status
+from triquad_client import InvalidInputError, Status
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,
@@ -169,6 +170,25 @@ def test_tiles_make_one_mesh(client):
     assert len(border) > 100
     assert len(np.unique(np.round(border, 5), axis=0)) == len(border)
     assert mesh.epoch == listed.epoch
+
+
+def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):
+    client.reset()
+    points = servers.sphere(20_000)
+    for _ in range(5):
+        client.publish_scan(points[np.abs(points[:, 0]) > 0.3], np.eye(4))
+    client.flush(servers.WAIT_S)
+    client.settle(servers.WAIT_S)
+    plain, mesh = client.mesh(), client.mesh(fill_m=0.6)
+    assert plain.filled is None
+    assert (~mesh.filled).sum() == len(plain.faces)
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    assert mesh.filled.sum() > 100
+    assert np.abs(centres[mesh.filled, 0]).min() < 0.1
+    assert (client.query_sdf(centres[mesh.filled]).status != Status.FREE).all()
+    assert client.mesh(((50, 50, 50), (60, 60, 60)), fill_m=0.6).filled.shape == (0,)
+    with pytest.raises(InvalidInputError, match="fill_m = 9: use 0 to 5"):
+        client.mesh(fill_m=9)
 
 
 def test_meshes_are_cropped_to_bounds(client):

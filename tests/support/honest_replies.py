@@ -185,7 +185,8 @@ def _tiles(request: TileListRequest) -> TileList:
 
 
 def _tile(request: TileRequest) -> Tile:
-    return Tile(_epoch(request), EPOCH, np.zeros(3), vertices=CORNERS, faces=FACE)
+    filled = np.zeros(len(FACE), np.uint8) if request.fill_m > 0 else None
+    return Tile(_epoch(request), EPOCH, np.zeros(3), vertices=CORNERS, faces=FACE, filled=filled)
 
 
 def _updates(request: TileUpdatesRequest) -> TileUpdates:

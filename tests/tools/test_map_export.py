@@ -1,6 +1,7 @@
 """Meshes and grids that ``triquad-pack`` writes, opened by the libraries that people use."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -55,6 +56,15 @@ def test_meshes_lie_on_the_surface(map_file, tmp_path):
     assert np.quantile(np.abs(answer.sdf), 0.95) < 0.01
     mesh = trimesh.Trimesh(ply.vertices, ply.faces, process=False)
     assert len(mesh.edges_unique) < 2 * len(ply.faces)  # tiles are joined
+
+
+def test_holes_are_filled_and_marked_where_that_is_asked_for(map_file, tmp_path, capsys):
+    out = export(map_file, tmp_path, "mesh.ply", "--fill", "0.5", "--cell", "0.2", "--crop", *BOX)
+    told = re.search(r"([\d,]+) faces, ([\d,]+) of them filled", capsys.readouterr().out)
+    faces, filled = (int(number.replace(",", "")) for number in told.groups())
+    raw = trimesh.load(out, process=False).metadata["_ply_raw"]["face"]["data"]
+    assert len(raw) == faces
+    assert 0 < raw["filled"].sum() == filled < faces / 2
 
 
 @pytest.mark.parametrize("name", ["crop.triquad", "crop.ply", "crop.npz"])
@@ -191,6 +201,8 @@ def test_refusals(map_file, tmp_path, capsys):
     refused("--cell = 0.001 is out of range: use 0.01 to 10", "mesh.ply", "--cell", "0.001")
     refused(".triquad, .ply, .glb, .obj, .stl, .npz", "mesh.gltf")
     refused("--sparse is of .npz", "mesh.ply", "--sparse")
+    refused("--fill is of meshes that can mark it, .ply, .glb, .obj", "a.stl", "--fill", "1")
+    refused("--fill = 6.0 is out of range: use 0 to 5", "mesh.ply", "--fill", "6")
     refused("of map files", "mesh.ply", "--max-error", "2mm")
     refused("nowhere is not a folder", "nowhere/mesh.ply")
 

@@ -3,6 +3,7 @@
 What is fetched goes in the background of all else.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import InvalidInputError
-from triquad_format.records.arrays import Doubles, Ints
+from triquad_format.records.arrays import Bools, Doubles, Ints
 from triquad_format.wire import keys
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import DownloadError
+from triquad_client.errors import BadReplyError, DownloadError
 from triquad_client.net.call import NEWEST, Ask, Call, Run, ask, ask_each, offload, retried
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ _Y_UP = np.array([(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1.0)])
 """The map's axes, of which z points upwards, as those of a glTF scene."""
 
 _PLY_FACE = np.dtype([("count", "u1"), ("indices", "<i4", (3,))])
+_PLY_MARKED_FACE = np.dtype([*_PLY_FACE.descr, ("filled", "u1")])
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,9 @@ class Mesh:
     vertices: NDArray[np.float64]  # [V, 3] metres
     faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
     epoch: int = 0  # number of the published state of the map that it shows; 0: of none
+    # [F] whether no ray has met the surface there: it is continued from what was seen, and the
+    # status there is UNKNOWN; None where no holes were to be filled
+    filled: Bools | None = None
 
     def save(self, path: str | Path) -> None:
         """Write the mesh to a file: ``.ply``, or ``.glb``, ``.obj`` or ``.stl`` with trimesh.
@@ -55,8 +60,12 @@ class Mesh:
         the positions in a ``.glb``, but relative to the middle of the mesh: its node moves them
         back, and turns the map's z axis to the y axis that points upwards in a glTF scene.
 
+        Where holes were filled, a ``.ply`` marks the faces by their property ``filled``, 1 or 0;
+        a ``.glb`` and an ``.obj`` have two meshes, ``seen`` and ``filled``.
+
         Raises:
-            InvalidInputError: the name ends otherwise, or trimesh is not installed.
+            InvalidInputError: the name ends otherwise, trimesh is not installed, or holes were
+                filled, which an ``.stl`` cannot tell.
             OSError: the file cannot be written.
         """
         Path(path).write_bytes(self.file_bytes(Path(path).suffix))
@@ -85,40 +94,53 @@ class Mesh:
         return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
 
 
-def fetch_tiles(bounds: Bounds | None, level: int) -> Call[TileList]:
+def fetch_tiles(bounds: Bounds | None, level: int, fill_m: float = 0.0) -> Call[TileList]:
     """The tiles that meet the bounds."""
     minimum, maximum = checks.box(bounds)
-    request = TileListRequest(minimum, maximum, NEWEST, level=checks.level_of_detail(level))
+    request = TileListRequest(
+        minimum,
+        maximum,
+        NEWEST,
+        level=checks.level_of_detail(level),
+        fill_m=checks.length_to_fill(fill_m),
+    )
     return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
 
 
 def fetch_tile(index: Sequence[int], level: int) -> Call[Mesh]:
     """The newest mesh of one tile."""
-    tile = yield from ask(_ask_tile(index, NEWEST, checks.level_of_detail(level)))
-    return Mesh(tile.origin + tile.vertices.astype(np.float64), tile.faces, tile.epoch)
+    tile = yield from ask(_ask_tile(index, NEWEST, checks.level_of_detail(level), fill_m=0.0))
+    return _mesh_of(tile)
 
 
-def fetch_mesh(bounds: Bounds | None, level: int, max_bytes: int) -> Call[Mesh]:
+def fetch_mesh(
+    bounds: Bounds | None, level: int, max_bytes: int, fill_m: float = 0.0
+) -> Call[Mesh]:
     """The faces whose centroids lie in the bounds, from one epoch.
 
     Raises:
+        BadReplyError: holes were to be filled, which a server of an earlier release does not do.
         DownloadError: its tiles take more than ``max_bytes``.
     """
     box = checks.box(bounds)
 
     def fetch() -> Call[Mesh]:
-        listed = yield from fetch_tiles(bounds, level)
+        listed = yield from fetch_tiles(bounds, level, fill_m)
         indices = listed.tiles.tolist()
         tiles: list[Tile] = []
         for start in range(0, len(indices), _TILES_AT_A_TIME):
             part = indices[start : start + _TILES_AT_A_TIME]
-            tiles += yield from ask_each(part, lambda at: _ask_tile(at, listed.epoch, level))
+            tiles += yield from ask_each(
+                part, lambda at: _ask_tile(at, listed.epoch, level, fill_m=fill_m)
+            )
+            if fill_m > 0 and any(tile.filled is None for tile in tiles):
+                raise BadReplyError("the reply lacks filled, which was asked for by fill_m")
             if sum(tile.vertices.nbytes + tile.faces.nbytes for tile in tiles) > max_bytes:
                 raise too_large_error(max_bytes)
 
         def join(_: Run) -> Mesh:
-            parts = [Mesh(tile.origin + tile.vertices, tile.faces, tile.epoch) for tile in tiles]
-            return joined(parts, listed.tile_side_m, box=box, epoch=listed.epoch)
+            parts = [_mesh_of(tile) for tile in tiles]
+            return joined(parts, listed.tile_side_m, box=box, epoch=listed.epoch, marked=fill_m > 0)
 
         return (yield from offload(join))
 
@@ -133,32 +155,49 @@ def too_large_error(max_bytes: int) -> DownloadError:
     )
 
 
-def _ask_tile(index: Sequence[int], epoch: int, level: int) -> Ask[Tile]:
+def _ask_tile(index: Sequence[int], epoch: int, level: int, fill_m: float) -> Ask[Tile]:
     x, y, z = index
-    return Ask(keys.TILE, TileRequest(x, y, z, epoch=epoch, level=level), Tile, background=True)
+    request = TileRequest(x, y, z, epoch=epoch, level=level, fill_m=fill_m)
+    return Ask(keys.TILE, request, Tile, background=True)
+
+
+def _mesh_of(tile: Tile) -> Mesh:
+    marks = None if tile.filled is None else tile.filled.astype(np.bool_)
+    return Mesh(tile.origin + tile.vertices, tile.faces, tile.epoch, filled=marks)
 
 
 def joined(
-    tiles: Sequence[Mesh], tile_side_m: float, *, box: tuple[Doubles, Doubles], epoch: int
+    tiles: Sequence[Mesh],
+    tile_side_m: float,
+    *,
+    box: tuple[Doubles, Doubles],
+    epoch: int,
+    marked: bool = False,
 ) -> Mesh:
-    """The tiles' faces whose centroids lie in a box, given by its corners [3], as one mesh."""
+    """The tiles' faces whose centroids lie in a box, given by its corners [3], as one mesh.
+
+    Where the tiles are ``marked``, all tell which faces fill holes.
+    """
     starts = np.cumsum([0, *(len(tile.vertices) for tile in tiles)])
     shifted = [tile.faces + int(start) for tile, start in zip(tiles, starts, strict=False)]
+    marks = [tile.filled for tile in tiles if tile.filled is not None]
     whole = welded(
         np.concatenate([np.zeros((0, 3)), *(tile.vertices for tile in tiles)]),
         np.concatenate([np.zeros((0, 3), np.int32), *shifted]).astype(np.int32),
         tile_side_m,
+        filled=np.concatenate([np.zeros(0, np.bool_), *marks]) if marked else None,
     )
     centroids = whole.vertices[whole.faces].mean(axis=1)
     inside = ((centroids >= box[0]) & (centroids <= box[1])).all(axis=1)
-    return compacted(whole.vertices, whole.faces[inside], epoch)
+    filled = None if whole.filled is None else whole.filled[inside]
+    return compacted(whole.vertices, whole.faces[inside], epoch, filled)
 
 
-def welded(vertices: Doubles, faces: Ints, tile_side_m: float) -> Mesh:
+def welded(vertices: Doubles, faces: Ints, tile_side_m: float, filled: Bools | None = None) -> Mesh:
     """The mesh with one vertex where tiles had several, without faces that this made degenerate.
 
     Of ``vertices`` [V, 3], metres, only those on the sides of tiles, ``tile_side_m`` long, can be
-    the same.
+    the same; ``filled`` [F] is as of :class:`Mesh`.
     """
     steps = vertices / tile_side_m
     border = (np.abs(steps - np.round(steps)) < WELD_M / tile_side_m).any(axis=1)
@@ -167,15 +206,21 @@ def welded(vertices: Doubles, faces: Ints, tile_side_m: float) -> Mesh:
     target[shared] = shared[_representatives(vertices[shared])]
     joined = target[faces]
     a, b, c = joined.T
-    return compacted(vertices, joined[(a != b) & (b != c) & (c != a)])
+    kept = (a != b) & (b != c) & (c != a)
+    return compacted(vertices, joined[kept], filled=None if filled is None else filled[kept])
 
 
-def compacted(vertices: Doubles, faces: NDArray[np.integer], epoch: int = 0) -> Mesh:
+def compacted(
+    vertices: Doubles,
+    faces: NDArray[np.integer],
+    epoch: int = 0,
+    filled: Bools | None = None,
+) -> Mesh:
     """The mesh without vertices that no face uses."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     number = np.cumsum(used) - 1
-    return Mesh(vertices[used], number[faces].astype(np.int32).reshape(-1, 3), epoch)
+    return Mesh(vertices[used], number[faces].astype(np.int32).reshape(-1, 3), epoch, filled)
 
 
 def _representatives(points: Doubles) -> NDArray[np.intp]:
@@ -190,28 +235,57 @@ def _representatives(points: Doubles) -> NDArray[np.intp]:
 
 def _ply(mesh: Mesh) -> bytes:
     """Binary PLY in double precision; that of trimesh is single, and this one needs no library."""
+    marked = mesh.filled is not None
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment triquad, metres\n"
         f"element vertex {len(mesh.vertices)}\n"
         "property double x\nproperty double y\nproperty double z\n"
         f"element face {len(mesh.faces)}\n"
-        "property list uchar int vertex_indices\nend_header\n"
+        "property list uchar int vertex_indices\n"
+        f"{'property uchar filled' + chr(10) if marked else ''}end_header\n"
     )
-    rows = np.empty(len(mesh.faces), _PLY_FACE)
+    rows = np.empty(len(mesh.faces), _PLY_MARKED_FACE if marked else _PLY_FACE)
     rows["count"] = 3
     rows["indices"] = mesh.faces
+    if marked:
+        rows["filled"] = mesh.filled
     return header.encode("ascii") + mesh.vertices.astype("<f8").tobytes() + rows.tobytes()
 
 
 def _glb(mesh: Mesh) -> bytes:
-    surface = mesh.to_trimesh()
-    middle = surface.bounds.mean(axis=0) if len(mesh.faces) else np.zeros(3)
-    surface.vertices -= middle
+    middle = mesh.to_trimesh().bounds.mean(axis=0) if len(mesh.faces) else np.zeros(3)
+    scene = _scene(dataclasses.replace(mesh, vertices=mesh.vertices - middle))
     back = _Y_UP.copy()
     back[:3, 3] = _Y_UP[:3, :3] @ middle
-    scene = surface.scene(camera=None)
     scene.apply_transform(back)
     return _exported(scene, "glb")
+
+
+def _obj(mesh: Mesh) -> bytes:
+    return _exported(mesh.to_trimesh() if mesh.filled is None else _scene(mesh), "obj")
+
+
+def _stl(mesh: Mesh) -> bytes:
+    if mesh.filled is not None:
+        raise InvalidInputError(
+            "an .stl cannot tell which faces fill holes: use .ply, .glb or .obj, or no fill_m"
+        )
+    return _exported(mesh.to_trimesh(), "stl")
+
+
+def _scene(mesh: Mesh) -> "trimesh.Scene":
+    """The mesh in a scene; where holes were filled, in two parts, ``seen`` and ``filled``."""
+    whole = mesh.to_trimesh()
+    if mesh.filled is None or not len(mesh.faces):
+        return whole.scene(camera=None)
+    import trimesh
+
+    scene = trimesh.Scene()
+    for name, chosen in (("seen", ~mesh.filled), ("filled", mesh.filled)):
+        if chosen.any():
+            part = compacted(mesh.vertices, mesh.faces[chosen])
+            scene.add_geometry(part.to_trimesh(), node_name=name, geom_name=name)
+    return scene
 
 
 def _exported(surface: "trimesh.Trimesh | trimesh.Scene", kind: str) -> bytes:
@@ -222,6 +296,6 @@ def _exported(surface: "trimesh.Trimesh | trimesh.Scene", kind: str) -> bytes:
 _FORMATS: dict[str, Callable[[Mesh], bytes]] = {
     ".ply": _ply,
     ".glb": _glb,
-    ".obj": lambda mesh: _exported(mesh.to_trimesh(), "obj"),
-    ".stl": lambda mesh: _exported(mesh.to_trimesh(), "stl"),
+    ".obj": _obj,
+    ".stl": _stl,
 }

@@ -1,8 +1,9 @@
 """The surface of a map as triangles: marching cubes (Lorensen and Cline 1987), block by block.
 
 Lattice points are the multiples of the cell, as those of the server's meshes, so that all blocks
-agree on the points that they share. Only faces where rays have seen a surface are kept: elsewhere
-the field has zeros that nobody taught it.
+agree on the points that they share. Only faces where rays have seen a surface are kept, and, where
+that is asked for, those where it goes on into unknown space, which are marked: elsewhere the field
+has zeros that nobody taught it.
 """
 
 from collections.abc import Callable, Collection
@@ -11,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
-from triquad_format.records.cells import cells_of_boxes, rows_by_cell
+from triquad_format.records.cells import cell_names, cells_of_boxes, rows_by_cell
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
+from triquad_map.filling import filled_voxels, on_filled
 from triquad_map.view import MapView
 
 from triquad_client import checks
@@ -38,7 +40,7 @@ BlockIndex = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _Voxels:
-    """Voxels with seen surface, and the cells around each that may hold faces of it."""
+    """Voxels with surface, and the cells around each that may hold faces of it."""
 
     places: Longs  # [N, 3] on the lattice of voxels
     first: Longs  # [N, 3] least cell
@@ -53,18 +55,30 @@ class MeshBlocks:
     """
 
     def __init__(
-        self, view: MapView, seen: MapRecord, cell_m: float, box: tuple[Doubles, Doubles]
+        self,
+        view: MapView,
+        seen: MapRecord,
+        cell_m: float,
+        box: tuple[Doubles, Doubles],
+        fill_m: float,
     ) -> None:
         """Use ``OfflineMap.mesh_blocks``; ``box`` are corners [3]."""
         self._view = view
+        self._fill_m = fill_m
         self.cell_m = cell_m
         self.side_m = BLOCK_CELLS * cell_m
         """Of a block."""
         self._leaf_m = seen.settings.leaf_m
         self._reach_m = (0.5 + _REACH_LEAVES) * self._leaf_m + cell_m / 2  # to a cell's middle
         middles = surface_voxels(seen)
-        low, high = box[0] - 2 * self._reach_m, box[1] + 2 * self._reach_m
-        self._middles = middles[((middles >= low) & (middles <= high)).all(axis=1)]
+        margin_m = 2 * self._reach_m
+        if fill_m > 0:
+            margin_m += fill_m + self._leaf_m  # filling begins beside the box, too
+        low, high = box[0] - margin_m, box[1] + margin_m
+        middles = middles[((middles >= low) & (middles <= high)).all(axis=1)]
+        self._seen = len(middles)
+        self._filled = filled_voxels(view, _places(middles, self._leaf_m), fill_m)
+        self._middles = np.concatenate([middles, (self._filled.voxels + 0.5) * self._leaf_m])
         around = self._voxels(self._middles)
         blocks, rows = cells_of_boxes(around.first // BLOCK_CELLS, around.last // BLOCK_CELLS)
         self._rows = {
@@ -82,7 +96,8 @@ class MeshBlocks:
         Raises:
             InvalidInputError: scikit-image is not installed.
         """
-        voxels = self._voxels(self._middles[self._rows[index]])
+        rows = self._rows[index]
+        voxels = self._voxels(self._middles[rows])
         origin = np.array(index, np.int64) * BLOCK_CELLS
         cells = _covered(voxels.first - origin, voxels.last - origin)
         asked = np.argwhere(_any_of_eight(np.pad(cells, 1)))  # lattice points at their corners
@@ -96,20 +111,35 @@ class MeshBlocks:
         surface = _marched(volume, cells)
         vertices = (origin + surface.vertices) * self.cell_m
         middles = vertices[surface.faces].mean(axis=1)
-        seen = _beside(voxels.places, middles, self._leaf_m)
-        return Mesh(vertices, surface.faces[seen], self._view.epoch)
+        seen = _beside(voxels.places[rows < self._seen], middles, self._leaf_m)
+        if self._fill_m == 0:
+            return Mesh(vertices, surface.faces[seen], self._view.epoch)
+        filled = np.zeros(len(middles), np.bool_)
+        filled[~seen] = on_filled(
+            self._view,
+            self._filled.chosen(rows[rows >= self._seen] - self._seen),
+            middles[~seen],
+            reach_m=_REACH_LEAVES * self._leaf_m,
+            fill_m=self._fill_m,
+        )
+        kept = seen | filled
+        return Mesh(vertices, surface.faces[kept], self._view.epoch, filled[kept])
 
     def _voxels(self, middles: Doubles) -> _Voxels:
         """The voxels with these middles [N, 3]."""
         return _Voxels(
-            np.floor(middles / self._leaf_m).astype(np.int64),
+            _places(middles, self._leaf_m),
             np.ceil((middles - self._reach_m) / self.cell_m - 0.5).astype(np.int64),
             np.floor((middles + self._reach_m) / self.cell_m - 0.5).astype(np.int64),
         )
 
 
 def mesh_blocks(
-    view: MapView, seen: MapRecord, cell_m: float | None, bounds: Bounds | None
+    view: MapView,
+    seen: MapRecord,
+    cell_m: float | None,
+    bounds: Bounds | None,
+    fill_m: float = 0.0,
 ) -> MeshBlocks:
     """The blocks of a map; ``OfflineMap.mesh_blocks`` documents the rest.
 
@@ -117,7 +147,9 @@ def mesh_blocks(
     """
     chosen_m = _CELL_LEAVES * view.voxel_m if cell_m is None else cell_m
     checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
-    return MeshBlocks(view, seen, checked_m, checks.box(bounds))
+    return MeshBlocks(
+        view, seen, checked_m, checks.box(bounds), fill_m=checks.length_to_fill(fill_m)
+    )
 
 
 def map_mesh(
@@ -126,9 +158,10 @@ def map_mesh(
     bounds: Bounds | None,
     cell_m: float | None,
     report: Report | None,
+    fill_m: float = 0.0,
 ) -> Mesh:
     """The surface of a map where rays have seen one, whole; arguments as of :func:`mesh_blocks`."""
-    blocks = mesh_blocks(view, seen, cell_m, bounds)
+    blocks = mesh_blocks(view, seen, cell_m, bounds, fill_m)
     parts: list[Mesh] = []
     faces = 0
     for number, index in enumerate(blocks.indices, start=1):
@@ -141,7 +174,7 @@ def map_mesh(
             )
         if report is not None:
             report(number, len(blocks.indices))
-    return joined(parts, blocks.side_m, box=checks.box(bounds), epoch=view.epoch)
+    return joined(parts, blocks.side_m, box=checks.box(bounds), epoch=view.epoch, marked=fill_m > 0)
 
 
 def _marched(volume: Floats, cells: Bools) -> Mesh:
@@ -179,18 +212,20 @@ def _any_of_eight(flags: Bools) -> Bools:
     return flags[:, :, :-1] | flags[:, :, 1:]
 
 
+def _places(middles: Doubles, leaf_m: float) -> Longs:
+    """The voxels [N, 3] with these middles [N, 3], on the lattice of voxels."""
+    return np.floor(middles / leaf_m).astype(np.int64)
+
+
 def _beside(voxels: Longs, points: Doubles, leaf_m: float) -> Bools:
     """Whether points [P, 3] lie within the reach of any of the voxels [N, 3], on each axis."""
+    near = np.zeros(len(points), np.bool_)
+    if not len(voxels):
+        return near
     places = points / leaf_m
     sides = [np.floor(places + shift).astype(np.int64) for shift in (-_REACH_LEAVES, _REACH_LEAVES)]
     least = voxels.min(axis=0) - 1
-    near = np.zeros(len(points), np.bool_)
     for x, y, z in np.ndindex(2, 2, 2):
         corner = np.stack([sides[x][:, 0], sides[y][:, 1], sides[z][:, 2]], axis=1)
-        near |= np.isin(_key(corner - least), _key(voxels - least))
+        near |= np.isin(cell_names(corner - least), cell_names(voxels - least))
     return near
-
-
-def _key(cells: Longs) -> Longs:
-    """One number for each of cells [N, 3] that lie near to each other."""
-    return np.asarray((cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2])

@@ -97,6 +97,7 @@ class OfflineMap(MapQueries):
         bounds: Bounds | None = None,
         cell_m: float | None = None,
         report: Report | None = None,
+        fill_m: float = 0.0,
     ) -> Mesh:
         """The surface where rays have seen one, by marching cubes: the faces centred in ``bounds``.
 
@@ -105,25 +106,29 @@ class OfflineMap(MapQueries):
             cell_m: side of the cells, 0.005 to 10 m; ``None``: half a leaf, 0.1 m unless the map
                 was made with others, as in a server's mesh.
             report: is told after each block how many are done, and of how many.
+            fill_m: also the surface up to so far from what was seen, 0 to 5 m, where the field
+                continues it into ``UNKNOWN`` space; those faces are marked in ``Mesh.filled``.
 
         Raises:
-            InvalidInputError: the bounds are not a box, the cells are out of range, there are more
-                than 50 million faces, or scikit-image is not installed.
+            InvalidInputError: the bounds are not a box, the cells or ``fill_m`` are out of range,
+                there are more than 50 million faces, or scikit-image is not installed.
             ClosedError: the map was closed.
         """
-        return map_mesh(self._opened().view, self._seen, bounds, cell_m=cell_m, report=report)
+        view = self._opened().view
+        return map_mesh(view, self._seen, bounds, cell_m=cell_m, report=report, fill_m=fill_m)
 
-    def mesh_blocks(self, cell_m: float | None = None) -> MeshBlocks:
+    def mesh_blocks(self, cell_m: float | None = None, fill_m: float = 0.0) -> MeshBlocks:
         """The surface as :meth:`mesh` has it, everywhere, to be made block by block.
 
         Args:
             cell_m: as of :meth:`mesh`.
+            fill_m: as of :meth:`mesh`; the holes are found here, before any block is made.
 
         Raises:
-            InvalidInputError: the cells are out of range.
+            InvalidInputError: the cells or ``fill_m`` are out of range.
             ClosedError: the map was closed.
         """
-        return mesh_blocks(self._opened().view, self._seen, cell_m, bounds=None)
+        return mesh_blocks(self._opened().view, self._seen, cell_m, bounds=None, fill_m=fill_m)
 
     def surface_voxels(self) -> Doubles:
         """Middles [N, 3] of the voxels in which rays ended, metres, map frame."""

@@ -27,5 +27,8 @@ MAX_CELL_M = 1e3
 MAX_TILE_M = 1e5
 """Side of a mesh tile."""
 
+MAX_FILL_M = 5.0
+"""How far from seen surface a mesh may be continued."""
+
 MAX_CHUNK_BYTES = 64 * 2**20
 """Of a map file, in one reply."""

@@ -102,6 +102,7 @@ class TileListRequest(Message):
     maximum: Point
     epoch: int
     level: int = 0  # of detail: cells are 2**level times as large as those of level 0
+    fill_m: float = 0.0  # tiles with surface that is continued up to so far, too
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,7 @@ class TileRequest(Message):
     z: int
     epoch: int
     level: int = 0  # of detail
+    fill_m: float = 0.0  # how far from seen surface it is continued into unknown space; 0: not
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,8 @@ class Tile(MapReply):
     vertices: FinitePositions  # [V, 3] metres, relative to origin
     # [F, 3], counter-clockwise seen from free space
     faces: Annotated[Faces, IndicesOf("vertices")]
+    # [F] 1 where the surface was continued and no ray met it, else 0; None: was not asked for
+    filled: Annotated[StatusCodes, Within(0, 1), RowsOf("faces")] | None = None
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are
 _VERTICES_PER_SAMPLE = 14
 """Of a region, for each sample of a step: each vertex takes about as many steps wherever it is."""
 
-_LEAST_BATCH = 2048  # what a step costs however few its samples are matters below
+_LEAST_BATCH = 4096  # what a step costs however few its samples are matters below
 
 _NEW_SCANS = 10
 """So long after it was first seen, the field has had time to learn a surface."""
@@ -100,6 +100,8 @@ class LiveRegion:
         self.evidence = evidence
         _, seed = setup.seeds(index)
         self._random = np.random.default_rng(seed)
+        # Of its own: free space is recorded beside, by another thread.
+        self._ray_random = np.random.default_rng([seed, 1])
         new_pool = partial(
             ReplayPool,
             placement=Placement(
@@ -237,7 +239,7 @@ class LiveRegion:
 
         ``normals`` [N, 3] are those at the rays' ends, NaN where unknown.
         """
-        passing = rays_through(rays, normals, self.centre, self.pool.placement, self._random)
+        passing = rays_through(rays, normals, self.centre, self.pool.placement, self._ray_random)
         if len(passing) == 0:
             return
         samples = int(self._keep(passing) * self._training.samples_per_ray)

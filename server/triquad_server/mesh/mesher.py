@@ -19,7 +19,9 @@ from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import STEPS, TileSurface
 from triquad_map.compiled.kernel import kernel
 from triquad_map.composition.composed_view import ComposedView
+from triquad_map.filling import FilledVoxels, on_filled
 
+from triquad_server.mesh.holes import cells_beside, filled_in_box
 from triquad_server.mesh.marching_cubes import Crossings, centroids
 from triquad_server.settings import MeshSettings
 
@@ -161,6 +163,7 @@ class TileMesh:
     cell_m: float
     crossings: Crossings  # the mesh, in cells from the origin
     border: TileBorder  # what it was made of on its faces
+    filled: Bools  # [F] which faces fill holes
 
     @property
     def vertices(self) -> Floats:
@@ -181,7 +184,11 @@ class TileMesh:
 
 
 def mesh_tile(
-    source: ComposedView, tile: TileIndex, lattice: TileLattice, around: TileBorder | None = None
+    source: ComposedView,
+    tile: TileIndex,
+    lattice: TileLattice,
+    around: TileBorder | None = None,
+    fill_m: float = 0.0,
 ) -> TileMesh:
     """The surface within one tile.
 
@@ -190,18 +197,34 @@ def mesh_tile(
         tile: indices of the tile, which covers ``[tile, tile + 1) * tile_side_m``.
         lattice: that of its level.
         around: distances at some lattice points, which are used instead of the map's.
+        fill_m: how far from seen surface it is continued into unknown space, metres.
     """
     first = np.asarray(tile, np.int64) * lattice.cells
-    seen = _seen_cells(source, first, lattice)
-    volume, points = _lattice_values(source, seen, first=first, lattice=lattice, around=around)
-    found = Crossings(seen, volume)
+    cells = _seen_cells(source, first, lattice)
+    holes = FilledVoxels.joined([])
+    if fill_m > 0:
+        low = first.astype(np.float64) * lattice.cell_m - lattice.reach_m
+        high = low + lattice.tile_side_m + 2 * lattice.reach_m
+        holes = filled_in_box(source, low, high, fill_m)
+        beside = cells_beside(holes, source.voxel_m, lattice.cell_m, lattice.reach_m) - first
+        inside = ((beside >= 0) & (beside < lattice.cells)).all(axis=1)
+        cells = _each_once(np.concatenate([cells, beside[inside]]))
+    volume, points = _lattice_values(source, cells, first=first, lattice=lattice, around=around)
+    found = Crossings(cells, volume)
     middles = centroids((found.places + first) * lattice.cell_m, found.faces)
-    found.keep(source.status(middles, lattice.reach_m) == Status.SURFACE)
+    kept = source.status(middles, lattice.reach_m) == Status.SURFACE
+    filled = ~kept
+    filled[filled] = on_filled(
+        source, holes, middles[filled], reach_m=lattice.reach_m, fill_m=fill_m
+    )
+    kept |= filled
+    found.keep(kept)
     return TileMesh(
         origin=(first * lattice.cell_m).astype(np.float64),
         cell_m=lattice.cell_m,
         crossings=found,
         border=TileBorder.of_tile(points, volume),
+        filled=filled[kept],
     )
 
 

@@ -8,6 +8,7 @@ from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRe
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
+from triquad_server.mesh.holes import check_fill
 from triquad_server.mesh.mesher import TileLattice, check_box, check_level, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
 
@@ -34,9 +35,10 @@ class TileQueries:
         """
         check_box(request.minimum, request.maximum)
         check_level(request.level)
+        check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
         lattice = self._cache.lattice(request.level)
-        tiles = surface_tiles(epoch, lattice)
+        tiles = surface_tiles(epoch, lattice, request.fill_m)
         tiles = tiles[lattice.meets(tiles, request.minimum, request.maximum)]
         if len(tiles) > MAX_TILES:
             raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
@@ -62,8 +64,10 @@ class TileQueries:
                 f"tile {index} is out of range: use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
             )
         check_level(request.level)
+        check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
-        mesh = mesh_tile(epoch, index, self._cache.lattice(request.level))
+        lattice = self._cache.lattice(request.level)
+        mesh = mesh_tile(epoch, index, lattice, fill_m=request.fill_m)
         # A change that no refresh found yet shows in a later list: the tile is fetched again then.
         (changed,) = self._cache.changed(request.level, np.array([index])).tolist()
         return Tile(
@@ -72,11 +76,15 @@ class TileQueries:
             origin=mesh.origin,
             vertices=mesh.vertices,
             faces=mesh.faces,
+            filled=mesh.filled.astype(np.uint8) if request.fill_m > 0 else None,
         )
 
 
-def surface_tiles(epoch: Epoch, lattice: TileLattice) -> Ints:
-    """Tiles [T, 3], sorted, that meet a block with seen surface, or what is meshed around it."""
+def surface_tiles(epoch: Epoch, lattice: TileLattice, fill_m: float = 0.0) -> Ints:
+    """Tiles [T, 3], sorted, that meet a block with seen surface, or what is meshed around it.
+
+    That is more where the surface is continued up to ``fill_m``.
+    """
     settings = epoch.field_settings
     side_m = BLOCK_VOXELS * settings.leaf_m
     corners = [np.zeros((0, 3))]
@@ -84,4 +92,5 @@ def surface_tiles(epoch: Epoch, lattice: TileLattice) -> Ints:
         origin = region.centre - settings.region_side_m / 2
         corners.append(region.evidence.surface_cells() * side_m + origin)
     low = np.concatenate(corners)
-    return lattice.tiles_meeting(low, low + side_m, lattice.reach_m).astype(np.int32)
+    margin_m = lattice.reach_m + fill_m
+    return lattice.tiles_meeting(low, low + side_m, margin_m).astype(np.int32)

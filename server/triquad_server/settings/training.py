@@ -13,7 +13,7 @@ class TrainingSettings(BaseModel):
     model_config = SECTION
 
     batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
-    """Samples per step, at most: it is one for each 14 vertices of a region, and at least 2048, so
+    """Samples per step, at most: it is one for each 14 vertices of a region, and at least 4096, so
     that a street learns alike in one region and across several."""
 
     learning_rate: Annotated[float, Field(ge=0, le=1)] = 0.01

@@ -1,6 +1,10 @@
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from support.small_world import settings, settled_epoch, world
+from triquad_client import OfflineMap
+from triquad_format.records.status import Status
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import TileMesh, mesh_tile, tile_lattice
@@ -66,6 +70,36 @@ def test_neighbouring_tiles_meet_without_seams(
 def test_nothing_is_meshed_where_nothing_was_seen(epoch: Epoch) -> None:
     for outside_or_below_ground in ((1000, 1000, 1000), (0, 0, -3)):
         assert len(mesh_tile(epoch, outside_or_below_ground, LATTICE).faces) == 0
+
+
+# Ambiguous cells differ; and tiles of level 1 reach farther beside voxels.
+@pytest.mark.parametrize(("level", "differ"), [(0, 0.02), (1, 0.1)])
+def test_holes_of_tiles_are_those_of_the_map_in_one_piece(
+    epoch: Epoch, level: int, differ: float
+) -> None:
+    lattice, fill_m = tile_lattice(settings().mesh, level), 0.6
+    low, high = np.array([0.0, -12.8, -12.8]), np.array([12.8, 0.0, 12.8])
+    indices = surface_tiles(epoch, lattice, fill_m)
+    inside = lattice.meets(indices, low + 1, high - 1)
+    made = [mesh_tile(epoch, (*index,), lattice, fill_m=fill_m) for index in indices[inside]]
+    seen, filled = (
+        np.concatenate([_middles(tile)[tile.filled == kind] for tile in made]) for kind in (0, 1)
+    )
+    with OfflineMap(epoch.record()) as offline:
+        whole = offline.mesh((low, high), lattice.cell_m, fill_m=fill_m)
+    middles = whole.vertices[whole.faces].mean(axis=1)
+    assert len(filled) > 0.02 * len(seen)
+    assert len(filled) == pytest.approx(whole.filled.sum(), rel=differ)
+    away = cKDTree(middles[whole.filled]).query(filled)[0]
+    assert (away < lattice.cell_m / 2).mean() > 1 - differ
+    assert (epoch.status(filled, 0.0) != Status.FREE).all()
+    plain = [mesh_tile(epoch, (*index,), lattice) for index in indices[inside]]
+    assert sum(len(tile.faces) for tile in plain) == len(seen)
+    assert not any(tile.filled.any() for tile in plain)
+
+
+def _middles(tile: TileMesh) -> NDArray[np.float64]:
+    return tile.origin + tile.vertices.astype(np.float64)[tile.faces].mean(axis=1)
 
 
 def test_meshes_are_repeatable(

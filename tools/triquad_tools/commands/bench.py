@@ -36,6 +36,7 @@ _USUAL_ON_STREET = (
     "file",
     "store",
     "mesh",
+    "fill",
     "answers",
     "align",
     "offline",
@@ -102,6 +103,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
     from triquad_tools.benchmarks.borders import measure_borders
     from triquad_tools.benchmarks.core import measure_core
     from triquad_tools.benchmarks.file import measure_file, measure_offline
+    from triquad_tools.benchmarks.fill import measure_fill
     from triquad_tools.benchmarks.mesh import measure_mesh
     from triquad_tools.benchmarks.neighbours import measure_neighbours
     from triquad_tools.benchmarks.planners import measure_planners
@@ -118,6 +120,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
         "file": measure_file,
         "store": measure_store,
         "mesh": measure_mesh,
+        "fill": measure_fill,
         "answers": measure_planners,
         "align": partial(measure_align, folder=options.recorded),
         "offline": measure_offline,
@@ -223,12 +226,12 @@ def _part(name: str) -> str:
 _DESCRIPTION = (
     "Measure triquad on this machine, on a simulated street: a server under a "
     "10 Hz lidar, its core against eager torch, a map that grows to 16 regions, one that is "
-    "restored, the map file, checkpoints, mesh tiles, answers to planners, scans put back, "
-    "maps opened offline, a server whose metrics are read, one with roles, clients that want too "
-    "much, a street across borders of regions, open air, things that move, a lidar that moves "
-    "while it turns, clouds of ROS 2, rooms, tables and streets with the presets that are for "
-    "them, and, if asked for, the viewer in a browser and the ablation. Takes over half an hour; "
-    "nothing else should run meanwhile."
+    "restored, the map file, checkpoints, mesh tiles, filled holes, answers to planners, scans put "
+    "back, maps opened offline, a server whose metrics are read, one with roles, clients that want "
+    "too much, a street across borders of regions, a scan far away, open air, things that move, a "
+    "lidar that moves while it turns, clouds of ROS 2, rooms, tables and streets with the presets "
+    "that are for them, and, if asked for, the viewer in a browser and the ablation. Takes over "
+    "half an hour; nothing else should run meanwhile."
 )
 
 

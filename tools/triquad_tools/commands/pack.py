@@ -12,8 +12,9 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
 from triquad_format.records.field_settings import check_range
 from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
+from triquad_format.wire.limits import MAX_FILL_M
 
-from triquad_tools.console.arguments import add_version, error_limit, positive
+from triquad_tools.console.arguments import add_version, error_limit, not_negative, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.mapfiles.grid import export_grid
@@ -30,6 +31,7 @@ from triquad_tools.mapfiles.source import (
 _COMMAND = "triquad-pack"
 _DAMAGE = (DamagedMapFileError, NothingLeftError)
 _MAP, _MESHES, _GRID, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".npz", ".png"
+_MARKED = (".ply", ".glb", ".obj")  # meshes that can tell which faces fill holes
 _SUFFIXES = (_MAP, *_MESHES, _GRID, _PICTURE)
 _PLANES = ("XY", "XZ", "YZ")
 _GRID_CELL_M = 0.2
@@ -98,6 +100,14 @@ def _add_target(add: _Add) -> None:
         metavar="M",
         help=f"side of cells (default: half a leaf of a mesh, {_GRID_CELL_M:g} of {_GRID})",
     )
+    add(
+        "--fill",
+        type=not_negative,
+        default=0.0,
+        metavar="M",
+        help="of a mesh: continue surface into unknown space, where the field does, up to so far "
+        f"from what was seen, at most {MAX_FILL_M:g} m; those faces are marked",
+    )
     add("--sparse", action="store_true", help=f"{_GRID}: only blocks around surface, not a box")
     add("--force", action="store_true", help="replace OUT where it exists")
 
@@ -141,6 +151,9 @@ def _check_usage(options: argparse.Namespace) -> None:
             options.max_error and options.precision in ("fp16", "fp32")
         ),
         "--cell is of meshes and grids: a map file has none": options.cell and suffix == _MAP,
+        f"--fill is of meshes that can mark it, {', '.join(_MARKED)}": (
+            options.fill and suffix not in _MARKED
+        ),
         f"--sparse is of {_GRID}": options.sparse and suffix != _GRID,
     }
     refuse(problems)
@@ -176,7 +189,9 @@ def _export(options: argparse.Namespace, path: Path) -> int:
     box, output = _box(options.crop), options.output
     if options.cell is not None:
         check_range("--cell", options.cell, *_CELL_RANGE_M)
-    margin_m = _MARGIN_CELLS * (options.cell or _GRID_CELL_M)
+    if options.fill:
+        check_range("--fill", options.fill, 0.0, MAX_FILL_M)
+    margin_m = _MARGIN_CELLS * (options.cell or _GRID_CELL_M) + options.fill
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
     if output.suffix == _GRID:
@@ -189,7 +204,7 @@ def _export(options: argparse.Namespace, path: Path) -> int:
     else:
         from triquad_tools.mapfiles.meshfile import export_mesh  # slow to import
 
-        written = export_mesh(source.record, box, options.cell, path=output)
+        written = export_mesh(source.record, box, options.cell, path=output, fill_m=options.fill)
     print_line(f"{output}: {written}")
     return OK if complete else FAILED
 

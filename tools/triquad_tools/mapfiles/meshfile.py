@@ -45,11 +45,13 @@ def read_mesh(path: Path) -> Mesh:
     return Mesh(vertices, faces)
 
 
-def export_mesh(record: MapRecord, box: Box | None, cell_m: float | None, path: Path) -> str:
+def export_mesh(
+    record: MapRecord, box: Box | None, cell_m: float | None, path: Path, fill_m: float = 0.0
+) -> str:
     """Write the mesh of a map; returns what was written.
 
     Its cells have the side ``cell_m``, half a leaf where that is not given. Given a box, it has
-    the faces whose centroids lie in it.
+    the faces whose centroids lie in it. Surface is continued up to ``fill_m`` into unknown space.
 
     Raises:
         InvalidInputError: the mesh is too large, or a library is missing.
@@ -58,10 +60,13 @@ def export_mesh(record: MapRecord, box: Box | None, cell_m: float | None, path: 
     """
     bounds = None if box is None else (box[0].tolist(), box[1].tolist())
     with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
-        mesh = opened.mesh(bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"))
+        mesh = opened.mesh(
+            bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"), fill_m
+        )
     if box is not None and len(mesh.faces) == 0:
         raise NothingLeftError(f"{path} is not written: no surface was seen in the box of --crop")
     packed = mesh.file_bytes(path.suffix)
     with replacing(path) as stream:
         stream.write(packed)
-    return f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
+    written = f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
+    return written if mesh.filled is None else f"{written}, {mesh.filled.sum():,} of them filled"
