@@ -31,6 +31,7 @@ def test_a_map_goes_on_from_large_epochs(tmp_path: Path, epoch: int) -> None:
         client.flush(30.0)
         assert client.query_sdf(servers.sphere(10)).epoch > epoch
         assert all(box.epoch > epoch for box in client.changes(since=epoch).boxes)
+        client.settle(30.0)
         assert client.mesh().faces.size
         assert client.checkpoint().epoch > epoch
         assert client.reset().epoch > epoch
