@@ -81,6 +81,9 @@ class Health:
             map_bytes=progress.map_bytes,
             map_max_bytes=self.map_max_bytes,
             fit=progress.fit,
+            rays_discarded=progress.rays_discarded,
+            replay_share=progress.replay_share,
+            samples_discarded=progress.samples_discarded,
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
