@@ -30,7 +30,7 @@ ENDLESS_S = 1800.0
 
 _BEATS_PER_LOG_LINE = 5
 _BEATS_PER_TRIM = 10  # of the memory
-_TRIMMED_AT_BYTES = 32 << 20
+_TRIMMED_AT_BYTES = 16 << 20
 """Where memory grew by so much, it is trimmed at once: much was asked."""
 
 
