@@ -28,7 +28,7 @@ WITHHELD_EVERY = 4
 RANGES_M = (2.0, 50.0)
 SETTINGS = Settings(
     scan=ScanSettings(range_min_m=RANGES_M[0], range_max_m=RANGES_M[1]),
-    training=TrainingSettings(samples_per_ray=12.0),
+    training=TrainingSettings(samples_per_ray=12.0, samples_per_voxel=50.0),
     service=ServiceSettings(scan_queue=64),
     ros2=Ros2Settings(enabled=True),
 )
