@@ -6,7 +6,7 @@ from pathlib import Path
 import msgpack
 import pytest
 from support import spec_reader
-from support.map_records import assert_same, random_record, with_rays
+from support.map_records import assert_same, random_record, with_progress, with_rays
 from support.mapfile_edit import (
     assert_refused,
     edited,
@@ -23,7 +23,6 @@ from triquad_format.mapfile.parts.body import unpack_body
 from triquad_format.mapfile.parts.part import MANIFEST, MAP, TRAINING
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord
 from triquad_format.recovery.recovered_map import recover
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -37,18 +36,7 @@ BYTES = bytes.fromhex(
 )  # fmt: skip
 
 
-def with_progress(record: MapRecord) -> MapRecord:
-    """The record of a map that has come some way, whose regions have forgotten at times."""
-    regions = []
-    for region in record.regions:
-        assert region.training is not None
-        counts = {"places_repaired": 3, "places_given_up": 1}
-        training = dataclasses.replace(region.training, **counts)
-        regions.append(dataclasses.replace(region, training=training))
-    return dataclasses.replace(record, regions=tuple(regions), progress=PROGRESS)
-
-
-RECORD = with_progress(with_rays(random_record(3)))
+RECORD = with_progress(with_rays(random_record(3)), PROGRESS)
 DATA = file_bytes(RECORD)
 
 
