@@ -30,7 +30,7 @@ ENDLESS_S = 1800.0
 
 _BEATS_PER_LOG_LINE = 5
 _BEATS_PER_TRIM = 10  # of the memory
-_TRIMMED_AT_BYTES = 32 << 20
+_TRIMMED_AT_BYTES = 16 << 20
 """Where memory grew by so much, it is trimmed at once: much was asked."""
 
 
@@ -81,6 +81,9 @@ class Health:
             map_bytes=progress.map_bytes,
             map_max_bytes=self.map_max_bytes,
             fit=progress.fit,
+            rays_discarded=progress.rays_discarded,
+            replay_share=progress.replay_share,
+            samples_discarded=progress.samples_discarded,
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:

@@ -155,9 +155,10 @@ def test_paths_bend_away_from_what_blocks_the_straight_one(run: Run) -> None:
 @pytest.mark.parametrize(
     ("arguments", "stop_m", "why"),
     [
-        ([], 7.0, "a step of +0.1"),  # the kerb
+        ([], 7.0, r"a step of \+0.1"),  # the kerb
         (["--step", "0.2"], 9.7, "the ground was not seen"),  # a house
-        (["--goal", "14", "-9", "--start", "14", "2"], 5.0, "the ground was not seen"),  # a car
+        # A car, of whose side the map may show a part.
+        (["--goal", "14", "-9", "--start", "14", "2"], 5.0, "not seen|a step"),
     ],
 )
 def test_a_robot_stops_where_it_cannot_stand(
@@ -166,7 +167,7 @@ def test_a_robot_stops_where_it_cannot_stand(
     output = run("walk.py", *arguments)
     found = re.search(r"stop after ([\d.]+) m: (.+)", output)
     assert float(found[1]) == pytest.approx(stop_m, abs=0.3)
-    assert why in found[2]
+    assert re.search(why, found[2])
 
 
 def test_a_robot_goes_on_along_the_road(run: Run) -> None:

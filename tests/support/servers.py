@@ -36,10 +36,10 @@ MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
 SMALL = Settings(
     field=FieldSettings(depth=7),
-    training=TrainingSettings(batch=2048, samples_per_ray=10.0, pool_rays=20_000),
+    training=TrainingSettings(batch=2048, samples_per_ray=10.0, pool_bytes=480_000),
 )
 SMALL_TOML = (
-    "[field]\ndepth = 7\n[training]\nbatch = 2048\nsamples_per_ray = 10.0\npool_rays = 20000\n"
+    "[field]\ndepth = 7\n[training]\nbatch = 2048\nsamples_per_ray = 10.0\npool_bytes = 480000\n"
 )
 RADIUS_M = 4.0
 

@@ -62,7 +62,8 @@ def test_a_server_that_is_gone_is_told_of_until_it_is_back(page_of: PageOf) -> N
         learn(client)
         page = page_of(endpoint)
         wait_until_drawn(page)
-    expect(page.get_by_text("⚠")).to_be_visible(timeout=60_000)
+        expect(page.get_by_text("no server has a map")).to_be_hidden()
+    expect(page.get_by_text("no server has a map")).to_be_visible(timeout=60_000)
     assert drawn_share(page) > 0.005, "what is known stays"
     with running_service(endpoint=endpoint), connect(endpoint) as client:
         expect(page.get_by_text("0 taken")).to_be_visible(timeout=60_000)

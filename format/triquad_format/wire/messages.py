@@ -241,6 +241,11 @@ class ServerStatus(Message):
     map_bytes: Count = 0  # memory of the map with its newest epoch
     map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not told
     fit: FieldFit | None = None  # as it was judged last, None: not yet
+    rays_discarded: Count = 0  # that gave way to others, since the server started
+    replay_share: Annotated[float, Within(0, 1)] = 1.0
+    """Of the rays that each place is to keep, the share that memory has room for."""
+
+    samples_discarded: Count = 0  # that more than a region may owe would have been
 
 
 @dataclass(frozen=True)

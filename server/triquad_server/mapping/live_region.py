@@ -39,6 +39,7 @@ from triquad_server.engine.live_field import (
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.fair_share import FairShare
 from triquad_server.mapping.held_out import are_held_out, both_tables
 from triquad_server.mapping.judgement import JudgedPlaces, Judgement, Repairs
 from triquad_server.mapping.memory_budget import RegionSize
@@ -85,10 +86,6 @@ _REPAIR_VISITS = 16  # to each ray there
 _CPU = torch.device("cpu")
 
 
-def _held_out_limit(pool_rays: int) -> int:
-    return max(1, pool_rays // HELD_OUT)
-
-
 class LiveRegion:
     """A region that is being mapped, by one thread. Everything public is in the map frame."""
 
@@ -117,8 +114,8 @@ class LiveRegion:
             seed=seed,
             team=setup.team,
         )
-        self.pool = new_pool(setup.training.pool_rays, device=setup.device)
-        self.held_out = new_pool(_held_out_limit(setup.training.pool_rays), device=_CPU)
+        self.pool = new_pool(device=setup.device)
+        self.held_out = new_pool(device=_CPU)
         self.places: JudgedPlaces | None = None
         """How well the field fits the rays that are held out, as it was judged last."""
 
@@ -127,6 +124,8 @@ class LiveRegion:
         self._unjudged_samples = 0  # that were trained since
         self._repair_budget_samples = 0  # that are to be from places that have forgotten
         self.budget_samples = 0  # the training budget: samples that are still to be trained on
+        self._most_budget_samples = 0  # that may be owed
+        self.samples_discarded = 0  # so far, that were more
         self._fresh_budget_samples = 0  # those of them that are to be from the newest scan
         self.changed = True  # since it was last published
         self._restored = False  # and not published since: where surfaces lie is in the field alone
@@ -163,8 +162,7 @@ class LiveRegion:
         if state is not None:
             region._keep(restored_rays(state.rays, setup.field))
             region.pool.add(samples_alone(state.sample_points, state.sample_labels))
-            most = setup.training.max_budget_samples if len(region.pool) else 0
-            region.budget_samples = min(state.budget_samples, most)
+            region.budget_samples = state.budget_samples if len(region.pool) else 0
             region.repairs = Repairs(state.places_repaired, state.places_given_up)
             # What it forgets from now on is told from what it knows now.
             region._judge(region.field.freeze())
@@ -247,7 +245,8 @@ class LiveRegion:
         if len(passing) == 0:
             return
         samples = int(self._keep(passing) * self._training.samples_per_ray)
-        self.budget_samples = min(self.budget_samples + samples, self._training.max_budget_samples)
+        self.budget_samples += samples
+        self._limit_budget()
         self._fresh_budget_samples = int(samples * self._training.fresh_share)
 
     def _keep(self, rays: RayTable) -> int:
@@ -257,10 +256,19 @@ class LiveRegion:
         self.pool.add(rays.of(~held))
         return len(rays) - int(held.sum())
 
-    def limit_rays(self, limit: int) -> None:
-        """Keep at most so many rays to train on, and the share of them that is held out."""
-        self.pool.limit(limit)
-        self.held_out.limit(_held_out_limit(limit))
+    def limit(self, share: FairShare) -> None:
+        """From now on, keep as many rays and owe as many samples as are its share."""
+        voxels = self.size.evidence.voxels
+        rays = max(1, int(share.rays * voxels))
+        self.pool.limit(rays)
+        self.held_out.limit(max(1, rays // HELD_OUT))
+        self._most_budget_samples = int(share.samples * voxels)
+        self._limit_budget()
+
+    def _limit_budget(self) -> None:
+        too_many = max(0, self.budget_samples - self._most_budget_samples)
+        self.budget_samples -= too_many
+        self.samples_discarded += too_many
 
     def ray_ends(self) -> Doubles:
         """Where the rays end [N, 3] that are kept, those of the newest scans last."""
@@ -396,9 +404,8 @@ class LiveRegion:
             )
         attended = self.pool.attend(places.forgotten_keys, self._settings)
         self._repair_budget_samples = _REPAIR_VISITS * attended
-        most = self._training.max_budget_samples
         needed = int(self._repair_budget_samples / _REPAIR_SHARE)
-        self.budget_samples = max(self.budget_samples, min(needed, most))
+        self.budget_samples = max(self.budget_samples, min(needed, self._most_budget_samples))
 
     def _surfels(
         self, evidence: FrozenEvidence, field: SampleField, epoch: int, before: FrozenRegion | None

@@ -17,12 +17,12 @@ from triquad_server.engine.shortage import shortages
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
+from triquad_server.mapping.fair_share import FairShare
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.regions_around import regions_around
-from triquad_server.mapping.replay_pool import shared_limit
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ANY_SOURCE, Settings
 
@@ -77,6 +77,7 @@ class Mapper:
         self._structure_changed = True
         # Regions of the newest epoch that a failed scan took, and for which memory is short.
         self._missing: dict[RegionIndex, FrozenRegion] = {}
+        self._share = FairShare.of(0, settings.training)
         # Of the map: a restart goes on counting.
         progress = record.progress if record else MapProgress()
         self.scans_taken = progress.scans_taken
@@ -85,7 +86,7 @@ class Mapper:
         for region in record.regions if record else ():
             self._regions[region.index] = live = LiveRegion.restore(region, self._setup)
             self._normals.restore(live.ray_ends())
-        self._share_pool()
+        self._share_out()
 
     def _no_normals(self) -> SurfaceNormals:
         return SurfaceNormals(self._field_settings.leaf_m, self._teams.mapping)
@@ -133,6 +134,21 @@ class Mapper:
     def rays_kept(self) -> int:
         """Rays that the replay pools hold an interval of, counted once for each region."""
         return sum(len(region.pool) for region in self._regions.values())
+
+    @property
+    def rays_discarded(self) -> int:
+        """Rays so far that gave way to others, or were too many."""
+        return sum(region.pool.discarded for region in self._regions.values())
+
+    @property
+    def samples_discarded(self) -> int:
+        """Samples so far that more than the regions may owe would have been."""
+        return sum(region.samples_discarded for region in self._regions.values())
+
+    @property
+    def replay_share(self) -> float:
+        """Of the rays that each place is to keep, the share that memory has room for."""
+        return self._share.rays_share
 
     def ingest(
         self,
@@ -197,9 +213,9 @@ class Mapper:
             for region in regions:
                 beside(region.see(rays, stamp_s))
             normals = self._normals.add(rays.ends, rays.origin)
+            self._share_out()  # by the voxels that are seen by now
             for region in regions:
                 region.learn(rays, normals)
-            self._share_pool()
         for region in regions:
             region.set_normals(normals)
 
@@ -233,7 +249,7 @@ class Mapper:
         for index, frozen in list(self._missing.items()):
             self._regions[index] = LiveRegion.restore(frozen.record(), self._setup)
             del self._missing[index]
-            self._share_pool()
+            self._share_out()
 
     @shortages()
     def train(self) -> None:
@@ -290,7 +306,7 @@ class Mapper:
         if not self._regions:
             self.scans_taken, self.samples_trained, self._loss = 0, 0, None
         self._normals.forget(minimum, maximum)
-        self._share_pool()
+        self._share_out()
         self._structure_changed = True
 
     @shortages()
@@ -352,13 +368,12 @@ class Mapper:
     def _region(self, index: RegionIndex) -> LiveRegion:
         if index not in self._regions:
             self._regions[index] = LiveRegion.unseen(index, self._setup)
-            self._share_pool()
             self._structure_changed = True
         return self._regions[index]
 
-    def _share_pool(self) -> None:
-        """Let the regions keep as many rays as they were offered, all up to one limit."""
-        offered = [region.pool.offered for region in self._regions.values()]
-        limit = shared_limit(offered, self._settings.training.pool_rays)
+    def _share_out(self) -> None:
+        """Let all places keep as many rays, and owe as much training."""
+        voxels = sum(region.size.evidence.voxels for region in self._regions.values())
+        self._share = FairShare.of(voxels, self._settings.training)
         for region in self._regions.values():
-            region.limit_rays(limit)
+            region.limit(self._share)

@@ -60,6 +60,9 @@ class Progress:
     own_samples_trained: int = 0
     samples_left: int = 0
     rays_kept: int = 0
+    rays_discarded: int = 0
+    replay_share: float = 1.0  # of the rays that each place is to keep
+    samples_discarded: int = 0
     map_bytes: int = 0  # that the map and its newest epoch take
     normals_bytes: int = 0  # that moments of points take, for normals of coming scans
     loss: float = 0.0
@@ -369,6 +372,9 @@ class MapperThread:
             own_samples_trained=self._samples_trained,
             samples_left=self._mapper.samples_left,
             rays_kept=self._mapper.rays_kept,
+            rays_discarded=self._mapper.rays_discarded,
+            replay_share=self._mapper.replay_share,
+            samples_discarded=self._mapper.samples_discarded,
             map_bytes=self._mapper.bytes_used,
             normals_bytes=self._mapper.normals_bytes,
             loss=self._loss,

@@ -6,7 +6,6 @@ take over.
 """
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -34,7 +33,10 @@ from triquad_server.mapping.ray_table import (
 _BIN_LEAVES = 4.0
 _BINS = 1 << 18
 _AHEAD = 16  # places that are brought into the cache before their turn
-_LIMIT_STEP = 1.1  # by which limits grow and shrink, since to lower one is expensive
+_NO_LIMIT = 1 << 62
+
+RAY_BYTES = 4 * (COLUMNS + 2)
+"""Of a ray, with where its origin and its bin are."""
 
 
 @kernel()
@@ -132,21 +134,20 @@ class ReplayPool:
 
     def __init__(
         self,
-        capacity: int,
         placement: Placement,
         leaf_m: float,
         device: torch.device,
         seed: int,
         team: Team,
     ) -> None:
-        """Up to ``capacity`` rays; ``team`` draws on the CPU, ``device`` does elsewhere."""
-        self._capacity = capacity
+        """No limit yet; ``team`` draws on the CPU, ``device`` does elsewhere."""
+        self._capacity = _NO_LIMIT
         self._bin_m = _BIN_LEAVES * leaf_m
         self._team = team
         self.placement = placement
         self._device = device
         self._size = 0
-        self.offered = 0  # rays so far, those included that were not kept
+        self.discarded = 0  # rays so far, that gave way to others or were too many
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator(device).manual_seed(seed)
         self._rows = np.zeros((0, COLUMNS), np.float32)
@@ -172,13 +173,13 @@ class ReplayPool:
 
     def add(self, new: RayTable, fresh: bool = True) -> None:
         """Take in rays; if ``fresh``, they become the newest."""
-        self.offered += len(new)
         used = self._size
         room = min(len(new), self._capacity - used)
         places = np.arange(used, used + room)
         if room < len(new):
             places = np.concatenate([places, self._best_to_push_out(len(new) - room)])
         rows, origin_of = new.rows, new.origin_of
+        self.discarded += len(new) - room
         if len(places) < len(new):
             # Any of them: the last rays of a scan are as good as the first.
             chosen = self._rng.permutation(len(new))[: len(places)]
@@ -241,13 +242,13 @@ class ReplayPool:
         """Change the capacity; what is too much goes at random."""
         self._capacity = capacity
         if self._size > capacity:
+            self.discarded += self._size - capacity
             self._keep(self._rng.permutation(self._size)[:capacity])
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Drop the rays that end between two corners [3], metres from the region's centre."""
         ends = self._rows[: self._size, END : END + 3]
         self._keep(np.flatnonzero(~((ends >= low) & (ends <= high)).all(axis=1)))
-        self.offered = self._size
 
     def forget_ends(self, voxels: Longs, settings: FieldSettings) -> None:
         """Drop the rays that end in ``voxels`` [N, 3] of a region with these ``settings``."""
@@ -339,13 +340,3 @@ def _coprime(size: int) -> int:
     while math.gcd(stride, size) != 1:
         stride += 1
     return stride
-
-
-def shared_limit(offered: Iterable[int], most: int) -> int:
-    """The limit of pools that were ``offered`` so many rays, which keep ``most`` together."""
-    left = limit = most
-    counts = sorted(offered)
-    for position, count in enumerate(counts):
-        limit = max(1, left // (len(counts) - position))
-        left -= min(count, limit)
-    return max(1, int(_LIMIT_STEP ** math.floor(math.log(limit, _LIMIT_STEP))))

@@ -195,6 +195,16 @@ _MAP = (
         "Rays in the replay pools",
         single(lambda f: f.status.rays_kept),
     ),
+    gauge(
+        "triquad_replay_share",
+        "Of the rays that each place is to keep, the share that memory has room for",
+        single(lambda f: f.status.replay_share),
+    ),
+    counter(
+        "triquad_rays_discarded_total",
+        "Rays that gave way to others of the same place",
+        single(lambda f: f.status.rays_discarded),
+    ),
 )
 
 _TRAINING = (
@@ -207,6 +217,11 @@ _TRAINING = (
         "triquad_samples_left",
         "Training samples until nothing is left to learn",
         single(lambda f: f.status.samples_left),
+    ),
+    counter(
+        "triquad_samples_discarded_total",
+        "Training samples that are more than the area mapped may owe",
+        single(lambda f: f.status.samples_discarded),
     ),
     gauge(
         "triquad_held_out_median_metres",

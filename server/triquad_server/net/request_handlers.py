@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 _REFUSALS = 2  # threads that send them
 
-_REFUSED_BYTES = 16_000_000
+_REFUSED_BYTES = 4_000_000
 """Of requests that are refused in these threads: beyond, large ones are refused by the receiver,
 so that the network waits for it and not they in memory."""
 

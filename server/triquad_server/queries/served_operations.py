@@ -27,7 +27,7 @@ ReadQueue = Callable[[], QueueMetrics]
 _OF_POINTS = frozenset({"field", "distances", "places", "poses"})
 """The groups of operations that ask about points."""
 
-_REPLY_BYTES = 64_000_000
+_REPLY_BYTES = 32_000_000
 """Of all replies on their way, to clients that may not read them; a large one beyond is refused."""
 
 _SMALL_REPLY_BYTES = 262_144

@@ -23,7 +23,7 @@ class ServiceSettings(BaseModel):
     """Requests that wait, per group of operations; of more, the newest of the client that has most
     of them is refused."""
 
-    request_queue_bytes: Annotated[int, Field(ge=0, le=2**40)] = 24_000_000
+    request_queue_bytes: Annotated[int, Field(ge=0, le=2**40)] = 16_000_000
     """Bytes of the requests that wait, per group of operations, likewise."""
 
     request_timeout_max_s: Annotated[float, Field(ge=0.1, le=1e6)] = 60.0

@@ -26,7 +26,14 @@ class TrainingSettings(BaseModel):
     """Decay of Adam's mean of squared gradients; at least the square of `beta1`."""
 
     pool_rays: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
-    """What so many rays taught is kept for training, over the whole map."""
+    """Rays that are kept for training, over the whole map, spread evenly over its surface; a large
+    map keeps more, by `rays_per_voxel`."""
+
+    rays_per_voxel: Annotated[float, Field(ge=0.01, le=10_000)] = 5.0
+    """A large map keeps so many rays for each voxel with surface."""
+
+    pool_bytes: Annotated[int, Field(ge=10_000, le=2**50)] = 400_000_000
+    """Bytes of all rays that are kept; a map too large for that keeps fewer for each voxel."""
 
     fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Share of a batch that is drawn from the newest scans while they stream in."""
@@ -35,7 +42,11 @@ class TrainingSettings(BaseModel):
     """Each new ray raises the training budget of its region by so many samples."""
 
     max_budget_samples: Annotated[int, Field(ge=1, le=10_000_000_000)] = 24_000_000
-    """Largest training budget of a region, in samples."""
+    """Largest training budget of the map, in samples, shared by its regions as they have surface; a
+    large map has a larger one, by `samples_per_voxel`."""
+
+    samples_per_voxel: Annotated[float, Field(ge=0.01, le=1_000_000)] = 100.0
+    """The budget of a large map is at most so many samples for each voxel with surface."""
 
     cooldown: Annotated[float, Field(ge=0.001, le=1000)] = 8.0
     """The learning rate falls once the budget is less than this many samples per kept ray."""

@@ -10,7 +10,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
 SETTINGS = Settings.model_validate(
-    {"field": {"depth": 6}, "training": {"batch": 64, "samples_per_ray": 1.0, "pool_rays": 1000}}
+    {"field": {"depth": 6}, "training": {"batch": 64, "samples_per_ray": 1.0, "pool_bytes": 24_000}}
 )
 LEAF_M = SETTINGS.field.leaf_m
 PITCH_M = SETTINGS.field.region_pitch_m

@@ -13,6 +13,7 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.region_setup import RegionSetup
+from triquad_server.mapping.replay_pool import RAY_BYTES
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 
@@ -315,13 +316,37 @@ def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
         mapper.ingest(scan.points, scan.world_from_sensor)
     record = mapper.changes_since(None).record
     assert len(record.regions) > 1
-    bounded = settings(pool_rays=4000)
+    bounded = settings(pool_bytes=4000 * RAY_BYTES)
     restarted = Mapper("test", bounded, "cpu", record)
     assert restarted.rays_kept <= 4000
     restarted.reset(np.array([5.0, -np.inf, -np.inf]), np.full(3, np.inf))
     for scan in world(2).scans:
         restarted.ingest(scan.points, scan.world_from_sensor)
     assert 1000 < restarted.rays_kept <= 4000
+
+
+def test_all_regions_keep_as_many_rays_for_each_voxel_and_tell_what_they_discarded() -> None:
+    mapper = Mapper("test", settings(pool_bytes=20_000 * RAY_BYTES), "cpu")
+    assert mapper.replay_share == 1.0
+    for scan in world(6).scans:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    assert mapper.replay_share < 1.0
+    sizes = [(len(region.pool), region.size.evidence.voxels) for region in mapper.regions]
+    densities = [rays / voxels for rays, voxels in sizes if voxels > 100]
+    assert len(densities) > 1
+    assert max(densities) < 1.2 * min(densities)
+    assert mapper.rays_kept <= 20_000
+    assert mapper.rays_discarded > 20_000
+
+
+def test_training_beyond_what_the_area_may_owe_is_discarded_and_told() -> None:
+    few = {"max_budget_samples": 1000, "samples_per_voxel": 10.0}
+    mapper = Mapper("test", settings(**few), "cpu")
+    scan = world().scans[0]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+    voxels = sum(region.size.evidence.voxels for region in mapper.regions)
+    assert 0.99 * 10 * voxels < mapper.samples_left <= 10 * voxels
+    assert mapper.samples_discarded > 0
 
 
 def test_the_training_budget_survives_a_restart() -> None:
@@ -333,7 +358,7 @@ def test_the_training_budget_survives_a_restart() -> None:
 
 
 def test_a_place_left_behind_is_not_forgotten() -> None:
-    chosen = settings(pool_rays=75_000)
+    chosen = settings(pool_bytes=75_000 * RAY_BYTES)
     here = world(3)
     mapper = settled_mapper(chosen, here)
     before = surface_error(mapper.publish(), here)

@@ -19,7 +19,9 @@ RNG = np.random.default_rng(0)
 
 
 def new_pool(capacity: int) -> ReplayPool:
-    return ReplayPool(capacity, PLACEMENT, leaf_m=0.2, device=CPU, seed=0, team=TEAM)
+    pool = ReplayPool(PLACEMENT, leaf_m=0.2, device=CPU, seed=0, team=TEAM)
+    pool.limit(capacity)
+    return pool
 
 
 def place(x: float, count: int) -> np.ndarray:

@@ -1,15 +1,25 @@
 """``triquad-bench`` of one scan more: what it changes where it does not look.
 
 A street is learnt, and then a single scan of another part of it, from which the first is out of
-sight. Ideally the first does not change at all.
+sight. Ideally the first does not change at all, and those who follow the mesh or keep a copy of the
+map are sent what that scan showed.
 """
 
+import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles, Floats
+from triquad_map.stored_map import StoredMap
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.mesher import TileIndex, tile_lattice
+from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.process.threads import Teams
+from triquad_server.settings import MeshSettings
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import settled_mapper
@@ -24,6 +34,7 @@ _COLUMNS = 700
 _POINTS = 100_000
 _VOXEL_M = 0.2  # points of the surface are so far apart
 _MOVED_M = 0.01
+_EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
 
 def measure_far_scan(seed: int) -> list[Figure]:
@@ -35,20 +46,83 @@ def measure_far_scan(seed: int) -> list[Figure]:
     (scan,) = SimulatedDrive(scene, lidar, poses[-1:], seed=seed)
     mapper = settled_mapper("the place", place.scans)
     before = _Place.of(mapper.publish(), place)
+    follower = _Follower(mapper.publish())
     mapper.ingest(scan.points, scan.world_from_sensor)
+    shown = follower.outdated_by(mapper.publish())
     _settle(mapper)
     after = _Place.of(mapper.publish(), place)
     while not mapper.settled:
         _settle(mapper)
         mapper.publish()
     repaired = _Place.of(mapper.publish(), place)
+    sent = follower.sent_of(mapper.publish())
+    in_sight = _near(sent, scan.world_from_sensor[:3, 3], lidar.range_max_m)
+    copied, fetched = follower.parts_of(mapper.publish())
     return [
         Figure("SDF error of a place, settled", before.error_cm, "cm"),
         Figure(f"the same after one more scan {_BETWEEN} m away", after.error_cm, "cm"),
         Figure("the same once what was forgotten is learnt again", repaired.error_cm, "cm"),
         Figure("moved by more than 1 cm, before that", 100 * before.moved(after), "%"),
         Figure("and then", 100 * before.moved(repaired), "%", at_most=2.0),
+        Figure("tiles of the mesh with new evidence", len(shown), ""),
+        Figure(
+            "tiles sent, times those with new evidence or changed in sight of the scan",
+            len(sent) / len(shown | in_sight),
+            "",
+            at_most=1.2,
+        ),
+        Figure("parts of a copy of the map", copied, ""),
+        Figure("those that are fetched again", 100 * fetched / copied, "%", at_most=10),
     ]
+
+
+class _Follower:
+    """Somebody who has the mesh and a copy of the map, and what they are sent."""
+
+    def __init__(self, epoch: Epoch) -> None:
+        self._tiles = TileCache(MeshSettings(), Teams().meshing)
+        self._tiles.refresh(epoch)
+        self._make()
+        self._revision = self._tiles.revision
+        self._parts = _parts(epoch)
+
+    def outdated_by(self, epoch: Epoch) -> set[TileIndex]:
+        """Tiles that have to be made again in an epoch."""
+        self._tiles.refresh(epoch)
+        return set(self._tiles.delta(0, *_EVERYWHERE, self._revision, {}).to_make)
+
+    def sent_of(self, epoch: Epoch) -> set[TileIndex]:
+        """Tiles that are others in an epoch."""
+        self._tiles.refresh(epoch)
+        self._make()
+        return {t.index for t in self._tiles.delta(0, *_EVERYWHERE, self._revision, {}).ready}
+
+    def parts_of(self, epoch: Epoch) -> tuple[int, int]:
+        """How many parts a map file has in an epoch, and how many of them were others before."""
+        parts = _parts(epoch)
+        return len(parts), sum(self._parts.get(key) != digest for key, digest in parts.items())
+
+    def _make(self) -> None:
+        while to_make := self._tiles.delta(0, *_EVERYWHERE, self._tiles.revision, {}).to_make:
+            for index in to_make:
+                self._tiles.make(0, index)
+
+
+def _parts(epoch: Epoch) -> Mapping[object, bytes]:
+    """Digests of the parts of a map file, as it is downloaded."""
+    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
+        path = Path(name) / "map.triquad"
+        write_map(epoch.record(), path)
+        with StoredMap.open(path) as stored:
+            return {entry.key: entry.sha256 for entry in stored.manifest.entries}
+
+
+def _near(tiles: set[TileIndex], place: Doubles, reach_m: float) -> set[TileIndex]:
+    """The tiles whose middles are within a reach."""
+    side_m = tile_lattice(MeshSettings(), 0).tile_side_m
+    return {
+        tile for tile in tiles if np.linalg.norm((np.array(tile) + 0.5) * side_m - place) <= reach_m
+    }
 
 
 @dataclass(frozen=True)

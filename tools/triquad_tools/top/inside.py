@@ -28,9 +28,17 @@ def _map(seen: Interval) -> Section:
         Row("loss", (f"{status.loss:.4f}",)),
         Row("regions", (count(status.regions),)),
         Row("parameters", (count(status.parameters),)),
+        *_kept(status),
         *_fit(status.fit),
     ]
     return Section("MAP", ("",), tuple(rows))
+
+
+def _kept(status: ServerStatus) -> list[Row]:
+    """Whether all rays are kept that are worth it."""
+    if status.replay_share >= 1.0:
+        return []
+    return [Row("rays kept", (f"{100 * status.replay_share:.0f} % of what is wanted",))]
 
 
 def _fit(fit: FieldFit | None) -> list[Row]:

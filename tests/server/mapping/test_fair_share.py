@@ -1,0 +1,43 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from triquad_server.mapping.fair_share import FairShare
+from triquad_server.mapping.replay_pool import RAY_BYTES
+from triquad_server.settings import TrainingSettings
+
+TRAINING = TrainingSettings(
+    pool_rays=10_000,
+    rays_per_voxel=4.0,
+    pool_bytes=100_000 * RAY_BYTES,
+    max_budget_samples=500_000,
+    samples_per_voxel=100.0,
+)
+
+
+def test_a_small_map_keeps_as_many_rays_and_owes_as_much_however_small_it_is() -> None:
+    for voxels in (10, 100, 1000):
+        share = FairShare.of(voxels, TRAINING)
+        assert 9000 < share.rays * voxels <= 10_000
+        assert share.samples * voxels == pytest.approx(500_000)
+        assert share.rays_share == 1.0
+
+
+def test_a_large_map_has_as_much_for_each_voxel() -> None:
+    small, large = FairShare.of(5000, TRAINING), FairShare.of(20_000, TRAINING)
+    assert small == large
+    assert 3.6 < large.rays <= 4.0
+    assert large.samples == 100.0
+
+
+def test_where_memory_has_no_room_each_voxel_has_less_and_this_is_told() -> None:
+    share = FairShare.of(50_000, TRAINING)
+    assert share.rays_share == pytest.approx(0.5)
+    assert 1.8 < share.rays <= 2.0
+    assert share.samples == 100.0
+
+
+@given(st.integers(0, 2**40))
+def test_all_rays_together_fit_into_memory_at_any_size(voxels: int) -> None:
+    share = FairShare.of(voxels, TRAINING)
+    assert share.rays * voxels * RAY_BYTES <= TRAINING.pool_bytes * (1 + 1e-9)
+    assert 0 < share.rays_share <= 1
