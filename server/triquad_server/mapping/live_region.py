@@ -121,10 +121,10 @@ class LiveRegion:
 
         self.repairs = Repairs()  # so far
         self._judgement = Judgement(setup.field)
+        self._share = FairShare.of(0, setup.training)  # of each voxel
         self._unjudged_samples = 0  # that were trained since
         self._repair_budget_samples = 0  # that are to be from places that have forgotten
         self.budget_samples = 0  # the training budget: samples that are still to be trained on
-        self._most_budget_samples = 0  # that may be owed
         self.samples_discarded = 0  # so far, that were more
         self._fresh_budget_samples = 0  # those of them that are to be from the newest scan
         self.changed = True  # since it was last published
@@ -258,12 +258,15 @@ class LiveRegion:
 
     def limit(self, share: FairShare) -> None:
         """From now on, keep as many rays and owe as many samples as are its share."""
-        voxels = self.size.evidence.voxels
-        rays = max(1, int(share.rays * voxels))
+        self._share = share
+        rays = max(1, int(share.rays * self.size.evidence.voxels))
         self.pool.limit(rays)
         self.held_out.limit(max(1, rays // HELD_OUT))
-        self._most_budget_samples = int(share.samples * voxels)
         self._limit_budget()
+
+    @property
+    def _most_budget_samples(self) -> int:
+        return int(self._share.samples * self.size.evidence.voxels)
 
     def _limit_budget(self) -> None:
         too_many = max(0, self.budget_samples - self._most_budget_samples)
@@ -368,7 +371,8 @@ class LiveRegion:
     def record(self) -> Region:
         """The region with its training state as plain arrays, sharing nothing with this one."""
         table = both_tables(self.pool.table, self.held_out.table)
-        rays, others = recorded_rays(table, self._settings)
+        most = int(self._share.recorded_rays * self.size.evidence.voxels)
+        rays, others = recorded_rays(table, self._settings, most)
         others = others[others < len(self.pool)]  # samples are for training
         state = training_state(
             self.field,

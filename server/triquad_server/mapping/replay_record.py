@@ -9,19 +9,22 @@ from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
 from triquad_server.mapping.held_out import ends_in_steps
 from triquad_server.mapping.ray_table import VALUE, RayTable
 
-_MOST_RAYS = 6_000_000  # of a region: so many fit into the parts of a single cube
+_MOST_RAYS = 6_000_000  # so many fit into the parts of a single cube
 
 _ORIGIN_BITS = 15  # beside 48 of a leaf's code
 
 
-def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays, Longs]:
-    """The rays of a table, and the places of all else in it: samples, and what ends far away."""
+def recorded_rays(table: RayTable, settings: FieldSettings, most: int) -> tuple[ReplayRays, Longs]:
+    """The rays of a table, ``most`` of them, and the places of all else in it: samples, and what
+    ends far away.
+    """
     side = 1 << settings.depth
     steps = ends_in_steps(table.rows, settings)
     fits = (table.origin_of >= 0) & ((steps >= 0) & (steps < 2 * side * STEPS)).all(axis=1)
     places = np.flatnonzero(fits)
-    if len(places) > _MOST_RAYS:
-        places = np.sort(np.random.default_rng(len(places)).choice(places, _MOST_RAYS, False))
+    most = min(most, _MOST_RAYS)
+    if len(places) > most:
+        places = np.sort(np.random.default_rng(len(places)).choice(places, most, False))
     # By origin within a leaf, nearly: neighbours that are alike take less room.
     coarser = max(0, len(table.origins).bit_length() - _ORIGIN_BITS)
     codes = morton.encode(steps[places] // STEPS) << _ORIGIN_BITS

@@ -29,10 +29,10 @@ class TrainingSettings(BaseModel):
     """Rays that are kept for training, over the whole map, spread evenly over its surface; a large
     map keeps more, by `rays_per_voxel`."""
 
-    rays_per_voxel: Annotated[float, Field(ge=0.01, le=10_000)] = 5.0
+    rays_per_voxel: Annotated[float, Field(ge=0.01, le=10_000)] = 12.0
     """A large map keeps so many rays for each voxel with surface."""
 
-    pool_bytes: Annotated[int, Field(ge=10_000, le=2**50)] = 400_000_000
+    pool_bytes: Annotated[int, Field(ge=10_000, le=2**50)] = 500_000_000
     """Bytes of all rays that are kept; a map too large for that keeps fewer for each voxel."""
 
     fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -45,7 +45,7 @@ class TrainingSettings(BaseModel):
     """Largest training budget of the map, in samples, shared by its regions as they have surface; a
     large map has a larger one, by `samples_per_voxel`."""
 
-    samples_per_voxel: Annotated[float, Field(ge=0.01, le=1_000_000)] = 100.0
+    samples_per_voxel: Annotated[float, Field(ge=0.01, le=1_000_000)] = 240.0
     """The budget of a large map is at most so many samples for each voxel with surface."""
 
     cooldown: Annotated[float, Field(ge=0.001, le=1000)] = 8.0
