@@ -33,12 +33,19 @@ def stop(server: servers.ServerProcess) -> None:
     assert server.wait() == 0, server.log
 
 
+def counts(client: Client) -> tuple[int, int]:
+    """What the map was made of."""
+    status = client.status()
+    return status.scans_taken, status.samples_trained
+
+
 def test_the_map_of_before_outlives_resets_and_checkpoints_without_end(tmp_path: Path) -> None:
     """Retention keeps the newest 20 checkpoints: 20 of an empty map pushed out all others."""
     with served(tmp_path, "--set", "store.keep=3") as (server, client):
         servers.learn(client)
         client.settle(servers.WAIT_S)
         before = client.query_sdf(PROBES)
+        made_of = counts(client)
         replies = []
         for number in range(ATTACKS):
             replies.append(client.reset())
@@ -52,11 +59,13 @@ def test_the_map_of_before_outlives_resets_and_checkpoints_without_end(tmp_path:
         assert f"--restore {first.kept_epoch}" in (first.undo or "")
         assert f"--restore {first.kept_epoch}" in server.log
         assert client.status().regions in (0, 1)
+        assert counts(client) < made_of
         stop(server)
     with served(tmp_path, "--restore", str(first.kept_epoch)) as (server, client):
         after = client.query_sdf(PROBES)
         assert np.array_equal(after.status, before.status)
         assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)
+        assert counts(client) == made_of
         assert client.status().epoch > replies[-1].epoch
         learnt_since = client.status().epoch
         servers.learn(client)

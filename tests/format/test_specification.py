@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from support import map_records, spec_reader
 from support.file_damage import flipped
 from support.map_records import SMALL
-from support.spec_parts import Map, RefusedError
+from support.spec_parts import Map, RefusedError, Settings, is_held_out
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.region import MapRecord
+from triquad_format.records.replay_rays import are_held_out
 from triquad_map.compiled.evidence.outcomes import outcome_counts
 from triquad_map.reference.evaluator import MapEvaluator
 
@@ -154,6 +155,21 @@ def test_rays_to_train_on() -> None:
     have = spec_reader.load_rays(path, spec_reader.load(path).settings)
     order = [np.lexsort(table.round(6).T) for table in (have, want)]
     np.testing.assert_allclose(have[order[0]], want[order[1]], atol=1e-6)
+
+
+def test_held_out_rays() -> None:
+    """At the greatest depth, too, where steps are more than a key has room for."""
+    for depth in (6, 15):
+        settings = dataclasses.replace(SMALL, depth=depth)
+        record = map_records.with_rays(
+            map_records.random_record(2, settings=settings, points=0), rays=5000
+        )
+        (training,) = (region.training for region in record.regions)
+        assert training is not None
+        ends = training.rays.ends_m(settings)
+        as_said = [is_held_out(end, Settings(dataclasses.asdict(settings))) for end in ends]
+        assert are_held_out(training.rays.ends).tolist() == as_said
+        assert sum(as_said) == pytest.approx(5000 / 32, rel=0.3)
 
 
 @pytest.mark.parametrize("name", VARIANTS)

@@ -12,12 +12,14 @@ from support.map_records import (
     with_integers,
     with_levels,
     with_outcomes,
+    with_progress,
     with_rays,
 )
 from support.mapfile_edit import write_pair
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
 from triquad_server.mesh.preview import previews_of
@@ -69,6 +71,9 @@ def valid_maps(folder: Path) -> list[ValidMap]:
         "levels": with_levels(plain),
         "outcomes": with_outcomes(plain),
         "rays": with_rays(random_record(settings=TINY, points=3), rays=12),
+        "progress": with_progress(
+            random_record(settings=TINY, points=3), MapProgress(60, 116_000_000, 0.25)
+        ),
     }
     maps = [_written(folder / kind, record) for kind, record in complete.items()]
     maps.append(_written_pair(folder / "delta", plain))

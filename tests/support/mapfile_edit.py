@@ -209,6 +209,6 @@ def write_pair(
 
 def write_record(path, record, **options):
     """A file of all parts of a record; options are those of ``write_parts``."""
-    facts = MapFacts(record.name, record.epoch, record.settings)
+    facts = MapFacts.of(record)
     parts = pack_record(record, "<f2", {})
     return write_parts(path, facts, parts, **options)

@@ -108,6 +108,14 @@ def rays_of(part: Any, cell: int, training: Any, settings: Settings) -> Array:
     return np.column_stack([ends, origins, plain(part["slopes"]) / 255])
 
 
+def is_held_out(end: Array, settings: Settings) -> bool:
+    """Section 5.5, of a ray that ends there, metres from the region's centre."""
+    u = end / settings.leaf + 2**settings.depth
+    x, y, z = (int(np.floor(128 * place)) % 2**21 for place in u)
+    key = x * 2**42 + y * 2**21 + z
+    return key * 0x9E3779B97F4A7C15 % 2**64 < 2**59
+
+
 def integers_of(stored: dict[str, Any]) -> NDArray[np.float32]:
     data = plain(stored).astype(np.int64)
     return sum(row << 8 * k for k, row in enumerate(data)).T.astype(np.float32)

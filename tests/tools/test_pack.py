@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from support.checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoints
-from support.map_records import SMALL, assert_same, random_record, with_rays
+from support.map_records import SMALL, assert_same, random_record, with_progress, with_rays
 from support.mapfile_edit import file_bytes, with_metadata, without_index
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import SLACK_LEAVES, crop_record, without_training
 from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.map_progress import MapProgress
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.stored_map import StoredMap
 from triquad_tools.commands.pack import main
@@ -147,6 +148,15 @@ def test_tool_packs(map_file, tmp_path, capsys):
     assert out.stat().st_size < map_file.stat().st_size / 2
     expected = crop_record(read_map(map_file), [-1, -1, -1], [2.5, 2, 2])
     assert_same(read_map(out), without_training(expected))
+
+
+def test_a_packed_map_still_tells_what_it_was_made_of(tmp_path):
+    record = with_progress(random_record(1), MapProgress(60, 116_000_000, 0.25))
+    write_map(record, tmp_path / "in.triquad")
+    out = tmp_path / "out.triquad"
+    options = ["--crop", "-4", "-4", "-4", "4", "4", "4", "--no-training"]
+    assert main([str(tmp_path / "in.triquad"), str(out), *options]) == 0
+    assert read_map(out).progress == record.progress
 
 
 def test_tool_changes_precision(tmp_path):

@@ -16,7 +16,15 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.server_records import CHECKPOINT, METRICS, STATUS, later, operation, sample
 from triquad_format.wire.metrics_messages import CheckpointMetrics, QueueMetrics, SourceMetrics
-from triquad_tools.top.amounts import count, duration, milliseconds, rate, size
+from triquad_tools.top.amounts import (
+    count,
+    duration,
+    millimetres,
+    milliseconds,
+    rate,
+    size,
+    within,
+)
 from triquad_tools.top.interval import Interval, Sample, interval
 from triquad_tools.top.page import Page
 from triquad_tools.top.report import json_line
@@ -256,6 +264,8 @@ def test_colours_are_left_out_where_that_is_asked_for(monkeypatch):
         (duration(90_000.0), "1 d 1 h"),
         (duration(float("inf")), "inf"),
         (milliseconds(0.00425), "4.25"),
+        (millimetres(0.0123), "12.3 mm"),
+        (within(0.00042, 0.00421), "0.42 mm, 90 % in 4.21 mm"),
     ],
 )
 def test_amounts_have_three_digits_and_a_unit(shown, text):

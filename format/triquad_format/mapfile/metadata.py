@@ -12,10 +12,17 @@ from datetime import datetime, timezone
 from typing import Any
 
 from triquad_format import __version__
-from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
+from triquad_format.errors import (
+    DamagedMapFileError,
+    FormatError,
+    MapFileError,
+    UnsupportedMapFileError,
+)
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.part import MANIFEST, MAP
 from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.map_progress import MapProgress
+from triquad_format.records.region import MapRecord
 from triquad_format.wire.keys import check_name
 
 METADATA_NAME = "triquad"
@@ -34,24 +41,33 @@ MAX_MAP_BYTES = 4 * 2**30
 
 @dataclass(frozen=True)
 class MapFacts:
-    """Name, epoch and settings of a map."""
+    """Name, epoch, settings and progress of a map."""
 
     name: str
     epoch: int
     settings: FieldSettings
+    progress: MapProgress = MapProgress()
+
+    @classmethod
+    def of(cls, record: MapRecord) -> "MapFacts":
+        """The facts of a record."""
+        return cls(record.name, record.epoch, record.settings, record.progress)
 
 
 def pack_facts(facts: MapFacts) -> dict[str, object]:
     """The facts as a msgpack map."""
     defaults = dataclasses.asdict(FieldSettings())
     settings = dataclasses.asdict(facts.settings)
-    return {
+    body: dict[str, object] = {
         "name": facts.name,
         "epoch": facts.epoch,
         "frame_id": FRAME_ID,
         "units": UNITS,
         "settings": {name: type(defaults[name])(value) for name, value in settings.items()},
     }
+    if facts.progress != MapProgress():
+        body["progress"] = dataclasses.asdict(facts.progress)
+    return body
 
 
 def unpack_facts(body: PartBody) -> MapFacts:
@@ -65,13 +81,31 @@ def unpack_facts(body: PartBody) -> MapFacts:
             raise UnsupportedMapFileError(f"{key} = {body.value(key, str)!r:.80}, not {wanted!r}")
     name = body.value("name", str)
     check_name("map", name)
-    return MapFacts(name, body.count("epoch"), _unpack_settings(body.mapping("settings")))
+    settings = _unpack_settings(body.mapping("settings"))
+    return MapFacts(name, body.count("epoch"), settings, _unpack_progress(body))
 
 
 def check_map_part(payload: bytes, facts: MapFacts) -> None:
     """Raise :class:`FormatError` unless the part ``/triquad/map`` tells the same facts."""
     if unpack_facts(unpack_body(MAP, payload)) != facts:
         raise DamagedMapFileError(f"{MAP} and {MANIFEST} contradict each other")
+
+
+def _unpack_progress(body: PartBody) -> MapProgress:
+    """The progress of a map; older files do not tell it."""
+    if not body.has("progress"):
+        return MapProgress()
+    told = PartBody(body.topic, body.mapping("progress"))
+    progress = MapProgress(
+        scans_taken=told.count("scans_taken"),
+        samples_trained=told.count("samples_trained"),
+        loss=told.value("loss", float),
+    )
+    try:
+        progress.check()
+    except FormatError as error:
+        raise DamagedMapFileError(f"{body.topic}: progress: {error}") from error
+    return progress
 
 
 def _unpack_settings(body: Mapping[str, object]) -> FieldSettings:

@@ -185,4 +185,4 @@ def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRec
             parts.add(entry.key, payload_of(entry))
         regions.append(parts.region())
     facts = manifest.facts
-    return MapRecord(facts.name, facts.epoch, settings, regions=tuple(regions))
+    return MapRecord(facts.name, facts.epoch, settings, tuple(regions), facts.progress)

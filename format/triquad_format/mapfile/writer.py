@@ -128,7 +128,7 @@ def write_map(
     if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
         raise FormatError(f"stamp_ns = {stamp_ns} is out of range: use 0 to 2**63 - 1")
     check_record(record)
-    facts = MapFacts(record.name, record.epoch, record.settings)
+    facts = MapFacts.of(record)
     parts = pack_record(record, feature_dtype, {} if previews is None else previews.parts)
     schema = None if previews is None else previews.schema
     return write_parts(file, facts, parts, stamp_ns=stamp_ns, preview_schema=schema).info

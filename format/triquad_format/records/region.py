@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
+from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.replay_rays import ReplayRays, no_rays
 
 AXES = ((0, 1), (0, 2), (1, 2))
@@ -110,6 +111,8 @@ class TrainingState:
     sample_labels: NDArray[np.floating]  # [S] signed distance, metres
     budget_samples: int  # training budget: samples still to be trained on; 0: all is learnt
     rays: ReplayRays = field(default_factory=no_rays)
+    places_repaired: int = 0  # that had forgotten what they knew, and were learnt again
+    places_given_up: int = 0  # that had, and that training did not mend
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,7 @@ class MapRecord:
     epoch: int
     settings: FieldSettings
     regions: tuple[Region, ...]
+    progress: MapProgress = MapProgress()
 
     @property
     def has_evidence(self) -> bool:

@@ -138,7 +138,8 @@ def _recovered(found: IntactParts) -> RecoveredMap:
     )
     near = _LossesNear(losses)
     regions = [_masked_where_lost(settings, region, near.of(region.index)) for region in regions]
-    record = MapRecord(found.facts.name, found.facts.epoch, settings, regions=tuple(regions))
+    facts = found.facts
+    record = MapRecord(facts.name, facts.epoch, settings, tuple(regions), facts.progress)
     return RecoveredMap(
         record,
         losses,

@@ -206,7 +206,7 @@ class FieldFit(Message):
     worst: FinitePoints  # [K, 3] map frame, metres: centres of the places with the largest medians
     worst_median_m: Lengths  # [K]
     repairing: Count  # places that have forgotten and are being learnt again
-    repaired: Count  # places that were, since the server started
+    repaired: Count  # places that were, so far
     given_up: Count  # and places that training did not mend
 
 
@@ -220,13 +220,13 @@ class ServerStatus(Message):
     device: Name
     epoch: Epoch
     settled: bool  # True: nothing is left to learn from the scans so far
-    scans_taken: Count
+    scans_taken: Count  # that are in the map, also those before a restart
     scans_dropped: dict[Name, Count]  # by reason
     scans_lost: dict[Name, Count]  # by source: never arrived, or pushed out of the full queue
     scans_waiting: Count
     points_dropped: dict[Name, Count]  # by reason, points and rays of scans that were taken
     requests_refused: dict[Name, Count]  # by error code
-    samples_trained: Count
+    samples_trained: Count  # of the map, likewise
     rays_kept: Count  # rays whose lessons are in the replay pools
     loss: Annotated[float, Within()]  # recent training loss, 0 before any training
     regions: Count

@@ -106,6 +106,8 @@ class ServerMetrics(Message):
     mapper_s: dict[Name, Duration]  # how the mapper's thread spent its time, by activity
     checkpoints: CheckpointMetrics
     sessions: dict[Name, Name]  # Zenoh sessions that are connected, by id: client, peer or router
+    scans_taken: Count = 0  # by this process; the status counts those of the map
+    samples_trained: Count = 0  # likewise
 
     def answer_time_s(
         self, operation: str, quantile: float, since: "ServerMetrics | None" = None

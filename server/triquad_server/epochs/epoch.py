@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord, Region
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
@@ -46,12 +47,17 @@ class Epoch(ComposedView):
         settings: FieldSettings,
         regions: tuple[FrozenRegion, ...],
         split: Split,
+        progress: MapProgress | None = None,
     ) -> None:
-        """The map called ``name``; ``split`` runs the work of its answers."""
+        """The map called ``name``; ``split`` runs the work of its answers.
+
+        ``progress`` is how far the map had come; ``None``: it was just begun.
+        """
         super().__init__(number, settings, regions, split=split)
         self.number = number
         self.field_settings = settings
         self.frozen_regions = regions
+        self.progress = progress or MapProgress()
         self._name = name
 
     @property
@@ -77,4 +83,6 @@ class Epoch(ComposedView):
     def record(self) -> MapRecord:
         """The epoch as a map file holds it, without training state."""
         regions = tuple(region.record() for region in self.frozen_regions)
-        return MapRecord(self._name, self.number, settings=self.field_settings, regions=regions)
+        return MapRecord(
+            self._name, self.number, self.field_settings, regions, progress=self.progress
+        )

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
+from triquad_map.field_fit import PlaceFits
+from triquad_map.places import Places
 
 from triquad_server.mapping.held_out import ray_keys
-from triquad_server.mapping.places import place_centres, place_keys
+from triquad_server.mapping.ray_table import END
 
 _LEAST_RAYS = 24  # of a place that is judged
 _SURE = 5.0
@@ -29,15 +31,11 @@ _REPAIRS = 3  # of a place in a row; then it is taken as it is
 
 
 @dataclass(frozen=True)
-class Places:
-    """How well a field fits the held-out rays of each of P places."""
+class JudgedPlaces(PlaceFits):
+    """How well a field fits its places, and where it did better before."""
 
-    centres: Doubles  # [P, 3] metres from the region's centre
-    rays: Longs  # [P]
-    medians_m: Doubles  # [P] of how far from zero the field is at the rays' ends
-    errors_m: Doubles  # [N] how far it is, for each ray
     forgotten: Bools  # [P] where the same rays fit worse than they did
-    forgotten_keys: Longs  # of these, as of :func:`triquad_server.mapping.places.place_keys`
+    forgotten_keys: Longs  # of these, as of :func:`triquad_map.places.place_keys`
     repaired: int  # places that had forgotten before, and have not any more
     given_up: int  # places that had, and that training did not mend
 
@@ -49,7 +47,7 @@ class Repairs:
     done: int = 0  # places that were learnt again
     given_up: int = 0  # places that training did not mend
 
-    def after(self, places: Places) -> "Repairs":
+    def after(self, places: JudgedPlaces) -> "Repairs":
         """With what was found now."""
         return Repairs(self.done + places.repaired, self.given_up + places.given_up)
 
@@ -65,7 +63,7 @@ class Judgement:
         self._best = np.zeros(0)
         self._repairs: dict[int, int] = {}  # in a row, of places that have forgotten
 
-    def judge(self, rows: Floats, sdf: NDArray[np.floating]) -> Places:
+    def judge(self, rows: Floats, sdf: NDArray[np.floating]) -> JudgedPlaces:
         """Judge the field by held-out rays.
 
         Args:
@@ -74,26 +72,21 @@ class Judgement:
         """
         keys = ray_keys(rows, self._settings)
         best = self._best_of(keys)
-        places, place_of, counts = np.unique(
-            place_keys(rows, self._settings), return_inverse=True, return_counts=True
-        )
-        changes = _Changes.of(sdf, best, place_of, counts)
-        seen_anew = changes.known < (1 - _SEEN_ANEW) * counts
+        places = Places.of(rows[:, END : END + 3], self._settings)
+        changes = _Changes.of(sdf, best, places)
+        seen_anew = changes.known < (1 - _SEEN_ANEW) * places.rays
         worse = changes.are_sure(_LEAST_RISE * self._settings.leaf_m) & ~seen_anew
         before = len(self._repairs)
-        forgotten = worse & self._may_be_repaired(places, worse)
+        forgotten = worse & self._may_be_repaired(places.keys, worse)
         given_up = int((worse & ~forgotten).sum())
         still = sum(count > 1 for count in self._repairs.values())
         is_best = ((changes.means < 0) | seen_anew | worse) & ~forgotten
-        now_best = is_best[place_of] | np.isnan(best)
+        now_best = is_best[places.place_of] | np.isnan(best)
         self._remember(keys, np.where(now_best, sdf, best))
-        return Places(
-            place_centres(places, self._settings),
-            counts,
-            _medians(np.abs(sdf), place_of, counts),
-            np.abs(sdf).astype(np.float64),
-            forgotten,
-            places[forgotten],
+        return JudgedPlaces(
+            **vars(PlaceFits.of(places, sdf)),
+            forgotten=forgotten,
+            forgotten_keys=places.keys[forgotten],
             repaired=before - still - given_up,
             given_up=given_up,
         )
@@ -127,34 +120,21 @@ class _Changes:
     errors: Doubles  # [P] standard errors of the means
 
     @classmethod
-    def of(
-        cls,
-        sdf: NDArray[np.floating],
-        best: Doubles,
-        place_of: NDArray[np.intp],
-        counts: Longs,
-    ) -> "_Changes":
+    def of(cls, sdf: NDArray[np.floating], best: Doubles, places: Places) -> "_Changes":
         rises = sdf.astype(np.float64) ** 2 - best**2
         is_known = ~np.isnan(rises)
-        rises, places = rises[is_known], place_of[is_known]
+        rises, place_of = rises[is_known], places.place_of[is_known]
 
         def sums(of: Doubles | None = None) -> Doubles:
-            return np.bincount(places, of, minlength=len(counts)).astype(np.float64)
+            return np.bincount(place_of, of, minlength=len(places.keys)).astype(np.float64)
 
         known = sums()
         least = np.maximum(known, 1)
         means = sums(rises) / least
-        variances = sums((rises - means[places]) ** 2) / least
+        variances = sums((rises - means[place_of]) ** 2) / least
         return cls(known.astype(np.int64), means, np.sqrt(variances / least))
 
     def are_sure(self, rise_m: float) -> Bools:
         """Where the field is worse for sure, as if by an error of ``rise_m`` beside the noise."""
         sure = self.means > np.maximum(_SURE * self.errors, rise_m**2)
         return sure & (self.known >= _LEAST_RAYS)
-
-
-def _medians(values: NDArray[np.floating], group_of: NDArray[np.intp], counts: Longs) -> Doubles:
-    """The median of the values of each group, of which none is empty."""
-    ordered = values[np.lexsort([values, group_of])]
-    medians: Doubles = ordered[np.cumsum(counts) - counts + counts // 2].astype(np.float64)
-    return medians

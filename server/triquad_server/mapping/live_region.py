@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -40,7 +41,7 @@ from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.fair_share import FairShare
 from triquad_server.mapping.held_out import are_held_out, both_tables
-from triquad_server.mapping.judgement import Judgement, Places, Repairs
+from triquad_server.mapping.judgement import JudgedPlaces, Judgement, Repairs
 from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.ray_table import (
     END,
@@ -115,7 +116,7 @@ class LiveRegion:
         )
         self.pool = new_pool(device=setup.device)
         self.held_out = new_pool(device=_CPU)
-        self.places: Places | None = None
+        self.places: JudgedPlaces | None = None
         """How well the field fits the rays that are held out, as it was judged last."""
 
         self.repairs = Repairs()  # so far
@@ -162,6 +163,9 @@ class LiveRegion:
             region._keep(restored_rays(state.rays, setup.field))
             region.pool.add(samples_alone(state.sample_points, state.sample_labels))
             region.budget_samples = state.budget_samples if len(region.pool) else 0
+            region.repairs = Repairs(state.places_repaired, state.places_given_up)
+            # What it forgets from now on is told from what it knows now.
+            region._judge(region.field.freeze())
         return region
 
     @property
@@ -342,7 +346,9 @@ class LiveRegion:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)
             self._restored = False
         self._forget_gone(surfels)
-        self._judge(field)
+        enough = _JUDGED_AFTER_SAMPLES if self.budget_samples else 1
+        if self._unjudged_samples >= enough:
+            self._judge(field)
         own = buffers_of((field, evidence, surfels))
         live = {
             "field": self.field,
@@ -374,12 +380,16 @@ class LiveRegion:
             samples=self.pool.draw_on(others),
             budget_samples=self.budget_samples,
         )
+        state = replace(
+            state,
+            places_repaired=self.repairs.done,
+            places_given_up=self.repairs.given_up,
+        )
         return region_record(self.index, self.field, self.evidence, training=state)
 
     def _judge(self, field: FrozenField) -> None:
         """Find out where the field has forgotten what it knew, and have it learnt again."""
-        enough = _JUDGED_AFTER_SAMPLES if self.budget_samples else 1
-        if self._unjudged_samples < enough or len(self.held_out) == 0:
+        if len(self.held_out) == 0:
             return
         self._unjudged_samples = 0
         rows = self.held_out.table.rows

@@ -1,6 +1,7 @@
 """The live map: takes in scans, trains, publishes epochs. Owned by one thread."""
 
 import logging
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.field_settings import RegionIndex
+from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 
 from triquad_server.engine.compiled_trainer import GradientSums
@@ -76,8 +78,11 @@ class Mapper:
         # Regions of the newest epoch that a failed scan took, and for which memory is short.
         self._missing: dict[RegionIndex, FrozenRegion] = {}
         self._share = FairShare.of(0, settings.training)
-        self.samples_trained = 0
-        self._loss: float | Tensor | None = None
+        # Of the map: a restart goes on counting.
+        progress = record.progress if record else MapProgress()
+        self.scans_taken = progress.scans_taken
+        self.samples_trained = progress.samples_trained
+        self._loss: float | Tensor | None = progress.loss or None
         for region in record.regions if record else ():
             self._regions[region.index] = live = LiveRegion.restore(region, self._setup)
             self._normals.restore(live.ray_ends())
@@ -100,6 +105,15 @@ class Mapper:
     def loss(self) -> float:
         """The loss of the last steps; on a GPU, to read it waits for all of them."""
         return 0.0 if self._loss is None else float(self._loss)
+
+    @property
+    def progress(self) -> MapProgress:
+        """How far the map has come; to read it on a GPU waits for the last steps."""
+        loss = self.loss
+        # A loss that is no number must not keep a map from being written.
+        return MapProgress(
+            self.scans_taken, self.samples_trained, loss if math.isfinite(loss) else 0.0
+        )
 
     @property
     def bytes_used(self) -> int:
@@ -181,6 +195,7 @@ class Mapper:
         except MemoryError as error:
             text = "the system gives the server no more memory"
             raise ScanRefusedError("out_of_memory", text) from error
+        self.scans_taken += 1
         return rays
 
     def _take_in_all(self, rays: ScanRays, around: list[RegionIndex], stamp_s: int) -> None:
@@ -216,6 +231,7 @@ class Mapper:
         published = {old.index: old for old in self._epoch.frozen_regions} if self._epoch else {}
         for index in touched:
             self._regions.pop(index, None)  # first: memory may be what is short
+        self.scans_taken = self._epoch.progress.scans_taken if self._epoch else 0
         self._structure_changed = True
         self._missing = {index: published[index] for index in published.keys() & set(touched)}
         try:
@@ -269,6 +285,7 @@ class Mapper:
             settings=self._field_settings,
             regions=regions,
             split=self._teams.answers.split,
+            progress=self.progress,
         )
         self._structure_changed = False
         return self._epoch
@@ -276,7 +293,7 @@ class Mapper:
     def reset(self, minimum: Doubles, maximum: Doubles) -> None:
         """Forget what lies between two corners [3], metres, map frame.
 
-        Regions wholly between them disappear.
+        Regions wholly between them disappear; where no region is left, the map begins anew.
         """
         self._restore_missing()
         half = self._field_settings.region_side_m / 2
@@ -286,6 +303,8 @@ class Mapper:
                 del self._regions[index]
             elif ((minimum < high) & (maximum > low)).all():
                 region.forget(np.maximum(minimum, low), np.minimum(maximum, high))
+        if not self._regions:
+            self.scans_taken, self.samples_trained, self._loss = 0, 0, None
         self._normals.forget(minimum, maximum)
         self._share_out()
         self._structure_changed = True
@@ -306,7 +325,7 @@ class Mapper:
             region.record() for index, region in self._regions.items() if index in changed
         )
         record = MapRecord(
-            self._name, newest.number, settings=self._field_settings, regions=regions
+            self._name, newest.number, self._field_settings, regions, progress=newest.progress
         )
         return MapChanges(record, tuple(self._regions), newest)
 

@@ -54,8 +54,10 @@ class Progress:
     """The mapper's numbers, as of its last slice."""
 
     settled: bool = True  # nothing is left to learn, and the newest epoch shows all
-    scans_taken: int = 0
-    samples_trained: int = 0
+    scans_taken: int = 0  # that are in the map, also those before a restart
+    samples_trained: int = 0  # of the map, likewise
+    own_scans_taken: int = 0  # by this process
+    own_samples_trained: int = 0
     samples_left: int = 0
     rays_kept: int = 0
     rays_discarded: int = 0
@@ -115,12 +117,12 @@ class MapperThread:
         self._stopping = threading.Event()
         self._next_publish = self._soonest_publish = 0.0
         self._unpublished = False
-        self._scans_taken = 0
-        self._loss = 0.0  # as of the newest epoch
-        self._fit: FieldFit | None = None
+        self._scans_taken = self._samples_trained = 0
+        self._loss = mapper.loss  # as of the newest epoch
         self._step_s = _GIVE_WAY_S  # what the last step of training took
         self._else_s = 0.0  # what all but scans took in the last round
         first = mapper.publish()
+        self._fit = map_fit(mapper.regions)
         older_bytes = (memory or MemorySettings()).epochs_bytes
         self.epochs = EpochHistory(first, settings, older_bytes=older_bytes)
         self.surface = SurfaceHistory(first, settings.changes_kept)
@@ -240,8 +242,10 @@ class MapperThread:
             self.epochs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
             self.time.begin(Activity.TRAINING)
             started = time.monotonic()
+            trained = self._mapper.samples_trained
             with self.epochs.gate.turn():
                 self._mapper.train()
+            self._samples_trained += self._mapper.samples_trained - trained
             self._step_s = time.monotonic() - started
             self._unpublished = True
         if self._is_publish_due():
@@ -362,8 +366,10 @@ class MapperThread:
     def _record_progress(self) -> None:
         self.progress = Progress(
             settled=self._mapper.settled and not self._unpublished,
-            scans_taken=self._scans_taken,
+            scans_taken=self._mapper.scans_taken,
             samples_trained=self._mapper.samples_trained,
+            own_scans_taken=self._scans_taken,
+            own_samples_trained=self._samples_trained,
             samples_left=self._mapper.samples_left,
             rays_kept=self._mapper.rays_kept,
             rays_discarded=self._mapper.rays_discarded,

@@ -16,9 +16,9 @@ from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, pack, with_room
+from triquad_map.places import place_keys
 
 from triquad_server.engine.live_field import Batch
-from triquad_server.mapping.places import place_keys
 from triquad_server.mapping.ray_table import (
     COLUMNS,
     END,
@@ -213,8 +213,8 @@ class ReplayPool:
         if len(places) == 0:
             self._attended = self._attended[:0]
         else:
-            rows = self._rows[: self._size]
-            self._attended = np.flatnonzero(np.isin(place_keys(rows, settings), places))
+            ends = self._rows[: self._size, END : END + 3]
+            self._attended = np.flatnonzero(np.isin(place_keys(ends, settings), places))
         return len(self._attended)
 
     def draw(self, count: int, fresh: int, attended: int = 0) -> Batch:

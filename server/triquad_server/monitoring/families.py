@@ -89,7 +89,7 @@ _SCANS = (
     counter(
         "triquad_scans_taken_total",
         "Scans that were taken in",
-        single(lambda f: f.status.scans_taken),
+        single(lambda f: f.metrics.scans_taken),
     ),
     counter(
         "triquad_scans_dropped_total",
@@ -211,7 +211,7 @@ _TRAINING = (
     counter(
         "triquad_samples_trained_total",
         "Training samples",
-        single(lambda f: f.status.samples_trained),
+        single(lambda f: f.metrics.samples_trained),
     ),
     gauge(
         "triquad_samples_left",

@@ -54,6 +54,8 @@ class Metrics:
             mapper_s=mapper.time.spent_s(),
             checkpoints=health.checkpoints.metrics(),
             sessions=self._sessions(),
+            scans_taken=mapper.progress.own_scans_taken,
+            samples_trained=mapper.progress.own_samples_trained,
         )
 
     def _queues(self) -> dict[str, QueueMetrics]:

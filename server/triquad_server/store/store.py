@@ -105,7 +105,7 @@ class Store:
             check_record(record)
             written = write_parts(
                 path,
-                MapFacts(record.name, record.epoch, record.settings),
+                MapFacts.of(record),
                 _changed_parts(changes, known, None if delta else others, stamp_ns=stamp_ns),
                 stamp_ns=stamp_ns,
                 known={} if known is None else known.entries if delta else known.stored_here(),

@@ -49,6 +49,7 @@ def test_nothing_of_it_is_published(
         assert isinstance(raised.value, ScanRefusedError)
         assert raised.value.reason == "out_of_memory"
     after = mapper.publish()
+    assert mapper.scans_taken == 3
     assert {r.index for r in after.frozen_regions} == {r.index for r in before.frozen_regions}
     then, now = (epoch.query(PROBES, gradient=False) for epoch in (before, after))
     assert np.array_equal(now.status, then.status)

@@ -6,11 +6,11 @@ from support.small_world import settings, settle, settled_mapper, surface_error,
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT
+from triquad_map.places import place_keys
 from triquad_server.mapping.held_out import are_held_out, ends_in_steps
-from triquad_server.mapping.judgement import Judgement, Places
+from triquad_server.mapping.judgement import JudgedPlaces, Judgement
 from triquad_server.mapping.map_fit import map_fit
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.places import place_keys
 
 FIELD = FieldSettings()
 NOISE_M = 0.02
@@ -23,7 +23,7 @@ NOISE = RNG.normal(0, NOISE_M, len(ROWS))
 FIRST, SECOND = np.arange(len(ROWS)) < 400, np.arange(len(ROWS)) >= 400
 
 
-def judged(judgement: Judgement, error_m: np.ndarray) -> Places:
+def judged(judgement: Judgement, error_m: np.ndarray) -> JudgedPlaces:
     """A field that is off by ``error_m`` where noisy rays end."""
     return judgement.judge(ROWS, (NOISE + error_m).astype(np.float32))
 
@@ -39,7 +39,7 @@ def test_what_fits_worse_than_it_did_is_forgotten() -> None:
     places = judged(judgement, off(SECOND, 0.02))
     (gone,) = places.centres[places.forgotten]
     assert np.linalg.norm(gone - 101) < 10
-    assert places.forgotten_keys == place_keys(ROWS[-1:], FIELD)
+    assert places.forgotten_keys == place_keys(ROWS[-1:, :3], FIELD)
 
 
 def test_the_medians_are_those_of_each_place() -> None:

@@ -8,11 +8,15 @@ from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records.arrays import Bytes, Doubles
 from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MAX_LEVEL, MapRecord, Region
 from triquad_format.records.seen_space import evidence_box, owned_evidence
+from triquad_map.field_fit import MapFit
 
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import Row, print_columns, print_rows
+from triquad_tools.mapfiles.recorded_fit import recorded_fit
+from triquad_tools.top.amounts import millimetres, within
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,9 @@ class MapSummary:
     bytes_per_parameter: float | None
     surface_m3: float
     free_m3: float
+    progress: MapProgress | None  # None: the file does not tell
     training: bool
+    fit: MapFit | None  # to the rays that are held out; None: it holds none
     regions: tuple[RegionSummary, ...]
     parts: dict[str, TopicSummary]
     checks: tuple[str, ...] = ()  # that were made beyond reading, and passed
@@ -88,7 +94,9 @@ def summarise(file: MapFile) -> MapSummary:
         bytes_per_parameter=(file.size - training_bytes) / parameters if whole else None,
         surface_m3=sum(region.surface_m3 for region in regions),
         free_m3=sum(region.free_m3 for region in regions),
+        progress=record.progress if record.progress != MapProgress() else None,
         training=any(region.training is not None for region in record.regions),
+        fit=recorded_fit(record),
         regions=regions,
         parts=parts,
     )
@@ -121,9 +129,29 @@ def _facts(summary: MapSummary) -> Iterator[Row]:
     each = f", {share:.2f} bytes each" if share else ""
     yield Row("parameters", f"{summary.parameters:,}{each}")
     yield Row("evidence", _evidence(summary))
+    if summary.progress is not None:
+        done = summary.progress
+        made = f"{done.scans_taken:,} scans, {done.samples_trained:,} training samples"
+        yield Row("made of", made)
     yield Row("training state", "yes" if summary.training else "no")
+    yield from _fit_facts(summary)
     settings = vars(summary.settings).items()
     yield Row("settings", ", ".join(f"{name} {value}" for name, value in settings))
+
+
+def _fit_facts(summary: MapSummary) -> Iterator[Row]:
+    """How well the map fits rays that it was not trained on."""
+    fit = summary.fit
+    if fit is None:
+        missing = "rays among it" if summary.training else "training state"
+        yield Row("held-out rays", f"none to judge the map by, as there is no {missing}")
+        return
+    yield Row("held-out rays", f"within {within(fit.median_m, fit.upper_m)}")
+    yield Row("", f"{fit.rays:,} rays in {fit.places:,} places")
+    name = "worst places"
+    for (x, y, z), median_m in zip(fit.worst.tolist(), fit.worst_median_m.tolist(), strict=True):
+        yield Row(name, f"within {millimetres(median_m)} at {x:.1f}, {y:.1f}, {z:.1f} m")
+        name = ""
 
 
 def _region_facts(region: RegionSummary) -> Iterator[Row]:

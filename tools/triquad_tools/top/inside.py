@@ -3,7 +3,7 @@
 from triquad_format.wire.messages import CheckpointInfo, FieldFit, ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
 
-from triquad_tools.top.amounts import count, duration, rate, size
+from triquad_tools.top.amounts import count, duration, rate, size, within
 from triquad_tools.top.interval import Interval
 from triquad_tools.top.problems import Grade
 from triquad_tools.top.section import NONE_YET, Row, Section
@@ -45,8 +45,7 @@ def _fit(fit: FieldFit | None) -> list[Row]:
     """How well the field fits rays that it is not trained on."""
     if fit is None:
         return []
-    within = f"{1e3 * fit.median_m:.0f} mm, 90 % in {1e3 * fit.upper_m:.0f} mm"
-    rows = [Row("held-out rays within", (within,))]
+    rows = [Row("held-out rays within", (within(fit.median_m, fit.upper_m),))]
     if fit.repairing:
         rows.append(Row("learnt again", (f"{count(fit.repairing)} places",), Grade.WARNING))
     return rows

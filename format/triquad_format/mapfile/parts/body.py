@@ -83,6 +83,10 @@ class PartBody:
             raise DamagedMapFileError(f"{self.topic}: {key} = {value} is not a count")
         return value
 
+    def optional_count(self, key: str) -> int:
+        """A number as of :meth:`count`; 0 where it is left out."""
+        return self.count(key) if self.has(key) else 0
+
     def texts(self, key: str) -> list[str]:
         """A list of strings."""
         values: list[Any] = self.value(key, list)

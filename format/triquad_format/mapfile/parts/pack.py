@@ -53,6 +53,9 @@ from triquad_format.wire.codec import binary_offsets, pack_array
 SAMPLES_PER_PART = 1 << 17
 RAYS_PER_PART = 1 << 21
 
+_COUNTS = ("places_repaired", "places_given_up")
+"""Of training state; left out where they are 0."""
+
 _MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
 
@@ -215,6 +218,8 @@ def _pack_training(
         "training_budget": training.budget_samples,
         "samples": len(training.sample_points),
     }
+    counts = {name: getattr(training, name) for name in _COUNTS}
+    fields |= {name: count for name, count in counts.items() if count}
     if len(training.rays):
         fields |= {"rays": len(training.rays), "origins": pack_array(training.rays.origins)}
     yield _region_part(PartKey(TRAINING, region.index), fields)

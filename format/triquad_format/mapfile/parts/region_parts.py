@@ -183,11 +183,13 @@ class RegionParts:
             sample_labels=labels,
             budget_samples=head.count("training_budget"),
             rays=self._rays(head),
+            places_repaired=head.optional_count("places_repaired"),
+            places_given_up=head.optional_count("places_given_up"),
         )
 
     def _rays(self, head: PartBody) -> ReplayRays:
         """The rays, of which older files have none."""
-        count = head.count("rays") if head.has("rays") else 0
+        count = head.optional_count("rays")
         keys = [key for key in self._rows if key.topic == RAYS]
         keys.sort(key=lambda key: (key.cell, key.plane))
         none = no_rays()

@@ -1,0 +1,52 @@
+"""Places of a region: cubes of some metres, for each of which is told how well it was learnt."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.field_settings import FieldSettings
+
+_PLACE_LEAVES = 32.0  # side of a place
+_AXIS_BITS = 20
+
+
+def place_keys(ends: Floats, settings: FieldSettings) -> Longs:
+    """The place [N] in which each ray ends, at ``ends`` [N, 3], metres from the region's centre."""
+    side_m = _PLACE_LEAVES * settings.leaf_m
+    cells = np.floor(ends / side_m).astype(np.int64) + (1 << (_AXIS_BITS - 1))
+    keys: Longs = cells[:, 0] << 2 * _AXIS_BITS | cells[:, 1] << _AXIS_BITS | cells[:, 2]
+    return keys
+
+
+@dataclass(frozen=True)
+class Places:
+    """The P places in which N rays end."""
+
+    keys: Longs  # [P] as of :func:`place_keys`, increasing
+    place_of: NDArray[np.intp]  # [N] row of each ray's place
+    rays: Longs  # [P] that end there, at least 1
+    settings: FieldSettings
+
+    @classmethod
+    def of(cls, ends: Floats, settings: FieldSettings) -> "Places":
+        """The places of rays that end at ``ends`` [N, 3], metres from the region's centre."""
+        keys, place_of, rays = np.unique(
+            place_keys(ends, settings), return_inverse=True, return_counts=True
+        )
+        return cls(keys, place_of, rays, settings)
+
+    @property
+    def centres(self) -> Doubles:
+        """Their centres [P, 3], metres from the region's centre."""
+        shifts = np.array([2 * _AXIS_BITS, _AXIS_BITS, 0])
+        cells = (self.keys[:, None] >> shifts & (1 << _AXIS_BITS) - 1) - (1 << (_AXIS_BITS - 1))
+        centres: Doubles = (cells + 0.5) * (_PLACE_LEAVES * self.settings.leaf_m)
+        return centres
+
+    def medians(self, values: NDArray[np.floating]) -> Doubles:
+        """The median of the rays' ``values`` [N] in each place [P]."""
+        ordered = values[np.lexsort([values, self.place_of])]
+        middles = np.cumsum(self.rays) - self.rays + self.rays // 2
+        medians: Doubles = ordered[middles].astype(np.float64)
+        return medians

@@ -1,0 +1,119 @@
+"""What a map knows of itself goes on where a restart interrupts it; real files between."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.small_world import World, settings, settle, settled_mapper, world
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.map_progress import MapProgress
+from triquad_format.records.region import MapRecord
+from triquad_server.mapping.map_fit import map_fit
+from triquad_server.mapping.mapper import Mapper
+
+EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
+SCANS = 6
+
+
+@cache
+def stayed() -> Mapper:
+    """A mapper that has learnt a short drive, and goes on as it is."""
+    mapper = settled_mapper(settings(), drive())
+    mapper.publish()
+    return mapper
+
+
+@cache
+def learnt() -> MapRecord:
+    """What its checkpoint is made of."""
+    return stayed().changes_since(None).record
+
+
+def drive() -> World:
+    return world(SCANS)
+
+
+@pytest.fixture
+def restarted(tmp_path: Path) -> Mapper:
+    """A mapper that goes on from the file of such a map."""
+    path = tmp_path / "map.triquad"
+    write_map(learnt(), path)
+    return Mapper("test", settings(), "cpu", read_map(path))
+
+
+def take_one_more(mapper: Mapper) -> None:
+    scan = drive().scans[-1]
+    mapper.ingest(scan.points, scan.world_from_sensor)
+
+
+def test_counters_go_on(restarted: Mapper) -> None:
+    before = learnt().progress
+    assert before.scans_taken == SCANS
+    assert before.samples_trained > 1_000_000
+    assert before.loss > 0
+    assert restarted.progress == before
+    take_one_more(restarted)
+    restarted.train()
+    assert restarted.scans_taken == SCANS + 1
+    assert restarted.samples_trained > before.samples_trained
+    assert restarted.loss == pytest.approx(before.loss, rel=0.5), "the average goes on"
+    assert restarted.changes_since(None).record.progress == restarted.progress
+
+
+def test_a_download_without_training_state_tells_them_too(restarted: Mapper) -> None:
+    assert restarted.publish().record().progress == learnt().progress
+
+
+def test_a_map_that_was_reset_begins_anew(restarted: Mapper) -> None:
+    restarted.reset(np.zeros(3), np.ones(3))
+    assert restarted.progress == learnt().progress, "only a corner was forgotten"
+    restarted.reset(*EVERYWHERE)
+    assert restarted.publish().regions == 0
+    assert restarted.changes_since(None).record.progress == MapProgress()
+    take_one_more(restarted)
+    assert restarted.scans_taken == 1
+
+
+def test_a_map_is_judged_before_anything_is_trained(restarted: Mapper) -> None:
+    """By the rays of the file, which are the same but for their rounding."""
+    live, now = map_fit(stayed().regions), map_fit(restarted.regions)
+    assert now.rays == pytest.approx(live.rays, rel=0.01)
+    assert now.median_m == pytest.approx(live.median_m, abs=5e-4)
+    assert now.upper_m == pytest.approx(live.upper_m, abs=2e-3)
+    assert now.repairing == 0
+
+
+def test_what_is_forgotten_after_a_restart_is_found_repaired_and_counted(restarted: Mapper) -> None:
+    before = map_fit(restarted.regions)
+    assert before is not None
+    damage(restarted)
+    settle(restarted)
+    restarted.publish()
+    forgetful = map_fit(restarted.regions)
+    assert forgetful.repairing > 0
+    assert forgetful.median_m > 1.2 * before.median_m
+    settle_all(restarted)
+    after = map_fit(restarted.regions)
+    assert after.repaired > 0
+    assert after.median_m < 1.1 * before.median_m
+    again = Mapper("test", settings(), "cpu", restarted.changes_since(None).record)
+    assert map_fit(again.regions).repaired == after.repaired
+
+
+def damage(mapper: Mapper) -> None:
+    """Have the field forget, and be trained for a step: what was not is not judged."""
+    for region in mapper.regions:
+        values = region.field.features.values.numpy()
+        values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
+        region.budget_samples = 1
+
+
+def settle_all(mapper: Mapper) -> None:
+    """Train until nothing is left to learn, nor to be learnt again."""
+    settle(mapper)
+    mapper.publish()
+    while not mapper.settled:
+        settle(mapper)
+        mapper.publish()

@@ -1,0 +1,41 @@
+"""How well a recorded map fits the rays that it was not trained on, as a server judges it."""
+
+import numpy as np
+from triquad_format.records.arrays import Floats
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.replay_rays import are_held_out
+from triquad_map.field_fit import MapFit, PlaceFits, map_fit
+from triquad_map.places import Places
+from triquad_map.reference.evaluator import in_chunks
+from triquad_map.reference.region_field import RegionField
+
+
+def recorded_fit(record: MapRecord) -> MapFit | None:
+    """How well a map fits; ``None``: it holds no rays to judge by, which are training state."""
+    settings = record.settings
+    fits = []
+    for region in record.regions:
+        if region.training is None:
+            continue
+        rays = region.training.rays
+        held_out = np.flatnonzero(are_held_out(rays.ends))
+        ends = rays.ends_m(settings)[held_out].astype(np.float32)
+        if len(ends):
+            fit = PlaceFits.of(Places.of(ends, settings), _field(region, settings, ends))
+            fits.append((settings.region_centre(region.index), fit))
+    return map_fit(fits)
+
+
+def _field(region: Region, settings: FieldSettings, points: Floats) -> Floats:
+    """What the field of a region says at points [N, 3], metres from its centre."""
+    field = RegionField(settings, region)
+    field.add(region.tables)
+    sdf = np.empty(len(points), np.float32)
+
+    def work(first: int, last: int) -> None:
+        sdf[first:last] = field.evaluate(points[first:last], gradient=False).sdf
+
+    with np.errstate(all="ignore"):  # a field that overflows fits badly, and that is told
+        in_chunks(len(points), work)
+    return sdf
