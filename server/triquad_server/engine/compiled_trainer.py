@@ -6,7 +6,7 @@ changes by::
     mean     += (1 - mean_decay) * (g - mean)
     variance += (1 - variance_decay) * (g**2 - variance)
     m, v      = mean / (1 - mean_decay**t), variance / (1 - variance_decay**t)
-    value    -= learning_rate * m / (sqrt(v) + EPSILON)
+    value    -= learning_rate(t) * m / (sqrt(v) + EPSILON)
 
 Steps are counted row by row, so that the moments of a row that is new or seldom touched are
 corrected for its own age. A row's learning rate falls with its age, too: what is learnt hardens.
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from triquad_format.records.arrays import Floats, Ints
+from triquad_format.records.arrays import Floats, Ints, Longs
 from triquad_map.compiled.field.encoding import BATCH, PointBatch, add_feature_gradient, load
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
 from triquad_map.compiled.field.field import (
@@ -33,7 +33,7 @@ from triquad_map.compiled.field.field import (
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import THREADS, Team, share
 
-from triquad_server.engine.live_field import HARDEST, SOFT_STEPS, Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
 
 EPSILON = 1e-10
 
@@ -62,14 +62,20 @@ class ParameterRows(NamedTuple):
 class CompiledRates(NamedTuple):
     """Rates with their corrections by age, as kernels take them."""
 
-    learning_rate: float
     mean_decay: float
     variance_decay: float
     mean_scales: Floats
-    """[n] Correction of the mean after 1, 2, ... steps, times the share of the rate; the last for
+    """[n] Correction of the mean after 1, 2, ... steps, times the learning rate; the last for
     more."""
 
     variance_scales: Floats  # [n] and of the variance
+
+    @classmethod
+    def of(cls, rates: Rates) -> "CompiledRates":
+        """These rates at all ages."""
+        mean_decay, variance_decay = rates.mean_decay, rates.variance_decay
+        ages, mean_scales, variance_scales = _corrections(mean_decay, variance_decay)
+        return cls(mean_decay, variance_decay, rates.by_age(ages) * mean_scales, variance_scales)
 
 
 def _parameter_rows(parameter: Parameter) -> ParameterRows:
@@ -84,14 +90,14 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
 
 
 @lru_cache(maxsize=4)
-def _corrections(mean_decay: float, variance_decay: float) -> tuple[Floats, Floats]:
-    """Scales of mean and variance by age, tabulated until they no longer change."""
+def _corrections(mean_decay: float, variance_decay: float) -> tuple[Longs, Floats, Floats]:
+    """Ages, and scales of mean and variance at each, until nothing changes any more."""
     slowest = max(mean_decay, variance_decay)
     count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
-    ages = np.arange(1, max(count, int(SOFT_STEPS / HARDEST)) + 1)
-    shares = np.clip(SOFT_STEPS / ages, HARDEST, 1)
+    ages = np.arange(1, max(count, LAST_AGE) + 1)
     return (
-        (shares / (1 - mean_decay**ages)).astype(np.float32),
+        ages,
+        (1 / (1 - mean_decay**ages)).astype(np.float32),
         (1 / (1 - variance_decay**ages)).astype(np.float32),
     )
 
@@ -108,7 +114,7 @@ def _step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: Comp
         parameter.variances,
         row,
         (np.float32(1 - rates.mean_decay), np.float32(1 - rates.variance_decay)),
-        (np.float32(rates.learning_rate) * rates.mean_scales[age], rates.variance_scales[age]),
+        (rates.mean_scales[age], rates.variance_scales[age]),
         np.float32(EPSILON),
     )
 
@@ -295,9 +301,8 @@ class CompiledTrainer:
 
     def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
         """Adam on the MLP and on the rows that were touched, so many by each thread."""
-        compiled = CompiledRates(*rates, *_corrections(rates.mean_decay, rates.variance_decay))
-        mlp_rate = self._field.next_mlp_rates(rates).learning_rate
-        of_mlp = compiled._replace(learning_rate=mlp_rate)
+        compiled = CompiledRates.of(rates)
+        of_mlp = CompiledRates.of(self._field.next_mlp_rates(rates))
         for part, parameter in enumerate(self._field.mlp):
             gradient = np.sum([thread[part] for thread in mlp_sums], axis=0).reshape(1, -1)
             _step_row(0, gradient, _parameter_rows(parameter), of_mlp)

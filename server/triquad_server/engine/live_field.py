@@ -82,11 +82,26 @@ class Rates(NamedTuple):
     learning_rate: float
     mean_decay: float  # in [0, 1), as is the next
     variance_decay: float
+    young_rate: float
+    """The learning rate of rows that took few steps yet; at least that of the others."""
+
+    def by_age(self, ages: Longs) -> Floats:
+        """The learning rate [N] of rows after 1, 2, ... steps, at their ``ages`` [N]."""
+        shares = np.clip(_SOFT_STEPS / ages, _HARDEST, 1)
+        young = np.minimum(1, (_YOUNG_STEPS / ages) ** 2)
+        rates = self.learning_rate * shares + (self.young_rate - self.learning_rate) * young
+        return np.asarray(rates, np.float32)
 
 
-SOFT_STEPS, HARDEST = 800, 0.1
+_SOFT_STEPS, _HARDEST = 800, 0.1
 """For so many steps a row of features learns at the full rate; after n times as many at an n-th of
 it, and at this share at least. What is learnt hardens, and moves little where others are."""
+
+LAST_AGE = int(_SOFT_STEPS / _HARDEST)  # from here on, no rate falls any more
+
+_YOUNG_STEPS = 200
+"""For so many steps a row learns at the rate of young ones; after n times as many, what is above
+the others' rate is down to ``1 / n**2`` of it."""
 
 _MLP_SOFT_STEPS, _MLP_HARDEST = 300, 0.02
 """The MLP does so, and in addition so: all places of a region share it."""
@@ -170,7 +185,9 @@ class LiveField:
         """The rates of the next step of the MLP, which hardens more than rows of features do."""
         self.mlp_steps += 1
         share = min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
-        return rates._replace(learning_rate=share * rates.learning_rate)
+        return rates._replace(
+            learning_rate=share * rates.learning_rate, young_rate=share * rates.young_rate
+        )
 
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""

@@ -1,11 +1,12 @@
 """Training a field on tensors, by automatic differentiation: any device, and the reference."""
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from triquad_server.engine.compiled_trainer import EPSILON
-from triquad_server.engine.live_field import HARDEST, SOFT_STEPS, Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
 from triquad_server.engine.tensor_field import Corners, TensorField
 
 
@@ -71,8 +72,7 @@ def step_rows(parameter: Parameter, rows: Tensor, gradient: Tensor, rates: Rates
     variances = parameter.variances[rows].lerp_(gradient.square(), 1 - rates.variance_decay)
     parameter.means[rows] = means
     parameter.variances[rows] = variances
-    direction = _direction(means, variances, parameter.steps[rows], rates=rates)
-    parameter.values[rows] -= rates.learning_rate * direction
+    parameter.values[rows] -= _change(means, variances, parameter.steps[rows], rates=rates)
 
 
 def step_where(parameter: Parameter, mask: Tensor, gradient: Tensor, rates: Rates) -> None:
@@ -86,13 +86,15 @@ def step_where(parameter: Parameter, mask: Tensor, gradient: Tensor, rates: Rate
     parameter.means.lerp_(gradient, (1 - rates.mean_decay) * mask)
     parameter.variances.lerp_(gradient.square(), (1 - rates.variance_decay) * mask)
     steps = parameter.steps.clamp(min=1)
-    direction = _direction(parameter.means, parameter.variances, steps, rates=rates)
-    parameter.values.sub_(rates.learning_rate * mask * direction)
+    change = _change(parameter.means, parameter.variances, steps, rates=rates)
+    parameter.values.sub_(mask * change)
 
 
-def _direction(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) -> Tensor:
-    """What rows [R, ...] that took ``steps`` [R] lose at a learning rate of 1."""
+def _change(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) -> Tensor:
+    """What rows [R, ...] lose that took ``steps`` [R], this one included."""
     age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
     mean = means / (1 - rates.mean_decay**age)
     deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()
-    return mean / (deviation + EPSILON) * (SOFT_STEPS / age).clamp(HARDEST, 1.0)
+    by_age = torch.from_numpy(rates.by_age(np.arange(1, LAST_AGE + 1))).to(means.device)
+    learning_rates = by_age[steps.long().clamp(max=LAST_AGE) - 1].reshape(age.shape)
+    return learning_rates * mean / (deviation + EPSILON)

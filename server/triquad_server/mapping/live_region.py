@@ -126,6 +126,7 @@ class LiveRegion:
         self._repair_budget_samples = 0  # that are to be from places that have forgotten
         self.budget_samples = 0  # the training budget: samples that are still to be trained on
         self.samples_discarded = 0  # so far, that were more
+        self._new_rays = 0  # since it had settled
         self._fresh_budget_samples = 0  # those of them that are to be from the newest scan
         self.changed = True  # since it was last published
         self._restored = False  # and not published since: where surfaces lie is in the field alone
@@ -163,6 +164,7 @@ class LiveRegion:
             region._keep(restored_rays(state.rays, setup.field))
             region.pool.add(samples_alone(state.sample_points, state.sample_labels))
             region.budget_samples = state.budget_samples if len(region.pool) else 0
+            region._new_rays = len(region.pool)
             region.repairs = Repairs(state.places_repaired, state.places_given_up)
             # What it forgets from now on is told from what it knows now.
             region._judge(region.field.freeze())
@@ -244,7 +246,11 @@ class LiveRegion:
         passing = rays_through(rays, normals, self.centre, self.pool.placement, self._ray_random)
         if len(passing) == 0:
             return
-        samples = int(self._keep(passing) * self._training.samples_per_ray)
+        if self.budget_samples == 0:
+            self._new_rays = 0
+        kept = self._keep(passing)
+        self._new_rays += kept
+        samples = int(kept * self._training.samples_per_ray)
         self.budget_samples += samples
         self._limit_budget()
         self._fresh_budget_samples = int(samples * self._training.fresh_share)
@@ -306,8 +312,13 @@ class LiveRegion:
         fresh = min(self._fresh_budget_samples, int(count * settings.fresh_share))
         repair = min(self._repair_budget_samples, int(count * _REPAIR_SHARE))
         batch = self.pool.draw(count, fresh, repair)
-        rate = settings.learning_rate * self._cooling()
-        loss = self._trainer.train(batch, Rates(rate, settings.beta1, settings.beta2))
+        rates = Rates(
+            settings.learning_rate * self._cooling(len(self.pool)),
+            settings.beta1,
+            settings.beta2,
+            young_rate=settings.learning_rate * self._cooling(min(self._new_rays, len(self.pool))),
+        )
+        loss = self._trainer.train(batch, rates)
         self._fresh_budget_samples -= fresh
         self._repair_budget_samples -= repair
         self._unjudged_samples += count
@@ -444,7 +455,11 @@ class LiveRegion:
         if self.budget_samples:  # else a map that has settled would change once more
             self.budget_samples += _VISITS * len(points)
 
-    def _cooling(self) -> float:
-        """Share of the learning rate: falls as the budget is used up, so that the field settles."""
-        enough = self._training.cooldown * max(1, len(self.pool))
+    def _cooling(self, rays: int) -> float:
+        """Share of the learning rate: falls as the budget is used up, so that the field settles.
+
+        It falls the later, the fewer the ``rays`` are from which there is something to learn: so
+        what is new learns quickly, beside much that has settled.
+        """
+        enough = self._training.cooldown * max(1, rays)
         return min(1.0, max(_LEAST_RATE, (self.budget_samples / enough) ** 2))

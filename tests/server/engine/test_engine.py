@@ -14,7 +14,7 @@ from triquad_server.engine.tensor_trainer import TensorTrainer, step_rows, step_
 from triquad_server.process.threads import Teams
 
 CPU = torch.device("cpu")
-RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99)
+RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99, young_rate=0.02)
 TEAM = Teams().mapping
 CASES = [
     FieldSettings(depth=8, frequencies=4),

@@ -21,7 +21,7 @@ from triquad_server.engine.tensor_field import TensorField
 from triquad_server.engine.tensor_trainer import TensorTrainer
 
 CPU = torch.device("cpu")
-RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99)
+RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99, young_rate=0.02)
 
 
 def small(encoding: str = "both", depth: int = 8) -> FieldSettings:

@@ -371,6 +371,19 @@ def test_a_place_left_behind_is_not_forgotten() -> None:
     assert surface_error(mapper.publish(), here) < before + 0.004
 
 
+def test_what_is_new_is_learnt_as_well_beside_much_that_has_settled() -> None:
+    training = {"batch": 4096, "samples_per_ray": 18.0}
+    one_region = Settings.model_validate({"field": {"depth": 11}, "training": training})
+    scan = world(30, 1.5).scans[-1]
+    there = World(world().scene, (scan,))
+    alone = Mapper("test", one_region, "cpu")
+    beside = settled_mapper(one_region, world(10))
+    for mapper in (alone, beside):
+        mapper.ingest(scan.points, scan.world_from_sensor)
+        settle(mapper)
+    assert surface_error(beside.publish(), there) < 1.25 * surface_error(alone.publish(), there)
+
+
 def test_reset_forgets_a_box_and_everything() -> None:
     mapper = settled_mapper(settings(samples_per_ray=3.0), world(2))
     hits = world(2).hits

@@ -43,7 +43,9 @@ def measure_far_scan(seed: int) -> list[Figure]:
     poses = drive(scene, _SCANS + _BETWEEN, _STEP_M)
     lidar = Lidar(columns=_COLUMNS)
     place = driven_street(SimulatedDrive(scene, lidar, poses[:_SCANS], seed=seed))
-    (scan,) = SimulatedDrive(scene, lidar, poses[-1:], seed=seed)
+    elsewhere = driven_street(SimulatedDrive(scene, lidar, poses[-1:], seed=seed))
+    (scan,) = elsewhere.scans
+    alone = settled_mapper("one scan elsewhere, alone", [scan])
     mapper = settled_mapper("the place", place.scans)
     before = _Place.of(mapper.publish(), place)
     follower = _Follower(mapper.publish())
@@ -54,16 +56,25 @@ def measure_far_scan(seed: int) -> list[Figure]:
     while not mapper.settled:
         _settle(mapper)
         mapper.publish()
-    repaired = _Place.of(mapper.publish(), place)
-    sent = follower.sent_of(mapper.publish())
+    after_all = mapper.publish()
+    repaired = _Place.of(after_all, place)
+    sent = follower.sent_of(after_all)
     in_sight = _near(sent, scan.world_from_sensor[:3, 3], lidar.range_max_m)
-    copied, fetched = follower.parts_of(mapper.publish())
+    alone_cm, beside_cm = _error_cm(alone.publish(), elsewhere), _error_cm(after_all, elsewhere)
+    copied, fetched = follower.parts_of(after_all)
     return [
         Figure("SDF error of a place, settled", before.error_cm, "cm"),
         Figure(f"the same after one more scan {_BETWEEN} m away", after.error_cm, "cm"),
         Figure("the same once what was forgotten is learnt again", repaired.error_cm, "cm"),
         Figure("moved by more than 1 cm, before that", 100 * before.moved(after), "%"),
         Figure("and then", 100 * before.moved(repaired), "%", at_most=2.0),
+        Figure("SDF error where that scan looks", beside_cm, "cm"),
+        Figure(
+            "the same, times that of a map of this scan alone",
+            beside_cm / alone_cm,
+            "",
+            at_most=1.1,
+        ),
         Figure("tiles of the mesh with new evidence", len(shown), ""),
         Figure(
             "tiles sent, times those with new evidence or changed in sight of the scan",
@@ -134,12 +145,15 @@ class _Place:
 
     @classmethod
     def of(cls, epoch: Epoch, place: DrivenStreet) -> "_Place":
-        error_m = score_street(epoch.query, place.probes).sdf_error_m
-        return cls(100 * error_m, epoch.query(_surface(place)).sdf)
+        return cls(_error_cm(epoch, place), epoch.query(_surface(place)).sdf)
 
     def moved(self, other: "_Place") -> float:
         """The share of the surface that is elsewhere."""
         return float((np.abs(self.sdf - other.sdf) > _MOVED_M).mean())
+
+
+def _error_cm(epoch: Epoch, place: DrivenStreet) -> float:
+    return 100 * score_street(epoch.query, place.probes).sdf_error_m
 
 
 def _surface(place: DrivenStreet) -> Doubles:
