@@ -81,7 +81,7 @@ def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> Do
 def _training(region: LiveRegion, settings: Settings) -> list[Figure]:
     training = settings.training
     trainer = TensorTrainer(region.field)
-    rates = Rates(_RATE, training.beta1, training.beta2)
+    rates = Rates(_RATE, training.beta1, training.beta2, young_rate=_RATE)
     rng = np.random.default_rng(0)
 
     def baseline() -> None:
