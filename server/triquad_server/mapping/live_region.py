@@ -30,7 +30,6 @@ from triquad_server.engine.compiled_trainer import CompiledTrainer
 from triquad_server.engine.live_field import (
     FrozenField,
     LiveField,
-    Rates,
     field_from_record,
     initial_field,
     region_record,
@@ -53,6 +52,7 @@ from triquad_server.mapping.ray_table import (
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.mapping.replay_record import recorded_rays, restored_rays
+from triquad_server.mapping.training_budget import TrainingBudget
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +63,6 @@ _CLEAR_SHORT = 2.5
 _SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
 _VISITS = 4  # to each of them
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
-_LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
 
 _VERTICES_PER_SAMPLE = 14
 """Of a region, for each sample of a step: each vertex takes about as many steps wherever it is."""
@@ -79,9 +78,6 @@ _SURFELS_REFITTED = 8_000
 
 _JUDGED_AFTER_SAMPLES = 8_000_000
 """A field that is being trained is judged once in so many samples: a few seconds."""
-
-_REPAIR_SHARE = 0.5  # of a batch, that is drawn where the field has forgotten
-_REPAIR_VISITS = 16  # to each ray there
 
 _CPU = torch.device("cpu")
 
@@ -123,11 +119,7 @@ class LiveRegion:
         self._judgement = Judgement(setup.field)
         self._share = FairShare.of(0, setup.training)  # of each voxel
         self._unjudged_samples = 0  # that were trained since
-        self._repair_budget_samples = 0  # that are to be from places that have forgotten
-        self.budget_samples = 0  # the training budget: samples that are still to be trained on
-        self.samples_discarded = 0  # so far, that were more
-        self._new_rays = 0  # since it had settled
-        self._fresh_budget_samples = 0  # those of them that are to be from the newest scan
+        self.budget = TrainingBudget(setup.training)
         self.changed = True  # since it was last published
         self._restored = False  # and not published since: where surfaces lie is in the field alone
         self._scans = 0  # that it was seen in
@@ -163,8 +155,7 @@ class LiveRegion:
         if state is not None:
             region._keep(restored_rays(state.rays, setup.field))
             region.pool.add(samples_alone(state.sample_points, state.sample_labels))
-            region.budget_samples = state.budget_samples if len(region.pool) else 0
-            region._new_rays = len(region.pool)
+            region.budget.restore(state.budget_samples, len(region.pool))
             region.repairs = Repairs(state.places_repaired, state.places_given_up)
             # What it forgets from now on is told from what it knows now.
             region._judge(region.field.freeze())
@@ -246,14 +237,7 @@ class LiveRegion:
         passing = rays_through(rays, normals, self.centre, self.pool.placement, self._ray_random)
         if len(passing) == 0:
             return
-        if self.budget_samples == 0:
-            self._new_rays = 0
-        kept = self._keep(passing)
-        self._new_rays += kept
-        samples = int(kept * self._training.samples_per_ray)
-        self.budget_samples += samples
-        self._limit_budget()
-        self._fresh_budget_samples = int(samples * self._training.fresh_share)
+        self.budget.add(self._keep(passing))
 
     def _keep(self, rays: RayTable) -> int:
         """Keep rays, some of which are held out; returns how many are to be trained on."""
@@ -264,20 +248,11 @@ class LiveRegion:
 
     def limit(self, share: FairShare) -> None:
         """From now on, keep as many rays and owe as many samples as are its share."""
-        self._share = share
-        rays = max(1, int(share.rays * self.size.evidence.voxels))
+        self._share, voxels = share, self.size.evidence.voxels
+        rays = max(1, int(share.rays * voxels))
         self.pool.limit(rays)
         self.held_out.limit(max(1, rays // HELD_OUT))
-        self._limit_budget()
-
-    @property
-    def _most_budget_samples(self) -> int:
-        return int(self._share.samples * self.size.evidence.voxels)
-
-    def _limit_budget(self) -> None:
-        too_many = max(0, self.budget_samples - self._most_budget_samples)
-        self.budget_samples -= too_many
-        self.samples_discarded += too_many
+        self.budget.limit(int(share.samples * voxels))
 
     def ray_ends(self) -> Doubles:
         """Where the rays end [N, 3] that are kept, those of the newest scans last."""
@@ -297,7 +272,7 @@ class LiveRegion:
     @property
     def owed(self) -> float:
         """Samples that are still to be trained on for each vertex."""
-        return self.budget_samples / max(1, self.field.vertices)
+        return self.budget.samples / max(1, self.field.vertices)
 
     @property
     def batch(self) -> int:
@@ -307,22 +282,11 @@ class LiveRegion:
 
     def train(self) -> float | Tensor:
         """One optimiser step; returns the loss: to read it on a GPU waits for the step."""
-        settings = self._training
-        count = self.batch
-        fresh = min(self._fresh_budget_samples, int(count * settings.fresh_share))
-        repair = min(self._repair_budget_samples, int(count * _REPAIR_SHARE))
-        batch = self.pool.draw(count, fresh, repair)
-        rates = Rates(
-            settings.learning_rate * self._cooling(len(self.pool)),
-            settings.beta1,
-            settings.beta2,
-            young_rate=settings.learning_rate * self._cooling(min(self._new_rays, len(self.pool))),
-        )
-        loss = self._trainer.train(batch, rates)
-        self._fresh_budget_samples -= fresh
-        self._repair_budget_samples -= repair
-        self._unjudged_samples += count
-        self.budget_samples = max(0, self.budget_samples - count)
+        step = self.budget.next_step(self.batch, len(self.pool))
+        batch = self.pool.draw(step.samples, step.fresh, step.repair)
+        loss = self._trainer.train(batch, step.rates)
+        self.budget.spend(step)
+        self._unjudged_samples += step.samples
         self.changed = True
         return loss
 
@@ -332,7 +296,7 @@ class LiveRegion:
         for pool in (self.pool, self.held_out):
             pool.forget(low - self.centre, high - self.centre)
         if len(self.pool) == 0:
-            self.budget_samples = 0
+            self.budget.clear()
         self.changed = True
 
     def voxels(self, points: Doubles) -> Doubles:
@@ -357,7 +321,7 @@ class LiveRegion:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)
             self._restored = False
         self._forget_gone(surfels)
-        enough = _JUDGED_AFTER_SAMPLES if self.budget_samples else 1
+        enough = _JUDGED_AFTER_SAMPLES if self.budget.samples else 1
         if self._unjudged_samples >= enough:
             self._judge(field)
         own = buffers_of((field, evidence, surfels))
@@ -389,7 +353,7 @@ class LiveRegion:
             self.field,
             rays=rays,
             samples=self.pool.draw_on(others),
-            budget_samples=self.budget_samples,
+            budget_samples=self.budget.samples,
         )
         state = replace(
             state,
@@ -418,9 +382,7 @@ class LiveRegion:
                 z,
             )
         attended = self.pool.attend(places.forgotten_keys, self._settings)
-        self._repair_budget_samples = _REPAIR_VISITS * attended
-        needed = int(self._repair_budget_samples / _REPAIR_SHARE)
-        self.budget_samples = max(self.budget_samples, min(needed, self._most_budget_samples))
+        self.budget.repair(attended)
 
     def _surfels(
         self, evidence: FrozenEvidence, field: SampleField, epoch: int, before: FrozenRegion | None
@@ -428,7 +390,7 @@ class LiveRegion:
         """The surfels of an epoch; a region that has settled has all of them from its field."""
         most: int | None = None
         shown: ShownByRays = nothing_shown
-        if self.budget_samples:
+        if self.budget.samples:
             most = _SURFELS_REFITTED
             shown = partial(self.evidence.ray_surfels, since=self._scans - _NEW_SCANS)
         if before is None:
@@ -452,14 +414,4 @@ class LiveRegion:
         surfels.find_nearest(points, nearest)
         offsets = ((points - middle) * leaf_m).astype(np.float32)
         self.pool.add(samples_alone(offsets, nearest.distances * leaf_m), fresh=False)
-        if self.budget_samples:  # else a map that has settled would change once more
-            self.budget_samples += _VISITS * len(points)
-
-    def _cooling(self, rays: int) -> float:
-        """Share of the learning rate: falls as the budget is used up, so that the field settles.
-
-        It falls the later, the fewer the ``rays`` are from which there is something to learn: so
-        what is new learns quickly, beside much that has settled.
-        """
-        enough = self._training.cooldown * max(1, rays)
-        return min(1.0, max(_LEAST_RATE, (self.budget_samples / enough) ** 2))
+        self.budget.add_samples(_VISITS * len(points))

@@ -99,7 +99,7 @@ class Mapper:
     @property
     def samples_left(self) -> int:
         """Training samples that are still owed, of all regions."""
-        return sum(region.budget_samples for region in self._regions.values())
+        return sum(region.budget.samples for region in self._regions.values())
 
     @property
     def loss(self) -> float:
@@ -143,7 +143,7 @@ class Mapper:
     @property
     def samples_discarded(self) -> int:
         """Samples so far that more than the regions may owe would have been."""
-        return sum(region.samples_discarded for region in self._regions.values())
+        return sum(region.budget.discarded for region in self._regions.values())
 
     @property
     def replay_share(self) -> float:
@@ -256,7 +256,7 @@ class Mapper:
         """One optimiser step where most is owed for what is there; nothing once all is settled."""
         self._restore_missing()
         region = max(self._regions.values(), key=lambda r: r.owed, default=None)
-        if region is None or region.budget_samples == 0:
+        if region is None or region.budget.samples == 0:
             return
         loss = region.train()
         before = loss if self._loss is None else self._loss

@@ -125,7 +125,7 @@ def test_forgetting_is_found_told_and_repaired() -> None:
     for region in mapper.regions:
         values = region.field.features.values.numpy()
         values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
-        region.budget_samples = 1  # for a step, since what was not trained was not judged
+        region.budget.samples = 1  # for a step, since what was not trained was not judged
     settle(mapper)
     assert surface_error(mapper.publish(), world()) > 1.2 * before_m
     assert map_fit(mapper.regions).repairing > 0

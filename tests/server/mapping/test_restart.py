@@ -107,7 +107,7 @@ def damage(mapper: Mapper) -> None:
     for region in mapper.regions:
         values = region.field.features.values.numpy()
         values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
-        region.budget_samples = 1
+        region.budget.samples = 1
 
 
 def settle_all(mapper: Mapper) -> None:

@@ -1,0 +1,100 @@
+"""What a region still has to learn: how many samples, on which rays, and at which rates."""
+
+from typing import NamedTuple
+
+from triquad_server.engine.live_field import Rates
+from triquad_server.settings import TrainingSettings
+
+_LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
+_REPAIR_SHARE = 0.5  # of a batch, that is drawn where the field has forgotten
+_REPAIR_VISITS = 16  # to each ray there
+
+
+class Step(NamedTuple):
+    """How the next step of the optimiser is to be."""
+
+    samples: int
+    fresh: int  # of them, on rays of the newest scan
+    repair: int  # and in places that have forgotten
+    rates: Rates
+
+
+class TrainingBudget:
+    """Samples that are still to be trained on. New rays add to it, and each step takes from it."""
+
+    def __init__(self, settings: TrainingSettings) -> None:
+        self._settings = settings
+        self.samples = 0
+        self.discarded = 0  # samples so far, that were more than may be owed
+        self._most = 0  # that may be owed
+        self._fresh = 0  # of the samples, those that are to be on rays of the newest scan
+        self._repair = 0  # and those in places that have forgotten
+        self._new_rays = 0  # since nothing was owed
+
+    def add(self, rays: int) -> None:
+        """There are new rays to learn from."""
+        if self.samples == 0:
+            self._new_rays = 0
+        self._new_rays += rays
+        samples = int(rays * self._settings.samples_per_ray)
+        self._fresh = int(samples * self._settings.fresh_share)
+        self.samples += samples
+        self.limit(self._most)
+
+    def add_samples(self, samples: int) -> None:
+        """There is more to learn from what is known; not once nothing is owed any more."""
+        if self.samples:
+            self.samples += samples
+
+    def restore(self, samples: int, rays: int) -> None:
+        """Go on with ``samples`` from a record, on so many rays."""
+        self.samples = samples if rays else 0
+        self._new_rays = rays
+
+    def limit(self, most: int) -> None:
+        """From now on, owe at most so many samples."""
+        self._most = most
+        too_many = max(0, self.samples - most)
+        self.samples -= too_many
+        self.discarded += too_many
+
+    def repair(self, rays: int) -> None:
+        """So many rays are in places that have forgotten: learn these again, and nothing else."""
+        self._repair = _REPAIR_VISITS * rays
+        needed = int(self._repair / _REPAIR_SHARE)
+        self.samples = max(self.samples, min(needed, self._most))
+
+    def clear(self) -> None:
+        """Owe nothing any more."""
+        self.samples = 0
+
+    def next_step(self, count: int, kept_rays: int) -> Step:
+        """A step of ``count`` samples, where so many rays are kept."""
+        settings = self._settings
+        rates = Rates(
+            settings.learning_rate * self._cooling(kept_rays),
+            settings.beta1,
+            settings.beta2,
+            young_rate=settings.learning_rate * self._cooling(min(self._new_rays, kept_rays)),
+        )
+        return Step(
+            count,
+            fresh=min(self._fresh, int(count * settings.fresh_share)),
+            repair=min(self._repair, int(count * _REPAIR_SHARE)),
+            rates=rates,
+        )
+
+    def spend(self, step: Step) -> None:
+        """A step was taken."""
+        self._fresh -= step.fresh
+        self._repair -= step.repair
+        self.samples = max(0, self.samples - step.samples)
+
+    def _cooling(self, rays: int) -> float:
+        """Share of the learning rate: falls as the budget is used up, so that the field settles.
+
+        It falls the later, the fewer the ``rays`` are from which there is something to learn: so
+        what is new learns quickly, beside much that has settled.
+        """
+        enough = self._settings.cooldown * max(1, rays)
+        return min(1.0, max(_LEAST_RATE, (self.samples / enough) ** 2))
