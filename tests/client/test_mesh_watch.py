@@ -291,7 +291,8 @@ def test_a_server_that_stops_says_so() -> None:
         answers = held_by(session)
         service.__exit__(None, None, None)
         (reply,) = answers
-        assert codec.decode(ErrorReply, reply.err.payload.to_bytes()).code == "timeout"
+        code = codec.decode(ErrorReply, reply.err.payload.to_bytes()).code
+        assert code in ("timeout", "busy")  # held by then, or about to be
 
 
 def tiles_by_hand(peer: servers.RawPeer, **changes: object) -> TileUpdates:
