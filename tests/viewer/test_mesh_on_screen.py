@@ -1,5 +1,6 @@
 """What a browser shows of the mesh of a server."""
 
+import re
 from collections.abc import Callable
 from functools import partial
 
@@ -11,6 +12,9 @@ from triquad_client import connect
 from triquad_format.records.arrays import Bytes
 from triquad_tools.benchmarks.browser import drawn_share, picture, wait_until, wait_until_drawn
 from triquad_tools.recordings.publishing import wait_until_settled
+
+GONE = re.compile("no server has a map|the link to the server is down")
+"""Whichever of both is found out first."""
 
 PageOf = Callable[[str], Page]
 
@@ -62,8 +66,8 @@ def test_a_server_that_is_gone_is_told_of_until_it_is_back(page_of: PageOf) -> N
         learn(client)
         page = page_of(endpoint)
         wait_until_drawn(page)
-        expect(page.get_by_text("no server has a map")).to_be_hidden()
-    expect(page.get_by_text("no server has a map")).to_be_visible(timeout=60_000)
+        expect(page.get_by_text(GONE)).to_be_hidden()
+    expect(page.get_by_text(GONE)).to_be_visible(timeout=60_000)
     assert drawn_share(page) > 0.005, "what is known stays"
     with running_service(endpoint=endpoint), connect(endpoint) as client:
         expect(page.get_by_text("0 taken")).to_be_visible(timeout=60_000)
