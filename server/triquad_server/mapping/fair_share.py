@@ -9,7 +9,7 @@ from triquad_server.settings import TrainingSettings
 _STEP = 1.1
 """By which the rays of a voxel become fewer: it is expensive, and so it is done seldom."""
 
-_RECORDED = 5.0
+_RECORDED = 7.0
 """Rays of a voxel in a checkpoint: fewer than are kept, since what they taught is in it as well."""
 
 
