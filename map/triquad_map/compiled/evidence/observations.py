@@ -7,7 +7,13 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import surface_counts, used_blocks
 
 from triquad_map.compiled.evidence.levels import fill_levels
-from triquad_map.compiled.evidence.observed import OBSERVED_VOXEL, Observed, row_of
+from triquad_map.compiled.evidence.observed import (
+    OBSERVED_VOXEL,
+    Observed,
+    row_of,
+    rows_around,
+    voxel_of,
+)
 from triquad_map.compiled.evidence.outcomes import outcome_codes, outcome_counts
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.evidence.sightings import Sighting, record_ends
@@ -20,6 +26,8 @@ _MIN_CAPACITY = 64
 _MIN_ROWS = 1024
 _DISC = int(SurfelKind.DISC)
 _DISC_ENDS, _DISC_SPREAD = 16.0, 0.15  # that a disc of the field stands for
+_FARTHEST_BESIDE = 0.75  # voxels from a voxel's middle to the disc of another one
+_OUTSIDE = 0.1  # voxels by which a disc may reach out of its own voxel
 
 _RECORD = ("hits", "earlier_passes", "earlier_misses")
 """What files keep of a voxel's record."""
@@ -53,6 +61,39 @@ def _set_discs(
             voxel.normal[axis] = normals[i, axis] if is_disc else 0.0
         voxel.spread = _DISC_SPREAD
         voxel.ends = _DISC_ENDS if is_disc else 0
+    for i in range(len(voxels)):
+        row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
+        if row != 0 and observed.voxels[row].ends == 0:
+            _set_disc_beside(row, seen, observed)
+
+
+@kernel()
+def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
+    """Take the disc of a voxel beside it for one that has none: the nearest to its middle.
+
+    The ends of noisy rays lie in voxels on both sides of a surface, and the disc in one of them.
+    """
+    voxel, corner = observed.voxels[row], voxel_of(row, seen, observed)
+    nearest = _FARTHEST_BESIDE
+    for near in rows_around(row, 1, seen, observed):
+        disc = observed.voxels[near]
+        normal, mean = disc.normal, disc.mean
+        if near == row or (normal[0] == 0 and normal[1] == 0 and normal[2] == 0):
+            continue
+        beside = voxel_of(near, seen, observed)
+        height = 0.0
+        for axis in range(3):
+            height += (corner[axis] + 0.5 - beside[axis] - mean[axis]) * normal[axis]
+        is_there = abs(height) < nearest
+        for axis in range(3):
+            foot = corner[axis] + 0.5 - height * normal[axis] - beside[axis]
+            is_there = is_there and -_OUTSIDE <= foot <= 1 + _OUTSIDE
+        if is_there:
+            nearest = abs(height)
+            for axis in range(3):
+                voxel.mean[axis] = 0.5 - height * normal[axis]
+                voxel.normal[axis] = normal[axis]
+            voxel.ends = _DISC_ENDS
 
 
 class Observations:
