@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import msgpack
+import numpy as np
 import pytest
 from support import spec_reader
 from support.map_records import assert_same, random_record, with_progress, with_rays
@@ -81,9 +82,13 @@ def test_nothing_is_written_of_a_map_that_was_just_begun() -> None:
 
 
 def test_readers_may_skip_it(tmp_path: Path) -> None:
-    path = tmp_path / "map.triquad"
+    path, plain = tmp_path / "map.triquad", tmp_path / "plain.triquad"
     path.write_bytes(DATA)
-    spec_reader.load(path)
+    plain.write_bytes(file_bytes(dataclasses.replace(RECORD, progress=MapProgress())))
+    points = np.random.default_rng(0).uniform(-20, 20, (1000, 3))
+    told, untold = spec_reader.load(path), spec_reader.load(plain)
+    assert vars(told.settings) == vars(untold.settings)
+    np.testing.assert_array_equal(told.status(points), untold.status(points))
 
 
 def test_a_delta_tells_that_of_its_own_epoch(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from triquad_format.records.arrays import Floats, Ints, Longs
+from triquad_format.records.arrays import Doubles, Floats, Ints
 from triquad_map.compiled.field.encoding import BATCH, PointBatch, add_feature_gradient, load
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
 from triquad_map.compiled.field.field import (
@@ -75,7 +75,8 @@ class CompiledRates(NamedTuple):
         """These rates at all ages."""
         mean_decay, variance_decay = rates.mean_decay, rates.variance_decay
         ages, mean_scales, variance_scales = _corrections(mean_decay, variance_decay)
-        return cls(mean_decay, variance_decay, rates.by_age(ages) * mean_scales, variance_scales)
+        learning_rates = rates.by_age(ages).astype(np.float32)
+        return cls(mean_decay, variance_decay, learning_rates * mean_scales, variance_scales)
 
 
 def _parameter_rows(parameter: Parameter) -> ParameterRows:
@@ -90,11 +91,11 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
 
 
 @lru_cache(maxsize=4)
-def _corrections(mean_decay: float, variance_decay: float) -> tuple[Longs, Floats, Floats]:
+def _corrections(mean_decay: float, variance_decay: float) -> tuple[Doubles, Floats, Floats]:
     """Ages, and scales of mean and variance at each, until nothing changes any more."""
     slowest = max(mean_decay, variance_decay)
     count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
-    ages = np.arange(1, max(count, LAST_AGE) + 1)
+    ages = np.arange(1.0, max(count, LAST_AGE) + 1)
     return (
         ages,
         (1 / (1 - mean_decay**ages)).astype(np.float32),
@@ -302,7 +303,8 @@ class CompiledTrainer:
     def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
         """Adam on the MLP and on the rows that were touched, so many by each thread."""
         compiled = CompiledRates.of(rates)
-        of_mlp = CompiledRates.of(self._field.next_mlp_rates(rates))
+        mlp_share = np.float32(self._field.next_mlp_share())
+        of_mlp = compiled._replace(mean_scales=mlp_share * compiled.mean_scales)
         for part, parameter in enumerate(self._field.mlp):
             gradient = np.sum([thread[part] for thread in mlp_sums], axis=0).reshape(1, -1)
             _step_row(0, gradient, _parameter_rows(parameter), of_mlp)

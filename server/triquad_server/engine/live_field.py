@@ -2,13 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from triquad_format.records.arrays import Floats, Longs
+from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
 from triquad_format.records.replay_rays import ReplayRays
@@ -76,6 +76,9 @@ class Batch:
     labels: Tensor  # [B] signed distances, metres
 
 
+AgesT = TypeVar("AgesT", Doubles, Tensor)
+
+
 class Rates(NamedTuple):
     """How fast values and moments follow the gradients."""
 
@@ -85,12 +88,11 @@ class Rates(NamedTuple):
     young_rate: float
     """The learning rate of rows that took few steps yet; at least that of the others."""
 
-    def by_age(self, ages: Longs) -> Floats:
-        """The learning rate [N] of rows after 1, 2, ... steps, at their ``ages`` [N]."""
-        shares = np.clip(_SOFT_STEPS / ages, _HARDEST, 1)
-        young = np.minimum(1, (_YOUNG_STEPS / ages) ** 2)
-        rates = self.learning_rate * shares + (self.young_rate - self.learning_rate) * young
-        return np.asarray(rates, np.float32)
+    def by_age(self, ages: AgesT) -> AgesT:
+        """The learning rates of rows that took so many steps, at least one each."""
+        shares = (_SOFT_STEPS / ages).clip(_HARDEST, 1)
+        young = (_YOUNG_STEPS / ages).clip(0, 1) ** 2
+        return self.learning_rate * shares + (self.young_rate - self.learning_rate) * young
 
 
 _SOFT_STEPS, _HARDEST = 800, 0.1
@@ -181,13 +183,10 @@ class LiveField:
         self.tree.restore(plane, h, codes)
         self.features.append(features)
 
-    def next_mlp_rates(self, rates: Rates) -> Rates:
-        """The rates of the next step of the MLP, which hardens more than rows of features do."""
+    def next_mlp_share(self) -> float:
+        """The share of the rates in the next step of the MLP: it hardens more than features do."""
         self.mlp_steps += 1
-        share = min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
-        return rates._replace(
-            learning_rate=share * rates.learning_rate, young_rate=share * rates.young_rate
-        )
+        return min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
 
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""

@@ -1,6 +1,5 @@
 """Training a field on tensors, by automatic differentiation: any device, and the reference."""
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -33,7 +32,10 @@ class TensorTrainer:
             loss = F.binary_cross_entropy_with_logits(logits, target)
             torch.autograd.backward(loss)
         first_row = torch.zeros(1, dtype=torch.int64, device=field.device)
-        mlp_rates = self._field.next_mlp_rates(rates)
+        share = self._field.next_mlp_share()
+        mlp_rates = rates._replace(
+            learning_rate=share * rates.learning_rate, young_rate=share * rates.young_rate
+        )
         for parameter, weight in zip(self._field.mlp, mlp, strict=True):
             assert weight.grad is not None
             step_rows(parameter, first_row, weight.grad[None], rates=mlp_rates)
@@ -95,6 +97,4 @@ def _change(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) -> Te
     age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
     mean = means / (1 - rates.mean_decay**age)
     deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()
-    by_age = torch.from_numpy(rates.by_age(np.arange(1, LAST_AGE + 1))).to(means.device)
-    learning_rates = by_age[steps.long().clamp(max=LAST_AGE) - 1].reshape(age.shape)
-    return learning_rates * mean / (deviation + EPSILON)
+    return rates.by_age(age.clamp(max=LAST_AGE)) * mean / (deviation + EPSILON)

@@ -44,7 +44,6 @@ from triquad_server.mapping.judgement import JudgedPlaces, Judgement, Repairs
 from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.ray_table import (
     END,
-    Placement,
     RayTable,
     rays_through,
     samples_alone,
@@ -98,14 +97,7 @@ class LiveRegion:
         self._ray_random = np.random.default_rng([seed, 1])
         new_pool = partial(
             ReplayPool,
-            placement=Placement(
-                surface_share=setup.scan.surface_share,
-                spread_m=setup.scan.spread_m,
-                truncation_m=setup.scan.truncation_m,
-                free_from=setup.scan.free_from,
-                behind_m=setup.scan.behind_m,
-                half_side_m=setup.field.region_side_m / 2,
-            ),
+            placement=setup.placement,
             leaf_m=setup.field.leaf_m,
             seed=seed,
             team=setup.team,

@@ -8,6 +8,7 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.mapping.ray_table import Placement
 from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
 
@@ -22,6 +23,18 @@ class RegionSetup:
     device: torch.device
     sums: GradientSums
     team: Team
+
+    @property
+    def placement(self) -> Placement:
+        """Where on their rays samples lie."""
+        return Placement(
+            surface_share=self.scan.surface_share,
+            spread_m=self.scan.spread_m,
+            truncation_m=self.scan.truncation_m,
+            free_from=self.scan.free_from,
+            behind_m=self.scan.behind_m,
+            half_side_m=self.field.region_side_m / 2,
+        )
 
     def seeds(self, index: RegionIndex) -> tuple[int, int]:
         """Seeds of a region's field and of its replay pool; no two regions share one."""

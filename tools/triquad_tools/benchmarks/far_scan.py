@@ -15,15 +15,20 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_map.stored_map import StoredMap
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import TileIndex, tile_lattice
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings
 
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import settled_mapper
-from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street, score_street
+from triquad_tools.benchmarks.mesh import EVERYWHERE, make_tiles
+from triquad_tools.benchmarks.street import (
+    learn_again,
+    learn_all,
+    sdf_error_cm,
+    settled_mapper,
+)
+from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
@@ -34,7 +39,6 @@ _COLUMNS = 700
 _POINTS = 100_000
 _VOXEL_M = 0.2  # points of the surface are so far apart
 _MOVED_M = 0.01
-_EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
 
 def measure_far_scan(seed: int) -> list[Figure]:
@@ -51,16 +55,15 @@ def measure_far_scan(seed: int) -> list[Figure]:
     follower = _Follower(mapper.publish())
     mapper.ingest(scan.points, scan.world_from_sensor)
     shown = follower.outdated_by(mapper.publish())
-    _settle(mapper)
+    learn_all(mapper)
     after = _Place.of(mapper.publish(), place)
-    while not mapper.settled:
-        _settle(mapper)
-        mapper.publish()
+    learn_again(mapper)
     after_all = mapper.publish()
     repaired = _Place.of(after_all, place)
     sent = follower.sent_of(after_all)
     in_sight = _near(sent, scan.world_from_sensor[:3, 3], lidar.range_max_m)
-    alone_cm, beside_cm = _error_cm(alone.publish(), elsewhere), _error_cm(after_all, elsewhere)
+    alone_cm = sdf_error_cm(alone.publish(), elsewhere.probes)
+    beside_cm = sdf_error_cm(after_all, elsewhere.probes)
     copied, fetched = follower.parts_of(after_all)
     return [
         Figure("SDF error of a place, settled", before.error_cm, "cm"),
@@ -93,30 +96,25 @@ class _Follower:
     def __init__(self, epoch: Epoch) -> None:
         self._tiles = TileCache(MeshSettings(), Teams().meshing)
         self._tiles.refresh(epoch)
-        self._make()
+        make_tiles(self._tiles)
         self._revision = self._tiles.revision
         self._parts = _parts(epoch)
 
     def outdated_by(self, epoch: Epoch) -> set[TileIndex]:
         """Tiles that have to be made again in an epoch."""
         self._tiles.refresh(epoch)
-        return set(self._tiles.delta(0, *_EVERYWHERE, self._revision, {}).to_make)
+        return set(self._tiles.delta(0, *EVERYWHERE, self._revision, {}).to_make)
 
     def sent_of(self, epoch: Epoch) -> set[TileIndex]:
         """Tiles that are others in an epoch."""
         self._tiles.refresh(epoch)
-        self._make()
-        return {t.index for t in self._tiles.delta(0, *_EVERYWHERE, self._revision, {}).ready}
+        make_tiles(self._tiles)
+        return {t.index for t in self._tiles.delta(0, *EVERYWHERE, self._revision, {}).ready}
 
     def parts_of(self, epoch: Epoch) -> tuple[int, int]:
         """How many parts a map file has in an epoch, and how many of them were others before."""
         parts = _parts(epoch)
         return len(parts), sum(self._parts.get(key) != digest for key, digest in parts.items())
-
-    def _make(self) -> None:
-        while to_make := self._tiles.delta(0, *_EVERYWHERE, self._tiles.revision, {}).to_make:
-            for index in to_make:
-                self._tiles.make(0, index)
 
 
 def _parts(epoch: Epoch) -> Mapping[object, bytes]:
@@ -145,15 +143,11 @@ class _Place:
 
     @classmethod
     def of(cls, epoch: Epoch, place: DrivenStreet) -> "_Place":
-        return cls(_error_cm(epoch, place), epoch.query(_surface(place)).sdf)
+        return cls(sdf_error_cm(epoch, place.probes), epoch.query(_surface(place)).sdf)
 
     def moved(self, other: "_Place") -> float:
         """The share of the surface that is elsewhere."""
         return float((np.abs(self.sdf - other.sdf) > _MOVED_M).mean())
-
-
-def _error_cm(epoch: Epoch, place: DrivenStreet) -> float:
-    return 100 * score_street(epoch.query, place.probes).sdf_error_m
 
 
 def _surface(place: DrivenStreet) -> Doubles:
@@ -161,8 +155,3 @@ def _surface(place: DrivenStreet) -> Doubles:
     chosen = np.random.default_rng(0).permutation(len(points))[:_POINTS]
     surface: Doubles = points[chosen]
     return surface
-
-
-def _settle(mapper: Mapper) -> None:
-    while not mapper.settled:
-        mapper.train()

@@ -12,20 +12,14 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import settled_mapper
+from triquad_tools.benchmarks.street import sdf_error_cm, settled_mapper
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.map_scores import (
-    DrivenStreet,
-    StreetProbes,
-    driven_street,
-    score_street,
-    street_probes,
-)
+from triquad_tools.evaluation.map_scores import StreetProbes, driven_street, street_probes
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.street import street
 
-LENGTH_M = 1600
+_LENGTH_M = 1600
 _STEP_M = 1.0
 _SHORT_M = 100  # of street, with which the long one is compared
 _PLACE_M = 50
@@ -43,15 +37,17 @@ class _Place:
 
     def error_cm(self, mapper: Mapper) -> float:
         """The mean error of the signed distance."""
-        return 100 * score_street(mapper.publish().query, self.probes).sdf_error_m
+        return sdf_error_cm(mapper.publish(), self.probes)
 
 
 def measure_long_drive(seed: int) -> list[Figure]:
     """Errors at the start, amid and at the end of a long drive, beside those of a short one."""
-    scene = street(seed, LENGTH_M)
-    poses = drive(scene, int(LENGTH_M / _STEP_M), _STEP_M)
-    short = _driven(scene, poses[: int(_SHORT_M / _STEP_M)], seed)
-    alone_cm = _short_error_cm(short)
+    scene = street(seed, _LENGTH_M)
+    poses = drive(scene, int(_LENGTH_M / _STEP_M), _STEP_M)
+    first = SimulatedDrive(scene, _lidar(), poses[: int(_SHORT_M / _STEP_M)], seed=seed)
+    short = driven_street(first)
+    alone = settled_mapper(f"the first {_SHORT_M} m", short.scans)
+    alone_cm = sdf_error_cm(alone.publish(), short.probes)
     places = _places(scene, poses, seed)
     mapper = Mapper("bench", Settings(), "cpu")
     with progress("taking in the drive", len(poses)) as report:
@@ -89,15 +85,6 @@ def _errors(
 
 def _lidar() -> Lidar:
     return Lidar(columns=_COLUMNS)
-
-
-def _driven(scene: Scene, poses: Doubles, seed: int) -> DrivenStreet:
-    return driven_street(SimulatedDrive(scene, _lidar(), poses, seed=seed))
-
-
-def _short_error_cm(short: DrivenStreet) -> float:
-    mapper = settled_mapper(f"the first {_SHORT_M} m", short.scans)
-    return 100 * score_street(mapper.publish().query, short.probes).sdf_error_m
 
 
 def _places(scene: Scene, poses: Doubles, seed: int) -> list[_Place]:

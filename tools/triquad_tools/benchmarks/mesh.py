@@ -20,7 +20,7 @@ from triquad_server.settings import MeshSettings, Settings
 
 from triquad_tools.benchmarks.figures import Figure, seconds
 from triquad_tools.benchmarks.served import latency_figures, served
-from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
+from triquad_tools.benchmarks.street import BenchStreet, learn_all, settled_mapper
 from triquad_tools.demo.probe import ask_until
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
 from triquad_tools.simulation.lidar import SimulatedScan
@@ -31,7 +31,7 @@ _ASKED = 1_000
 _NEEDLESS = 0.4  # of the tiles that are meshed again; where all are, or some at random, it is more
 _NEXT = 50  # the scan that comes again, from half a metre on
 _CANDIDATES = 8  # triangles that are tried for each point: those of the nearest centroids
-_EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
+EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
 
 def measure_mesh(made: BenchStreet) -> list[Figure]:
@@ -143,7 +143,7 @@ def _work(made: BenchStreet) -> list[Figure]:
     mapper = settled_mapper("the street", made.scans, settings)
     cache = TileCache(settings.mesh, Teams().meshing)
     cache.refresh(mapper.publish())
-    _make(cache)
+    make_tiles(cache)
     whole = cache.tiles_made
     before = _meshes(cache)
 
@@ -151,14 +151,13 @@ def _work(made: BenchStreet) -> list[Figure]:
     mapper.ingest(scan.points, scan.world_from_sensor)
     epoch = mapper.publish()
     refresh_s = seconds(lambda: cache.refresh(epoch))
-    evidence = len(cache.delta(0, *_EVERYWHERE, cache.revision, {}).to_make)
-    while not mapper.settled:
-        mapper.train()
+    evidence = len(cache.delta(0, *EVERYWHERE, cache.revision, {}).to_make)
+    learn_all(mapper)
     epoch = mapper.publish()
     cache.refresh(epoch)
-    touched = len(cache.delta(0, *_EVERYWHERE, cache.revision, {}).to_make)
+    touched = len(cache.delta(0, *EVERYWHERE, cache.revision, {}).to_make)
     started = time.perf_counter()
-    again = _make(cache)
+    again = make_tiles(cache)
     made_s = time.perf_counter() - started
     meshed = cache.tiles_made - whole
     changed = _changed(before, epoch, settings.mesh)
@@ -184,7 +183,7 @@ def _meshes(cache: TileCache) -> dict[TileIndex, Mesh]:
     """All tiles of a cache that show what the map has, in the map frame."""
     lattice = cache.lattice(0)
     meshes = {}
-    for tile in cache.delta(0, *_EVERYWHERE, 0, {}).ready:
+    for tile in cache.delta(0, *EVERYWHERE, 0, {}).ready:
         data = cache.data(0, tile)
         assert data is not None, "the cache is too small for the street"
         surface = decode_tile(data)
@@ -197,16 +196,16 @@ def _changed(before: dict[TileIndex, Mesh], epoch: Epoch, settings: MeshSettings
     """Tiles whose surface is another one in an epoch, all meshed anew."""
     cache = TileCache(settings, Teams().meshing)
     cache.refresh(epoch)
-    _make(cache)
+    make_tiles(cache)
     return changed_tiles(
         before, _meshes(cache), tolerance_m=settings.tolerance_m, cell_m=settings.cell_m
     )
 
 
-def _make(cache: TileCache) -> set[TileIndex]:
-    """Make what has to be made; returns which tiles that were."""
+def make_tiles(cache: TileCache) -> set[TileIndex]:
+    """Make the tiles that have to be made; returns which those were."""
     made: set[TileIndex] = set()
-    while to_make := cache.delta(0, *_EVERYWHERE, cache.revision, {}).to_make:
+    while to_make := cache.delta(0, *EVERYWHERE, cache.revision, {}).to_make:
         for index in to_make:
             cache.make(0, index)
         made.update(to_make)

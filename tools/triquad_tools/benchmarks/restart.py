@@ -15,9 +15,9 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import settled_mapper
+from triquad_tools.benchmarks.street import learn_again, sdf_error_cm, settled_mapper
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street, score_street
+from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
@@ -37,11 +37,11 @@ def measure_restart(seed: int) -> list[Figure]:
         path = Path(name) / "checkpoint.triquad"
         size = write_map(record, path).bytes
         restored = Mapper("bench", Settings(), "cpu", read_map(path))
-    before = _error_cm(stayed, first)
+    before = sdf_error_cm(stayed.publish(), first.probes)
     errors = []
     for name, mapper in (("without a restart", stayed), ("after a restart", restored)):
         _learn(name, mapper, later)
-        errors.append(_error_cm(mapper, first))
+        errors.append(sdf_error_cm(mapper.publish(), first.probes))
     without, after = errors
     return [
         Figure("checkpoint with all that training needs", size / 1e6, "MB"),
@@ -68,12 +68,5 @@ def _learn(name: str, mapper: Mapper, scans: Sequence[PosedScan]) -> None:
         for number, scan in enumerate(scans):
             mapper.ingest(scan.points, scan.world_from_sensor)
             report(number, f"scan {number}")
-        while not mapper.settled:
-            while not mapper.settled:
-                mapper.train()
-            mapper.publish()  # what was forgotten is found then, and learnt again
+        learn_again(mapper)
         report(len(scans) + 1, "settled")
-
-
-def _error_cm(mapper: Mapper, place: DrivenStreet) -> float:
-    return 100 * score_street(mapper.publish().query, place.probes).sdf_error_m

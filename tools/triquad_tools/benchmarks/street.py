@@ -7,13 +7,19 @@ from functools import partial
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 from triquad_sensors.sweep import PosedScan
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.figures import seconds
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.map_scores import DrivenStreet, driven_street
+from triquad_tools.evaluation.map_scores import (
+    DrivenStreet,
+    StreetProbes,
+    driven_street,
+    score_street,
+)
 from triquad_tools.evaluation.metrics import (
     STREET_SAMPLES_MAX,
     STREET_VOXEL_M,
@@ -66,10 +72,27 @@ def settled_mapper(
         for number, scan in enumerate(scans):
             mapper.ingest(scan.points, scan.world_from_sensor)
             report(number, f"scan {number}")
-        while not mapper.settled:
-            mapper.train()
+        learn_all(mapper)
         report(len(scans) + 1, "settled")
     return mapper
+
+
+def learn_all(mapper: Mapper) -> None:
+    """Train until nothing is left to learn."""
+    while not mapper.settled:
+        mapper.train()
+
+
+def learn_again(mapper: Mapper) -> None:
+    """As :func:`learn_all`, with what was forgotten meanwhile: that is found as it is published."""
+    while not mapper.settled:
+        learn_all(mapper)
+        mapper.publish()
+
+
+def sdf_error_cm(epoch: Epoch, probes: StreetProbes) -> float:
+    """The mean error of the signed distance at points near the surface."""
+    return 100 * score_street(epoch.query, probes).sdf_error_m
 
 
 class StreamedMap:
