@@ -188,6 +188,13 @@ class LiveField:
         self.mlp_steps += 1
         return min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
 
+    def now(self) -> FrozenField:
+        """The field in its own memory, to be asked before anything changes it."""
+        tree = self.tree.freeze()
+        if self.device.type == "cpu":
+            return FrozenCompiledField(self.settings, tree, self.arrays)
+        return TensorField(self.settings, tree, self.tensors)
+
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""
         tree = self.tree.freeze()

@@ -23,11 +23,13 @@ from triquad_server.mapping.ray_table import (
     COLUMNS,
     END,
     NO_ORIGIN,
+    VALUE,
     Placement,
     RayTable,
     TensorTable,
     draw_ordered_samples,
     draw_samples,
+    slopes_at,
 )
 
 _BIN_LEAVES = 4.0
@@ -225,9 +227,7 @@ class ReplayPool:
         if self._on_device is not None:
             chosen = self._choose(count, fresh, attended)
             return draw_samples(self._on_device, chosen, self.placement, self._generator)
-        places = self._rng.integers(self._size, size=count)
-        if fresh and len(self._fresh):
-            places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
+        places = self._at_random(count, fresh)
         if attended and len(self._attended):
             rows = self._rng.integers(len(self._attended), size=min(attended, count - fresh))
             places[fresh : fresh + attended] = self._attended[rows]
@@ -237,6 +237,21 @@ class ReplayPool:
         """A sample on each of the rays of :attr:`table` at ``places`` [N]."""
         table = self.table
         return draw_ordered_samples(table, places, self.placement, rng=self._rng, team=self._team)
+
+    def unsure(self, count: int, fresh: int) -> Longs:
+        """Rays whose slope no normal told, among ``count`` at random, ``fresh`` of the newest."""
+        places = np.unique(self._at_random(count, fresh))
+        is_unsure = (self._rows[places, VALUE] < 0) & (self._origin_of[places] >= 0)
+        unsure: Longs = places[is_unsure]
+        return unsure
+
+    def set_slopes(self, places: Longs, gradients: Floats) -> None:
+        """Take the slopes of the rays ``places`` [N] from a field's ``gradients`` [N, 3] there."""
+        slopes = slopes_at(self.table, places, gradients)
+        self._rows[places, VALUE] = slopes
+        if self._on_device is not None:
+            changed = torch.from_numpy(places).to(self._device)
+            self._on_device.rows[changed, VALUE] = torch.from_numpy(slopes).to(self._device)
 
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
@@ -267,6 +282,13 @@ class ReplayPool:
         self._fresh = self._fresh[self._fresh < self._size]
         self._attended = self._attended[self._attended < self._size]
         self._copy_to_device()
+
+    def _at_random(self, count: int, fresh: int) -> Longs:
+        """Places [count] at random, ``fresh`` of them of the newest."""
+        places: Longs = self._rng.integers(self._size, size=count)
+        if fresh and len(self._fresh):
+            places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
+        return places
 
     def _choose(self, count: int, fresh: int, attended: int) -> Tensor:
         """Places [count] at random, on the device."""

@@ -12,6 +12,7 @@ from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.ray_table import END, VALUE
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import RAY_BYTES
 from triquad_server.process.threads import Teams
@@ -382,6 +383,20 @@ def test_what_is_new_is_learnt_as_well_beside_much_that_has_settled() -> None:
         mapper.ingest(scan.points, scan.world_from_sensor)
         settle(mapper)
     assert surface_error(beside.publish(), there) < 1.25 * surface_error(alone.publish(), there)
+
+
+def test_where_no_normal_is_known_the_field_tells_how_steep_rays_fall() -> None:
+    one_region = settings().model_copy(update={"field": Settings().field})
+    mapper = settled_mapper(one_region, world())
+    (region,) = mapper.regions
+    table = region.pool.table
+    unsure = np.flatnonzero((table.rows[:, VALUE] < 0) & (table.origin_of >= 0))
+    assert len(unsure) > 0.05 * len(table)
+    ends = table.rows[unsure, END : END + 3].astype(np.float64)
+    ways = ends - table.origins[table.origin_of[unsure]]
+    cosines = (ways * world().scene.gradient(ends)).sum(axis=1) / np.linalg.norm(ways, axis=1)
+    off = np.abs(np.abs(cosines) + table.rows[unsure, VALUE]).mean()
+    assert off < 0.4 * np.abs(np.abs(cosines) - 1).mean()
 
 
 def test_reset_forgets_a_box_and_everything() -> None:
