@@ -1,4 +1,4 @@
-"""Where a region learns: everywhere, or only where it is seen anew since it had settled."""
+"""Where a region learns: everywhere, or only where it is seen anew since all of it had settled."""
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
@@ -17,10 +17,11 @@ _MOST_SHARE = 0.25
 
 
 class Focus:
-    """What of a settled region is seen anew.
+    """What of a region is seen anew since all of it had settled.
 
     It learns there alone: on rays that end there, in rows of features that no surface elsewhere
-    uses, and with the MLP that it has. Everything else stays as it is, to the bit.
+    uses, and with the MLP that it has. Everything else stays as it is, to the bit. Once much is
+    seen anew, be it scan by scan, all of the region learns, with an MLP that suits all of it.
     """
 
     def __init__(self, field: LiveField, evidence: LiveEvidence, pool: ReplayPool) -> None:
@@ -32,10 +33,10 @@ class Focus:
         self._applied = 0  # of them, those that were known when it was applied last
 
     def narrow(self) -> None:
-        """The region has settled: from now on, only what is seen anew learns."""
-        if self._field.settings.encoding == "fourier":  # whose MLP knows all
-            return
-        self._seen_anew, self._applied = np.zeros(0, np.int64), 0
+        """The region has settled: where all of it learnt, only what is seen anew does from now."""
+        has_features = self._field.settings.encoding != "fourier"
+        if self._seen_anew is None and has_features:
+            self._seen_anew, self._applied = np.zeros(0, np.int64), 0
 
     def widen_to(self, voxels: Doubles) -> None:
         """``voxels`` [N, 3] are seen anew."""
