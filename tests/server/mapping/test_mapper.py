@@ -399,6 +399,31 @@ def test_where_no_normal_is_known_the_field_tells_how_steep_rays_fall() -> None:
     assert off < 0.4 * np.abs(np.abs(cosines) - 1).mean()
 
 
+def test_where_little_is_seen_anew_all_else_stays_to_the_bit() -> None:
+    training = {"batch": 4096, "samples_per_ray": 18.0}
+    one_region = Settings.model_validate({"field": {"depth": 11}, "training": training})
+    mapper, alone = settled_mapper(one_region, world(10)), Mapper("test", one_region, "cpu")
+    before = mapper.publish()
+    scan = world(30, 1.5).scans[-1]
+    reach_m = 10.0
+    is_near = np.linalg.norm(scan.points, axis=1) < reach_m
+    for learning in (alone, mapper):
+        learning.ingest(scan.points[is_near], scan.world_from_sensor)
+        settle(learning)
+    after = mapper.publish()
+    seen = np.concatenate([moved(s.points, s.world_from_sensor) for s in world(10).scans])
+    away = np.linalg.norm(seen - scan.world_from_sensor[:3, 3], axis=1) > reach_m + 3
+    np.testing.assert_array_equal(after.query(seen[away]).sdf, before.query(seen[away]).sdf)
+    here = scan.true_hits[is_near]
+    off = [float(np.abs(of.query(here).sdf).mean()) for of in (after, alone.publish())]
+    assert off[0] < 1.1 * off[1]
+    for scan in world(30, 1.5).scans[-10:]:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    settle(mapper)
+    later = mapper.publish()
+    assert (later.query(seen[away]).sdf != before.query(seen[away]).sdf).any()
+
+
 def test_reset_forgets_a_box_and_everything() -> None:
     mapper = settled_mapper(settings(samples_per_ray=3.0), world(2))
     hits = world(2).hits
