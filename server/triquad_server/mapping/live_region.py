@@ -52,7 +52,8 @@ from triquad_server.mapping.ray_table import (
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.mapping.replay_record import recorded_rays, restored_rays
-from triquad_server.mapping.training_budget import Step, TrainingBudget
+from triquad_server.mapping.slopes import Slopes
+from triquad_server.mapping.training_budget import TrainingBudget
 
 _log = logging.getLogger(__name__)
 
@@ -78,13 +79,6 @@ _SURFELS_REFITTED = 8_000
 
 _JUDGED_AFTER_SAMPLES = 8_000_000
 """A field that is being trained is judged once in so many samples: a few seconds."""
-
-_ASKED_AFTER_SAMPLES = 1 << 15
-"""Rays without a normal take their slope from the field once in so many samples."""
-
-_ASKED_SHARE = 0.25  # as many rays are looked at, for each sample: a few times each
-_LEARNT_WITHIN = 0.25  # leaves: so near to a ray's end is the surface of a field that knows it
-_LEARNT_SLOPE = 0.5  # and its gradient is longer than this
 
 _CPU = torch.device("cpu")
 
@@ -119,9 +113,9 @@ class LiveRegion:
         self._judgement = Judgement(setup.field)
         self._share = FairShare.of(0, setup.training)  # of each voxel
         self._unjudged_samples = 0  # that were trained since
-        self._unasked_samples = 0  # and since the field was asked for slopes
         self.budget = TrainingBudget(setup.training)
         self._focus = Focus(field, evidence, self.pool)
+        self._slopes = Slopes(field, self.pool)
         self.changed = True  # since it was last published
         self._restored = False  # and not published since: where surfaces lie is in the field alone
         self._scans = 0  # that it was seen in
@@ -293,22 +287,9 @@ class LiveRegion:
         loss = self._trainer.train(batch, step.rates)
         self.budget.spend(step)
         self._unjudged_samples += step.samples
-        self._unasked_samples += step.samples
-        if self._unasked_samples >= _ASKED_AFTER_SAMPLES:
-            self._ask_for_slopes(step)
+        self._slopes.after(step)
         self.changed = True
         return loss
-
-    def _ask_for_slopes(self, step: Step) -> None:
-        """Ask the field how steep rays fall whose surface has no normal, where it knows it."""
-        asked = int(_ASKED_SHARE * self._unasked_samples)
-        self._unasked_samples = 0
-        places = self.pool.unsure(asked, asked * step.fresh // step.samples)
-        ends = np.ascontiguousarray(self.pool.table.rows[places, END : END + 3])
-        values = self.field.now().evaluate(ends, gradient=True)
-        is_learnt = np.abs(values.sdf) < _LEARNT_WITHIN * self._settings.leaf_m
-        is_learnt &= np.linalg.norm(values.gradient, axis=1) > _LEARNT_SLOPE
-        self.pool.set_slopes(places[is_learnt], values.gradient[is_learnt])
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget evidence and samples between two corners [3]."""

@@ -34,7 +34,7 @@ NO_ORIGIN = -1
 
 AnyFloats = NDArray[np.floating]
 
-_MIN_COSINE = 0.05
+LEAST_SLOPE = 0.05
 
 _CELLS = 128
 """Cells from the centre of the cube to its face, by which samples are put in order."""
@@ -163,7 +163,7 @@ def _fill(
         for axis in range(3):
             cosine += direction[axis] * normals[i, axis]
             rows[count, END + axis] = ends[i, axis]
-        rows[count, VALUE] = -1.0 if np.isnan(cosine) else max(abs(cosine), _MIN_COSINE)
+        rows[count, VALUE] = -1.0 if np.isnan(cosine) else max(abs(cosine), LEAST_SLOPE)
         count += 1
     return count
 
@@ -191,18 +191,6 @@ def rays_through(
     chances = rng.random(len(rows))
     rows = rows[: _fill(origin, rays.ends - centre, normals, placement, chances, rows)]
     return RayTable(rows, np.zeros(len(rows), np.int32), origin[None].astype(np.float32))
-
-
-def slopes_at(table: RayTable, chosen: Longs, gradients: Floats) -> Floats:
-    """By how much the distance falls for each metre of rays ``chosen`` [N], by a field's gradients.
-
-    These are [N, 3], at the rays' ends. The result [N] is negated, as no normal told it.
-    """
-    ways = table.rows[chosen, END : END + 3] - table.origins[table.origin_of[chosen]]
-    lengths = np.linalg.norm(ways, axis=1) * np.linalg.norm(gradients, axis=1)
-    cosines = np.abs((ways * gradients).sum(axis=1)) / np.maximum(lengths, 1e-9)
-    slopes: Floats = -np.clip(cosines, _MIN_COSINE, 1).astype(np.float32)
-    return slopes
 
 
 def samples_alone(points: Floats, labels: NDArray[np.floating]) -> RayTable:

@@ -36,7 +36,6 @@ from triquad_server.mapping.ray_table import (
     TensorTable,
     draw_ordered_samples,
     draw_samples,
-    slopes_at,
 )
 
 _BIN_LEAVES = 4.0
@@ -282,19 +281,19 @@ class ReplayPool:
         return draw_ordered_samples(table, places, self.placement, rng=self._rng, team=self._team)
 
     def unsure(self, count: int, fresh: int) -> Longs:
-        """Rays whose slope no normal told, among ``count`` at random, ``fresh`` of the newest."""
+        """The places of rays whose slope no normal told, among ``count`` that are drawn on."""
         places = np.unique(self._at_random(count, fresh))
         is_unsure = (self._rows[places, VALUE] < 0) & (self._origin_of[places] >= 0)
         unsure: Longs = places[is_unsure]
         return unsure
 
-    def set_slopes(self, places: Longs, gradients: Floats) -> None:
-        """Take the slopes of the rays ``places`` [N] from a field's ``gradients`` [N, 3] there."""
-        slopes = slopes_at(self.table, places, gradients)
-        self._rows[places, VALUE] = slopes
+    def set_slopes(self, places: Longs, slopes: Doubles) -> None:
+        """The rays at ``places`` [N] have these ``slopes`` [N], which no normal told."""
+        self._rows[places, VALUE] = -slopes
         if self._on_device is not None:
             changed = torch.from_numpy(places).to(self._device)
-            self._on_device.rows[changed, VALUE] = torch.from_numpy(slopes).to(self._device)
+            told = torch.from_numpy(self._rows[places, VALUE])
+            self._on_device.rows[changed, VALUE] = told.to(self._device)
 
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
