@@ -142,12 +142,18 @@ class LiveField:
         self.held: Tensor | None = None
         """Which of the first rows of features [N] stay as they are, as does the MLP; None: none."""
 
+        self._vertices_held = 0
         self._generator = generator
 
     @property
     def vertices(self) -> int:
         """Vertices on all planes and levels."""
         return len(self.features) - 1
+
+    @property
+    def vertices_that_learn(self) -> int:
+        """All but those that are held."""
+        return self.vertices - self._vertices_held
 
     @property
     def parameters(self) -> int:
@@ -206,6 +212,7 @@ class LiveField:
         Rows that are added later learn.
         """
         self.held = None if rows is None else torch.from_numpy(rows).to(self.device)
+        self._vertices_held = 0 if rows is None else int(rows[1:].sum())
 
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""

@@ -275,8 +275,8 @@ class LiveRegion:
 
     @property
     def batch(self) -> int:
-        """Samples of a step: fewer while the region is small, or it would take too few steps."""
-        wanted = self.field.vertices // _VERTICES_PER_SAMPLE
+        """Samples of a step: fewer where little learns, or it would take too few steps."""
+        wanted = self.field.vertices_that_learn // _VERTICES_PER_SAMPLE
         return min(self._training.batch, max(_LEAST_BATCH, wanted))
 
     def train(self) -> float | Tensor:
