@@ -270,7 +270,10 @@ def warm_up(
     for _ in range(_WARM_UP_SCANS):
         mapper.ingest((2 * directions * radius).astype(np.float32), np.eye(4))
     epoch = mapper.publish()
-    Mapper("warm-up", settings, device, mapper.changes_since(None).record, teams).publish()
+    again = Mapper("warm-up", settings, device, mapper.changes_since(None).record, teams)
+    again.publish()
+    again.ingest((2 * directions[:1] * radius).astype(np.float32), np.eye(4))  # of it a little
+    again.train()
     report("queries")
     epoch.query(directions, gradient=True)
     distances(epoch, directions, DistanceOptions(unknown_distance=True))

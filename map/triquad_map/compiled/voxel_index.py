@@ -110,6 +110,13 @@ def cells_of(keys: Longs) -> Longs:
     return np.stack([keys >> 42, keys >> 21 & _KEY_LOW, keys & _KEY_LOW], axis=1) - CELL_LIMIT
 
 
+def keys_of(cells: Longs) -> Longs:
+    """The keys [N] of ``cells`` [N, 3]."""
+    x, y, z = cells.T + CELL_LIMIT
+    keys: Longs = (x << 42) | (y << 21) | z
+    return keys
+
+
 class VoxelIndex:
     """Cells in use, numbered as they come: row ``i`` of the owner's arrays belongs to cell ``i``.
 
@@ -141,9 +148,8 @@ class VoxelIndex:
     @classmethod
     def of_cells(cls, cells: Longs) -> "VoxelIndex":
         """An index whose rows belong to different ``cells`` [N, 3], in their order."""
-        x, y, z = cells.T + CELL_LIMIT
         index = cls(1)
-        index._refill((x << 42) | (y << 21) | z, max(256, 2 * len(cells)))
+        index._refill(keys_of(cells), max(256, 2 * len(cells)))
         return index
 
     def _refill(self, keys: Longs, capacity: int) -> None:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from triquad_format.records.arrays import Doubles, Floats, Ints
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints
 from triquad_map.compiled.field.encoding import BATCH, PointBatch, add_feature_gradient, load
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
 from triquad_map.compiled.field.field import (
@@ -41,6 +41,7 @@ _NEGLIGIBLE = 1e-8
 _MAX_CORRECTED = 1 << 20
 _AHEAD = 12  # rows that are brought into the cache before their turn
 _LAST_STEP = 2**31 - 1
+_NONE_HELD = np.zeros(0, np.bool_)
 
 
 class Touched(NamedTuple):
@@ -128,11 +129,13 @@ def _step_touched(
     touched: tuple[Touched, ...],
     sums: tuple[Floats, ...],
     parameter: ParameterRows,
+    held: Bools,
     rates: CompiledRates,
 ) -> None:
     """Adam on the ``count`` rows that the thread ``part`` touched; clears their sums.
 
-    A row that several threads touched is left to the first of them.
+    A row that several threads touched is left to the first of them. Those that are ``held`` [N]
+    take no step.
     """
     rows = touched[part].rows
     for i in range(count):
@@ -152,7 +155,9 @@ def _step_touched(
             for k in range(sums[part].shape[1]):
                 sums[part][row, k] += sums[other][row, k]
                 sums[other][row, k] = 0
-        if mine:
+        if mine and row < len(held) and held[row]:
+            sums[part][row] = 0
+        elif mine:
             _step_row(row, sums[part], parameter, rates)
 
 
@@ -309,8 +314,9 @@ class CompiledTrainer:
             gradient = np.sum([thread[part] for thread in mlp_sums], axis=0).reshape(1, -1)
             _step_row(0, gradient, _parameter_rows(parameter), of_mlp)
         sums, features = self._sums, _parameter_rows(self._field.features)
+        held = _NONE_HELD if self._field.held is None else self._field.held.numpy()
         self._team.each(
             lambda part: _step_touched(
-                part, counts[part], sums.step, sums.touched, sums.features, features, compiled
+                part, counts[part], sums.step, sums.touched, sums.features, features, held, compiled
             )
         )

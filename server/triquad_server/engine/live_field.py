@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
 from triquad_format.records.replay_rays import ReplayRays
@@ -139,12 +139,21 @@ class LiveField:
         self.frequencies = frequencies
         self.mlp = [Parameter(part[None]) for part in mlp]
         self.mlp_steps = 0  # that the MLP took; to read its own from a GPU would take a wait
+        self.held: Tensor | None = None
+        """Which of the first rows of features [N] stay as they are, as does the MLP; None: none."""
+
+        self._vertices_held = 0
         self._generator = generator
 
     @property
     def vertices(self) -> int:
         """Vertices on all planes and levels."""
         return len(self.features) - 1
+
+    @property
+    def vertices_that_learn(self) -> int:
+        """All but those that are held."""
+        return self.vertices - self._vertices_held
 
     @property
     def parameters(self) -> int:
@@ -185,8 +194,25 @@ class LiveField:
 
     def next_mlp_share(self) -> float:
         """The share of the rates in the next step of the MLP: it hardens more than features do."""
+        if self.held is not None:
+            return 0.0
         self.mlp_steps += 1
         return min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
+
+    def now(self) -> FrozenField:
+        """The field in its own memory, to be asked before anything changes it."""
+        tree = self.tree.freeze()
+        if self.device.type == "cpu":
+            return FrozenCompiledField(self.settings, tree, self.arrays)
+        return TensorField(self.settings, tree, self.tensors)
+
+    def hold(self, rows: Bools | None) -> None:
+        """From now on, the feature ``rows`` [N] and the MLP stay as they are; None: all learns.
+
+        Rows that are added later learn.
+        """
+        self.held = None if rows is None else torch.from_numpy(rows).to(self.device)
+        self._vertices_held = 0 if rows is None else int(rows[1:].sum())
 
     def freeze(self) -> FrozenField:
         """The field as it is now: compiled on the CPU, in tensors on other devices."""

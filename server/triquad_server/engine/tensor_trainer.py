@@ -60,6 +60,8 @@ class TensorTrainer:
         touched = torch.zeros(len(total), dtype=torch.bool, device=total.device)
         touched[rows] = True
         touched[0] = False  # absent vertices stay zero
+        if (held := self._field.held) is not None:
+            touched[: len(held)] &= ~held
         if total.device.type == "cpu":
             chosen = touched.nonzero()[:, 0]
             step_rows(features, chosen, total[chosen], rates=rates)

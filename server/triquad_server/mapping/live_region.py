@@ -39,6 +39,7 @@ from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.fair_share import FairShare
+from triquad_server.mapping.focus import Focus
 from triquad_server.mapping.held_out import are_held_out, both_tables
 from triquad_server.mapping.judgement import JudgedPlaces, Judgement, Repairs
 from triquad_server.mapping.memory_budget import RegionSize
@@ -51,6 +52,7 @@ from triquad_server.mapping.ray_table import (
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.mapping.replay_record import recorded_rays, restored_rays
+from triquad_server.mapping.slopes import Slopes
 from triquad_server.mapping.training_budget import TrainingBudget
 
 _log = logging.getLogger(__name__)
@@ -98,7 +100,7 @@ class LiveRegion:
         new_pool = partial(
             ReplayPool,
             placement=setup.placement,
-            leaf_m=setup.field.leaf_m,
+            settings=setup.field,
             seed=seed,
             team=setup.team,
         )
@@ -112,6 +114,8 @@ class LiveRegion:
         self._share = FairShare.of(0, setup.training)  # of each voxel
         self._unjudged_samples = 0  # that were trained since
         self.budget = TrainingBudget(setup.training)
+        self._focus = Focus(field, evidence, self.pool)
+        self._slopes = Slopes(field, self.pool)
         self.changed = True  # since it was last published
         self._restored = False  # and not published since: where surfaces lie is in the field alone
         self._scans = 0  # that it was seen in
@@ -229,6 +233,9 @@ class LiveRegion:
         passing = rays_through(rays, normals, self.centre, self.pool.placement, self._ray_random)
         if len(passing) == 0:
             return
+        if self.budget.samples == 0:
+            self._focus.narrow()
+        self._focus.widen_to(self.voxels(rays.ends))
         self.budget.add(self._keep(passing))
 
     def _keep(self, rays: RayTable) -> int:
@@ -268,17 +275,19 @@ class LiveRegion:
 
     @property
     def batch(self) -> int:
-        """Samples of a step: fewer while the region is small, or it would take too few steps."""
-        wanted = self.field.vertices // _VERTICES_PER_SAMPLE
+        """Samples of a step: fewer where little learns, or it would take too few steps."""
+        wanted = self.field.vertices_that_learn // _VERTICES_PER_SAMPLE
         return min(self._training.batch, max(_LEAST_BATCH, wanted))
 
     def train(self) -> float | Tensor:
         """One optimiser step; returns the loss: to read it on a GPU waits for the step."""
-        step = self.budget.next_step(self.batch, len(self.pool))
+        self._focus.apply()
+        step = self.budget.next_step(self.batch, self.pool.rays_drawn_on)
         batch = self.pool.draw(step.samples, step.fresh, step.repair)
         loss = self._trainer.train(batch, step.rates)
         self.budget.spend(step)
         self._unjudged_samples += step.samples
+        self._slopes.after(step)
         self.changed = True
         return loss
 
@@ -373,7 +382,9 @@ class LiveRegion:
                 y,
                 z,
             )
-        attended = self.pool.attend(places.forgotten_keys, self._settings)
+        attended = self.pool.attend(places.forgotten_keys)
+        if attended:
+            self._focus.release()
         self.budget.repair(attended)
 
     def _surfels(
@@ -398,7 +409,7 @@ class LiveRegion:
         self._gone.clear()
         voxels = voxels[~self.evidence.freeze().ended_in(voxels)]  # nothing ended there since
         for pool in (self.pool, self.held_out):
-            pool.forget_ends(voxels, self._settings)
+            pool.forget_ends(voxels)
         inside = self._random.random((_SAMPLES_PER_VOXEL, len(voxels), 3))
         points = (voxels + inside).reshape(-1, 3)
         leaf_m, middle = self._settings.leaf_m, 1 << (self._settings.depth - 1)

@@ -4,6 +4,8 @@ A ray tells the signed distance all along itself: nothing at its end point, more
 behind it. The published label is the distance to the end point along the ray, which is too large
 where the ray meets the surface at an angle. Where the surface's normal is known, the label here is
 the distance to its plane, so it changes by the cosine of the angle of incidence for each metre.
+Near edges and on small things the points around tell no normal: there the label is the distance
+along the ray at first, and by the gradient of the field itself once that knows the surface.
 
 All is in metres, relative to the region's centre. Every draw (3QFP, section III-C) makes new
 samples: a ray that is trained on again teaches other points of itself.
@@ -32,7 +34,7 @@ NO_ORIGIN = -1
 
 AnyFloats = NDArray[np.floating]
 
-_MIN_COSINE = 0.05
+LEAST_SLOPE = 0.05
 
 _CELLS = 128
 """Cells from the centre of the cube to its face, by which samples are put in order."""
@@ -45,7 +47,7 @@ class RayTable(NamedTuple):
 
     rows: Floats
     """[N, COLUMNS] The end point, and by how much the signed distance falls for each metre of the
-    ray; of a sample, the point and its signed distance."""
+    ray, negated where no normal told it; of a sample, the point and its signed distance."""
 
     origin_of: Ints  # [N] row of a ray's origin; NO_ORIGIN of a sample
     origins: Floats  # [K, 3] where the sensor was
@@ -161,7 +163,7 @@ def _fill(
         for axis in range(3):
             cosine += direction[axis] * normals[i, axis]
             rows[count, END + axis] = ends[i, axis]
-        rows[count, VALUE] = 1.0 if np.isnan(cosine) else max(abs(cosine), _MIN_COSINE)
+        rows[count, VALUE] = -1.0 if np.isnan(cosine) else max(abs(cosine), LEAST_SLOPE)
         count += 1
     return count
 
@@ -227,7 +229,7 @@ def draw_samples(
     surface_share = placement.surface_share
     kinds = kinds * (surface_share + (1 - surface_share) * inside)
     offsets = torch.where((kinds < surface_share) & ~outside, near, free)
-    labels = torch.where(is_ray, -offsets * values, values)
+    labels = torch.where(is_ray, -offsets * values.abs(), values)
     return Batch(ends + torch.where(is_ray, offsets, 0.0)[:, None] * directions, labels)
 
 
@@ -265,7 +267,7 @@ def _draw(
                     offset = first + places[i] * (last - first)
         for axis in range(3):
             samples[i, axis] = row[END + axis] + offset * direction[axis]
-        samples[i, 3] = -offset * row[VALUE] if origin >= 0 else row[VALUE]
+        samples[i, 3] = -offset * abs(row[VALUE]) if origin >= 0 else row[VALUE]
         u = min(max(int(samples[i, 0] * per_m + _CELLS), 0), 2 * _CELLS - 1)
         v = min(max(int(samples[i, 1] * per_m + _CELLS), 0), 2 * _CELLS - 1)
         cells[i] = morton_code(u, v)

@@ -15,7 +15,14 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Team
-from triquad_map.compiled.voxel_index import Index, VoxelIndex, find_row, pack, with_room
+from triquad_map.compiled.voxel_index import (
+    Index,
+    VoxelIndex,
+    block_key,
+    find_row,
+    pack,
+    with_room,
+)
 from triquad_map.places import place_keys
 
 from triquad_server.engine.live_field import Batch
@@ -23,6 +30,7 @@ from triquad_server.mapping.ray_table import (
     COLUMNS,
     END,
     NO_ORIGIN,
+    VALUE,
     Placement,
     RayTable,
     TensorTable,
@@ -87,6 +95,30 @@ def _put(
         occupancy[bins[place]] += 1
 
 
+@kernel(inline="always")
+def _voxel(row: Floats, leaf_m: float, middle: float) -> tuple[int, int, int]:
+    """The voxel in which a ray ends."""
+    return (
+        int(np.floor(row[END] / leaf_m + middle)),
+        int(np.floor(row[END + 1] / leaf_m + middle)),
+        int(np.floor(row[END + 2] / leaf_m + middle)),
+    )
+
+
+@kernel()
+def _ending_in(blocks: Index, leaf_m: float, middle: float, rows: Floats) -> Longs:
+    """Which rays [N] end in blocks of voxels."""
+    chosen = np.empty(len(rows), np.int64)
+    count = 0
+    for i in range(len(rows)):
+        x, y, z = _voxel(rows[i], leaf_m, middle)
+        if find_row(blocks, block_key(x, y, z)) >= 0:
+            chosen[count] = i
+            count += 1
+    ending: Longs = chosen[:count].copy()
+    return ending
+
+
 @kernel()
 def _bins_of(voxels: Longs, leaf_m: float, middle: float) -> Bools:
     """Which bins hold any part of ``voxels`` [N, 3]."""
@@ -117,9 +149,7 @@ def _remove_ending_in(
     i = 0
     while i < size:
         if bins_of_gone[bins[i]]:
-            x = int(np.floor(rows[i, END] / leaf_m + middle))
-            y = int(np.floor(rows[i, END + 1] / leaf_m + middle))
-            z = int(np.floor(rows[i, END + 2] / leaf_m + middle))
+            x, y, z = _voxel(rows[i], leaf_m, middle)
             if find_row(gone, pack(x, y, z)) >= 0:
                 occupancy[bins[i]] -= 1
                 size -= 1
@@ -135,14 +165,16 @@ class ReplayPool:
     def __init__(
         self,
         placement: Placement,
-        leaf_m: float,
+        settings: FieldSettings,
         device: torch.device,
         seed: int,
         team: Team,
     ) -> None:
         """No limit yet; ``team`` draws on the CPU, ``device`` does elsewhere."""
+        self._settings = settings
         self._capacity = _NO_LIMIT
-        self._bin_m = _BIN_LEAVES * leaf_m
+        self._bin_m = _BIN_LEAVES * settings.leaf_m
+        self._middle = float(1 << (settings.depth - 1))  # of the region, voxels
         self._team = team
         self.placement = placement
         self._device = device
@@ -161,6 +193,8 @@ class ReplayPool:
         self._occupancy = np.zeros(_BINS, np.int32)
         self._fresh = np.zeros(0, np.int64)
         self._attended = np.zeros(0, np.int64)
+        self._blocks: Index | None = None  # in which the rays end that are drawn on at random
+        self._focused: Longs | None = None  # their places; None: to be found
 
     def __len__(self) -> int:
         return self._size
@@ -208,13 +242,23 @@ class ReplayPool:
         if fresh:
             self._fresh = places
 
-    def attend(self, places: Longs, settings: FieldSettings) -> int:
+    def focus(self, blocks: Longs | None) -> None:
+        """From now on, draw on rays that end in ``blocks`` [B, 3] of voxels alone; None: on all."""
+        self._blocks = None if blocks is None else VoxelIndex.of_cells(blocks).arrays
+        self._focused = None
+
+    @property
+    def rays_drawn_on(self) -> int:
+        """How many rays are drawn on at random."""
+        return self._size if self._blocks is None else len(self._in_focus())
+
+    def attend(self, places: Longs) -> int:
         """From now on, some samples are drawn in ``places`` [P] on request; returns their rays."""
         if len(places) == 0:
             self._attended = self._attended[:0]
         else:
             ends = self._rows[: self._size, END : END + 3]
-            self._attended = np.flatnonzero(np.isin(place_keys(ends, settings), places))
+            self._attended = np.flatnonzero(np.isin(place_keys(ends, self._settings), places))
         return len(self._attended)
 
     def draw(self, count: int, fresh: int, attended: int = 0) -> Batch:
@@ -225,9 +269,7 @@ class ReplayPool:
         if self._on_device is not None:
             chosen = self._choose(count, fresh, attended)
             return draw_samples(self._on_device, chosen, self.placement, self._generator)
-        places = self._rng.integers(self._size, size=count)
-        if fresh and len(self._fresh):
-            places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
+        places = self._at_random(count, fresh)
         if attended and len(self._attended):
             rows = self._rng.integers(len(self._attended), size=min(attended, count - fresh))
             places[fresh : fresh + attended] = self._attended[rows]
@@ -237,6 +279,21 @@ class ReplayPool:
         """A sample on each of the rays of :attr:`table` at ``places`` [N]."""
         table = self.table
         return draw_ordered_samples(table, places, self.placement, rng=self._rng, team=self._team)
+
+    def unsure(self, count: int, fresh: int) -> Longs:
+        """The places of rays whose slope no normal told, among ``count`` that are drawn on."""
+        places = np.unique(self._at_random(count, fresh))
+        is_unsure = (self._rows[places, VALUE] < 0) & (self._origin_of[places] >= 0)
+        unsure: Longs = places[is_unsure]
+        return unsure
+
+    def set_slopes(self, places: Longs, slopes: Doubles) -> None:
+        """The rays at ``places`` [N] have these ``slopes`` [N], which no normal told."""
+        self._rows[places, VALUE] = -slopes
+        if self._on_device is not None:
+            changed = torch.from_numpy(places).to(self._device)
+            told = torch.from_numpy(self._rows[places, VALUE])
+            self._on_device.rows[changed, VALUE] = told.to(self._device)
 
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
@@ -250,13 +307,13 @@ class ReplayPool:
         ends = self._rows[: self._size, END : END + 3]
         self._keep(np.flatnonzero(~((ends >= low) & (ends <= high)).all(axis=1)))
 
-    def forget_ends(self, voxels: Longs, settings: FieldSettings) -> None:
-        """Drop the rays that end in ``voxels`` [N, 3] of a region with these ``settings``."""
-        middle = float(1 << (settings.depth - 1))
+    def forget_ends(self, voxels: Longs) -> None:
+        """Drop the rays that end in ``voxels`` [N, 3]."""
+        leaf_m, middle = self._settings.leaf_m, self._middle
         self._size = _remove_ending_in(
             VoxelIndex.of_cells(voxels).arrays,
-            _bins_of(voxels, settings.leaf_m, middle),
-            settings.leaf_m,
+            _bins_of(voxels, leaf_m, middle),
+            leaf_m,
             middle,
             self._size,
             self._rows,
@@ -266,11 +323,23 @@ class ReplayPool:
         )
         self._fresh = self._fresh[self._fresh < self._size]
         self._attended = self._attended[self._attended < self._size]
+        self._focused = None
         self._copy_to_device()
+
+    def _at_random(self, count: int, fresh: int) -> Longs:
+        """Places [count] at random, ``fresh`` of them of the newest."""
+        places: Longs = self._rng.integers(self.rays_drawn_on, size=count)
+        if self._blocks is not None:
+            places = self._in_focus()[places]
+        if fresh and len(self._fresh):
+            places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
+        return places
 
     def _choose(self, count: int, fresh: int, attended: int) -> Tensor:
         """Places [count] at random, on the device."""
-        places = self._random(self._size, count)
+        places = self._random(self.rays_drawn_on, count)
+        if self._blocks is not None:
+            places = torch.from_numpy(self._in_focus()).to(self._device)[places]
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh_on_device[self._random(len(self._fresh), fresh)]
         if attended and len(self._attended):
@@ -278,6 +347,16 @@ class ReplayPool:
             drawn = torch.from_numpy(self._attended[rows]).to(self._device)
             places[fresh : fresh + attended] = drawn
         return places
+
+    def _in_focus(self) -> Longs:
+        """The places of the rays that are drawn on at random; all, where none is in focus."""
+        if self._focused is None:
+            assert self._blocks is not None
+            rows = self._rows[: self._size]
+            self._focused = _ending_in(self._blocks, self._settings.leaf_m, self._middle, rows)
+            if len(self._focused) == 0:
+                self._focused = np.arange(self._size)
+        return self._focused
 
     def _random(self, below: int, count: int) -> Tensor:
         return torch.randint(below, (count,), generator=self._generator, device=self._device)
@@ -290,6 +369,7 @@ class ReplayPool:
         self._occupancy = np.bincount(self._bins, minlength=_BINS).astype(np.int32)
         self._fresh = self._fresh[:0]
         self._attended = self._attended[:0]
+        self._focused = None
         self._copy_to_device()
 
     def _extend(self, size: int) -> None:

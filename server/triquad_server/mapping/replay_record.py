@@ -29,7 +29,7 @@ def recorded_rays(table: RayTable, settings: FieldSettings, most: int) -> tuple[
     coarser = max(0, len(table.origins).bit_length() - _ORIGIN_BITS)
     codes = morton.encode(steps[places] // STEPS) << _ORIGIN_BITS
     places = places[np.argsort(codes | table.origin_of[places] >> coarser)]
-    slopes = np.rint(SLOPE_SCALE * table.rows[places, VALUE])
+    slopes = np.rint(SLOPE_SCALE * np.abs(table.rows[places, VALUE]))
     rays = ReplayRays(
         steps[places].astype(np.int32),
         table.origin_of[places],
@@ -42,5 +42,6 @@ def recorded_rays(table: RayTable, settings: FieldSettings, most: int) -> tuple[
 def restored_rays(rays: ReplayRays, settings: FieldSettings) -> RayTable:
     """The rays of a record."""
     slopes = rays.slopes / SLOPE_SCALE
+    slopes[rays.slopes == SLOPE_SCALE] = -1.0  # which may be since nothing told it
     rows = np.column_stack([rays.ends_m(settings), slopes]).astype(np.float32)
     return RayTable(rows, rays.origin_of, rays.origins)

@@ -114,6 +114,31 @@ def test_an_old_decoder_moves_less_than_a_young_one(compiled: bool) -> None:
     assert 0.01 * young < old < 0.05 * young
 
 
+@pytest.mark.parametrize("compiled", [False, True], ids=["tensors", "compiled"])
+def test_what_is_held_stays_as_it_is_and_all_else_learns_as_ever(compiled: bool) -> None:
+    settings = CASES[0]
+    batch = samples(settings, 4000, seed=2)
+    fields = [trained(settings) for _ in range(3)]
+    before, held_in, free = fields
+    rows = np.random.default_rng(0).random(len(held_in.features) - 50) < 0.5
+    held_in.hold(rows)
+    for field in (held_in, free):
+        trainer = CompiledTrainer(field, GradientSums(), TEAM) if compiled else TensorTrainer(field)
+        trainer.train(batch, RATES)
+    stay = torch.zeros(len(before.features), dtype=torch.bool)
+    stay[: len(rows)] = torch.from_numpy(rows)
+    for held, old, new in zip(
+        *(vars(f.features).values() for f in (held_in, before, free)), strict=True
+    ):
+        if isinstance(held, torch.Tensor):
+            assert torch.equal(held[stay], old[stay])
+            torch.testing.assert_close(held[~stay], new[~stay])
+    moved = [not torch.equal(x.values, y.values) for x, y in zip(before.mlp, free.mlp, strict=True)]
+    kept = [torch.equal(x.values, y.values) for x, y in zip(before.mlp, held_in.mlp, strict=True)]
+    assert all(moved)
+    assert all(kept)
+
+
 def test_points_outside_the_cube_get_values_without_features() -> None:
     settings = FieldSettings(depth=8, frequencies=4)
     field = trained(settings)

@@ -1,5 +1,6 @@
 import numpy as np
 import torch
+from triquad_format.records.field_settings import FieldSettings
 from triquad_server.engine.live_field import Batch
 from triquad_server.mapping.ray_table import Placement, RayTable, samples_alone
 from triquad_server.mapping.replay_pool import ReplayPool
@@ -19,7 +20,7 @@ RNG = np.random.default_rng(0)
 
 
 def new_pool(capacity: int) -> ReplayPool:
-    pool = ReplayPool(PLACEMENT, leaf_m=0.2, device=CPU, seed=0, team=TEAM)
+    pool = ReplayPool(PLACEMENT, settings=FieldSettings(), device=CPU, seed=0, team=TEAM)
     pool.limit(capacity)
     return pool
 
@@ -80,6 +81,26 @@ def test_the_newest_can_be_drawn_apart() -> None:
     labels = pool.draw(1000, 400).labels
     assert 400 <= labels.sum() < 450
     assert pool.draw(1000, 0).labels.sum() < 50
+
+
+def test_only_what_is_in_focus_is_drawn_on_whatever_comes_and_goes() -> None:
+    pool = new_pool(100_000)
+    pool.add(labelled(place(0, 50_000)))
+    pool.add(labelled(place(30, 500), 1))
+    middle = 1 << FieldSettings().depth - 1
+    block = np.array([[30.0, 0, 0], [32, 0, 0], [30, 2, 2], [32, 2, 2]]) / 0.2 + middle
+    pool.focus(np.floor(block / 8).astype(np.int64))
+    assert 0 < pool.rays_drawn_on < 500
+    assert pool.draw(1000, 0).labels.min() == 1
+    pool.add(labelled(place(0, 1000)))
+    assert pool.draw(1000, 400).labels.sum() == 600  # the newest are drawn on wherever they end
+    pool.limit(40_000)
+    assert pool.draw(1000, 0).labels.min() == 1
+    pool.forget_ends(np.floor(np.array([[31.0, 1, 1]]) / 0.2 + middle).astype(np.int64))
+    assert pool.draw(1000, 0).labels.min() == 1
+    pool.focus(None)
+    assert pool.rays_drawn_on == len(pool)
+    assert pool.draw(1000, 0).labels.mean() < 0.1
 
 
 def test_forgetting_a_box() -> None:

@@ -62,6 +62,10 @@ class LiveEvidence:
         observed = self._observations
         return EvidenceSize(self.blocks, observed.blocks, observed.voxels)
 
+    def surface_blocks(self) -> Longs:
+        """The blocks [B, 3] in which surface is believed."""
+        return self._blocks.cells()[self._seen.surface[: self.blocks].any(axis=1)]
+
     def new_ends(self, ends: Doubles) -> NewEnds:
         """What rays that end at ``ends`` [N, 3] would add; nothing is recorded."""
         return new_ends(ends, self._seen)

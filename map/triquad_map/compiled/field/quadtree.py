@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numba.extending import register_jitable
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bytes, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 
@@ -157,6 +157,21 @@ def count_new_vertices(shape: Shape, vertices: Vertices, leaves: Longs, keys: Lo
 
 
 @kernel()
+def mark_rows(shape: Shape, vertices: Vertices, cubes: Longs, side: int, marked: Bools) -> None:
+    """Mark the rows of the vertices on the shadows of ``cubes`` [N, 3] of so many leaves."""
+    down = shape.levels - 1
+    for i in range(len(cubes)):
+        for plane in range(3):
+            u, v = cubes[i, _AXES[plane, 0]] * side, cubes[i, _AXES[plane, 1]] * side
+            for block_u in range(u >> down, (u + side - 1 >> down) + 1):
+                for block_v in range(v >> down, (v + side - 1 >> down) + 1):
+                    block = find_row(vertices.blocks, block_key(plane, block_u, block_v))
+                    if block >= 0:
+                        for row in vertices.rows[block]:
+                            marked[row] = True
+
+
+@kernel()
 def restore_vertices(
     shape: Shape,
     vertices: Vertices,
@@ -243,6 +258,15 @@ class LiveQuadtree:
             len(leaves), lambda *state: grow_vertices(self.shape, self.vertices, leaves, *state)
         )
         return self._rows - before
+
+    def rows_under(self, cubes: Longs, side: int) -> Bools:
+        """Which rows [rows] are those of vertices in or beside the shadows of cubes of leaves.
+
+        ``cubes`` [N, 3] are counted in cubes of ``side`` leaves.
+        """
+        marked = np.zeros(self._rows, np.bool_)
+        mark_rows(self.shape, self.vertices, cubes, side, marked)
+        return marked
 
     def growth_by(self, leaves: Longs) -> int:
         """How many rows :meth:`grow` would add; an estimate where they are very many."""
