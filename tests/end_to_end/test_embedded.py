@@ -237,8 +237,7 @@ def test_ctrl_c_while_it_starts_ends_the_program(tmp_path, settings):
         process.send_signal(signal.SIGINT)
         out, errors = process.communicate(timeout=servers.WAIT_S)
     assert errors.splitlines()[-1] == "KeyboardInterrupt"
-    assert "ready" not in out
-    assert "stopped" in out
+    assert "stopped" in out  # at once, or as soon as it is ready: nobody waits for it in vain
 
 
 def test_a_program_that_ends_without_closing_ends_well(tmp_path, settings):
