@@ -5,15 +5,10 @@ sight. Ideally the first does not change at all, and those who follow the mesh o
 map are sent what that scan showed.
 """
 
-import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_map.stored_map import StoredMap
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.mesher import TileIndex, tile_lattice
 from triquad_server.mesh.tile_cache import TileCache
@@ -21,6 +16,7 @@ from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings
 
 from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.map_copy import MapCopy
 from triquad_tools.benchmarks.mesh import EVERYWHERE, make_tiles
 from triquad_tools.benchmarks.street import (
     learn_again,
@@ -52,7 +48,7 @@ def measure_far_scan(seed: int) -> list[Figure]:
     alone = settled_mapper("one scan elsewhere, alone", [scan])
     mapper = settled_mapper("the place", place.scans)
     before = _Place.of(mapper.publish(), place)
-    follower = _Follower(mapper.publish())
+    follower, copy = _Follower(mapper.publish()), MapCopy.of(mapper.publish())
     mapper.ingest(scan.points, scan.world_from_sensor)
     shown = follower.outdated_by(mapper.publish())
     learn_all(mapper)
@@ -64,7 +60,7 @@ def measure_far_scan(seed: int) -> list[Figure]:
     in_sight = _near(sent, scan.world_from_sensor[:3, 3], lidar.range_max_m)
     alone_cm = sdf_error_cm(alone.publish(), elsewhere.probes)
     beside_cm = sdf_error_cm(after_all, elsewhere.probes)
-    copied, fetched = follower.parts_of(after_all)
+    newer = MapCopy.of(after_all)
     return [
         Figure("SDF error of a place, settled", before.error_cm, "cm"),
         Figure(f"the same after one more scan {_BETWEEN} m away", after.error_cm, "cm"),
@@ -85,20 +81,20 @@ def measure_far_scan(seed: int) -> list[Figure]:
             "",
             at_most=1.2,
         ),
-        Figure("parts of a copy of the map", copied, ""),
-        Figure("those that are fetched again", 100 * fetched / copied, "%", at_most=10),
+        Figure("parts of a copy of the map, before", len(copy.parts), ""),
+        Figure("and then", len(newer.parts), ""),
+        Figure("those that are fetched", newer.fetched_by(copy), ""),
     ]
 
 
 class _Follower:
-    """Somebody who has the mesh and a copy of the map, and what they are sent."""
+    """Somebody who has the mesh, and what they are sent."""
 
     def __init__(self, epoch: Epoch) -> None:
         self._tiles = TileCache(MeshSettings(), Teams().meshing)
         self._tiles.refresh(epoch)
         make_tiles(self._tiles)
         self._revision = self._tiles.revision
-        self._parts = _parts(epoch)
 
     def outdated_by(self, epoch: Epoch) -> set[TileIndex]:
         """Tiles that have to be made again in an epoch."""
@@ -110,20 +106,6 @@ class _Follower:
         self._tiles.refresh(epoch)
         make_tiles(self._tiles)
         return {t.index for t in self._tiles.delta(0, *EVERYWHERE, self._revision, {}).ready}
-
-    def parts_of(self, epoch: Epoch) -> tuple[int, int]:
-        """How many parts a map file has in an epoch, and how many of them were others before."""
-        parts = _parts(epoch)
-        return len(parts), sum(self._parts.get(key) != digest for key, digest in parts.items())
-
-
-def _parts(epoch: Epoch) -> Mapping[object, bytes]:
-    """Digests of the parts of a map file, as it is downloaded."""
-    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
-        path = Path(name) / "map.triquad"
-        write_map(epoch.record(), path)
-        with StoredMap.open(path) as stored:
-            return {entry.key: entry.sha256 for entry in stored.manifest.entries}
 
 
 def _near(tiles: set[TileIndex], place: Doubles, reach_m: float) -> set[TileIndex]:

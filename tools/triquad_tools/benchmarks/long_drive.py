@@ -1,6 +1,7 @@
 """``triquad-bench`` of a long drive: whether all of it is learnt as well as a short one.
 
 1.6 km of street in three regions, taken in much faster than they can be learnt, and then settled.
+At last one more scan comes from the middle; who keeps a copy of the map fetches what it changed.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,8 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.figures import Figure
-from triquad_tools.benchmarks.street import sdf_error_cm, settled_mapper
+from triquad_tools.benchmarks.map_copy import MapCopy
+from triquad_tools.benchmarks.street import learn_again, sdf_error_cm, settled_mapper
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.map_scores import StreetProbes, driven_street, street_probes
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
@@ -59,11 +61,20 @@ def measure_long_drive(seed: int) -> list[Figure]:
     taken_in_cm = [place.error_cm(mapper) for place in places]
     _settle(mapper)
     settled_cm = [place.error_cm(mapper) for place in places]
+    copy = MapCopy.of(mapper.publish())
+    again = SimulatedDrive(scene, _lidar(), poses[len(poses) // 2 :][:1], seed=seed + 1)
+    for scan in again:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    learn_again(mapper)
+    newer = MapCopy.of(mapper.publish())
+    fetched = newer.fetched_by(copy) / len(newer.parts)
     return [
         Figure(f"SDF error of the first {_SHORT_M} m alone", alone_cm, "cm"),
         *_errors(places, taken_in_cm, settled_cm, alone_cm),
         Figure("training samples", mapper.samples_trained / 1e6, "M"),
         Figure("rays kept", mapper.rays_kept / 1e6, "M"),
+        Figure("parts of a copy of the map", len(newer.parts), ""),
+        Figure("those fetched after one more scan in the middle", 100 * fetched, "%", at_most=10),
     ]
 
 
