@@ -11,6 +11,7 @@ from contextlib import ExitStack, closing
 import numpy as np
 import torch
 from triquad_format.errors import SettingsError
+from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import MapRecord
 from triquad_map.questions.distance import DistanceOptions, distances
 
@@ -272,7 +273,11 @@ def warm_up(
     epoch = mapper.publish()
     again = Mapper("warm-up", settings, device, mapper.changes_since(None).record, teams)
     again.publish()
-    again.ingest((2 * directions[:1] * radius).astype(np.float32), np.eye(4))  # of it a little
+    region = again.regions[0]
+    blocks = region.evidence.surface_blocks()
+    region.field.hold(region.field.tree.rows_under(blocks, BLOCK_VOXELS))
+    region.field.live_view().evaluate(rays.ends.astype(np.float32), gradient=True)
+    region.pool.focus(blocks)  # as if it were seen anew
     again.train()
     report("queries")
     epoch.query(directions, gradient=True)

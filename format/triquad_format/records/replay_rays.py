@@ -54,7 +54,8 @@ class ReplayRays:
     origin_of: Ints  # [R] row of each ray's origin
     slopes: Bytes
     """[R] by how much the signed distance falls for each metre of the ray, ``1 / SLOPE_SCALE``:
-    the cosine of its angle to the surface's normal."""
+    the cosine of its angle to the surface's normal, or to the field's gradient where no normal is
+    known; SLOPE_SCALE also where neither is."""
 
     origins: Floats  # [K, 3] where the sensor was, metres from the region's centre
 

@@ -308,11 +308,8 @@ class CompiledTrainer:
     def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
         """Adam on the MLP and on the rows that were touched, so many by each thread."""
         compiled = CompiledRates.of(rates)
-        mlp_share = np.float32(self._field.next_mlp_share())
-        of_mlp = compiled._replace(mean_scales=mlp_share * compiled.mean_scales)
-        for part, parameter in enumerate(self._field.mlp):
-            gradient = np.sum([thread[part] for thread in mlp_sums], axis=0).reshape(1, -1)
-            _step_row(0, gradient, _parameter_rows(parameter), of_mlp)
+        if self._field.held is None:
+            self._step_mlp(mlp_sums, compiled)
         sums, features = self._sums, _parameter_rows(self._field.features)
         held = _NONE_HELD if self._field.held is None else self._field.held.numpy()
         self._team.each(
@@ -320,3 +317,11 @@ class CompiledTrainer:
                 part, counts[part], sums.step, sums.touched, sums.features, features, held, compiled
             )
         )
+
+    def _step_mlp(self, sums: list[Mlp], rates: CompiledRates) -> None:
+        """Adam on the MLP, by the gradients of each thread."""
+        share = np.float32(self._field.next_mlp_share())
+        of_mlp = rates._replace(mean_scales=share * rates.mean_scales)
+        for part, parameter in enumerate(self._field.mlp):
+            gradient = np.sum([thread[part] for thread in sums], axis=0).reshape(1, -1)
+            _step_row(0, gradient, _parameter_rows(parameter), of_mlp)

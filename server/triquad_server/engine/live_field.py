@@ -76,7 +76,7 @@ class Batch:
     labels: Tensor  # [B] signed distances, metres
 
 
-AgesT = TypeVar("AgesT", Doubles, Tensor)
+AgesT = TypeVar("AgesT", Doubles, Tensor)  # [N], or of any shape
 
 
 class Rates(NamedTuple):
@@ -89,7 +89,7 @@ class Rates(NamedTuple):
     """The learning rate of rows that took few steps yet; at least that of the others."""
 
     def by_age(self, ages: AgesT) -> AgesT:
-        """The learning rates of rows that took so many steps, at least one each."""
+        """The learning rates, shaped as ``ages``, of rows that took so many steps: one at least."""
         shares = (_SOFT_STEPS / ages).clip(_HARDEST, 1)
         young = (_YOUNG_STEPS / ages).clip(0, 1) ** 2
         return self.learning_rate * shares + (self.young_rate - self.learning_rate) * young
@@ -193,14 +193,12 @@ class LiveField:
         self.features.append(features)
 
     def next_mlp_share(self) -> float:
-        """The share of the rates in the next step of the MLP: it hardens more than features do."""
-        if self.held is not None:
-            return 0.0
+        """Count a step of the MLP; the share of the rates in it: it hardens more than features."""
         self.mlp_steps += 1
         return min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
 
-    def now(self) -> FrozenField:
-        """The field in its own memory, to be asked before anything changes it."""
+    def live_view(self) -> FrozenField:
+        """The field in its own memory: for its thread alone, and of use until it changes."""
         tree = self.tree.freeze()
         if self.device.type == "cpu":
             return FrozenCompiledField(self.settings, tree, self.arrays)

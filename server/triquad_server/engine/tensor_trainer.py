@@ -31,14 +31,8 @@ class TensorTrainer:
             target = torch.sigmoid(batch.labels / field.settings.logit_scale_m)
             loss = F.binary_cross_entropy_with_logits(logits, target)
             torch.autograd.backward(loss)
-        first_row = torch.zeros(1, dtype=torch.int64, device=field.device)
-        share = self._field.next_mlp_share()
-        mlp_rates = rates._replace(
-            learning_rate=share * rates.learning_rate, young_rate=share * rates.young_rate
-        )
-        for parameter, weight in zip(self._field.mlp, mlp, strict=True):
-            assert weight.grad is not None
-            step_rows(parameter, first_row, weight.grad[None], rates=mlp_rates)
+        if self._field.held is None:
+            self._step_mlp(mlp, rates)
         if corners is not None and encoded is not None and encoded.grad is not None:
             self._step_features(corners, encoded.grad, rates)
         return loss.detach()
@@ -49,6 +43,16 @@ class TensorTrainer:
             field = self._field
             self._tensor_field = TensorField(field.settings, field.tree, field.tensors)
         return self._tensor_field
+
+    def _step_mlp(self, mlp: tuple[Tensor, ...], rates: Rates) -> None:
+        first_row = torch.zeros(1, dtype=torch.int64, device=self._field.device)
+        share = self._field.next_mlp_share()
+        mlp_rates = rates._replace(
+            learning_rate=share * rates.learning_rate, young_rate=share * rates.young_rate
+        )
+        for parameter, weight in zip(self._field.mlp, mlp, strict=True):
+            assert weight.grad is not None
+            step_rows(parameter, first_row, weight.grad[None], rates=mlp_rates)
 
     def _step_features(self, corners: Corners, gradient: Tensor, rates: Rates) -> None:
         features = self._field.features

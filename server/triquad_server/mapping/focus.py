@@ -1,7 +1,7 @@
 """Where a region learns: everywhere, or only where it is seen anew since all of it had settled."""
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.voxel_index import cells_of, keys_of
@@ -10,18 +10,26 @@ from triquad_server.engine.live_field import LiveField
 from triquad_server.mapping.replay_pool import ReplayPool
 
 _GROWTH = 1.1
-"""By which what is seen anew grows before it counts: to find its rays and rows takes a while."""
+"""New blocks are taken into account once there are so many times as many: to find their rays and
+rows is expensive."""
+
+_LATEST_SAMPLES = 1 << 19
+"""Or once so many samples were trained on without them."""
 
 _MOST_SHARE = 0.25
 """Where more of the blocks with surface are seen anew, all of the region learns."""
 
+_LEARNT_STEPS = 300
+"""An MLP that took fewer has not learnt enough to stay as it is."""
+
 
 class Focus:
-    """What of a region is seen anew since all of it had settled.
+    """The blocks of a region in which anything is seen anew since all of it had settled.
 
-    It learns there alone: on rays that end there, in rows of features that no surface elsewhere
-    uses, and with the MLP that it has. Everything else stays as it is, to the bit. Once much is
-    seen anew, be it scan by scan, all of the region learns, with an MLP that suits all of it.
+    The region learns there alone: on rays that end there, in rows of features that no surface
+    elsewhere uses, and with the MLP that it has. Everything else stays as it is, to the bit. Once
+    much is seen anew, be it scan by scan, all of the region learns, with an MLP that suits all of
+    it.
     """
 
     def __init__(self, field: LiveField, evidence: LiveEvidence, pool: ReplayPool) -> None:
@@ -30,19 +38,23 @@ class Focus:
         self._evidence = evidence
         self._pool = pool
         self._seen_anew: Longs | None = None  # keys [B] of blocks; None: all learns
-        self._applied = 0  # of them, those that were known when it was applied last
+        self._blocks_applied = 0  # of them, those that the field and the pool know of
+        self._samples_since = 0  # that were trained on since
 
     def narrow(self) -> None:
-        """The region has settled: where all of it learnt, only what is seen anew does from now."""
+        """Nothing is owed any more: where all learnt, only what is seen anew does from now on."""
         has_features = self._field.settings.encoding != "fourier"
-        if self._seen_anew is None and has_features:
-            self._seen_anew, self._applied = np.zeros(0, np.int64), 0
+        has_learnt = self._field.mlp_steps >= _LEARNT_STEPS
+        if self._seen_anew is None and has_features and has_learnt:
+            self._seen_anew = np.zeros(0, np.int64)
+        self._blocks_applied = 0
 
-    def widen_to(self, voxels: Doubles) -> None:
-        """``voxels`` [N, 3] are seen anew."""
+    def widen_to(self, voxels: Longs) -> None:
+        """Something is seen anew in ``voxels`` [N, 3]; those outside the region do not count."""
         if self._seen_anew is not None:
-            seen = keys_of(np.floor(voxels / BLOCK_VOXELS).astype(np.int64))
-            self._seen_anew = np.union1d(self._seen_anew, seen)
+            is_inside = ((voxels >= 0) & (voxels < 1 << self._field.settings.depth)).all(axis=1)
+            blocks = keys_of(voxels[is_inside] // BLOCK_VOXELS)
+            self._seen_anew = np.union1d(self._seen_anew, blocks)
 
     def release(self) -> None:
         """All of the region learns."""
@@ -50,15 +62,22 @@ class Focus:
         self._field.hold(None)
         self._pool.focus(None)
 
-    def apply(self) -> None:
-        """Have the field and the pool keep to what is seen anew, where that has grown by much."""
-        if self._seen_anew is None or len(self._seen_anew) <= _GROWTH * self._applied:
+    def apply(self, samples: int) -> None:
+        """Have the field and the pool keep to what is seen anew, before ``samples`` are trained."""
+        if self._seen_anew is None:
             return
-        self._applied = len(self._seen_anew)
+        self._samples_since += samples
+        blocks, applied = len(self._seen_anew), self._blocks_applied
+        is_late = self._samples_since >= _LATEST_SAMPLES
+        if blocks > (applied if is_late else _GROWTH * applied):
+            self._blocks_applied, self._samples_since = blocks, 0
+            self._keep_to(self._seen_anew)
+
+    def _keep_to(self, seen_anew: Longs) -> None:
         surface = self._evidence.surface_blocks()
-        elsewhere = surface[~np.isin(keys_of(surface), self._seen_anew)]
-        if len(elsewhere) < (1 - _MOST_SHARE) * len(surface):
+        elsewhere = surface[~np.isin(keys_of(surface), seen_anew)]
+        if len(elsewhere) <= (1 - _MOST_SHARE) * len(surface):
             self.release()
             return
         self._field.hold(self._field.tree.rows_under(elsewhere, BLOCK_VOXELS))
-        self._pool.focus(cells_of(self._seen_anew))
+        self._pool.focus(cells_of(seen_anew))

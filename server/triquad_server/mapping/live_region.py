@@ -235,7 +235,7 @@ class LiveRegion:
             return
         if self.budget.samples == 0:
             self._focus.narrow()
-        self._focus.widen_to(self.voxels(rays.ends))
+        self._focus.widen_to(np.floor(self.voxels(rays.ends)).astype(np.int64))
         self.budget.add(self._keep(passing))
 
     def _keep(self, rays: RayTable) -> int:
@@ -281,7 +281,7 @@ class LiveRegion:
 
     def train(self) -> float | Tensor:
         """One optimiser step; returns the loss: to read it on a GPU waits for the step."""
-        self._focus.apply()
+        self._focus.apply(self.batch)
         step = self.budget.next_step(self.batch, self.pool.rays_drawn_on)
         batch = self.pool.draw(step.samples, step.fresh, step.repair)
         loss = self._trainer.train(batch, step.rates)
@@ -293,6 +293,7 @@ class LiveRegion:
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget evidence and samples between two corners [3]."""
+        self._focus.release()
         self.evidence.clear(self.voxels(low[None])[0], self.voxels(high[None])[0])
         for pool in (self.pool, self.held_out):
             pool.forget(low - self.centre, high - self.centre)
@@ -410,6 +411,7 @@ class LiveRegion:
         voxels = voxels[~self.evidence.freeze().ended_in(voxels)]  # nothing ended there since
         for pool in (self.pool, self.held_out):
             pool.forget_ends(voxels)
+        self._focus.widen_to(voxels)
         inside = self._random.random((_SAMPLES_PER_VOXEL, len(voxels), 3))
         points = (voxels + inside).reshape(-1, 3)
         leaf_m, middle = self._settings.leaf_m, 1 << (self._settings.depth - 1)

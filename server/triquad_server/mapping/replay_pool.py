@@ -222,6 +222,7 @@ class ReplayPool:
         origin_of = np.where(origin_of >= 0, origin_of + first, NO_ORIGIN).astype(np.int32)
         new = RayTable(rows, origin_of, self._origins)
         self._extend(used + room)
+        self._select_anew(places, new.rows)
         _put(
             new,
             self._bin_m,
@@ -250,7 +251,8 @@ class ReplayPool:
     @property
     def rays_drawn_on(self) -> int:
         """How many rays are drawn on at random."""
-        return self._size if self._blocks is None else len(self._in_focus())
+        in_focus = self._in_focus()
+        return self._size if in_focus is None else len(in_focus)
 
     def attend(self, places: Longs) -> int:
         """From now on, some samples are drawn in ``places`` [P] on request; returns their rays."""
@@ -281,9 +283,14 @@ class ReplayPool:
         return draw_ordered_samples(table, places, self.placement, rng=self._rng, team=self._team)
 
     def unsure(self, count: int, fresh: int) -> Longs:
-        """The places of rays whose slope no normal told, among ``count`` that are drawn on."""
+        """The places of rays whose slope no normal told, among ``count`` that are drawn on.
+
+        They end in the cube: elsewhere a field knows no surface.
+        """
         places = np.unique(self._at_random(count, fresh))
         is_unsure = (self._rows[places, VALUE] < 0) & (self._origin_of[places] >= 0)
+        ends = self._rows[places, END : END + 3]
+        is_unsure &= (np.abs(ends) < self.placement.half_side_m).all(axis=1)
         unsure: Longs = places[is_unsure]
         return unsure
 
@@ -328,9 +335,10 @@ class ReplayPool:
 
     def _at_random(self, count: int, fresh: int) -> Longs:
         """Places [count] at random, ``fresh`` of them of the newest."""
+        in_focus = self._in_focus()
         places: Longs = self._rng.integers(self.rays_drawn_on, size=count)
-        if self._blocks is not None:
-            places = self._in_focus()[places]
+        if in_focus is not None:
+            places = in_focus[places]
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
         return places
@@ -338,8 +346,8 @@ class ReplayPool:
     def _choose(self, count: int, fresh: int, attended: int) -> Tensor:
         """Places [count] at random, on the device."""
         places = self._random(self.rays_drawn_on, count)
-        if self._blocks is not None:
-            places = torch.from_numpy(self._in_focus()).to(self._device)[places]
+        if (in_focus := self._in_focus()) is not None:
+            places = torch.from_numpy(in_focus).to(self._device)[places]
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh_on_device[self._random(len(self._fresh), fresh)]
         if attended and len(self._attended):
@@ -348,15 +356,24 @@ class ReplayPool:
             places[fresh : fresh + attended] = drawn
         return places
 
-    def _in_focus(self) -> Longs:
-        """The places of the rays that are drawn on at random; all, where none is in focus."""
+    def _in_focus(self) -> Longs | None:
+        """The places of the rays that are drawn on at random; None: all of them."""
+        if self._blocks is None:
+            return None
         if self._focused is None:
-            assert self._blocks is not None
             rows = self._rows[: self._size]
             self._focused = _ending_in(self._blocks, self._settings.leaf_m, self._middle, rows)
-            if len(self._focused) == 0:
-                self._focused = np.arange(self._size)
-        return self._focused
+        return self._focused if len(self._focused) else None
+
+    def _select_anew(self, places: Longs, rows: Floats) -> None:
+        """Other rays are at ``places`` [N] now, with these ``rows`` [N, COLUMNS]."""
+        is_other = np.zeros(self._size, np.bool_)
+        is_other[places] = True
+        self._attended = self._attended[~is_other[self._attended]]
+        if self._blocks is not None and self._focused is not None:
+            inside = _ending_in(self._blocks, self._settings.leaf_m, self._middle, rows)
+            kept = self._focused[~is_other[self._focused]]
+            self._focused = np.concatenate([kept, places[inside]])
 
     def _random(self, below: int, count: int) -> Tensor:
         return torch.randint(below, (count,), generator=self._generator, device=self._device)

@@ -12,7 +12,7 @@ from triquad_server.mapping.ray_table import END, LEAST_SLOPE, RayTable
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.mapping.training_budget import Step
 
-_EVERY_SAMPLES = 1 << 15
+_EVERY_SAMPLES = 1 << 15  # the field is asked
 _SHARE = 0.25  # of the samples, as many rays are looked at: each of them a few times
 _LEARNT_WITHIN = 0.25  # leaves: so near to a ray's end is the surface of a field that knows it
 _LEARNT_SLOPE = 0.5  # and its gradient is longer than this
@@ -22,21 +22,24 @@ class Slopes:
     """Keeps the slopes of a pool's rays up to date while a field learns from them."""
 
     def __init__(self, field: LiveField, pool: ReplayPool) -> None:
+        """Of the rays of ``pool``, from which ``field`` learns."""
         self._field = field
         self._pool = pool
-        self._samples = 0  # since the field was asked
+        self._samples_since = 0  # that were trained on since the field was asked
 
     def after(self, step: Step) -> None:
         """A step was taken: from time to time, ask the field about some of the rays drawn on."""
-        self._samples += step.samples
-        if self._samples < _EVERY_SAMPLES:
+        self._samples_since += step.samples
+        if self._samples_since < _EVERY_SAMPLES:
             return
-        count = int(_SHARE * self._samples)
-        self._samples = 0
+        count = int(_SHARE * self._samples_since)
+        self._samples_since = 0
         table = self._pool.table
         rays = self._pool.unsure(count, count * step.fresh // step.samples)
+        if len(rays) == 0:
+            return
         ends = np.ascontiguousarray(table.rows[rays, END : END + 3])
-        values = self._field.now().evaluate(ends, gradient=True)
+        values = self._field.live_view().evaluate(ends, gradient=True)
         is_learnt = np.abs(values.sdf) < _LEARNT_WITHIN * self._field.settings.leaf_m
         is_learnt &= np.linalg.norm(values.gradient, axis=1) > _LEARNT_SLOPE
         rays, gradients = rays[is_learnt], values.gradient[is_learnt]
@@ -47,5 +50,5 @@ def _slopes(table: RayTable, rays: Longs, gradients: Floats) -> Doubles:
     """Slopes [N] of ``rays`` [N] where the field has these ``gradients`` [N, 3] at their ends."""
     ways = table.rows[rays, END : END + 3] - table.origins[table.origin_of[rays]]
     lengths = np.linalg.norm(ways, axis=1) * np.linalg.norm(gradients, axis=1)
-    slopes: Doubles = np.abs((ways * gradients).sum(axis=1)) / lengths
+    slopes: Doubles = np.abs((ways * gradients).sum(axis=1)) / np.maximum(lengths, 1e-9)
     return slopes.clip(LEAST_SLOPE, 1)

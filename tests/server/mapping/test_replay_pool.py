@@ -94,7 +94,12 @@ def test_only_what_is_in_focus_is_drawn_on_whatever_comes_and_goes() -> None:
     assert pool.draw(1000, 0).labels.min() == 1
     pool.add(labelled(place(0, 1000)))
     assert pool.draw(1000, 400).labels.sum() == 600  # the newest are drawn on wherever they end
+    known = pool.rays_drawn_on
+    pool.add(labelled(place(30, 500), 2), fresh=False)
+    assert pool.rays_drawn_on > known
+    assert pool.draw(1000, 0).labels.max() == 2
     pool.limit(40_000)
+    pool.add(labelled(place(0, 10_000)), fresh=False)  # in place of others, in focus or not
     assert pool.draw(1000, 0).labels.min() == 1
     pool.forget_ends(np.floor(np.array([[31.0, 1, 1]]) / 0.2 + middle).astype(np.int64))
     assert pool.draw(1000, 0).labels.min() == 1

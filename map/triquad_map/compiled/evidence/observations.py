@@ -143,7 +143,8 @@ class Observations:
     def set_discs(self, voxels: Longs, surfels: Surfels, seen: SeenVoxels) -> None:
         """Take the middles and normals of ``voxels`` [N, 3] from their ``surfels``.
 
-        Where there is no disc, the next ray that ends there tells where the surface is.
+        Where there is no disc, it is the nearest one beside, or else the next ray that ends there
+        tells where the surface is.
         """
         _set_discs(voxels, surfels.offsets, surfels.normals, surfels.kinds, seen, self.arrays)
 

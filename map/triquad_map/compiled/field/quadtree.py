@@ -168,7 +168,7 @@ def mark_rows(shape: Shape, vertices: Vertices, cubes: Longs, side: int, marked:
                     block = find_row(vertices.blocks, block_key(plane, block_u, block_v))
                     if block >= 0:
                         for row in vertices.rows[block]:
-                            marked[row] = True
+                            marked[row] = row != 0
 
 
 @kernel()
