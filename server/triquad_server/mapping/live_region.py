@@ -80,6 +80,10 @@ _SURFELS_REFITTED = 8_000
 _JUDGED_AFTER_SAMPLES = 8_000_000
 """A field that is being trained is judged once in so many samples: a few seconds."""
 
+_FEW_GONE = 32
+"""Where the surface of more voxels is gone, all of the region learns: rows that others use as well
+have to forget it."""
+
 _CPU = torch.device("cpu")
 
 
@@ -411,7 +415,10 @@ class LiveRegion:
         voxels = voxels[~self.evidence.freeze().ended_in(voxels)]  # nothing ended there since
         for pool in (self.pool, self.held_out):
             pool.forget_ends(voxels)
-        self._focus.widen_to(voxels)
+        if len(voxels) > _FEW_GONE:
+            self._focus.release()
+        else:
+            self._focus.widen_to(voxels)
         inside = self._random.random((_SAMPLES_PER_VOXEL, len(voxels), 3))
         points = (voxels + inside).reshape(-1, 3)
         leaf_m, middle = self._settings.leaf_m, 1 << (self._settings.depth - 1)

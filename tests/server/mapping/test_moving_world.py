@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from support.mapfile_edit import file_bytes, read_bytes
-from support.small_world import WALLED, WALLED_BOUNDS, settings
+from support.small_world import WALLED, WALLED_BOUNDS, settings, settle
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.region import Region
@@ -129,6 +129,30 @@ def test_the_field_learns_that_it_is_free_there() -> None:
     after = watched.scan(count=20)
     free = faces()[faces()[:, 2] > 0.5]
     assert np.median(after.query(free).sdf) > 0.1
+
+
+def test_a_settled_map_that_is_seen_anew_in_part_unlearns_what_went() -> None:
+    chosen = settings(samples_per_ray=30.0)
+    watched = Watched(chosen.model_copy(update={"field": Settings().field}))
+    watched.scan(BOX, count=8)
+    settle(watched.mapper)
+    faced = watched.mapper.publish()
+    scene = Scene(WALLED, WALLED_BOUNDS)
+    for number in range(20):
+        pose = np.eye(4)
+        pose[:3, 3] = (0.0, 0.05 * number, 1.4)
+        made = Lidar(columns=1024).scan(scene, pose, np.random.default_rng(number))
+        ahead = np.abs(np.arctan2(made.points[:, 1], made.points[:, 0])) < 0.25
+        watched.mapper.ingest(made.points[ahead], pose, stamp_s=100 + number)
+        for _ in range(8):
+            watched.mapper.train()
+        watched.mapper.publish()
+    settle(watched.mapper)
+    after = watched.mapper.publish()
+    free = faces()[faces()[:, 2] > 0.5]
+    free = free[free[:, 0] < CENTRE[0] - 0.9 * HALF[0]]
+    assert np.median(np.abs(faced.query(free).sdf)) < 0.05
+    assert np.median(after.query(free).sdf) > 0.07
 
 
 def test_no_ray_that_ended_there_is_trained_on_again() -> None:
