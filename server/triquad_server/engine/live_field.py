@@ -199,10 +199,7 @@ class LiveField:
 
     def live_view(self) -> FrozenField:
         """The field in its own memory: for its thread alone, and of use until it changes."""
-        tree = self.tree.freeze()
-        if self.device.type == "cpu":
-            return FrozenCompiledField(self.settings, tree, self.arrays)
-        return TensorField(self.settings, tree, self.tensors)
+        return self._answering_from(self.tensors)
 
     def hold(self, rows: Bools | None) -> None:
         """From now on, the feature ``rows`` [N] and the MLP stay as they are; None: all learns.
@@ -213,15 +210,16 @@ class LiveField:
         self._vertices_held = 0 if rows is None else int(rows[1:].sum())
 
     def freeze(self) -> FrozenField:
-        """The field as it is now: compiled on the CPU, in tensors on other devices."""
-        tree = self.tree.freeze()
+        """The field as it is now, in memory of its own."""
         now = self.tensors  # of which the frequencies never change
-        if self.device.type == "cpu":
-            features, mlp, frequencies = now.arrays
-            own = FieldArrays(features.copy(), tuple(part.copy() for part in mlp), frequencies)
-            return FrozenCompiledField(self.settings, tree, own)
         clones = tuple(part.clone() for part in now.mlp)
-        tensors = FieldTensors(now.features.clone(), clones, now.frequencies)
+        return self._answering_from(FieldTensors(now.features.clone(), clones, now.frequencies))
+
+    def _answering_from(self, tensors: FieldTensors) -> FrozenField:
+        """Compiled on the CPU, in tensors on other devices."""
+        tree = self.tree.freeze()
+        if self.device.type == "cpu":
+            return FrozenCompiledField(self.settings, tree, tensors.arrays)
         return TensorField(self.settings, tree, tensors)
 
 

@@ -1,7 +1,7 @@
 """Where a region learns: everywhere, or only where it is seen anew since all of it had settled."""
 
 import numpy as np
-from triquad_format.records.arrays import Longs
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.voxel_index import cells_of, keys_of
@@ -49,12 +49,12 @@ class Focus:
             self._seen_anew = np.zeros(0, np.int64)
         self._blocks_applied = 0
 
-    def widen_to(self, voxels: Longs) -> None:
-        """Something is seen anew in ``voxels`` [N, 3]; those outside the region do not count."""
+    def widen_to(self, voxels: Doubles | Longs) -> None:
+        """Something is seen anew at ``voxels`` [N, 3]; those outside the region do not count."""
         if self._seen_anew is not None:
             is_inside = ((voxels >= 0) & (voxels < 1 << self._field.settings.depth)).all(axis=1)
-            blocks = keys_of(voxels[is_inside] // BLOCK_VOXELS)
-            self._seen_anew = np.union1d(self._seen_anew, blocks)
+            blocks = (voxels[is_inside] // BLOCK_VOXELS).astype(np.int64)
+            self._seen_anew = np.union1d(self._seen_anew, keys_of(blocks))
 
     def release(self) -> None:
         """All of the region learns."""

@@ -194,6 +194,9 @@ class LiveRegion:
         self._marks = self.evidence.mark_surface(ends, sighting)
         # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
         self.field.grow(self._marks.new)
+        if self.budget.samples == 0:
+            self._focus.narrow()
+        self._focus.widen_to(ends)
         self.changed = True
         clear = math.inf if self._setup.change.static else _CLEAR_SHORT
         reach = Reach(_CARVE_SHORT, clear, self._scans)
@@ -237,9 +240,6 @@ class LiveRegion:
         passing = rays_through(rays, normals, self.centre, self.pool.placement, self._ray_random)
         if len(passing) == 0:
             return
-        if self.budget.samples == 0:
-            self._focus.narrow()
-        self._focus.widen_to(np.floor(self.voxels(rays.ends)).astype(np.int64))
         self.budget.add(self._keep(passing))
 
     def _keep(self, rays: RayTable) -> int:

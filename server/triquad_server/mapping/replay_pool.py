@@ -367,6 +367,8 @@ class ReplayPool:
 
     def _select_anew(self, places: Longs, rows: Floats) -> None:
         """Other rays are at ``places`` [N] now, with these ``rows`` [N, COLUMNS]."""
+        if len(self._attended) == 0 and self._focused is None:
+            return
         is_other = np.zeros(self._size, np.bool_)
         is_other[places] = True
         self._attended = self._attended[~is_other[self._attended]]

@@ -62,9 +62,9 @@ def measure_long_drive(seed: int) -> list[Figure]:
     _settle(mapper)
     settled_cm = [place.error_cm(mapper) for place in places]
     copy = MapCopy.of(mapper.publish())
-    again = SimulatedDrive(scene, _lidar(), poses[len(poses) // 2 :][:1], seed=seed + 1)
-    for scan in again:
-        mapper.ingest(scan.points, scan.world_from_sensor)
+    middle = len(poses) // 2
+    (again,) = SimulatedDrive(scene, _lidar(), poses[middle : middle + 1], seed=seed + 1)
+    mapper.ingest(again.points, again.world_from_sensor)
     learn_again(mapper)
     newer = MapCopy.of(mapper.publish())
     fetched = newer.fetched_by(copy) / len(newer.parts)

@@ -15,6 +15,7 @@ from triquad_map.compiled.evidence.observed import (
     ObservedVoxel,
     Vector,
     Voxel,
+    is_flat,
     voxel_of,
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
@@ -52,7 +53,7 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> bool:
     to_z = corner[2] + mean[2] - ray.start[2]
     along = to_x * way[0] + to_y * way[1] + to_z * way[2]
     radius = _LEAST_RADIUS
-    if _is_flat(voxel):
+    if is_flat(voxel):
         facing = way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]
         if abs(facing) < _LEAST_COSINE:
             return False
@@ -65,13 +66,6 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> bool:
         return False
     off_x, off_y, off_z = along * way[0] - to_x, along * way[1] - to_y, along * way[2] - to_z
     return bool(off_x * off_x + off_y * off_y + off_z * off_z <= radius * radius)
-
-
-@kernel(inline="always")
-def _is_flat(voxel: ObservedVoxel) -> bool:
-    """Whether the normal of the surface in a voxel is known."""
-    normal = voxel.normal
-    return bool(normal[0] != 0 or normal[1] != 0 or normal[2] != 0)
 
 
 @kernel()
@@ -88,7 +82,7 @@ def note_passes(
             continue
         voxel = observed.voxels[row]
         crossing = _crosses(ray, voxel_of(row, seen, observed), voxel)
-        if not crossing and voxel.ends >= _KNOWN_ENDS and _is_flat(voxel):
+        if not crossing and voxel.ends >= _KNOWN_ENDS and is_flat(voxel):
             continue
         if voxel.hit_scan == ray.scan:
             voxel.earlier_passes += 1

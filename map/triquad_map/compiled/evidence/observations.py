@@ -10,6 +10,7 @@ from triquad_map.compiled.evidence.levels import fill_levels
 from triquad_map.compiled.evidence.observed import (
     OBSERVED_VOXEL,
     Observed,
+    is_flat,
     row_of,
     rows_around,
     voxel_of,
@@ -78,7 +79,7 @@ def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
     for near in rows_around(row, 1, seen, observed):
         disc = observed.voxels[near]
         normal, mean = disc.normal, disc.mean
-        if near == row or (normal[0] == 0 and normal[1] == 0 and normal[2] == 0):
+        if near == row or not is_flat(disc):
             continue
         beside = voxel_of(near, seen, observed)
         height = 0.0

@@ -51,6 +51,13 @@ Vector = tuple[float, float, float]
 
 
 @kernel(inline="always")
+def is_flat(voxel: ObservedVoxel) -> bool:
+    """Whether the normal of the surface in a voxel is known."""
+    normal = voxel.normal
+    return bool(normal[0] != 0 or normal[1] != 0 or normal[2] != 0)
+
+
+@kernel(inline="always")
 def row_of(seen: SeenVoxels, observed: Observed, x: int, y: int, z: int) -> int:
     """The row of a voxel; 0 where no ray ended in it."""
     block = find_block(seen.blocks, x, y, z, seen.side)
