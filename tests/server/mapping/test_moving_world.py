@@ -212,7 +212,8 @@ def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
     near = chosen.model_copy(update={"scan": chosen.scan.model_copy(update={"range_max_m": 6.5})})
     watched = Watched(near)
     assert share(watched.scan(BOX, count=8), Status.SURFACE, front=True) > 0.95
-    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.1
+    # Few rays of a scan are taken for this: which, hangs on chance.
+    assert share(watched.scan(count=60), Status.SURFACE, front=True) < 0.1
 
 
 def test_an_hour_elsewhere_takes_nothing_back() -> None:
