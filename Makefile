@@ -2,7 +2,7 @@
 # make check     the checks alone: style, types, which package may import which
 # make docs      write the tables of docs/settings.md from the settings
 # make pictures  make the pictures of the documentation anew; those of the viewer need Chromium
-# make pretrained train the MLP that regions begin with, on simulated streets: 10 minutes
+# make pretrained   train the MLP that regions begin with, on simulated streets: 10 minutes
 # make campaign  try for 5 minutes to break a server and its files; CAMPAIGN_MINUTES=60: for an hour
 # make demo      set up a virtual environment and map a street, end to end
 VENV ?= .venv

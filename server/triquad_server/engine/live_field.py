@@ -131,7 +131,8 @@ class LiveField:
             settings: its shape.
             frequencies: [m] of Fourier features, on coordinates normalised to [-1, 1].
             mlp: weights [in, out] and bias [out] of each layer in turn.
-            mlp_steps: that the MLP took.
+            mlp_steps: that the MLP counts as having taken; with moments of zero, the first few of
+                an old one are up to twice as large.
             generator: draws the feature vectors of new vertices.
         """
         self.settings = settings
@@ -229,7 +230,7 @@ class LiveField:
 
 
 def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> LiveField:
-    """A field of which nothing is learnt yet: random, but for its MLP (:mod:`.initial_mlp`)."""
+    """A field of which nothing is learnt yet: random, but for its MLP (:func:`initial_mlp`)."""
     generator = torch.Generator(device).manual_seed(seed)
     frequencies = torch.randn(settings.frequencies, generator=generator, device=device)
     frequencies *= math.sqrt(settings.frequency_variance)
@@ -305,6 +306,7 @@ def field_from_record(
         settings,
         _tensor(record.frequencies, device),
         [_tensor(array, device) for layer in layers for array in layer],
+        # Without training state nothing tells how much it learnt.
         mlp_steps=0 if record.training is None else record.training.mlp_steps,
         generator=torch.Generator(device).manual_seed(seed),
     )
