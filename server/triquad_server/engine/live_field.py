@@ -17,6 +17,7 @@ from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
 from triquad_map.compiled.field.quadtree import LiveQuadtree
 
+from triquad_server.engine.initial_mlp import initial_mlp
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
 
 FrozenField = FrozenCompiledField | TensorField
@@ -121,6 +122,7 @@ class LiveField:
         settings: FieldSettings,
         frequencies: Tensor,
         mlp: list[Tensor],
+        mlp_steps: int,
         generator: torch.Generator,
     ) -> None:
         """A field without vertices.
@@ -129,6 +131,8 @@ class LiveField:
             settings: its shape.
             frequencies: [m] of Fourier features, on coordinates normalised to [-1, 1].
             mlp: weights [in, out] and bias [out] of each layer in turn.
+            mlp_steps: that the MLP counts as having taken; with moments of zero, the first few of
+                an old one are up to twice as large.
             generator: draws the feature vectors of new vertices.
         """
         self.settings = settings
@@ -138,7 +142,9 @@ class LiveField:
         self.features = Parameter(torch.zeros((1, settings.feature_size), device=self.device))
         self.frequencies = frequencies
         self.mlp = [Parameter(part[None]) for part in mlp]
-        self.mlp_steps = 0  # that the MLP took; to read its own from a GPU would take a wait
+        for part in self.mlp:
+            part.steps.fill_(mlp_steps)
+        self.mlp_steps = mlp_steps  # to read its own from a GPU would take a wait
         self.held: Tensor | None = None
         """Which of the first rows of features [N] stay as they are, as does the MLP; None: none."""
 
@@ -224,18 +230,12 @@ class LiveField:
 
 
 def initial_field(settings: FieldSettings, device: torch.device, seed: int) -> LiveField:
-    """A field of which nothing is learnt yet, drawn at random."""
+    """A field of which nothing is learnt yet: random, but for its MLP (:func:`initial_mlp`)."""
     generator = torch.Generator(device).manual_seed(seed)
     frequencies = torch.randn(settings.frequencies, generator=generator, device=device)
     frequencies *= math.sqrt(settings.frequency_variance)
-    # Uniform in +-1/sqrt(inputs), as those of torch.nn.Linear.
-    hidden = settings.hidden
-    mlp = []
-    for inputs, outputs in ((settings.input_size, hidden), (hidden, hidden), (hidden, 1)):
-        for size in ((inputs, outputs), (outputs,)):
-            uniform = torch.rand(size, generator=generator, device=device) * 2 - 1
-            mlp.append(uniform * (1 / math.sqrt(inputs)))
-    return LiveField(settings, frequencies, mlp, generator=generator)
+    mlp, steps = initial_mlp(settings, generator)
+    return LiveField(settings, frequencies, mlp, mlp_steps=steps, generator=generator)
 
 
 def region_record(
@@ -306,6 +306,8 @@ def field_from_record(
         settings,
         _tensor(record.frequencies, device),
         [_tensor(array, device) for layer in layers for array in layer],
+        # Without training state nothing tells how much it learnt.
+        mlp_steps=0 if record.training is None else record.training.mlp_steps,
         generator=torch.Generator(device).manual_seed(seed),
     )
     for table in record.tables:
@@ -328,7 +330,6 @@ def _restore_optimiser(field: LiveField, state: TrainingState) -> None:
         torch.cat([zero, *variances]),
         torch.cat([zero[:, 0].int(), *steps]),
     )
-    field.mlp_steps = state.mlp_steps
     mlp = field.mlp[0::2] + field.mlp[1::2]
     for part, mean, variance in zip(mlp, state.mlp_means, state.mlp_variances, strict=True):
         taken = torch.full((1,), state.mlp_steps, dtype=torch.int32, device=device)

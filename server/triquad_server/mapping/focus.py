@@ -20,7 +20,7 @@ _MOST_SHARE = 0.25
 """Where more of the blocks with surface are seen anew, all of the region learns."""
 
 _LEARNT_STEPS = 300
-"""An MLP that took fewer has not learnt enough to stay as it is."""
+"""An MLP that took fewer has not learnt enough to stay as it is; a pretrained one has."""
 
 
 class Focus:
@@ -49,11 +49,12 @@ class Focus:
             self._seen_anew = np.zeros(0, np.int64)
         self._blocks_applied = 0
 
-    def widen_to(self, voxels: Doubles | Longs) -> None:
-        """Something is seen anew at ``voxels`` [N, 3]; those outside the region do not count."""
+    def widen_to(self, positions: Doubles | Longs) -> None:
+        """Something is seen anew at ``positions`` [N, 3], in voxels; outside it does not count."""
         if self._seen_anew is not None:
-            is_inside = ((voxels >= 0) & (voxels < 1 << self._field.settings.depth)).all(axis=1)
-            blocks = (voxels[is_inside] // BLOCK_VOXELS).astype(np.int64)
+            side = 1 << self._field.settings.depth
+            is_inside = ((positions >= 0) & (positions < side)).all(axis=1)
+            blocks = (positions[is_inside] // BLOCK_VOXELS).astype(np.int64)
             self._seen_anew = np.union1d(self._seen_anew, keys_of(blocks))
 
     def release(self) -> None:

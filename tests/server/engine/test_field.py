@@ -98,7 +98,7 @@ def test_it_equals_the_slow_reference(encoding: str) -> None:
     field = grown(small(encoding))
     points = (torch.rand((60, 3)) * 2 - 1) * field.settings.region_side_m * 0.2
     expected = [slow_sdf(field, point) for point in points.double().numpy()]
-    np.testing.assert_allclose(in_tensors(field).sdf(points).numpy(), expected, atol=2e-6)
+    np.testing.assert_allclose(in_tensors(field).sdf(points).numpy(), expected, atol=1e-5)
 
 
 def test_the_gradient_is_that_of_the_values() -> None:

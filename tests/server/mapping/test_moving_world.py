@@ -208,11 +208,14 @@ def test_a_restored_map_stays_until_rays_contradict_it() -> None:
 
 
 def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
-    chosen = settings(samples_per_ray=6.0)
-    near = chosen.model_copy(update={"scan": chosen.scan.model_copy(update={"range_max_m": 6.5})})
-    watched = Watched(near)
-    assert share(watched.scan(BOX, count=8), Status.SURFACE, front=True) > 0.95
-    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.1
+    left = []
+    for seed in range(4):  # few rays of a scan are taken for this, at random
+        chosen = settings(samples_per_ray=6.0, seed=seed)
+        scan = chosen.scan.model_copy(update={"range_max_m": 6.5})
+        watched = Watched(chosen.model_copy(update={"scan": scan}))
+        assert share(watched.scan(BOX, count=8), Status.SURFACE, front=True) > 0.95
+        left.append(share(watched.scan(count=20), Status.SURFACE, front=True))
+    assert np.mean(left) < 0.35
 
 
 def test_an_hour_elsewhere_takes_nothing_back() -> None:

@@ -233,7 +233,7 @@ def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
     make_all(cache)
     before = surfaces(cache)
     known = cache.revision
-    mapper.reset(np.array([0.0, -50, -50]), np.array([50.0, 50, 50]))
+    mapper.reset(np.array([0.0, -50, -50]), np.array([200.0, 50, 50]))
     cache.refresh(mapper.publish())
     made = make_all(cache)
     side_m = cache.lattice(0).tile_side_m

@@ -1,0 +1,72 @@
+"""The MLP that a region begins with: one that has learnt simulated streets, where its shape allows.
+
+What it knows is how features become distances, in leaves, which is much alike everywhere: at leaves
+of up to 0.2 m features find their values in fewer steps, and where little is trained the map is
+better. Of where things are, it knows nothing: that is in the features, and in the weights of the
+Fourier features, which start at zero.
+"""
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from triquad_format.records.arrays import Floats
+from triquad_format.records.field_settings import FieldSettings
+
+PRETRAINED = Path(__file__).with_name("pretrained_mlp.npz")
+"""Arrays, as :func:`initial_mlp` reads them; `make pretrained` writes them."""
+
+_STEPS = 1000
+"""That a pretrained MLP counts as having taken, so that it moves less than a young one."""
+
+
+class InitialMlp(NamedTuple):
+    """What a region begins with."""
+
+    parts: list[Tensor]  # weights [in, out] and bias [out] of each layer in turn
+    steps: int  # it counts as having taken
+
+
+def initial_mlp(settings: FieldSettings, generator: torch.Generator) -> InitialMlp:
+    """On the device of ``generator``, which draws what is not pretrained.
+
+    Pretrained it is where features, their deviation and the hidden layers are as by default.
+    """
+    random = random_mlp(settings, generator)
+    if settings.encoding == "fourier":
+        return InitialMlp(random, steps=0)
+    stored = _read_pretrained()
+    shape = (settings.feature_levels, settings.feature_size, settings.hidden)
+    if stored["weights1"].shape != shape or stored["feature_std"] != settings.feature_std:
+        return InitialMlp(random, steps=0)
+    names = ("weights1", "bias1", "weights2", "bias2", "weights3", "bias3")
+    parts = [torch.tensor(stored[name], device=generator.device) for name in names]
+    of_features = parts[0].flatten(end_dim=1)
+    of_fourier = torch.zeros_like(random[0][len(of_features) :])
+    logits_per_leaf = settings.leaf_m / settings.logit_scale_m
+    last = [part * logits_per_leaf for part in parts[-2:]]
+    return InitialMlp([torch.cat([of_features, of_fourier]), *parts[1:-2], *last], _STEPS)
+
+
+def random_mlp(settings: FieldSettings, generator: torch.Generator) -> list[Tensor]:
+    """Weights [in, out] and bias [out] of each layer in turn, as those of torch.nn.Linear."""
+    hidden = settings.hidden
+    mlp = []
+    for inputs, outputs in ((settings.input_size, hidden), (hidden, hidden), (hidden, 1)):
+        for size in ((inputs, outputs), (outputs,)):
+            uniform = torch.rand(size, generator=generator, device=generator.device) * 2 - 1
+            mlp.append(uniform * (1 / math.sqrt(inputs)))
+    return mlp
+
+
+@cache
+def _read_pretrained() -> dict[str, Floats]:
+    """Weights and bias of each layer: the first [levels, features, hidden], without those of the
+    Fourier features; distances in leaves come out of the last.
+    """
+    with np.load(PRETRAINED) as stored:
+        return dict(stored)

@@ -1,0 +1,115 @@
+"""What regions begin with: an MLP that knows how features become distances."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from triquad_format.records.field_settings import FieldSettings
+from triquad_server.engine.initial_mlp import random_mlp
+from triquad_server.engine.live_field import Batch, LiveField, Rates, initial_field
+from triquad_server.engine.tensor_trainer import TensorTrainer
+
+CPU = torch.device("cpu")
+DEFAULT = FieldSettings(depth=8)
+RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99, young_rate=0.01)
+RADIUS = 9.0  # of the ball that is learnt, leaves
+
+
+@pytest.mark.parametrize("leaf_m", [0.01, 0.05, 0.2])
+def test_a_new_region_learns_quicker_than_one_that_begins_at_random(leaf_m: float) -> None:
+    settings = replace(DEFAULT, leaf_m=leaf_m)
+    pretrained = [error_leaves(initial_field(settings, CPU, seed)) for seed in range(6)]
+    at_random = [error_leaves(begun_at_random(settings, seed)) for seed in range(6)]
+    assert np.mean(pretrained) < 0.95 * np.mean(at_random)
+
+
+@pytest.mark.parametrize(("hidden", "age"), [(32, 1000), (16, 0)], ids=["pretrained", "random"])
+def test_what_is_pretrained_is_no_longer_young(hidden: int, age: int) -> None:
+    field = initial_field(replace(DEFAULT, hidden=hidden), CPU, 1)
+    assert field.mlp_steps == age
+    assert all((part.steps == age).all() for part in field.mlp)
+
+
+def test_it_begins_alike_whatever_the_leaf_and_the_scale_of_the_logits() -> None:
+    fine = replace(DEFAULT, leaf_m=DEFAULT.leaf_m / 4, logit_scale_m=DEFAULT.logit_scale_m / 3)
+    points = near_the_ball(np.random.default_rng(0), 500)
+    first, second = (
+        leaves_at(grown(initial_field(settings, CPU, 1)), points) for settings in (DEFAULT, fine)
+    )
+    assert np.ptp(first) > 0.01
+    np.testing.assert_allclose(second, first, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        replace(DEFAULT, encoding="fourier"),
+        replace(DEFAULT, hidden=16),
+        replace(DEFAULT, feature_size=4),
+        replace(DEFAULT, feature_levels=2, feature_size=12),
+        replace(DEFAULT, feature_std=1.0),
+    ],
+    ids=[
+        "no features",
+        "narrower",
+        "shorter features",
+        "as many features of other levels",
+        "larger features",
+    ],
+)
+def test_other_shapes_begin_at_random(settings: FieldSettings) -> None:
+    one, other = (initial_field(settings, CPU, seed).arrays.mlp for seed in (1, 2))
+    assert not any(np.array_equal(*parts) for parts in zip(one, other, strict=True))
+
+
+def test_without_fourier_features_it_begins_alike() -> None:
+    points = near_the_ball(np.random.default_rng(0), 500)
+    both, features = (
+        grown(initial_field(replace(DEFAULT, encoding=encoding), CPU, 1))
+        for encoding in ("both", "features")
+    )
+    features.features.values.copy_(both.features.values)
+    np.testing.assert_allclose(leaves_at(features, points), leaves_at(both, points), atol=1e-5)
+
+
+def begun_at_random(settings: FieldSettings, seed: int) -> LiveField:
+    generator = torch.Generator().manual_seed(seed)
+    frequencies = initial_field(settings, CPU, seed).frequencies
+    return LiveField(settings, frequencies, random_mlp(settings, generator), 0, generator)
+
+
+def grown(field: LiveField) -> LiveField:
+    """With room for the surface of the ball."""
+    side = np.arange(-12, 12)
+    leaves = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+    off = np.linalg.norm(leaves + 0.5, axis=1) - RADIUS
+    field.grow(leaves[np.abs(off) < 1.5] + (1 << field.settings.depth - 1))
+    return field
+
+
+def near_the_ball(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Points [count, 3] in leaves from the middle of the ball, within some leaves of it."""
+    ways = rng.normal(size=(count, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    return ways * (RADIUS + rng.normal(0, 0.5, (count, 1)))
+
+
+def error_leaves(field: LiveField) -> float:
+    """The mean error near the surface of a ball that was learnt in a few steps."""
+    trainer, leaf_m = TensorTrainer(grown(field)), field.settings.leaf_m
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        points = near_the_ball(rng, 1024)
+        labels = np.linalg.norm(points, axis=1) - RADIUS
+        samples = torch.from_numpy(np.column_stack([points, labels]) * leaf_m).float()
+        trainer.train(Batch(samples[:, :3], samples[:, 3]), RATES)
+    points = near_the_ball(rng, 4096)
+    return float(np.abs(leaves_at(field, points) - np.linalg.norm(points, axis=1) + RADIUS).mean())
+
+
+def leaves_at(field: LiveField, points: np.ndarray) -> np.ndarray:
+    """Signed distances [N] at points [N, 3], all in leaves."""
+    leaf_m = field.settings.leaf_m
+    values = field.freeze().evaluate((points * leaf_m).astype(np.float32), gradient=False)
+    return values.sdf / leaf_m
