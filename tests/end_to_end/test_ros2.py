@@ -36,12 +36,15 @@ def test_clouds_and_transforms_become_a_map(way: str, mode: str) -> None:
 
 
 def test_clouds_wait_for_their_transforms_and_stay_in_order() -> None:
-    with serving() as (endpoint, client), robot(endpoint) as r2:
+    with serving(waiting_s=30.0) as (endpoint, client), robot(endpoint) as r2:
         for number in range(4):
             r2.cloud(0.2 * number + 0.1, servers.sphere())
-        stand(r2, 1)  # the later pose before the earlier one, and both after the clouds
-        stand(r2, 0)
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        for second in (1, 0):  # the later pose before the earlier one, and both after the clouds
+            r2.tf(second, ("odom", "base_link", shifted(*AT)))
+        # Last, and on the same topic: only there messages keep their order for sure.
+        for second in (0, 1):
+            r2.tf(second, ("map", "odom", shifted()))
         status = until(client, lambda status: accounted(status) == 4)
         assert (status.scans_taken, status.scans_lost) == (4, {}), status
 
