@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Longs
 
+from triquad_map.sorted_keys import rows_of
+
 _CELL_VOXELS = 2
 """A cluster is made of cells of this side, which touch: its voxels lie up to as far apart."""
 
@@ -101,20 +103,12 @@ class _CellSet:
     def neighbours(self, step: tuple[int, int, int]) -> NDArray[np.intp]:
         """Pairs [2, P] of numbers of cells of which the second lies a ``step`` from the first."""
         x, y, z = step
-        column = _rows_of(self._columns, self._columns + x * self._width + y)
+        column = rows_of(self._columns, self._columns + x * self._width + y)
         beside = column[self._keys // self._height]
         wanted = beside * self._height + self._keys % self._height + z
-        found = np.where(beside >= 0, _rows_of(self._keys, wanted), -1)
+        found = np.where(beside >= 0, rows_of(self._keys, wanted), -1)
         rows = np.flatnonzero(found >= 0)
         return np.stack([rows, found[rows]])
-
-
-def _rows_of(keys: Longs, wanted: Longs) -> NDArray[np.intp]:
-    """The rows of ``wanted`` in ``keys``, which increase; -1 for those that are not among them."""
-    if not len(keys):
-        return np.zeros(0, np.intp)
-    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[rows] == wanted, rows, -1)
 
 
 def _around(voxels: Longs, group: NDArray[np.intp]) -> Boxes:

@@ -11,7 +11,7 @@ _PLACE_LEAVES = 32.0  # side of a place
 _AXIS_BITS = 20
 
 
-def place_keys(ends: Floats, settings: FieldSettings) -> Longs:
+def place_keys(ends: NDArray[np.floating], settings: FieldSettings) -> Longs:
     """The place [N] in which each ray ends, at ``ends`` [N, 3], metres from the region's centre."""
     side_m = _PLACE_LEAVES * settings.leaf_m
     cells = np.floor(ends / side_m).astype(np.int64) + (1 << (_AXIS_BITS - 1))

@@ -138,3 +138,8 @@ class FieldSettings:
     def leaf_coordinates(self, offset: NDArray[_Float]) -> NDArray[_Float]:
         """Leaf coordinates [N, 3] at ``offset`` [N, 3] from a region's centre, metres."""
         return np.asarray(offset / self.leaf_m + (1 << (self.depth - 1)), offset.dtype)
+
+    def offsets(self, leaf_coordinates: NDArray[_Float]) -> NDArray[_Float]:
+        """Offsets [N, 3] from a region's centre, metres, of ``leaf_coordinates`` [N, 3]."""
+        offsets = (leaf_coordinates - (1 << (self.depth - 1))) * self.leaf_m
+        return np.asarray(offsets, leaf_coordinates.dtype)

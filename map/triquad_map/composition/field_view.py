@@ -204,10 +204,9 @@ def _ramp_gradient(offsets: Doubles, ramps: Doubles, overlap_m: float) -> Double
 
 def field_samples(engine: FieldEngine, settings: FieldSettings, split: Split) -> SampleField:
     """The field of a region in voxels, at its leaf coordinates."""
-    middle = 1 << (settings.depth - 1)
 
     def sample(voxels: Doubles) -> FieldSample:
-        local = ((voxels - middle) * settings.leaf_m).astype(np.float32)
+        local = settings.offsets(voxels).astype(np.float32)
         values = np.empty(len(local), np.float32)
         gradients = np.empty((len(local), 3), np.float32)
 

@@ -19,6 +19,10 @@ _LATEST_SAMPLES = 1 << 19
 _MOST_SHARE = 0.25
 """Where more of the blocks with surface are seen anew, all of the region learns."""
 
+_LEAST_FREE = 0.5
+"""Or where, of the rows under what is seen anew, fewer are under nothing else: in a small place,
+nearly all rows are shared."""
+
 _LEARNT_STEPS = 300
 """An MLP that took fewer has not learnt enough to stay as it is; a pretrained one has."""
 
@@ -28,8 +32,8 @@ class Focus:
 
     The region learns there alone: on rays that end there, in rows of features that no surface
     elsewhere uses, and with the MLP that it has. Everything else stays as it is, to the bit. Once
-    much is seen anew, be it scan by scan, all of the region learns, with an MLP that suits all of
-    it.
+    much is seen anew, be it scan by scan, or where there are few such rows, all of the region
+    learns, with an MLP that suits all of it.
     """
 
     def __init__(self, field: LiveField, evidence: LiveEvidence, pool: ReplayPool) -> None:
@@ -80,5 +84,11 @@ class Focus:
         if len(elsewhere) <= (1 - _MOST_SHARE) * len(surface):
             self.release()
             return
-        self._field.hold(self._field.tree.rows_under(elsewhere, BLOCK_VOXELS))
-        self._pool.focus(cells_of(seen_anew))
+        anew = cells_of(seen_anew)
+        held = self._field.tree.rows_under(elsewhere, BLOCK_VOXELS)
+        learning = self._field.tree.rows_under(anew, BLOCK_VOXELS)
+        if (learning & ~held).sum() < _LEAST_FREE * learning.sum():
+            self.release()
+            return
+        self._field.hold(held)
+        self._pool.focus(anew)

@@ -13,7 +13,9 @@ from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.field_fit import PlaceFits
 from triquad_map.places import Places
+from triquad_map.sorted_keys import rows_of
 
+from triquad_server.mapping.group_means import GroupMeans
 from triquad_server.mapping.held_out import ray_keys
 from triquad_server.mapping.ray_table import END
 
@@ -73,14 +75,14 @@ class Judgement:
         keys = ray_keys(rows, self._settings)
         best = self._best_of(keys)
         places = Places.of(rows[:, END : END + 3], self._settings)
-        changes = _Changes.of(sdf, best, places)
-        seen_anew = changes.known < (1 - _SEEN_ANEW) * places.rays
-        worse = changes.are_sure(_LEAST_RISE * self._settings.leaf_m) & ~seen_anew
+        rises = _rises(sdf, best, places)
+        seen_anew = rises.counts < (1 - _SEEN_ANEW) * places.rays
+        worse = _are_sure(rises, _LEAST_RISE * self._settings.leaf_m) & ~seen_anew
         before = len(self._repairs)
         forgotten = worse & self._may_be_repaired(places.keys, worse)
         given_up = int((worse & ~forgotten).sum())
         still = sum(count > 1 for count in self._repairs.values())
-        is_best = ((changes.means < 0) | seen_anew | worse) & ~forgotten
+        is_best = ((rises.means < 0) | seen_anew | worse) & ~forgotten
         now_best = is_best[places.place_of] | np.isnan(best)
         self._remember(keys, np.where(now_best, sdf, best))
         return JudgedPlaces(
@@ -93,10 +95,10 @@ class Judgement:
 
     def _best_of(self, keys: Longs) -> Doubles:
         """What is remembered of rays; NaN where nothing is."""
-        if len(self._keys) == 0:
-            return np.full(len(keys), np.nan)
-        rows = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        return np.where(self._keys[rows] == keys, self._best[rows], np.nan)
+        best = np.full(len(keys), np.nan)
+        rows = rows_of(self._keys, keys)
+        best[rows >= 0] = self._best[rows[rows >= 0]]
+        return best
 
     def _remember(self, keys: Longs, best: Doubles) -> None:
         order = np.argsort(keys)
@@ -111,30 +113,14 @@ class Judgement:
         return fine
 
 
-@dataclass(frozen=True)
-class _Changes:
-    """By how much the squares of the field at the same rays' ends rose, for each of P places."""
+def _rises(sdf: NDArray[np.floating], best: Doubles, places: Places) -> GroupMeans:
+    """By how much the squares of the field at the same rays' ends rose, for each place."""
+    rises = sdf.astype(np.float64) ** 2 - best**2
+    is_known = ~np.isnan(rises)
+    return GroupMeans.of(rises[is_known], places.place_of[is_known], len(places.keys))
 
-    known: Longs  # [P] rays of which it is known
-    means: Doubles  # [P] metres squared
-    errors: Doubles  # [P] standard errors of the means
 
-    @classmethod
-    def of(cls, sdf: NDArray[np.floating], best: Doubles, places: Places) -> "_Changes":
-        rises = sdf.astype(np.float64) ** 2 - best**2
-        is_known = ~np.isnan(rises)
-        rises, place_of = rises[is_known], places.place_of[is_known]
-
-        def sums(of: Doubles | None = None) -> Doubles:
-            return np.bincount(place_of, of, minlength=len(places.keys)).astype(np.float64)
-
-        known = sums()
-        least = np.maximum(known, 1)
-        means = sums(rises) / least
-        variances = sums((rises - means[place_of]) ** 2) / least
-        return cls(known.astype(np.int64), means, np.sqrt(variances / least))
-
-    def are_sure(self, rise_m: float) -> Bools:
-        """Where the field is worse for sure, as if by an error of ``rise_m`` beside the noise."""
-        sure = self.means > np.maximum(_SURE * self.errors, rise_m**2)
-        return sure & (self.known >= _LEAST_RAYS)
+def _are_sure(rises: GroupMeans, rise_m: float) -> Bools:
+    """Where the field is worse for sure, as if by an error of ``rise_m`` beside the noise."""
+    sure = rises.means > np.maximum(_SURE * rises.errors, rise_m**2)
+    return sure & (rises.counts >= _LEAST_RAYS)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import torch
 from torch import Tensor
-from triquad_format.records.arrays import Doubles, Ints, Longs
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
 from triquad_format.records.replay_rays import HELD_OUT
@@ -42,6 +42,7 @@ from triquad_server.mapping.fair_share import FairShare
 from triquad_server.mapping.focus import Focus
 from triquad_server.mapping.held_out import are_held_out, both_tables
 from triquad_server.mapping.judgement import JudgedPlaces, Judgement, Repairs
+from triquad_server.mapping.learnt_places import VISITS, LearntPlaces
 from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.ray_table import (
     END,
@@ -73,12 +74,19 @@ _LEAST_BATCH = 4096  # what a step costs however few its samples are matters bel
 _NEW_SCANS = 10
 """So long after it was first seen, the field has had time to learn a surface."""
 
+_FEW_NEW = 2
+"""In more voxels than these, new surface makes what was learnt before to be learnt again."""
+
 _SURFELS_REFITTED = 8_000
 """With each epoch while the field is being trained: some 10 ms."""
 
 
 _JUDGED_AFTER_SAMPLES = 8_000_000
-"""A field that is being trained is judged once in so many samples: a few seconds."""
+"""A field that is being trained is judged once in so many samples: a few seconds. Where few rays
+are kept, it is as soon as each was visited as often as makes a difference."""
+
+_JUDGED_AFTER_SHARE = 0.5
+"""A field that has settled is judged once this share of the rays that are held out is new."""
 
 _FEW_GONE = 32
 """Where the surface of more voxels is gone, all of the region learns: rows that others use as well
@@ -114,9 +122,11 @@ class LiveRegion:
         """How well the field fits the rays that are held out, as it was judged last."""
 
         self.repairs = Repairs()  # so far
+        self.learnt = LearntPlaces(setup.field)
         self._judgement = Judgement(setup.field)
-        self._share = FairShare.of(0, setup.training)  # of each voxel
+        self._field_state = object()  # another one with each step
         self._unjudged_samples = 0  # that were trained since
+        self._unjudged_rays = 0  # that were held out since
         self.budget = TrainingBudget(setup.training)
         self._focus = Focus(field, evidence, self.pool)
         self._slopes = Slopes(field, self.pool)
@@ -194,9 +204,13 @@ class LiveRegion:
         self._marks = self.evidence.mark_surface(ends, sighting)
         # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
         self.field.grow(self._marks.new)
+        if len(self.learnt) and self.evidence.new_surface(self._marks, _NEW_SCANS) > _FEW_NEW:
+            self.learnt.learn_all_again()
         if self.budget.samples == 0:
             self._focus.narrow()
-        self._focus.widen_to(ends)
+        offsets = rays.ends - self.centre
+        self.learnt.see(offsets)
+        self._focus.widen_to(ends[self.learnt.owing(offsets)])
         self.changed = True
         clear = math.inf if self._setup.change.static else _CLEAR_SHORT
         reach = Reach(_CARVE_SHORT, clear, self._scans)
@@ -240,18 +254,21 @@ class LiveRegion:
         passing = rays_through(rays, normals, self.centre, self.pool.placement, self._ray_random)
         if len(passing) == 0:
             return
-        self.budget.add(self._keep(passing))
+        held = self._keep(passing)
+        owing = self.learnt.owing(passing.rows[:, END : END + 3])
+        self.budget.add(int((owing & ~held).sum()))
 
-    def _keep(self, rays: RayTable) -> int:
-        """Keep rays, some of which are held out; returns how many are to be trained on."""
+    def _keep(self, rays: RayTable) -> Bools:
+        """Keep rays [N]; returns which of them are held out."""
         held = are_held_out(rays.rows, self._settings)
         self.held_out.add(rays.of(held))
         self.pool.add(rays.of(~held))
-        return len(rays) - int(held.sum())
+        self._unjudged_rays += int(held.sum())
+        return held
 
     def limit(self, share: FairShare) -> None:
         """From now on, keep as many rays and owe as many samples as are its share."""
-        self._share, voxels = share, self.size.evidence.voxels
+        voxels = self.size.evidence.voxels
         rays = max(1, int(share.rays * voxels))
         self.pool.limit(rays)
         self.held_out.limit(max(1, rays // HELD_OUT))
@@ -290,7 +307,9 @@ class LiveRegion:
         batch = self.pool.draw(step.samples, step.fresh, step.repair)
         loss = self._trainer.train(batch, step.rates)
         self.budget.spend(step)
+        self._field_state = object()
         self._unjudged_samples += step.samples
+        self.learnt.trained(step.samples / self.pool.rays_drawn_on)
         self._slopes.after(step)
         self.changed = True
         return loss
@@ -298,6 +317,7 @@ class LiveRegion:
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget evidence and samples between two corners [3]."""
         self._focus.release()
+        self.learnt.learn_all_again()
         self.evidence.clear(self.voxels(low[None])[0], self.voxels(high[None])[0])
         for pool in (self.pool, self.held_out):
             pool.forget(low - self.centre, high - self.centre)
@@ -315,6 +335,7 @@ class LiveRegion:
         ``before`` is how it was published last: what did not change is shared with it.
         """
         self.changed = False
+        fitted_to = None if self.budget.samples else self._field_state
         field = self.field.freeze()
         samples = field_samples(field, self._settings, self._setup.team.split)
         if self._passed:
@@ -327,8 +348,7 @@ class LiveRegion:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)
             self._restored = False
         self._forget_gone(surfels)
-        enough = _JUDGED_AFTER_SAMPLES if self.budget.samples else 1
-        if self._unjudged_samples >= enough:
+        if self._is_to_be_judged:
             self._judge(field)
         own = buffers_of((field, evidence, surfels))
         live = {
@@ -345,6 +365,7 @@ class LiveRegion:
             vertices=self.field.vertices,
             parameters=self.field.parameters,
             changed=epoch,
+            surfels_fitted_to=fitted_to,
             live_bytes=bytes_by_part(live, without=own),
             buffers=own,
         )
@@ -352,8 +373,7 @@ class LiveRegion:
     def record(self) -> Region:
         """The region with its training state as plain arrays, sharing nothing with this one."""
         table = both_tables(self.pool.table, self.held_out.table)
-        most = int(self._share.recorded_rays * self.size.evidence.voxels)
-        rays, others = recorded_rays(table, self._settings, most)
+        rays, others = recorded_rays(table, self._settings)
         others = others[others < len(self.pool)]  # samples are for training
         state = training_state(
             self.field,
@@ -368,14 +388,28 @@ class LiveRegion:
         )
         return region_record(self.index, self.field, self.evidence, training=state)
 
+    @property
+    def _is_to_be_judged(self) -> bool:
+        if self.budget.samples:
+            enough = min(_JUDGED_AFTER_SAMPLES, VISITS * len(self.pool))
+            return self._unjudged_samples >= enough
+        new = self._unjudged_rays >= _JUDGED_AFTER_SHARE * len(self.held_out)
+        return self._unjudged_samples > 0 or new
+
     def _judge(self, field: FrozenField) -> None:
         """Find out where the field has forgotten what it knew, and have it learnt again."""
         if len(self.held_out) == 0:
             return
-        self._unjudged_samples = 0
+        self._unjudged_samples = self._unjudged_rays = 0
         rows = self.held_out.table.rows
-        sdf = field.evaluate(np.ascontiguousarray(rows[:, END : END + 3]), gradient=False).sdf
+        ends = np.ascontiguousarray(rows[:, END : END + 3])
+
+        def at_ends(points: Floats) -> Floats:
+            return field.evaluate(points, gradient=False).sdf
+
+        sdf = at_ends(ends)
         self.places = places = self._judgement.judge(rows, sdf)
+        self.learnt.judge(ends, sdf, at_ends, settled=self.budget.samples == 0)
         self.repairs = self.repairs.after(places)
         if len(places.forgotten_keys):
             x, y, z = places.centres[places.forgotten][0] + self.centre
@@ -395,11 +429,12 @@ class LiveRegion:
     def _surfels(
         self, evidence: FrozenEvidence, field: SampleField, epoch: int, before: FrozenRegion | None
     ) -> SurfelMap:
-        """The surfels of an epoch; a region that has settled has all of them from its field."""
+        """The surfels of an epoch; once a region has settled, all are fitted to its field."""
         most: int | None = None
         shown: ShownByRays = nothing_shown
-        if self.budget.samples:
-            most = _SURFELS_REFITTED
+        is_fitted = before is not None and before.surfels_fitted_to is self._field_state
+        if self.budget.samples or is_fitted:
+            most = _SURFELS_REFITTED if self.budget.samples else 0
             shown = partial(self.evidence.ray_surfels, since=self._scans - _NEW_SCANS)
         if before is None:
             return first_surfels(evidence, field, epoch, shown)
@@ -413,6 +448,7 @@ class LiveRegion:
         voxels = np.unique(np.concatenate(self._gone), axis=0)
         self._gone.clear()
         voxels = voxels[~self.evidence.freeze().ended_in(voxels)]  # nothing ended there since
+        self.learnt.lose(self._settings.offsets(voxels.astype(np.float64) + 0.5))
         for pool in (self.pool, self.held_out):
             pool.forget_ends(voxels)
         if len(voxels) > _FEW_GONE:
@@ -421,9 +457,9 @@ class LiveRegion:
             self._focus.widen_to(voxels)
         inside = self._random.random((_SAMPLES_PER_VOXEL, len(voxels), 3))
         points = (voxels + inside).reshape(-1, 3)
-        leaf_m, middle = self._settings.leaf_m, 1 << (self._settings.depth - 1)
+        leaf_m = self._settings.leaf_m
         nearest = no_surfels(np.full(len(points), self._setup.scan.truncation_m / leaf_m))
         surfels.find_nearest(points, nearest)
-        offsets = ((points - middle) * leaf_m).astype(np.float32)
+        offsets = self._settings.offsets(points).astype(np.float32)
         self.pool.add(samples_alone(offsets, nearest.distances * leaf_m), fresh=False)
         self.budget.add_samples(_VISITS * len(points))

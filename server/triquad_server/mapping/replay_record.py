@@ -1,10 +1,14 @@
-"""The rays of a replay pool as a record holds them, and back."""
+"""The rays of a replay pool as a record holds them, and back.
+
+The file tells where rays end, and at which angle they met the surface, more finely than any sensor
+does. Values that are rounded take less room there, so it has room for more rays.
+"""
 
 import numpy as np
 from triquad_format.records import morton
-from triquad_format.records.arrays import Longs
+from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
+from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays, are_held_out
 
 from triquad_server.mapping.held_out import ends_in_steps
 from triquad_server.mapping.ray_table import VALUE, RayTable
@@ -13,30 +17,53 @@ _MOST_RAYS = 6_000_000  # so many fit into the parts of a single cube
 
 _ORIGIN_BITS = 15  # beside 48 of a leaf's code
 
+_ROUNDED_STEPS = 5
+"""To the middle of so many steps: 8 mm at the default leaf, which adds 2 mm of noise."""
 
-def recorded_rays(table: RayTable, settings: FieldSettings, most: int) -> tuple[ReplayRays, Longs]:
-    """The rays of a table, ``most`` of them, and the places of all else in it: samples, and what
-    ends far away.
+_FIRST = np.arange(STEPS, dtype=np.int32) // _ROUNDED_STEPS * _ROUNDED_STEPS
+_ROUNDED = (_FIRST + np.minimum(_FIRST + _ROUNDED_STEPS, STEPS) - 1) // 2  # of each step of a leaf
+
+_ROUNDED_SLOPES = 8  # of SLOPE_SCALE
+
+
+def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays, Longs]:
+    """The rays of a table, as many as a file holds, and the places of all else in it: samples, and
+    what ends far away.
     """
     side = 1 << settings.depth
     steps = ends_in_steps(table.rows, settings)
     fits = (table.origin_of >= 0) & ((steps >= 0) & (steps < 2 * side * STEPS)).all(axis=1)
     places = np.flatnonzero(fits)
-    most = min(most, _MOST_RAYS)
-    if len(places) > most:
-        places = np.sort(np.random.default_rng(len(places)).choice(places, most, False))
+    if len(places) > _MOST_RAYS:
+        places = np.sort(np.random.default_rng(len(places)).choice(places, _MOST_RAYS, False))
     # By origin within a leaf, nearly: neighbours that are alike take less room.
     coarser = max(0, len(table.origins).bit_length() - _ORIGIN_BITS)
     codes = morton.encode(steps[places] // STEPS) << _ORIGIN_BITS
     places = places[np.argsort(codes | table.origin_of[places] >> coarser)]
-    slopes = np.rint(SLOPE_SCALE * np.abs(table.rows[places, VALUE]))
     rays = ReplayRays(
-        steps[places].astype(np.int32),
+        _rounded_ends(steps[places].astype(np.int32)),
         table.origin_of[places],
-        slopes.astype(np.uint8),
+        _rounded_slopes(table.rows[places, VALUE]),
         origins=table.origins,
     )
     return rays.chosen(np.arange(len(rays))), np.flatnonzero(~fits)
+
+
+def _rounded_ends(steps: Ints) -> Ints:
+    """Ends [N, 3] within the same leaves; rays that are held out stay what they are, and no others
+    become it.
+    """
+    rounded = steps - steps % STEPS + _ROUNDED[steps % STEPS]
+    is_exact = are_held_out(steps) | are_held_out(rounded)
+    rounded[is_exact] = steps[is_exact]
+    return rounded
+
+
+def _rounded_slopes(values: Floats) -> Bytes:
+    """Slopes [N] of rays with these ``values`` [N] in their table; SLOPE_SCALE: nothing told it."""
+    slopes = (SLOPE_SCALE * np.abs(values)).astype(np.uint8)
+    rounded = slopes - slopes % _ROUNDED_SLOPES + _ROUNDED_SLOPES // 2
+    return np.where(values == -1, SLOPE_SCALE, rounded).astype(np.uint8)
 
 
 def restored_rays(rays: ReplayRays, settings: FieldSettings) -> RayTable:

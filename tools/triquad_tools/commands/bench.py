@@ -51,6 +51,7 @@ USUAL_PARTS = (
     "growth",
     "restart",
     "far-scan",
+    "parked",
     "air",
     "moving",
     "sweeps",
@@ -155,6 +156,7 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
     from triquad_tools.benchmarks.far_scan import measure_far_scan
     from triquad_tools.benchmarks.long_drive import measure_long_drive
     from triquad_tools.benchmarks.moving import measure_moving
+    from triquad_tools.benchmarks.parked import measure_parked
     from triquad_tools.benchmarks.presets import measure_presets
     from triquad_tools.benchmarks.restart import measure_restart
     from triquad_tools.benchmarks.ros2 import measure_ros2
@@ -164,6 +166,7 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
         "growth": _growth,
         "restart": measure_restart,
         "far-scan": measure_far_scan,
+        "parked": measure_parked,
         "air": measure_air,
         "moving": partial(measure_moving, folder=options.recorded),
         "sweeps": measure_sweeps,

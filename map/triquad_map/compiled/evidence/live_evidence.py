@@ -29,6 +29,8 @@ _MIN_CAPACITY = 256
 _FIELD_FREE = 0.3
 """A field of more voxels than this, where a surface was seen, shows none."""
 
+_LEAST_HITS = 3  # scans in which new surface was seen
+
 
 class Marks(NamedTuple):
     """Where the rays of a scan ended."""
@@ -95,6 +97,21 @@ class LiveEvidence:
     def set_normals(self, marks: Marks, normals: Doubles) -> None:
         """Keep the unit ``normals`` [N, 3] of surfaces that were marked; NaN where unknown."""
         self._observations.set_normals(marks.rows, normals)
+
+    def new_surface(self, marks: Marks, scans: int) -> int:
+        """In how many voxels the newest scan's rays ended on surface of the last ``scans``.
+
+        It was first seen in these, and seen in at least half of the scans since and in three:
+        single rays end beside a surface by chance.
+        """
+        voxels = self._observations.arrays.voxels
+        rows = marks.rows[marks.rows > 0]
+        if len(rows) == 0:
+            return 0
+        age = voxels["hit_scan"][rows].max() - voxels["first_scan"][rows] + 1
+        rows, age = rows[age <= scans], age[age <= scans]
+        hits = voxels["hits"][rows]
+        return len(np.unique(rows[(hits >= _LEAST_HITS) & (2 * hits >= age)]))
 
     def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
         """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].

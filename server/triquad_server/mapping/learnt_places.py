@@ -1,0 +1,179 @@
+"""The places of a region that are learnt: training on more of their rays makes them no better.
+
+A robot at rest sends the same surfaces again and again. They are taken in, since they tell what is
+still there, but once the error of a place falls no more, its rays owe no training: so the map
+settles while scans come. When anything changes in sight, all is learnt again as if it were new.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
+from triquad_format.records.field_settings import FieldSettings
+from triquad_map.places import place_keys
+from triquad_map.sorted_keys import rows_of
+
+from triquad_server.mapping.group_means import GroupMeans
+
+AtEnds = Callable[[Floats], NDArray[np.floating]]
+
+VISITS = 5
+"""To each ray on average, between two comparisons: so many samples make a difference where there is
+one to be made."""
+
+_COMPARISONS = 2  # in a row, in which the error of a place that is learnt did not fall
+
+_LEAST_FALL = 0.2
+"""Share of the mean square error, with the noise of the rays, by which it falls where it does."""
+
+_SURE = 5.0
+"""By so many standard errors of the mean a place must fit worse than when it had settled."""
+
+_LEAST_RISE = 0.5
+"""And by this share of its mean square error."""
+
+_LEAST_RAYS = 24
+"""Of a place by itself: those that have fewer are compared as one."""
+
+_TURNS = 4
+"""Of one scan's rays in so many it is told where they end, of others the next time."""
+
+_FEW_GONE = 2
+"""Where at once surface goes from more voxels of a place, all is learnt again: single ones hold the
+noise of rays."""
+
+_FOLLOWED = np.dtype(
+    [
+        ("key", np.int64),
+        ("error", np.float64),  # mean square error, as a multiple of the first that was compared
+        ("least", np.float64),  # the last of these that had fallen
+        ("comparisons", np.int64),  # since
+        ("settled", np.float64),  # mean square error once it was learnt and had settled, or NaN
+    ]
+)
+
+
+class LearntPlaces:
+    """Follows the error of a region's places at the ends of rays that are held out."""
+
+    def __init__(self, settings: FieldSettings) -> None:
+        """None is learnt."""
+        self._settings = settings
+        self._turn = 0
+        self._visits = 0.0  # to each ray on average, since errors were compared
+        self._ends = np.zeros((0, 3), np.float32)  # of the rays for the next comparison
+        self._squares = np.zeros(0)  # of what the field said there
+        self.learn_all_again()
+
+    def __len__(self) -> int:
+        return len(self._learnt)
+
+    def learn_all_again(self) -> None:
+        """From now on, no place is learnt."""
+        self._followed = np.zeros(0, _FOLLOWED)  # increasing keys
+        self._learnt = np.zeros(0, np.int64)  # keys of those that are
+        self._seen = np.zeros(0, np.int64)  # keys of places in which rays ended since the last time
+
+    def see(self, ends: Doubles) -> None:
+        """Rays end at ``ends`` [N, 3], metres from the region's centre."""
+        self._turn = (self._turn + 1) % _TURNS
+        keys = place_keys(ends[self._turn :: _TURNS], self._settings)
+        new = rows_of(self._seen, keys) < 0
+        if new.any():
+            self._seen = np.union1d(self._seen, keys[new])
+
+    def owing(self, ends: Doubles | Floats) -> Bools:
+        """Which rays [N] owe training, that end at ``ends`` [N, 3]."""
+        if len(self._learnt) == 0:
+            return np.ones(len(ends), np.bool_)
+        return rows_of(self._learnt, place_keys(ends, self._settings)) < 0
+
+    def lose(self, points: Doubles) -> None:
+        """Surface went from ``points`` [N, 3], one in each voxel."""
+        _, counts = np.unique(place_keys(points, self._settings), return_counts=True)
+        if (counts > _FEW_GONE).any():
+            self.learn_all_again()
+
+    def trained(self, visits: float) -> None:
+        """Samples were drawn on each ray, so many on average, and trained on."""
+        self._visits += visits
+
+    def judge(
+        self, ends: Floats, sdf: NDArray[np.floating], field: AtEnds, *, settled: bool
+    ) -> None:
+        """Find out where the error falls no more, and whether it rose.
+
+        Args:
+            ends: [N, 3] of the rays that are held out now, metres from the region's centre.
+            sdf: [N] what the field says there, metres.
+            field: tells what the field says elsewhere.
+            settled: nothing is trained any more. Before, errors rise and fall by chance.
+        """
+        squares = sdf.astype(np.float64) ** 2
+        if settled and self._rose(ends, squares):
+            self.learn_all_again()
+        if self._visits < VISITS:
+            return
+        self._compare(field)
+        self._ends, self._squares = ends.copy(), squares
+        self._visits = 0.0
+        self._seen = self._seen[:0]
+
+    def _compare(self, field: AtEnds) -> None:
+        """The errors at the rays of the last time, in places that were seen since."""
+        keys = self._seen
+        rows = rows_of(keys, place_keys(self._ends, self._settings))
+        is_seen = rows >= 0
+        groups = _with_few_as_one(rows[is_seen], len(keys))
+        group_of = groups[rows[is_seen]]
+        now = field(np.ascontiguousarray(self._ends[is_seen])).astype(np.float64) ** 2
+        before = GroupMeans.of(self._squares[is_seen], group_of, len(keys) + 1)
+        after = GroupMeans.of(now, group_of, len(keys) + 1)
+        told = (after.counts >= _LEAST_RAYS) & (before.means > 0)
+        times = np.divide(after.means, before.means, out=np.ones(len(told)), where=told)[groups]
+        told = told[groups]
+        self._follow(keys[told], times[told])
+
+    def _follow(self, keys: Longs, times: Doubles) -> None:
+        """The errors of places became so many ``times`` what they were."""
+        self._begin_to_follow(keys)
+        rows = rows_of(self._followed["key"], keys)
+        places = self._followed[rows]
+        was_learnt = places["comparisons"] >= _COMPARISONS
+        places["error"] *= times
+        falls = places["error"] < (1 - _LEAST_FALL) * places["least"]
+        falls |= np.isnan(places["least"])  # the first time
+        places["least"] = np.where(falls, places["error"], places["least"])
+        places["comparisons"] = np.where(falls & ~was_learnt, 0, places["comparisons"] + 1)
+        self._followed[rows] = places
+        self._learnt = self._followed["key"][self._followed["comparisons"] >= _COMPARISONS]
+
+    def _begin_to_follow(self, keys: Longs) -> None:
+        new = np.zeros(len(keys), _FOLLOWED)
+        new["key"], new["error"] = keys, 1.0
+        new["least"] = new["settled"] = np.nan
+        new = new[~np.isin(keys, self._followed["key"])]
+        self._followed = np.sort(np.concatenate([self._followed, new]), order="key")
+
+    def _rose(self, ends: Floats, squares: Doubles) -> bool:
+        """Whether the field fits the rays of now anywhere worse than those when it had settled.
+
+        A place that has settled now is compared from now on.
+        """
+        if len(self._learnt) == 0:
+            return False
+        places = self._followed
+        rows = rows_of(places["key"], place_keys(ends, self._settings))
+        now = GroupMeans.of(squares[rows >= 0], rows[rows >= 0], len(places))
+        enough = (now.counts >= _LEAST_RAYS) & (places["comparisons"] >= _COMPARISONS)
+        is_first = enough & np.isnan(places["settled"])
+        places["settled"] = np.where(is_first, now.means, places["settled"])
+        least = np.maximum(_SURE * now.errors, _LEAST_RISE * places["settled"])
+        return bool((enough & (now.means - places["settled"] > least)).any())
+
+
+def _with_few_as_one(place_of: Longs, places: int) -> Longs:
+    """The group of each of the places [P]: its own row, or P for all that have few rays."""
+    rays = np.bincount(place_of, minlength=places)
+    return np.where(rays >= _LEAST_RAYS, np.arange(places), places)
