@@ -184,26 +184,30 @@ def on_filled(
 ) -> Bools:
     """Whether points [N, 3], metres, map frame, of a surface lie where it was continued.
 
-    That is up to ``reach_m`` beside a filled voxel on each axis, at most ``fill_m`` from the voxel
-    with seen surface at which that began, and not in a ``FREE`` voxel.
+    That is up to ``reach_m`` beside a voxel with seen surface, of which they are in a part that was
+    not seen; or so far beside a filled voxel on each axis, at most ``fill_m`` from the voxel with
+    seen surface at which that began, and not in a ``FREE`` voxel.
     """
-    found = np.zeros(len(points), np.bool_)
+    if fill_m == 0:
+        return np.zeros(len(points), np.bool_)
+    found: Bools = view.status(points, reach_m) == Status.SURFACE
     if not len(filled.voxels):
         return found
+    continued = np.zeros(len(points), np.bool_)
     places = points / view.voxel_m
     least = filled.voxels.min(axis=0) - 2
     names = cell_names(filled.voxels - least)
     reach, limit = reach_m / view.voxel_m, fill_m / view.voxel_m
     inside = ((places >= least + 1) & (places < filled.voxels.max(axis=0) + 2)).all(axis=1)
     for shift in np.ndindex(2, 2, 2):
-        left = np.flatnonzero(inside & ~found)
+        left = np.flatnonzero(inside & ~(found | continued))
         beside = np.floor(places[left] + (2 * np.array(shift) - 1) * reach).astype(np.int64)
         rows = _rows(names, cell_names(beside - least))
         near = _box_distances(places[left], filled.sources[rows]) <= limit
-        found[left] = (rows >= 0) & near
-    at = np.flatnonzero(found)
-    found[at] = view.status(points[at], 0.0) != Status.FREE
-    return found
+        continued[left] = (rows >= 0) & near
+    at = np.flatnonzero(continued)
+    continued[at] = view.status(points[at], 0.0) != Status.FREE
+    return found | continued
 
 
 def _rows(names: Longs, asked: Longs) -> NDArray[np.intp]:

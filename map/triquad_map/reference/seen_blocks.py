@@ -2,18 +2,28 @@
 
 import itertools
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
-from triquad_format.records.region import BLOCK_BYTES, Evidence
+from triquad_format.records.region import BLOCK_BYTES, Evidence, seen_voxels
 from triquad_format.records.status import Status
 
 from triquad_map.reference.coded_rows import ONE_CELL, CodedRows
+from triquad_map.sorted_keys import rows_of
+from triquad_map.surface import MARGIN_STEP
 
 _BLOCKS_AT_ONCE = 2048
+
+
+class _Margins(NamedTuple):
+    """The margins of voxels with surface."""
+
+    codes: Longs  # [S] of the voxels
+    margins: Bytes  # [S, 6]
 
 
 class SeenBlocks:
@@ -24,12 +34,16 @@ class SeenBlocks:
         self._side = 1 << settings.depth
         self._surface = CodedRows(BLOCK_BYTES, np.uint8, shift)
         self._free = CodedRows(BLOCK_BYTES, np.uint8, shift)
+        self._margins: list[_Margins] = []
         self.newest_s = 0  # when a ray last ended anywhere, seconds since 1970
 
     def add(self, evidence: Evidence) -> None:
         """Add the evidence of some cells."""
         self._surface.add(evidence.codes, evidence.surface)
         self._free.add(evidence.codes, evidence.free)
+        if evidence.margins is not None:
+            codes = morton.encode(seen_voxels(evidence, evidence.surface))
+            self._margins.append(_Margins(codes, evidence.margins))
         if evidence.seen_s is not None:
             self.newest_s = max(self.newest_s, int(evidence.seen_s.max(initial=0)))
 
@@ -47,6 +61,31 @@ class SeenBlocks:
     def ended_in(self, voxels: Longs) -> Bools:
         """Whether rays ended in ``voxels`` [N, 3]."""
         return self._holds(self._surface, voxels)
+
+    def near_ends(self, voxels: Doubles, reach: float) -> Bools:
+        """Where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
+        near = np.zeros(len(voxels), np.bool_)
+        low = np.floor(voxels - reach).astype(np.int64)
+        high = np.floor(voxels + reach).astype(np.int64)
+        steps = range(int((high - low).max(initial=0)) + 1)
+        for step in itertools.product(steps, repeat=3):
+            places = np.minimum(low + step, high)
+            rows = np.flatnonzero(~near & self.ended_in(places))
+            inside, margins = voxels[rows] - places[rows], self._margins_of(places[rows])
+            near[rows] = (np.hstack([inside, 1 - inside]) >= MARGIN_STEP * margins).all(axis=1)
+        return near
+
+    def _margins_of(self, voxels: Longs) -> Doubles:
+        """The margins [N, 6] of voxels [N, 3] with surface; less than all where none is."""
+        codes = np.concatenate([np.zeros(0, np.int64), *(part.codes for part in self._margins)])
+        margins = np.concatenate([np.zeros((0, 6)), *(part.margins for part in self._margins)])
+        found = np.full((len(voxels), 6), -np.inf)
+        order = np.argsort(codes)
+        rows = rows_of(codes[order], morton.encode(voxels))
+        known = rows >= 0
+        told = margins[order[rows[known]]]
+        found[known] = np.where(told > 0, told, -np.inf)
+        return found
 
     def find_unknown(
         self, voxels: Doubles, blocks: range, distances: Doubles, nearest: Doubles
