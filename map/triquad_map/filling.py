@@ -190,24 +190,31 @@ def on_filled(
     """
     if fill_m == 0:
         return np.zeros(len(points), np.bool_)
-    found: Bools = view.status(points, reach_m) == Status.SURFACE
+    found = _beside_filled(view, filled, points, reach_m=reach_m, fill_m=fill_m)
+    found |= view.status(points, reach_m) == Status.SURFACE
+    at = np.flatnonzero(found)
+    found[at] = view.status(points[at], 0.0) != Status.FREE
+    return found
+
+
+def _beside_filled(
+    view: MapView, filled: FilledVoxels, points: Doubles, reach_m: float, fill_m: float
+) -> Bools:
+    found = np.zeros(len(points), np.bool_)
     if not len(filled.voxels):
         return found
-    continued = np.zeros(len(points), np.bool_)
     places = points / view.voxel_m
     least = filled.voxels.min(axis=0) - 2
     names = cell_names(filled.voxels - least)
     reach, limit = reach_m / view.voxel_m, fill_m / view.voxel_m
     inside = ((places >= least + 1) & (places < filled.voxels.max(axis=0) + 2)).all(axis=1)
     for shift in np.ndindex(2, 2, 2):
-        left = np.flatnonzero(inside & ~(found | continued))
+        left = np.flatnonzero(inside & ~found)
         beside = np.floor(places[left] + (2 * np.array(shift) - 1) * reach).astype(np.int64)
         rows = _rows(names, cell_names(beside - least))
         near = _box_distances(places[left], filled.sources[rows]) <= limit
-        continued[left] = (rows >= 0) & near
-    at = np.flatnonzero(continued)
-    continued[at] = view.status(points[at], 0.0) != Status.FREE
-    return found | continued
+        found[left] = (rows >= 0) & near
+    return found
 
 
 def _rows(names: Longs, asked: Longs) -> NDArray[np.intp]:

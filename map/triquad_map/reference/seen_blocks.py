@@ -2,28 +2,28 @@
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
-from triquad_format.records.region import BLOCK_BYTES, Evidence, seen_voxels
+from triquad_format.records.region import (
+    BLOCK_BYTES,
+    MARGIN_BITS,
+    Evidence,
+    seen_voxels,
+    surface_counts,
+)
 from triquad_format.records.status import Status
 
 from triquad_map.reference.coded_rows import ONE_CELL, CodedRows
-from triquad_map.sorted_keys import rows_of
 from triquad_map.surface import MARGIN_STEP
 
 _BLOCKS_AT_ONCE = 2048
 
-
-class _Margins(NamedTuple):
-    """The margins of voxels with surface."""
-
-    codes: Longs  # [S] of the voxels
-    margins: Bytes  # [S, 6]
+_VOXEL_BITS = 3 * (BLOCK_VOXELS.bit_length() - 1)
+"""By which the code of a voxel is longer than that of its block."""
 
 
 class SeenBlocks:
@@ -34,7 +34,7 @@ class SeenBlocks:
         self._side = 1 << settings.depth
         self._surface = CodedRows(BLOCK_BYTES, np.uint8, shift)
         self._free = CodedRows(BLOCK_BYTES, np.uint8, shift)
-        self._margins: list[_Margins] = []
+        self._margins = CodedRows(len(MARGIN_BITS), np.uint8, min(shift + _VOXEL_BITS, ONE_CELL))
         self.newest_s = 0  # when a ray last ended anywhere, seconds since 1970
 
     def add(self, evidence: Evidence) -> None:
@@ -42,8 +42,9 @@ class SeenBlocks:
         self._surface.add(evidence.codes, evidence.surface)
         self._free.add(evidence.codes, evidence.free)
         if evidence.margins is not None:
-            codes = morton.encode(seen_voxels(evidence, evidence.surface))
-            self._margins.append(_Margins(codes, evidence.margins))
+            voxels = seen_voxels(evidence, evidence.surface) % BLOCK_VOXELS
+            blocks = evidence.codes.repeat(surface_counts(evidence.surface))
+            self._margins.add(_voxel_codes(blocks, voxels), evidence.margins)
         if evidence.seen_s is not None:
             self.newest_s = max(self.newest_s, int(evidence.seen_s.max(initial=0)))
 
@@ -72,20 +73,15 @@ class SeenBlocks:
             places = np.minimum(low + step, high)
             rows = np.flatnonzero(~near & self.ended_in(places))
             inside, margins = voxels[rows] - places[rows], self._margins_of(places[rows])
-            near[rows] = (np.hstack([inside, 1 - inside]) >= MARGIN_STEP * margins).all(axis=1)
+            depths = np.hstack([inside, 1 - inside])
+            near[rows] = ~((margins > 0) & (depths < MARGIN_STEP * margins)).any(axis=1)
         return near
 
-    def _margins_of(self, voxels: Longs) -> Doubles:
-        """The margins [N, 6] of voxels [N, 3] with surface; less than all where none is."""
-        codes = np.concatenate([np.zeros(0, np.int64), *(part.codes for part in self._margins)])
-        margins = np.concatenate([np.zeros((0, 6)), *(part.margins for part in self._margins)])
-        found = np.full((len(voxels), 6), -np.inf)
-        order = np.argsort(codes)
-        rows = rows_of(codes[order], morton.encode(voxels))
-        known = rows >= 0
-        told = margins[order[rows[known]]]
-        found[known] = np.where(told > 0, told, -np.inf)
-        return found
+    def _margins_of(self, voxels: Longs) -> Bytes:
+        """The margins [N, 6] of voxels [N, 3]; 0 where none are known."""
+        blocks, inner = np.divmod(voxels, BLOCK_VOXELS)
+        codes = _voxel_codes(morton.encode(blocks), inner)
+        return np.asarray(self._margins.find(codes).rows, np.uint8)
 
     def find_unknown(
         self, voxels: Doubles, blocks: range, distances: Doubles, nearest: Doubles
@@ -163,6 +159,12 @@ def _search_inside(
     rows = going[nearer]
     squares[rows] = gaps[each, best][nearer]
     nearest[rows] = places[each, best][nearer]
+
+
+def _voxel_codes(blocks: Longs, inner: Longs) -> Longs:
+    """Codes [N] of voxels, by those of their blocks [N] and where in these they are [N, 3]."""
+    codes: Longs = (blocks << _VOXEL_BITS) + inner @ (BLOCK_VOXELS**2, BLOCK_VOXELS, 1)
+    return codes
 
 
 def _steps(shell: int) -> Iterator[Longs]:
