@@ -18,7 +18,8 @@ from triquad_map.reference.seen_blocks import SeenBlocks
 SETTINGS = FieldSettings(depth=8)
 SIDE = 1 << SETTINGS.depth
 REACH = 0.1
-AGAIN = Sighting(np.zeros(3), 0.2, 2, scan=2)
+MANY = 10  # scans
+AGAIN = Sighting(np.zeros(3), 0.2, 2, scan=MANY + 1)
 
 
 class Wall(NamedTuple):
@@ -32,9 +33,11 @@ class Wall(NamedTuple):
         return np.stack([np.full(count, 20.5), y, z], axis=1)
 
 
-def seen(ends: Doubles) -> LiveEvidence:
+def seen(ends: Doubles, scans: int = MANY) -> LiveEvidence:
+    """Evidence of rays that ended there, in each of so many scans."""
     evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(ends, Sighting(np.zeros(3), 0.2, 1, scan=1))
+    for number in range(1, scans + 1):
+        evidence.mark_surface(ends, Sighting(np.zeros(3), 0.2, 1, scan=number))
     return evidence
 
 
@@ -58,6 +61,19 @@ def test_a_wall_ends_where_the_last_rays_did() -> None:
     assert not near(evidence, Wall((17.6, 30.0), (18.0, 34.0)).points(rng)).any()
 
 
+def test_of_what_few_scans_saw_nothing_is_left_out() -> None:
+    """They may have missed it; as soon as a voxel beside was hit often, they would not have."""
+    rng = np.random.default_rng(6)
+    wall, rest = Wall((10.4, 30.0), (17.3, 34.0)), Wall((17.7, 30.0), (18.0, 34.0))
+    evidence = seen(wall.points(rng), scans=1)
+    assert near(evidence, rest.points(rng)).all()
+    beside = Wall((16.0, 30.0), (17.0, 34.0))
+    for number in range(2, MANY):
+        evidence.mark_surface(beside.points(rng), Sighting(np.zeros(3), 0.2, 2, scan=number))
+    assert not near(evidence, rest.points(rng)).any()
+    assert near(evidence, Wall((10.0, 30.0), (10.1, 34.0)).points(rng)).all()
+
+
 def test_it_goes_on_between_rays() -> None:
     """Two lines of rays a voxel apart: nothing is missing between them, whatever rays there are."""
     rng = np.random.default_rng(2)
@@ -76,13 +92,18 @@ def test_every_end_is_near(seed: int, count: int) -> None:
 
 
 @settings(max_examples=100, deadline=None)
-@given(seed=st.integers(0, 10_000), count=st.integers(0, 200), reach=st.floats(0, 1.5))
-def test_all_ways_to_ask_agree(seed: int, count: int, reach: float) -> None:
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(0, 200),
+    scans=st.integers(1, MANY),
+    reach=st.floats(0, 1.5),
+)
+def test_all_ways_to_ask_agree(seed: int, count: int, scans: int, reach: float) -> None:
     """As the server asks, as from a file, and with numpy alone."""
     ends = random_ends(seed, count)
     rng = np.random.default_rng(seed)
     points = random_ends(seed, 500) + rng.normal(0, 0.3, (500, 3))
-    frozen = seen(ends).freeze()
+    frozen = seen(ends, scans).freeze()
     record = frozen.record()
     slow = SeenBlocks(SETTINGS)
     slow.add(record)

@@ -16,7 +16,12 @@ from triquad_format.records.region import MARGIN_BITS, seen_voxels, surface_coun
 from triquad_format.records.region import Evidence as EvidenceRecord
 from triquad_format.records.status import Status
 
-from triquad_map.compiled.evidence.margins import near_ends, without_inner
+from triquad_map.compiled.evidence.margins import (
+    MOST_HITS,
+    SeenMargins,
+    margins_that_count,
+    near_ends,
+)
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.evidence.unknown_search import find_unknown
 from triquad_map.compiled.kernel import kernel
@@ -88,7 +93,8 @@ class FrozenEvidence:
 
     seen: SeenVoxels
     levels: Bytes  # [S] how well each voxel in ``surface`` is supported, in their order
-    margins: Bytes  # [S, 6] of these voxels, also where the surface goes on beyond
+    hits: Bytes  # [S] scans of which rays ended in each, and
+    margins: Bytes  # [S, 6] their margins, whether they count or not
     seen_s: Longs  # [B] when a ray last ended in each block, seconds since 1970; 0: never
 
     @property
@@ -101,6 +107,10 @@ class FrozenEvidence:
         """[B] The number of each block's first voxel among those with surface."""
         counts = surface_counts(self.surface)
         return np.cumsum(counts) - counts
+
+    @property
+    def _seen_margins(self) -> SeenMargins:
+        return SeenMargins(self.seen, self._firsts, self.hits, self.margins)
 
     @property
     def cells(self) -> Longs:
@@ -118,7 +128,7 @@ class FrozenEvidence:
 
     def near_ends(self, voxels: Doubles, reach: float) -> Bools:
         """Where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
-        return near_ends(voxels, reach, self.seen, self._firsts, self.margins)
+        return near_ends(voxels, reach, self._seen_margins)
 
     def ended_in(self, voxels: Longs) -> Bools:
         """Whether rays ended in ``voxels`` [N, 3]."""
@@ -159,8 +169,8 @@ class FrozenEvidence:
             outcomes=None if outcomes is None else outcomes[voxels],
         )
         ended_in = seen_voxels(record, record.surface)
-        outer = without_inner(self.margins[voxels], ended_in, self.seen)
-        return replace(record, margins=outer)
+        margins = margins_that_count(ended_in, voxels, self._seen_margins)
+        return replace(record, margins=margins)
 
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "FrozenEvidence":
@@ -174,5 +184,6 @@ class FrozenEvidence:
         margins = record.margins
         if margins is None:
             margins = np.zeros((len(levels), len(MARGIN_BITS)), np.uint8)
+        hits = np.full(len(levels), MOST_HITS, np.uint8)  # those that a file tells count
         masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
-        return cls(SeenVoxels(side, index, *masks), levels, margins, seen_s)
+        return cls(SeenVoxels(side, index, *masks), levels, hits, margins, seen_s)

@@ -216,7 +216,7 @@ class LiveEvidence:
             self._frozen = FrozenEvidence(
                 SeenVoxels(side, self._blocks.freeze(), surface, free),
                 self._observations.levels(surface),
-                self._observations.margins(surface),
+                *self._observations.margins(surface),
                 self._observations.seen_s(self.blocks),
             )
         return self._frozen

@@ -2,8 +2,11 @@
 
 A surface may end within a voxel, at the corner of a house or where nobody looked any farther. How
 many quarters of a voxel on each of its sides lie beyond all ends tells where. A margin counts only
-where the surface does not go on beyond that side: in between, few rays leave gaps.
+where the surface does not go on beyond that side: in between, few rays leave gaps. And it counts
+only where rays would have ended in it: by as many scans as hit the voxel, or one beside it.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
@@ -18,10 +21,18 @@ from triquad_map.surface import MARGIN_STEP
 
 _SIDES = 6
 
+MOST_HITS = 255
+
+_CHANCE = 0.1
+"""A margin counts where the chance is less that all scans missed a surface that goes on."""
+
 
 @kernel()
-def fill_margins(surface: Bytes, observed: Observed, margins: Bytes) -> None:
-    """Fill in the ``margins`` [S, 6] of the voxels of ``surface``: at least an eighth less."""
+def fill_margins(surface: Bytes, observed: Observed, hits: Bytes, margins: Bytes) -> None:
+    """Fill in ``hits`` [S] and ``margins`` [S, 6] of the voxels of ``surface``.
+
+    Margins are told as less by an eighth of a voxel at least.
+    """
     at = 0
     for block in range(len(surface)):
         place = observed.places[block]
@@ -32,6 +43,7 @@ def fill_margins(surface: Bytes, observed: Observed, margins: Bytes) -> None:
             for z in range(BLOCK_VOXELS):
                 if bits >> z & 1:
                     voxel = observed.voxels[observed.rows[place, byte << SHIFT | z]]
+                    hits[at] = min(voxel.hits, MOST_HITS)
                     for axis in range(3):
                         beyond = EIGHTHS - 1 - voxel.highest[axis]
                         margins[at, axis] = max(voxel.lowest[axis] - 1, 0) >> 1
@@ -62,6 +74,15 @@ def _goes_on(voxel: Voxel, side: int, seen: SeenVoxels) -> bool:
     return False
 
 
+class SeenMargins(NamedTuple):
+    """The margins of all surface voxels, and what tells whether they count, as kernels take it."""
+
+    seen: SeenVoxels
+    firsts: Longs  # [B] number of the first surface voxel of each block
+    hits: Bytes  # [S] scans of which rays ended in each voxel, up to ``MOST_HITS``
+    margins: Bytes  # [S, 6]
+
+
 @kernel()
 def _number_of(row: int, voxel: Voxel, firsts: Longs, seen: SeenVoxels) -> int:
     """The number of a surface voxel, in the block ``row``, among all."""
@@ -78,32 +99,48 @@ def _number_of(row: int, voxel: Voxel, firsts: Longs, seen: SeenVoxels) -> int:
 
 
 @kernel()
-def _holds(point: Doubles, voxel: Voxel, margins: Bytes, seen: SeenVoxels) -> bool:
-    """Whether a point near a voxel is not beyond its ends, on no side beyond which nothing is."""
+def _most_hits(voxel: Voxel, known: SeenMargins) -> int:
+    """Scans that hit a voxel or one of those around it, whichever was hit most."""
+    seen, most = known.seen, 0
+    for x in range(voxel[0] - 1, voxel[0] + 2):
+        for y in range(voxel[1] - 1, voxel[1] + 2):
+            for z in range(voxel[2] - 1, voxel[2] + 2):
+                row = find_block(seen.blocks, x, y, z, seen.side)
+                if row >= 0 and is_set(seen.surface, row, x, y, z):
+                    number = _number_of(row, (x, y, z), known.firsts, seen)
+                    most = max(most, int(known.hits[number]))
+    return most
+
+
+@kernel(inline="always")
+def _is_sure(margin: int, hits: int) -> bool:
+    """Whether so many scans would have hit a surface that goes on in a margin."""
+    left = 1 - MARGIN_STEP * (margin + 0.5)  # of the voxel: the margin begins so much earlier
+    return bool(left**hits < _CHANCE)
+
+
+@kernel()
+def _holds(point: Doubles, voxel: Voxel, number: int, known: SeenMargins) -> bool:
+    """Whether a point near a voxel lies in none of its margins that count."""
     for side in range(_SIDES):
-        if margins[side] == 0:
-            continue
+        margin = known.margins[number, side]
         inside = point[side % 3] - voxel[side % 3]
         depth = inside if side < 3 else 1 - inside
-        if depth < margins[side] * MARGIN_STEP and not _goes_on(voxel, side, seen):
+        if margin == 0 or depth >= margin * MARGIN_STEP or _goes_on(voxel, side, known.seen):
+            continue
+        if _is_sure(margin, _most_hits(voxel, known)):
             return False
     return True
 
 
 @kernel()
-def near_ends(
-    points: Doubles, reach: float, seen: SeenVoxels, firsts: Longs, margins: Bytes
-) -> Bools:
+def near_ends(points: Doubles, reach: float, known: SeenMargins) -> Bools:
     """Whether ``points`` [N, 3] lie within ``reach`` of surface voxels, and not in their margins.
 
-    Args:
-        points: in voxels.
-        reach: beyond sides without a margin, on each axis.
-        seen: the evidence.
-        firsts: [B] number of the first voxel of each block among those with surface.
-        margins: [S, 6] of all of these.
+    All is in voxels. The reach is on each axis, and beyond sides without a margin.
     """
     near = np.zeros(len(points), np.bool_)
+    seen = known.seen
     for i in range(len(points)):
         x0, y0, z0 = np.floor(points[i] - reach)
         x1, y1, z1 = np.floor(points[i] + reach)
@@ -113,18 +150,23 @@ def near_ends(
                     row = -1 if near[i] else find_block(seen.blocks, x, y, z, seen.side)
                     if row >= 0 and is_set(seen.surface, row, x, y, z):
                         voxel = (x, y, z)
-                        number = _number_of(row, voxel, firsts, seen)
-                        near[i] = _holds(points[i], voxel, margins[number], seen)
+                        number = _number_of(row, voxel, known.firsts, seen)
+                        near[i] = _holds(points[i], voxel, number, known)
     return near
 
 
 @kernel()
-def without_inner(margins: Bytes, voxels: Longs, seen: SeenVoxels) -> Bytes:
-    """The margins [S, 6] of ``voxels`` [S, 3], but 0 where the surface goes on."""
-    outer = np.zeros_like(margins)
+def margins_that_count(voxels: Longs, numbers: Longs, known: SeenMargins) -> Bytes:
+    """The margins [S, 6] of ``voxels`` [S, 3], whose ``numbers`` [S] are known; 0: none counts."""
+    told = np.zeros((len(voxels), _SIDES), np.uint8)
     for i in range(len(voxels)):
         voxel = (voxels[i, 0], voxels[i, 1], voxels[i, 2])
+        hits = -1  # until a margin needs it
         for side in range(_SIDES):
-            if margins[i, side] and not _goes_on(voxel, side, seen):
-                outer[i, side] = margins[i, side]
-    return outer
+            margin = known.margins[numbers[i], side]
+            if margin == 0 or _goes_on(voxel, side, known.seen):
+                continue
+            hits = _most_hits(voxel, known) if hits < 0 else hits
+            if _is_sure(margin, hits):
+                told[i, side] = margin
+    return told

@@ -167,16 +167,17 @@ class Observations:
         voxels = self.arrays.voxels[rows]
         return outcome_codes(np.stack([voxels[name] for name in _RECORD], axis=1))
 
-    def margins(self, surface: Bytes) -> Bytes:
-        """The margins [S, 6] of each voxel set in ``surface``, in their order.
+    def margins(self, surface: Bytes) -> tuple[Bytes, Bytes]:
+        """Hits [S] and margins [S, 6] of each voxel set in ``surface``, in their order.
 
-        Also those beyond which the surface goes on.
+        See :class:`triquad_map.compiled.evidence.margins.SeenMargins`.
         """
         used = used_blocks(surface)
         surface, places = surface[used], self.arrays.places[used]
-        margins = np.empty((int(surface_counts(surface).sum()), len(MARGIN_BITS)), np.uint8)
-        fill_margins(surface, self.arrays._replace(places=places), margins)
-        return margins
+        count = int(surface_counts(surface).sum())
+        hits, margins = np.empty(count, np.uint8), np.empty((count, len(MARGIN_BITS)), np.uint8)
+        fill_margins(surface, self.arrays._replace(places=places), hits, margins)
+        return hits, margins
 
     def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
