@@ -184,9 +184,22 @@ def on_filled(
 ) -> Bools:
     """Whether points [N, 3], metres, map frame, of a surface lie where it was continued.
 
-    That is up to ``reach_m`` beside a filled voxel on each axis, at most ``fill_m`` from the voxel
-    with seen surface at which that began, and not in a ``FREE`` voxel.
+    That is up to ``reach_m`` beside a voxel with seen surface, of which they are in a part that was
+    not seen; or so far beside a filled voxel on each axis, at most ``fill_m`` from the voxel with
+    seen surface at which that began, and not in a ``FREE`` voxel.
     """
+    if fill_m == 0:
+        return np.zeros(len(points), np.bool_)
+    found = _beside_filled(view, filled, points, reach_m=reach_m, fill_m=fill_m)
+    found |= view.status(points, reach_m) == Status.SURFACE
+    at = np.flatnonzero(found)
+    found[at] = view.status(points[at], 0.0) != Status.FREE
+    return found
+
+
+def _beside_filled(
+    view: MapView, filled: FilledVoxels, points: Doubles, reach_m: float, fill_m: float
+) -> Bools:
     found = np.zeros(len(points), np.bool_)
     if not len(filled.voxels):
         return found
@@ -201,8 +214,6 @@ def on_filled(
         rows = _rows(names, cell_names(beside - least))
         near = _box_distances(places[left], filled.sources[rows]) <= limit
         found[left] = (rows >= 0) & near
-    at = np.flatnonzero(found)
-    found[at] = view.status(points[at], 0.0) != Status.FREE
     return found
 
 

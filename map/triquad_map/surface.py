@@ -26,6 +26,9 @@ DISC_RADIUS = 0.45
 """Of a surfel, in voxels: discs of neighbours overlap where a surface goes on, and jut out little
 where it ends."""
 
+MARGIN_STEP = 0.25
+"""Margins of voxels, beyond which no ray ended, are told in so many voxels."""
+
 OUTSIDE = 0.5
 """How far a surfel reaches out of its voxel at most, in voxels."""
 

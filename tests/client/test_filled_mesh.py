@@ -11,13 +11,14 @@ from support.small_world import settled_epoch, world
 from triquad_client import InvalidInputError, Mesh, OfflineMap
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.region import MapRecord, Region, masked, seen_voxels
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
 
 HALF = 1 << (SETTINGS.depth - 1)
 HOLE = (5, 15)  # voxels along x and along y: 1 m to 3 m
 HOLE_M2 = 4.0
+EDGE = 10  # voxels along x
 FIELD_MAX_M = 32.0
 
 
@@ -159,3 +160,38 @@ def test_of_a_learnt_street_only_unknown_space_beside_seen_surface_is_filled() -
     was = plain.vertices[plain.faces].mean(axis=1)
     assert len(was) == (~mesh.filled).sum()
     assert cKDTree(was).query(centres[~mesh.filled])[0].max() < 1e-9
+
+
+def with_edge(quarters: int) -> MapRecord:
+    """Ground up to x = 2 m, on which rays ended up to so many quarters of a voxel before that."""
+    evidence = GROUND.regions[0].evidence
+    blocks = morton.decode(evidence.codes, 3)[:, :1] * BLOCK_VOXELS - HALF
+    x = blocks + np.repeat(np.arange(BLOCK_VOXELS), BLOCK_VOXELS**2)
+    evidence = masked(evidence, np.packbits(x < EDGE, axis=1, bitorder="little"))
+    outermost = seen_voxels(evidence, evidence.surface)[:, 0] == HALF + EDGE - 1
+    margins = np.zeros((len(outermost), 6), np.uint8)
+    margins[outermost, 3] = quarters
+    return changed(GROUND, evidence=dataclasses.replace(evidence, margins=margins))
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_a_surface_ends_where_the_last_rays_did(quarters: int) -> None:
+    mesh = mesh_of(with_edge(quarters), cell_m=0.02)
+    end_m = 0.2 * EDGE - 0.05 * quarters
+    assert mesh.vertices[mesh.faces][..., 0].max() == pytest.approx(end_m, abs=0.03)
+    assert area(mesh, np.ones(len(mesh.faces), np.bool_)) == pytest.approx(4 * end_m, abs=0.1)
+
+
+def test_the_rest_of_a_voxel_is_filled_and_marked() -> None:
+    mesh = mesh_of(with_edge(3), cell_m=0.02, fill_m=0.3)
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
+    seen_to_m = 0.2 * EDGE - 0.15
+    assert middles[~mesh.filled, 0].max() == pytest.approx(seen_to_m, abs=0.02)
+    assert area(mesh, mesh.filled) >= 4 * 0.15 - 0.05
+    assert mesh.vertices[mesh.faces][..., 0].max() <= 0.2 * EDGE + 0.3 + 0.02
+
+
+def test_large_faces_are_kept_whole() -> None:
+    """They stand for rays that ended on any part of them."""
+    mesh, whole = (mesh_of(with_edge(quarters), cell_m=0.2) for quarters in (3, 0))
+    assert np.array_equal(mesh.faces, whole.faces)

@@ -18,6 +18,7 @@ from support.map_records import (
     random_record,
     with_integers,
     with_levels,
+    with_margins,
     with_outcomes,
     with_rays,
 )
@@ -46,6 +47,7 @@ GOLDEN = Path(__file__).parents[1] / "golden"
 GOLDEN_NAMES = ("map_v1.triquad", "map_v1_next.triquad")
 GOLDEN_LEVELS = "map_v1_levels.triquad"
 GOLDEN_OUTCOMES = "map_v1_outcomes.triquad"
+GOLDEN_MARGINS = "map_v1_margins.triquad"
 GOLDEN_RAYS = "map_v1_rays.triquad"
 GOLDEN_PRODUCER = "0.1.0"
 GOLDEN_ZSTD = (1, 5, 7)
@@ -74,6 +76,11 @@ def golden_outcomes():
     return with_outcomes(golden_levels())
 
 
+def golden_margins():
+    """The record of the golden file that has margins of voxels besides."""
+    return with_margins(golden_levels())
+
+
 def golden_rays():
     """The record of the golden file with rays to train on."""
     return with_rays(random_record(2026, points=12, name="golden", epoch=45))
@@ -87,6 +94,7 @@ def write_golden(folder):
     previews = Previews(schema, {})
     write_map(golden_levels(), folder / GOLDEN_LEVELS, stamp_ns=stamps[0], previews=previews)
     write_map(golden_outcomes(), folder / GOLDEN_OUTCOMES, stamp_ns=stamps[0], previews=previews)
+    write_map(golden_margins(), folder / GOLDEN_MARGINS, stamp_ns=stamps[0], previews=previews)
     write_map(golden_rays(), folder / GOLDEN_RAYS, stamp_ns=stamps[0], previews=previews)
 
 
@@ -242,6 +250,7 @@ def test_golden_files_read_back():
     assert_same(read_map(GOLDEN / GOLDEN_NAMES[1]), record)
     assert_same(read_map(GOLDEN / GOLDEN_LEVELS), golden_levels())
     assert_same(read_map(GOLDEN / GOLDEN_OUTCOMES), golden_outcomes())
+    assert_same(read_map(GOLDEN / GOLDEN_MARGINS), golden_margins())
     assert_same(read_map(GOLDEN / GOLDEN_RAYS), golden_rays())
 
 
@@ -250,7 +259,7 @@ def golden_pairs(monkeypatch, tmp_path):
     """The golden files, and what the writer writes now, under the name that it had then."""
     monkeypatch.setattr("triquad_format.mapfile.metadata.__version__", GOLDEN_PRODUCER)
     write_golden(tmp_path)
-    names = (*GOLDEN_NAMES, GOLDEN_LEVELS, GOLDEN_OUTCOMES, GOLDEN_RAYS)
+    names = (*GOLDEN_NAMES, GOLDEN_LEVELS, GOLDEN_OUTCOMES, GOLDEN_MARGINS, GOLDEN_RAYS)
     return [((GOLDEN / name).read_bytes(), (tmp_path / name).read_bytes()) for name in names]
 
 

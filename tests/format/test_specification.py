@@ -63,6 +63,9 @@ VARIANTS = {
     "outcomes": map_records.with_outcomes(
         map_records.random_record(11, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
     ),
+    "margins": map_records.with_margins(
+        map_records.random_record(12, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
+    ),
     "no vertices": map_records.random_record(9, points=0),
 }
 
@@ -119,6 +122,10 @@ def assert_same_support(answers: Map, record: MapRecord) -> None:
         codes = or_zeros(evidence.outcomes, (bits.sum(), 3)).astype(np.uint8)
         assert not outcomes[~bits].any()
         np.testing.assert_array_equal(outcomes[bits].astype(np.int64), outcome_counts(codes))
+        margins = have.margins(blocks).reshape(*bits.shape, 6)
+        assert not margins[~bits].any()
+        wanted = or_zeros(evidence.margins, (bits.sum(), 6))
+        np.testing.assert_array_equal(margins[bits], wanted)
 
 
 def or_zeros(column: NDArray | None, shape: int | tuple[int, ...]) -> NDArray:
@@ -131,7 +138,14 @@ def write_variant(path: Path, name: str) -> Path:
     return path
 
 
-SAMPLES = ("map_v1", "map_v1_next", "map_v1_levels", "map_v1_outcomes", "map_v1_rays")
+SAMPLES = (
+    "map_v1",
+    "map_v1_next",
+    "map_v1_levels",
+    "map_v1_outcomes",
+    "map_v1_margins",
+    "map_v1_rays",
+)
 
 
 @pytest.mark.parametrize("name", [f"{name}.triquad" for name in SAMPLES])
@@ -183,8 +197,9 @@ def test_maps_of_every_kind(tmp_path: Path, name: str) -> None:
     assert_agree(answers, record, points)
     assert_same_support(answers, record)
     evidence = record.regions[0].evidence
-    assert (evidence.levels is not None) == (name in ("levels", "outcomes"))
-    assert (evidence.outcomes is not None) == (name == "outcomes")
+    assert (evidence.levels is not None) == (name in ("levels", "outcomes", "margins"))
+    assert (evidence.outcomes is not None) == (name in ("outcomes", "margins"))
+    assert (evidence.margins is not None) == (name == "margins")
 
 
 # Section 9

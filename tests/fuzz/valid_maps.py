@@ -11,6 +11,7 @@ from support.map_records import (
     random_record,
     with_integers,
     with_levels,
+    with_margins,
     with_outcomes,
     with_progress,
     with_rays,
@@ -70,6 +71,7 @@ def valid_maps(folder: Path) -> list[ValidMap]:
         "integers": with_integers(plain),
         "levels": with_levels(plain),
         "outcomes": with_outcomes(plain),
+        "margins": with_margins(plain),
         "rays": with_rays(random_record(settings=TINY, points=3), rays=12),
         "progress": with_progress(
             random_record(settings=TINY, points=3), MapProgress(60, 116_000_000, 0.25)

@@ -11,6 +11,7 @@ from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
+    MARGIN_BITS,
     OUTCOME_BITS,
     Evidence,
     MapRecord,
@@ -217,6 +218,18 @@ def with_outcomes(record: MapRecord, seed: int = 0) -> MapRecord:
         for region in with_levels(record, seed).regions
     )
     return dataclasses.replace(record, regions=regions)
+
+
+def with_margins(record: MapRecord, seed: int = 0) -> MapRecord:
+    """The record with margins of its surface voxels besides, on a third of all sides."""
+    rng = np.random.RandomState(seed)
+    regions = []
+    for region in with_outcomes(record, seed).regions:
+        shape = (int(np.unpackbits(region.evidence.surface).sum()), len(MARGIN_BITS))
+        margins = rng.randint(1, 4, shape, np.int64) * (rng.randint(0, 3, shape, np.int64) == 0)
+        evidence = dataclasses.replace(region.evidence, margins=margins.astype(np.uint8))
+        regions.append(dataclasses.replace(region, evidence=evidence))
+    return dataclasses.replace(record, regions=tuple(regions))
 
 
 def _missed(rng: np.random.RandomState, evidence: Evidence) -> Evidence:

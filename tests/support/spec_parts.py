@@ -1,5 +1,6 @@
 """Parts of a version 1 map and their answers, from docs/map-file.md and nothing of the project."""
 
+from collections.abc import Callable
 from typing import Any
 
 import msgpack
@@ -126,6 +127,9 @@ def place(coordinates: NDArray[np.int64]) -> NDArray[np.int64]:
     return coordinates @ (1 << 20 * np.arange(coordinates.shape[1]))
 
 
+OfVoxels = Callable[[dict[str, Any], NDArray[np.bool_]], Array]
+
+
 class Table:
     """Rows of values at places; zeros elsewhere."""
 
@@ -162,7 +166,8 @@ class Region:
         }
         self.surface, self.free = self._evidence(own, "surface"), self._evidence(own, "free")
         self.levels, self.seen = self._support(own)
-        self.outcomes = self._outcomes(own)
+        self.outcomes = self._of_voxels(own, outcomes_of, 3, "<f8")
+        self.margins = self._of_voxels(own, margins_of, 6, "|u1")
 
     def _table(self, own: dict[Key, Any], plane: int, i: int, scale: Array) -> Table:
         bits = 2 * (8 - (self.settings.sizes - 1 - i))
@@ -194,15 +199,15 @@ class Region:
                 times.append((blocks, times_of(part, surface.any(1))))
         return Table(levels, 512, "|u1"), Table(times, 1, "<i8")
 
-    def _outcomes(self, own: dict[Key, Any]) -> Table:
-        """Hits, passes and misses of each voxel of a block [1536], in the order of bits."""
+    def _of_voxels(self, own: dict[Key, Any], of: OfVoxels, width: int, dtype: str) -> Table:
+        """What a part tells ``of`` each voxel of a block [512 * width], in the order of bits."""
         chunks = []
         for key, part in own.items():
             if key[0] == "/triquad/evidence":
                 blocks = place(demorton(codes_of(part["codes"], key[3], 15), 3))
                 surface = np.unpackbits(plain(part["surface"]), axis=1, bitorder="little")
-                chunks.append((blocks, outcomes_of(part, surface.astype(bool))))
-        return Table(chunks, 3 * 512, "<f8")
+                chunks.append((blocks, of(part, surface.astype(bool))))
+        return Table(chunks, width * 512, dtype)
 
 
 def is_of(key: Key, index: Index) -> bool:
@@ -232,22 +237,33 @@ def levels_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
 
 def outcomes_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
     """Section 5.4: hits, passes and misses [B, 1536], where there are surface voxels; else 0."""
-    count = surface.sum()
     counts = np.zeros((*surface.shape, 3))
-    codes = np.zeros((3, count), np.int64)
-    if "outcomes" in part:
-        stored = np.unpackbits(plain(part["outcomes"]), axis=1, bitorder="little")
-        check(stored.shape == (10, (count + 7) // 8 * 8), "outcomes of other voxels")
-        for row, (first, last) in enumerate([(0, 2), (2, 6), (6, 10)]):
-            bit = np.zeros(count, np.int64)
-            for plane in stored[first:last, :count]:
-                bit = plane ^ bit
-                codes[row] = 2 * codes[row] + bit
-    h, p, m = codes
+    h, p, m = voxel_codes(part, "outcomes", [2, 4, 4], surface.sum())
     hits = np.where(h == 0, 8, 2.0 ** (h - 1))
     passes, misses = (np.where(c == 0, 0, hits * 2.0 ** (c - 4)) for c in (p, m))
     counts[surface] = np.stack([hits, passes, misses], axis=1)
     return counts.reshape(len(surface), -1)
+
+
+def margins_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
+    """Section 5.4: margins [B, 3072] of surface voxels; else 0."""
+    margins = np.zeros((*surface.shape, 6), np.uint8)
+    margins[surface] = voxel_codes(part, "margins", 6 * [2], surface.sum()).T
+    return margins.reshape(len(surface), -1)
+
+
+def voxel_codes(part: dict[str, Any], name: str, bits: list[int], count: int) -> Array:
+    """Section 5.4: codes [columns, count] of so many bits each; 0 where the part has none."""
+    codes = np.zeros((len(bits), count), np.int64)
+    if name in part:
+        stored = np.unpackbits(plain(part[name]), axis=1, bitorder="little")
+        check(stored.shape == (sum(bits), (count + 7) // 8 * 8), f"{name} of other voxels")
+        for row, planes in enumerate(np.split(stored[:, :count], np.cumsum(bits)[:-1])):
+            bit = np.zeros(count, np.int64)
+            for plane in planes:
+                bit = plane ^ bit
+                codes[row] = 2 * codes[row] + bit
+    return codes
 
 
 def times_of(part: dict[str, Any], touched: NDArray[np.bool_]) -> Array:

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
-from triquad_format.records.cells import cell_names, cells_of_boxes, rows_by_cell
+from triquad_format.records.cells import cells_of_boxes, rows_by_cell
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_map.filling import filled_voxels, on_filled
-from triquad_map.view import MapView
+from triquad_map.seen_faces import are_seen
+from triquad_map.view import MeshedView
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
@@ -56,7 +57,7 @@ class MeshBlocks:
 
     def __init__(
         self,
-        view: MapView,
+        view: MeshedView,
         seen: MapRecord,
         cell_m: float,
         box: tuple[Doubles, Doubles],
@@ -111,7 +112,8 @@ class MeshBlocks:
         surface = _marched(volume, cells)
         vertices = (origin + surface.vertices) * self.cell_m
         middles = vertices[surface.faces].mean(axis=1)
-        seen = _beside(voxels.places[rows < self._seen], middles, self._leaf_m)
+        reach_m = _REACH_LEAVES * self._leaf_m
+        seen = are_seen(self._view, middles, self.cell_m, reach_m)
         if self._fill_m == 0:
             return Mesh(vertices, surface.faces[seen], self._view.epoch)
         filled = np.zeros(len(middles), np.bool_)
@@ -119,7 +121,7 @@ class MeshBlocks:
             self._view,
             self._filled.chosen(rows[rows >= self._seen] - self._seen),
             middles[~seen],
-            reach_m=_REACH_LEAVES * self._leaf_m,
+            reach_m=reach_m,
             fill_m=self._fill_m,
         )
         kept = seen | filled
@@ -135,7 +137,7 @@ class MeshBlocks:
 
 
 def mesh_blocks(
-    view: MapView,
+    view: MeshedView,
     seen: MapRecord,
     cell_m: float | None,
     bounds: Bounds | None,
@@ -153,7 +155,7 @@ def mesh_blocks(
 
 
 def map_mesh(
-    view: MapView,
+    view: MeshedView,
     seen: MapRecord,
     bounds: Bounds | None,
     cell_m: float | None,
@@ -215,17 +217,3 @@ def _any_of_eight(flags: Bools) -> Bools:
 def _places(middles: Doubles, leaf_m: float) -> Longs:
     """The voxels [N, 3] with these middles [N, 3], on the lattice of voxels."""
     return np.floor(middles / leaf_m).astype(np.int64)
-
-
-def _beside(voxels: Longs, points: Doubles, leaf_m: float) -> Bools:
-    """Whether points [P, 3] lie within the reach of any of the voxels [N, 3], on each axis."""
-    near = np.zeros(len(points), np.bool_)
-    if not len(voxels):
-        return near
-    places = points / leaf_m
-    sides = [np.floor(places + shift).astype(np.int64) for shift in (-_REACH_LEAVES, _REACH_LEAVES)]
-    least = voxels.min(axis=0) - 1
-    for x, y, z in np.ndindex(2, 2, 2):
-        corner = np.stack([sides[x][:, 0], sides[y][:, 1], sides[z][:, 2]], axis=1)
-        near |= np.isin(cell_names(corner - least), cell_names(voxels - least))
-    return near

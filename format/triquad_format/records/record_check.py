@@ -13,6 +13,7 @@ from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
     FLOATS,
+    MARGIN_BITS,
     MAX_INTEGER,
     MAX_LEVEL,
     MAX_SEEN_S,
@@ -108,11 +109,15 @@ def _check_evidence(settings: FieldSettings, evidence: Evidence) -> None:
         ArraySpec("|u1", (int(counts.sum()),)).check("evidence levels", evidence.levels)
         if evidence.levels.max(initial=0) > MAX_LEVEL:
             raise FormatError(f"evidence levels: one exceeds {MAX_LEVEL}")
-    if evidence.outcomes is not None:
-        shape = (int(counts.sum()), len(OUTCOME_BITS))
-        ArraySpec("|u1", shape).check("evidence outcomes", evidence.outcomes)
-        if (evidence.outcomes >> np.array(OUTCOME_BITS, np.uint8)).any():
-            raise FormatError(f"evidence outcomes: a code exceeds {OUTCOME_BITS} bits")
+    for name, codes, bits in (
+        ("outcomes", evidence.outcomes, OUTCOME_BITS),
+        ("margins", evidence.margins, MARGIN_BITS),
+    ):
+        if codes is None:
+            continue
+        ArraySpec("|u1", (int(counts.sum()), len(bits))).check(f"evidence {name}", codes)
+        if (codes >> np.array(bits, np.uint8)).any():
+            raise FormatError(f"evidence {name}: a code exceeds {bits} bits")
     if evidence.seen_s is not None:
         ArraySpec("<i8", counts.shape).check("evidence seen_s", evidence.seen_s)
         low, high = evidence.seen_s.min(initial=0), evidence.seen_s.max(initial=0)

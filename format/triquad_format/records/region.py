@@ -29,6 +29,9 @@ MAX_LEVEL = 7
 MAX_SEEN_S = (2**63 - 1) // 10**9
 """The latest time of a surface: stamps are nanoseconds below ``2**63``."""
 
+MARGIN_BITS = (2,) * 6
+"""Bits of the margins of a surface voxel, one for each of its sides."""
+
 OUTCOME_BITS = (2, 4, 4)
 """Bits of the codes that tell how often rays hit, passed and missed a surface voxel."""
 
@@ -90,6 +93,12 @@ class Evidence:
 
     In the order of :func:`seen_voxels`. ``docs/map-file.md`` says what the codes stand for;
     ``None``: not known.
+    """
+    margins: Bytes | None = None
+    """[S, 6] On each side of each surface voxel, how many quarters of it lie beyond all ends.
+
+    In the order of :func:`seen_voxels`; the sides towards lesser x, y, z, then towards greater
+    ones. 0 as well where the surface goes on beyond that side; ``None``: not known.
     """
 
 
@@ -177,15 +186,15 @@ def masked(evidence: Evidence, mask: Bytes) -> Evidence:
     """The evidence of the voxels whose bit is set in ``mask`` [B, BLOCK_BYTES]."""
     surface, free = evidence.surface & mask, evidence.free & mask
     rows = np.flatnonzero((surface | free).any(axis=1))
-    levels, seen_s, outcomes = evidence.levels, evidence.seen_s, evidence.outcomes
-    if levels is not None or outcomes is not None:
-        before, after = (
-            np.unpackbits(bits, bitorder="little").astype(bool)
-            for bits in (evidence.surface, surface)
-        )
-        kept = after[before]
-        levels = None if levels is None else levels[kept]
-        outcomes = None if outcomes is None else outcomes[kept]
+    before, after = (
+        np.unpackbits(bits, bitorder="little").astype(bool) for bits in (evidence.surface, surface)
+    )
+    kept = after[before]
+    levels, outcomes, margins = (
+        None if column is None else column[kept]
+        for column in (evidence.levels, evidence.outcomes, evidence.margins)
+    )
+    seen_s = evidence.seen_s
     if seen_s is not None:
         seen_s = np.where(surface.any(axis=1), seen_s, 0)[rows]
     return Evidence(
@@ -195,4 +204,5 @@ def masked(evidence: Evidence, mask: Bytes) -> Evidence:
         levels=levels,
         seen_s=seen_s,
         outcomes=outcomes,
+        margins=margins,
     )

@@ -55,7 +55,7 @@ class ReplayRays:
     slopes: Bytes
     """[R] by how much the signed distance falls for each metre of the ray, ``1 / SLOPE_SCALE``:
     the cosine of its angle to the surface's normal, or to the field's gradient where no normal is
-    known; SLOPE_SCALE also where neither is."""
+    known; SLOPE_SCALE also where neither is, and where the ends around tell the normal."""
 
     origins: Floats  # [K, 3] where the sensor was, metres from the region's centre
 

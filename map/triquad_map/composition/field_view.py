@@ -101,6 +101,21 @@ class FieldView:
         self._split(len(points), work)
         return status
 
+    def near_ends(self, points: Doubles, reach_m: float) -> Bools:
+        """Whether points [N, 3] lie where rays ended; see :class:`triquad_map.view.MeshedView`."""
+        reach = reach_m / self._settings.leaf_m
+        near = np.zeros(len(points), np.bool_)
+
+        def work(first: int, last: int) -> None:
+            part, mine = points[first:last], near[first:last]
+            for owned in self._owners(part).groups:
+                offsets = part[owned.points] - owned.region.centre
+                voxels = self._settings.leaf_coordinates(offsets)
+                mine[owned.points] = owned.region.evidence.near_ends(voxels, reach)
+
+        self._split(len(points), work)
+        return near
+
     def _owners(self, points: Doubles) -> _Owners:
         """Who answers for points [N, 3], metres, map frame."""
         # Axis by axis, which makes every step here one of long vectors.

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.surface import Surfels
@@ -37,6 +37,13 @@ class SeenSpace(Protocol):
         """Values of :class:`Status` [N] at leaf coordinates [N, 3].
 
         ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
+        """
+
+    def near_ends(self, voxels: Doubles, reach: float) -> Bools:
+        """Whether leaf coordinates [N, 3] lie where rays ended.
+
+        That is within ``reach`` voxels of one in which they did, on each axis, and not in its
+        margins (:attr:`triquad_format.records.region.Evidence.margins`).
         """
 
     def find_unknown(

@@ -8,12 +8,22 @@ from numpy.typing import NDArray
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
-from triquad_format.records.region import BLOCK_BYTES, Evidence
+from triquad_format.records.region import (
+    BLOCK_BYTES,
+    MARGIN_BITS,
+    Evidence,
+    seen_voxels,
+    surface_counts,
+)
 from triquad_format.records.status import Status
 
 from triquad_map.reference.coded_rows import ONE_CELL, CodedRows
+from triquad_map.surface import MARGIN_STEP
 
 _BLOCKS_AT_ONCE = 2048
+
+_VOXEL_BITS = 3 * (BLOCK_VOXELS.bit_length() - 1)
+"""By which the code of a voxel is longer than that of its block."""
 
 
 class SeenBlocks:
@@ -24,12 +34,17 @@ class SeenBlocks:
         self._side = 1 << settings.depth
         self._surface = CodedRows(BLOCK_BYTES, np.uint8, shift)
         self._free = CodedRows(BLOCK_BYTES, np.uint8, shift)
+        self._margins = CodedRows(len(MARGIN_BITS), np.uint8, min(shift + _VOXEL_BITS, ONE_CELL))
         self.newest_s = 0  # when a ray last ended anywhere, seconds since 1970
 
     def add(self, evidence: Evidence) -> None:
         """Add the evidence of some cells."""
         self._surface.add(evidence.codes, evidence.surface)
         self._free.add(evidence.codes, evidence.free)
+        if evidence.margins is not None:
+            voxels = seen_voxels(evidence, evidence.surface) % BLOCK_VOXELS
+            blocks = evidence.codes.repeat(surface_counts(evidence.surface))
+            self._margins.add(_voxel_codes(blocks, voxels), evidence.margins)
         if evidence.seen_s is not None:
             self.newest_s = max(self.newest_s, int(evidence.seen_s.max(initial=0)))
 
@@ -47,6 +62,26 @@ class SeenBlocks:
     def ended_in(self, voxels: Longs) -> Bools:
         """Whether rays ended in ``voxels`` [N, 3]."""
         return self._holds(self._surface, voxels)
+
+    def near_ends(self, voxels: Doubles, reach: float) -> Bools:
+        """Where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
+        near = np.zeros(len(voxels), np.bool_)
+        low = np.floor(voxels - reach).astype(np.int64)
+        high = np.floor(voxels + reach).astype(np.int64)
+        steps = range(int((high - low).max(initial=0)) + 1)
+        for step in itertools.product(steps, repeat=3):
+            places = np.minimum(low + step, high)
+            rows = np.flatnonzero(~near & self.ended_in(places))
+            inside, margins = voxels[rows] - places[rows], self._margins_of(places[rows])
+            depths = np.hstack([inside, 1 - inside])
+            near[rows] = ~((margins > 0) & (depths < MARGIN_STEP * margins)).any(axis=1)
+        return near
+
+    def _margins_of(self, voxels: Longs) -> Bytes:
+        """The margins [N, 6] of voxels [N, 3]; 0 where none are known."""
+        blocks, inner = np.divmod(voxels, BLOCK_VOXELS)
+        codes = _voxel_codes(morton.encode(blocks), inner)
+        return np.asarray(self._margins.find(codes).rows, np.uint8)
 
     def find_unknown(
         self, voxels: Doubles, blocks: range, distances: Doubles, nearest: Doubles
@@ -124,6 +159,12 @@ def _search_inside(
     rows = going[nearer]
     squares[rows] = gaps[each, best][nearer]
     nearest[rows] = places[each, best][nearer]
+
+
+def _voxel_codes(blocks: Longs, inner: Longs) -> Longs:
+    """Codes [N] of voxels, by those of their blocks [N] and where in these they are [N, 3]."""
+    codes: Longs = (blocks << _VOXEL_BITS) + inner @ (BLOCK_VOXELS**2, BLOCK_VOXELS, 1)
+    return codes
 
 
 def _steps(shell: int) -> Iterator[Longs]:

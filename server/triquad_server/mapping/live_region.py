@@ -163,7 +163,7 @@ class LiveRegion:
         region._restored = True
         state = record.training
         if state is not None:
-            region._keep(restored_rays(state.rays, setup.field))
+            region._keep(restored_rays(state.rays, setup.field, setup.team))
             region.pool.add(samples_alone(state.sample_points, state.sample_labels))
             region.budget.restore(state.budget_samples, len(region.pool))
             region.repairs = Repairs(state.places_repaired, state.places_given_up)

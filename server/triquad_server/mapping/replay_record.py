@@ -1,7 +1,8 @@
 """The rays of a replay pool as a record holds them, and back.
 
-The file tells where rays end, and at which angle they met the surface, more finely than any sensor
-does. Values that are rounded take less room there, so it has room for more rays.
+The file tells where rays end more finely than any sensor does, and at which angle they met the
+surface. Rounded ends take less room there, and angles that the ends around tell again take none: so
+there is room for more rays.
 """
 
 import numpy as np
@@ -9,16 +10,18 @@ from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays, are_held_out
+from triquad_map.compiled.team import Team
 
 from triquad_server.mapping.held_out import ends_in_steps
-from triquad_server.mapping.ray_table import VALUE, RayTable
+from triquad_server.mapping.normals import SurfaceNormals
+from triquad_server.mapping.ray_table import LEAST_SLOPE, VALUE, RayTable
 
 _MOST_RAYS = 6_000_000  # so many fit into the parts of a single cube
 
 _ORIGIN_BITS = 15  # beside 48 of a leaf's code
 
-_ROUNDED_STEPS = 5
-"""To the middle of so many steps: 8 mm at the default leaf, which adds 2 mm of noise."""
+_ROUNDED_STEPS = 3
+"""To the middle of so many steps: 5 mm at the default leaf, which adds 1.4 mm of noise."""
 
 _FIRST = np.arange(STEPS, dtype=np.int32) // _ROUNDED_STEPS * _ROUNDED_STEPS
 _ROUNDED = (_FIRST + np.minimum(_FIRST + _ROUNDED_STEPS, STEPS) - 1) // 2  # of each step of a leaf
@@ -43,7 +46,7 @@ def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays,
     rays = ReplayRays(
         _rounded_ends(steps[places].astype(np.int32)),
         table.origin_of[places],
-        _rounded_slopes(table.rows[places, VALUE]),
+        _told_slopes(table.rows[places, VALUE]),
         origins=table.origins,
     )
     return rays.chosen(np.arange(len(rays))), np.flatnonzero(~fits)
@@ -59,16 +62,25 @@ def _rounded_ends(steps: Ints) -> Ints:
     return rounded
 
 
-def _rounded_slopes(values: Floats) -> Bytes:
-    """Slopes [N] of rays with these ``values`` [N] in their table; SLOPE_SCALE: nothing told it."""
+def _told_slopes(values: Floats) -> Bytes:
+    """Slopes [N] of rays with these ``values`` [N] in their table, if the field told them.
+
+    SLOPE_SCALE where a normal did, and where nothing did.
+    """
     slopes = (SLOPE_SCALE * np.abs(values)).astype(np.uint8)
     rounded = slopes - slopes % _ROUNDED_SLOPES + _ROUNDED_SLOPES // 2
-    return np.where(values == -1, SLOPE_SCALE, rounded).astype(np.uint8)
+    is_told = (values < 0) & (values > -1)
+    return np.where(is_told, rounded, SLOPE_SCALE).astype(np.uint8)
 
 
-def restored_rays(rays: ReplayRays, settings: FieldSettings) -> RayTable:
-    """The rays of a record."""
-    slopes = rays.slopes / SLOPE_SCALE
-    slopes[rays.slopes == SLOPE_SCALE] = -1.0  # which may be since nothing told it
-    rows = np.column_stack([rays.ends_m(settings), slopes]).astype(np.float32)
+def restored_rays(rays: ReplayRays, settings: FieldSettings, team: Team) -> RayTable:
+    """The rays of a record; their slopes are told by the ends around, where these have a normal."""
+    ends = rays.ends_m(settings)
+    normals = SurfaceNormals(settings.leaf_m, team, max_cells=len(ends)).add(ends, np.zeros(3))
+    ways = ends - rays.origins[rays.origin_of]
+    cosines = (ways * normals).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
+    slopes = np.maximum(np.abs(cosines), LEAST_SLOPE)
+    is_unsure = np.isnan(slopes)
+    slopes[is_unsure] = -rays.slopes[is_unsure].astype(np.float64) / SLOPE_SCALE
+    rows = np.column_stack([ends, slopes]).astype(np.float32)
     return RayTable(rows, rays.origin_of, rays.origins)

@@ -20,6 +20,7 @@ from triquad_format.wire.tile_codec import STEPS, TileSurface
 from triquad_map.compiled.kernel import kernel
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.filling import FilledVoxels, on_filled
+from triquad_map.seen_faces import are_seen
 
 from triquad_server.mesh.holes import cells_beside, filled_in_box
 from triquad_server.mesh.marching_cubes import Crossings, centroids
@@ -212,7 +213,7 @@ def mesh_tile(
     volume, points = _lattice_values(source, cells, first=first, lattice=lattice, around=around)
     found = Crossings(cells, volume)
     middles = centroids((found.places + first) * lattice.cell_m, found.faces)
-    kept = source.status(middles, lattice.reach_m) == Status.SURFACE
+    kept = are_seen(source, middles, lattice.cell_m, lattice.reach_m)
     filled = ~kept
     filled[filled] = on_filled(
         source, holes, middles[filled], reach_m=lattice.reach_m, fill_m=fill_m

@@ -18,6 +18,9 @@ _LEFT_VOXELS = 4
 """Where the surface left so many voxels of a group, and that share of them, something is gone; of
 fewer, training is the cause, which never leaves all voxels alone."""
 
+_FARTHER = 2
+"""Quarters of a voxel by which what was seen of it must grow to be told."""
+
 
 @dataclass(frozen=True)
 class Changes:
@@ -32,6 +35,7 @@ class _Voxels:
     """The voxels of a region with seen surface."""
 
     keys: Longs  # [V] increasing
+    margins: NDArray[np.int8]  # [V, 6] quarters of a voxel beyond all ends
     centres: Doubles  # [V, 3] metres, map frame
     groups: Doubles  # [G, 3] centres of the groups
     group: NDArray[np.intp]  # [V] of each voxel
@@ -44,6 +48,7 @@ class _Recorded:
     region: FrozenRegion
     voxels: _Voxels
     offsets: Floats  # [V] metres from each voxel's centre to the surface
+    margins: NDArray[np.int8]  # [V, 6] of the voxels
 
 
 class SurfaceChanges:
@@ -52,7 +57,7 @@ class SurfaceChanges:
     Where the surface crosses a voxel follows from the field at the voxel's centre, along its
     gradient. While a field is trained, single voxels are never at rest; so a group changes where
 
-    * a voxel with seen surface is new, or forgotten;
+    * a voxel with seen surface is new, or forgotten, or was seen half a voxel farther;
     * the surface left some voxels (moved by more than half their side);
     * it moved by more than the tolerance in more than half of the group's voxels, since the group
       was last reported: small movements add up.
@@ -92,17 +97,19 @@ class SurfaceChanges:
     def _compare(self, old: _Recorded, new: _Recorded) -> tuple[_Recorded, Changes]:
         """What is to be recorded, and what changed."""
         voxels = new.voxels
-        before = old.offsets
+        before, margins = old.offsets, old.margins
         gone = np.zeros((0, 3))
         if voxels is not old.voxels:
             before = np.full(len(voxels.keys), np.nan, np.float32)
+            margins = voxels.margins.copy()
             _, rows, old_rows = np.intersect1d(
                 voxels.keys, old.voxels.keys, assume_unique=True, return_indices=True
             )
-            before[rows] = old.offsets[old_rows]
+            before[rows], margins[rows] = old.offsets[old_rows], old.margins[old_rows]
             gone = np.delete(old.voxels.centres, old_rows, axis=0)
         moved = np.abs(new.offsets - before)
         is_new = np.isnan(before)
+        is_new |= (np.abs(voxels.margins - margins) >= _FARTHER).any(axis=1)
 
         def count(chosen: Bools) -> NDArray[np.intp]:
             return np.bincount(voxels.group[chosen], minlength=len(voxels.groups))
@@ -112,16 +119,18 @@ class SurfaceChanges:
         many_left = count(left) >= np.maximum(_LEFT_VOXELS, _LEFT_SHARE * size)
         drifted = 2 * count(moved > self._tolerance_m) > size
         reported = drifted | many_left | (count(is_new) > 0)
-        recorded = np.where(reported[voxels.group], new.offsets, before)
+        is_told = reported[voxels.group]
+        offsets = np.where(is_told, new.offsets, before)
+        margins = np.where(is_told[:, None], voxels.margins, margins)
         places = is_new | (left & many_left[voxels.group])
-        return _Recorded(new.region, voxels, recorded), Changes(
+        return _Recorded(new.region, voxels, offsets, margins), Changes(
             np.concatenate([gone, voxels.centres[places]]), voxels.groups[drifted]
         )
 
     def _measure(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
         unchanged = old if old and old.region.evidence is region.evidence else None
         voxels = unchanged.voxels if unchanged else self._voxels(region)
-        return _Recorded(region, voxels, self._offsets(region, voxels.centres))
+        return _Recorded(region, voxels, self._offsets(region, voxels.centres), voxels.margins)
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
         evidence = region.evidence
@@ -134,7 +143,8 @@ class SurfaceChanges:
         low = cells.min(axis=0, initial=0)
         _, first, group = np.unique(_key(cells - low), return_index=True, return_inverse=True)
         groups = ((cells[first] + 0.5) * self._group_m).astype(np.float64)
-        return _Voxels(keys[order], centres, groups, group=group.ravel())
+        margins = evidence.margins[order].astype(np.int8)
+        return _Voxels(keys[order], margins, centres, groups, group=group.ravel())
 
     def _offsets(self, region: FrozenRegion, centres: Doubles) -> Floats:
         """How far [V] the surface is from the centres; at most a voxel: beyond are others."""

@@ -84,6 +84,16 @@ class Patchwork:
             status[rows] = self.epochs[index].status(points[rows], reach_m)
         return status
 
+    def near_ends(self, points: NDArray[np.float64], reach_m: float) -> NDArray[np.bool_]:
+        near = np.zeros(len(points), np.bool_)
+        for index, rows in self._owned(points / self.lattice.cell_m).items():
+            near[rows] = self.epochs[index].near_ends(points[rows], reach_m)
+        return near
+
+    @property
+    def voxel_m(self) -> float:
+        return next(iter(self.epochs.values())).voxel_m
+
     def _owned(self, steps: NDArray[np.floating]) -> dict[TileIndex, NDArray[np.intp]]:
         tiles = np.floor(steps / self.lattice.cells).astype(np.int64)
         found, inverse = np.unique(tiles, axis=0, return_inverse=True)

@@ -33,14 +33,16 @@ from triquad_format.mapfile.parts.part import (
     shuffle_codes,
     shuffle_counts,
     split_bits,
+    split_codes,
     split_integers,
-    split_outcomes,
     square_shift,
 )
 from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
+    MARGIN_BITS,
+    OUTCOME_BITS,
     MapRecord,
     Region,
     TrainingState,
@@ -195,8 +197,12 @@ def _pack_evidence(region: Region) -> Iterator[Part]:
             fields["levels"] = pack_array(split_bits(evidence.levels[voxels], LEVEL_BITS))
         if evidence.seen_s is not None:
             fields |= _seen_fields(evidence.seen_s[rows][surface.any(axis=1)])
-        if evidence.outcomes is not None:
-            fields["outcomes"] = pack_array(split_outcomes(evidence.outcomes[voxels]))
+        for name, column, widths in (
+            ("outcomes", evidence.outcomes, OUTCOME_BITS),
+            ("margins", evidence.margins, MARGIN_BITS),
+        ):
+            if column is not None:
+                fields[name] = pack_array(split_codes(column[voxels], widths))
         yield _region_part(PartKey(EVIDENCE, region.index, cell=cell), fields)
 
 

@@ -5,6 +5,7 @@ checkpoint to checkpoint: vertices into squares of a plane, evidence into cubes.
 are stored as they compress well: in byte planes, bit planes, and differences of codes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Longs
 from triquad_format.records.crop import LeafBox, whole_region
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
-from triquad_format.records.region import AXES, FLOATS, MAX_LEVEL, OUTCOME_BITS
+from triquad_format.records.region import AXES, FLOATS, MAX_LEVEL
 
 PREFIX = "/triquad/"
 MAP = "/triquad/map"
@@ -234,13 +235,13 @@ def join_bits(planes: Bytes, count: int) -> Bytes:
     return numbers
 
 
-def split_outcomes(outcomes: Bytes) -> Bytes:
-    """Planes [sum of OUTCOME_BITS, N] of the codes [S, 3], one column after the other."""
-    columns = zip(outcomes.T, OUTCOME_BITS, strict=True)
+def split_codes(codes: Bytes, widths: Sequence[int]) -> Bytes:
+    """Planes [sum of ``widths``, N] of codes [S, C], one column of so many bits after the other."""
+    columns = zip(codes.T, widths, strict=True)
     return np.concatenate([split_bits(column, width) for column, width in columns])
 
 
-def join_outcomes(planes: Bytes, count: int) -> Bytes:
-    """Codes [count, 3]; the inverse of :func:`split_outcomes`."""
-    columns = np.split(planes, np.cumsum(OUTCOME_BITS)[:-1])
+def join_codes(planes: Bytes, widths: Sequence[int], count: int) -> Bytes:
+    """Codes [count, C]; the inverse of :func:`split_codes`."""
+    columns = np.split(planes, np.cumsum(widths)[:-1])
     return np.stack([join_bits(column, count) for column in columns], axis=1)

@@ -27,7 +27,7 @@ from triquad_format.mapfile.parts.part import (
     cube_shift,
     feature_column,
     join_bits,
-    join_outcomes,
+    join_codes,
     leaf_shift,
     moment_columns,
     square_shift,
@@ -39,6 +39,7 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
+    MARGIN_BITS,
     MAX_SEEN_S,
     MLP_LAYERS,
     OUTCOME_BITS,
@@ -237,13 +238,27 @@ def _read_evidence(body: PartBody, key: PartKey) -> Evidence:
         body.array(name, "|u1", (len(codes), BLOCK_BYTES)) for name in ("surface", "free")
     )
     count = int(surface_counts(surface).sum())
-    levels = outcomes = None
+    levels = None
     if body.has("levels"):
         levels = join_bits(_planes(body, "levels", LEVEL_BITS, count), count)
-    if body.has("outcomes"):
-        outcomes = join_outcomes(_planes(body, "outcomes", sum(OUTCOME_BITS), count), count)
-    seen_s = _read_seen(body, surface) if body.has("seen_s") else None
-    return Evidence(codes, surface, free, levels=levels, seen_s=seen_s, outcomes=outcomes)
+    return Evidence(
+        codes,
+        surface,
+        free,
+        levels=levels,
+        seen_s=_read_seen(body, surface) if body.has("seen_s") else None,
+        outcomes=_read_codes_of_voxels(body, "outcomes", OUTCOME_BITS, count),
+        margins=_read_codes_of_voxels(body, "margins", MARGIN_BITS, count),
+    )
+
+
+def _read_codes_of_voxels(
+    body: PartBody, key: str, widths: Sequence[int], count: int
+) -> Bytes | None:
+    """Codes [count, C] of surface voxels, of so many bits each; ``None``: the part has none."""
+    if not body.has(key):
+        return None
+    return join_codes(_planes(body, key, sum(widths), count), widths, count)
 
 
 def _planes(body: PartBody, key: str, planes: int, count: int) -> Bytes:
@@ -286,21 +301,23 @@ def _joined(topic: str, portions: Sequence[_Columns], empty: _Columns) -> _Colum
 def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
     """The evidence of a region from that of its cubes, in their order.
 
-    Where some of them tell no levels, times or outcomes and others do, the former's are 0.
+    Where some of them tell no levels, times, outcomes or margins and others do, the former's are 0.
     """
     if len(portions) == 1:
         return portions[0]
     codes, masks = np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8)
     blocks = [(len(portion.codes),) for portion in portions]
     voxels = [(int(surface_counts(portion.surface).sum()),) for portion in portions]
-    pairs = [(*shape, len(OUTCOME_BITS)) for shape in voxels]
+    outcomes = [(*shape, len(OUTCOME_BITS)) for shape in voxels]
+    margins = [(*shape, len(MARGIN_BITS)) for shape in voxels]
     return Evidence(
         np.concatenate([codes, *(portion.codes for portion in portions)]),
         np.concatenate([masks, *(portion.surface for portion in portions)]),
         np.concatenate([masks, *(portion.free for portion in portions)]),
         levels=_joined_column([portion.levels for portion in portions], voxels),
         seen_s=_joined_column([portion.seen_s for portion in portions], blocks),
-        outcomes=_joined_column([portion.outcomes for portion in portions], pairs),
+        outcomes=_joined_column([portion.outcomes for portion in portions], outcomes),
+        margins=_joined_column([portion.margins for portion in portions], margins),
     )
 
 

@@ -16,6 +16,7 @@ from triquad_map.compiled.evidence.observed import (
     Observed,
     ObservedVoxel,
     Voxel,
+    forget_ends,
     has_surface,
     rows_around,
     voxel_of,
@@ -175,8 +176,7 @@ def _take_back(
     x, y, z = voxel_of(row, seen, observed)
     taken.append((x, y, z))
     seen.surface[voxel.owner >> (3 * SHIFT), byte_of(x, y)] &= ~bit_of(z)
-    voxel.weight = voxel.ends = 0
-    voxel.sectors = 0
+    forget_ends(voxel)
     since = max(voxel.passed_scan, voxel.hit_scan + 1)
     for near in rows_around(row, _GROUP_REACH, seen, observed):
         if observed.voxels[near].hit_scan < since:

@@ -6,15 +6,22 @@ answers as if it had been seen. Only a 3-D record can tell such ghosts from surf
 All coordinates here are voxel coordinates of the region (see :mod:`triquad_format.records.region`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
+from triquad_format.records.region import MARGIN_BITS, seen_voxels, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
-from triquad_format.records.region import surface_counts
 from triquad_format.records.status import Status
 
+from triquad_map.compiled.evidence.margins import (
+    MOST_HITS,
+    SeenMargins,
+    margins_that_count,
+    near_ends,
+)
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.evidence.unknown_search import find_unknown
 from triquad_map.compiled.kernel import kernel
@@ -86,12 +93,24 @@ class FrozenEvidence:
 
     seen: SeenVoxels
     levels: Bytes  # [S] how well each voxel in ``surface`` is supported, in their order
+    hits: Bytes  # [S] scans of which rays ended in each, and
+    margins: Bytes  # [S, 6] their margins, whether they count or not
     seen_s: Longs  # [B] when a ray last ended in each block, seconds since 1970; 0: never
 
     @property
     def surface(self) -> Bytes:
         """The voxels in which rays ended [B, BLOCK_BYTES]."""
         return self.seen.surface
+
+    @cached_property
+    def _firsts(self) -> Longs:
+        """[B] The number of each block's first voxel among those with surface."""
+        counts = surface_counts(self.surface)
+        return np.cumsum(counts) - counts
+
+    @property
+    def _seen_margins(self) -> SeenMargins:
+        return SeenMargins(self.seen, self._firsts, self.hits, self.margins)
 
     @property
     def cells(self) -> Longs:
@@ -106,6 +125,10 @@ class FrozenEvidence:
     def status(self, voxels: Doubles, reach: float = 0.5) -> Bytes:
         """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
         return _status(voxels, reach, self.seen)
+
+    def near_ends(self, voxels: Doubles, reach: float) -> Bools:
+        """Where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
+        return near_ends(voxels, reach, self._seen_margins)
 
     def ended_in(self, voxels: Longs) -> Bools:
         """Whether rays ended in ``voxels`` [N, 3]."""
@@ -131,14 +154,13 @@ class FrozenEvidence:
         codes = morton.encode(self.cells[used])
         order = np.argsort(codes)
         used = used[order]
-        counts = surface_counts(surface)
-        firsts = np.cumsum(counts) - counts
+        counts, firsts = surface_counts(surface), self._firsts
         # The voxels block by block, in the order of the record.
         runs = np.repeat(firsts[used] - (np.cumsum(counts[used]) - counts[used]), counts[used])
         voxels = runs + np.arange(len(runs))
         # In whole minutes: else each scan would change every part that it sees.
         seen_s = np.where(counts > 0, self.seen_s // _SEEN_STEP_S * _SEEN_STEP_S, 0)
-        return EvidenceRecord(
+        record = EvidenceRecord(
             codes[order],
             surface[used],
             free[used],
@@ -146,6 +168,9 @@ class FrozenEvidence:
             seen_s=seen_s[used],
             outcomes=None if outcomes is None else outcomes[voxels],
         )
+        ended_in = seen_voxels(record, record.surface)
+        margins = margins_that_count(ended_in, voxels, self._seen_margins)
+        return replace(record, margins=margins)
 
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "FrozenEvidence":
@@ -156,5 +181,9 @@ class FrozenEvidence:
             levels = np.zeros(int(surface_counts(record.surface).sum()), np.uint8)
         if seen_s is None:
             seen_s = np.zeros(len(record.codes), np.int64)
+        margins = record.margins
+        if margins is None:
+            margins = np.zeros((len(levels), len(MARGIN_BITS)), np.uint8)
+        hits = np.full(len(levels), MOST_HITS, np.uint8)  # those that a file tells count
         masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
-        return cls(SeenVoxels(side, index, *masks), levels, seen_s)
+        return cls(SeenVoxels(side, index, *masks), levels, hits, margins, seen_s)

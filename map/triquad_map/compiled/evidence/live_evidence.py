@@ -216,6 +216,7 @@ class LiveEvidence:
             self._frozen = FrozenEvidence(
                 SeenVoxels(side, self._blocks.freeze(), surface, free),
                 self._observations.levels(surface),
+                *self._observations.margins(surface),
                 self._observations.seen_s(self.blocks),
             )
         return self._frozen
@@ -232,7 +233,11 @@ class LiveEvidence:
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
         evidence._seen = frozen.seen
         evidence._observations = Observations.restore(
-            frozen.surface, frozen.levels, frozen.seen_s, outcomes=record.outcomes
+            frozen.surface,
+            frozen.levels,
+            frozen.seen_s,
+            margins=frozen.margins,
+            outcomes=record.outcomes,
         )
         evidence._make_room()
         return evidence

@@ -4,10 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import surface_counts, used_blocks
+from triquad_format.records.region import MARGIN_BITS, surface_counts, used_blocks
 
 from triquad_map.compiled.evidence.levels import fill_levels
+from triquad_map.compiled.evidence.margins import fill_margins
 from triquad_map.compiled.evidence.observed import (
+    EIGHTHS,
     OBSERVED_VOXEL,
     Observed,
     is_flat,
@@ -165,6 +167,18 @@ class Observations:
         voxels = self.arrays.voxels[rows]
         return outcome_codes(np.stack([voxels[name] for name in _RECORD], axis=1))
 
+    def margins(self, surface: Bytes) -> tuple[Bytes, Bytes]:
+        """Hits [S] and margins [S, 6] of each voxel set in ``surface``, in their order.
+
+        See :class:`triquad_map.compiled.evidence.margins.SeenMargins`.
+        """
+        used = used_blocks(surface)
+        surface, places = surface[used], self.arrays.places[used]
+        count = int(surface_counts(surface).sum())
+        hits, margins = np.empty(count, np.uint8), np.empty((count, len(MARGIN_BITS)), np.uint8)
+        fill_margins(surface, self.arrays._replace(places=places), hits, margins)
+        return hits, margins
+
     def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
         return self.arrays.seen_s[self.arrays.places[:blocks]]
@@ -177,11 +191,18 @@ class Observations:
 
     @classmethod
     def restore(
-        cls, surface: Bytes, levels: Bytes, seen_s: Longs, *, outcomes: Bytes | None
+        cls,
+        surface: Bytes,
+        levels: Bytes,
+        seen_s: Longs,
+        *,
+        margins: Bytes,
+        outcomes: Bytes | None,
     ) -> "Observations":
         """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels.
 
-        ``outcomes`` are the codes [S, 3] of what became of rays; ``None``: not known.
+        And these ``margins`` [S, 6]. ``outcomes`` are the codes [S, 3] of what became of rays;
+        ``None``: not known.
         """
         used = used_blocks(surface)
         places = slice(1, 1 + len(used))
@@ -201,6 +222,8 @@ class Observations:
         known = levels > 0
         voxels["weight"] = known * LEAST_STRENGTH * 2.0 ** (levels - 1.0)
         voxels["sectors"] = known
+        eighths = np.where(margins > 0, 2 * margins + 1, 0)
+        voxels["lowest"], voxels["highest"] = eighths[:, :3], EIGHTHS - 1 - eighths[:, 3:]
         if outcomes is None:
             outcomes = np.zeros((len(levels), len(_RECORD)), np.uint8)
         for name, counts in zip(_RECORD, outcome_counts(outcomes).T, strict=True):
@@ -221,9 +244,11 @@ class Observations:
 
 
 def _arrays(blocks: int, places: int, rows: int) -> Observed:
+    voxels = np.zeros(rows, OBSERVED_VOXEL)
+    voxels["highest"][0] = EIGHTHS - 1  # of a voxel of which nothing is known, no part is left out
     return Observed(
         places=np.zeros(blocks, np.int32),
         rows=np.zeros((places, _VOXELS), np.int32),
         seen_s=np.zeros(places, np.int64),
-        voxels=np.zeros(rows, OBSERVED_VOXEL),
+        voxels=voxels,
     )

@@ -15,6 +15,8 @@ OBSERVED_VOXEL = np.dtype(
         ("owner", np.int64),  # the block's row in the evidence, and the voxel in the block
         ("mean", np.float32, 3),  # of the ends, voxels, in the voxel
         ("normal", np.float32, 3),  # of the surface; 0 where it is not known or not flat
+        ("lowest", np.uint8, 3),  # eighths of the voxel in which any of its rays ended, and
+        ("highest", np.uint8, 3),  # the last of these, on each axis
         ("towards", np.float32, 3),  # from the last end to the sensor, voxels
         ("spread", np.float32),  # mean squared distance of the ends from their mean, voxels
         ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
@@ -33,6 +35,8 @@ OBSERVED_VOXEL = np.dtype(
     align=True,
 )
 
+EIGHTHS = 8
+
 ObservedVoxel = Any
 """A record of OBSERVED_VOXEL."""
 
@@ -48,6 +52,15 @@ class Observed(NamedTuple):
 
 Voxel = tuple[int, int, int]
 Vector = tuple[float, float, float]
+
+
+@kernel(inline="always")
+def forget_ends(voxel: ObservedVoxel) -> None:
+    """From now on, no ray ended in a voxel."""
+    voxel.weight = voxel.ends = 0
+    voxel.sectors = 0
+    for axis in range(3):
+        voxel.lowest[axis], voxel.highest[axis] = EIGHTHS - 1, 0
 
 
 @kernel(inline="always")

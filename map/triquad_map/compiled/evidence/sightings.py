@@ -8,7 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Doubles, Ints
 
-from triquad_map.compiled.evidence.observed import Observed, ObservedVoxel, Vector
+from triquad_map.compiled.evidence.observed import (
+    EIGHTHS,
+    Observed,
+    ObservedVoxel,
+    Vector,
+    forget_ends,
+)
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block
@@ -74,6 +80,9 @@ def _add_end(voxel: ObservedVoxel, end: Vector) -> None:
     voxel.ends = count
     squared = np.float32(0)
     for axis in range(3):
+        eighth = int(EIGHTHS * end[axis])
+        voxel.lowest[axis] = min(voxel.lowest[axis], eighth)
+        voxel.highest[axis] = max(voxel.highest[axis], eighth)
         off = np.float32(end[axis]) - mean[axis]
         step = off / count
         mean[axis] += step
@@ -118,6 +127,7 @@ def record_ends(
             row = rows
             observed.rows[place, voxel] = row
             observed.voxels[row].owner = block << (3 * SHIFT) | voxel
+            forget_ends(observed.voxels[row])
             rows += 1
         found[i] = row
         observed.seen_s[place] = max(observed.seen_s[place], sighting.stamp_s)

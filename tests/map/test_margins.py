@@ -1,0 +1,168 @@
+"""Within a voxel, a surface ends where the last rays ended, unless it goes on beside it."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from triquad_format.records.arrays import Bools, Doubles
+from triquad_format.records.field_settings import FieldSettings
+from triquad_map.compiled.evidence.carving import Reach
+from triquad_map.compiled.evidence.contradictions import Disbelief
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.evidence.sightings import Sighting
+from triquad_map.reference.seen_blocks import SeenBlocks
+
+SETTINGS = FieldSettings(depth=8)
+SIDE = 1 << SETTINGS.depth
+REACH = 0.1
+MANY = 10  # scans
+AGAIN = Sighting(np.zeros(3), 0.2, 2, scan=MANY + 1)
+
+
+class Wall(NamedTuple):
+    """A wall at ``x = 20.5`` voxels, between two corners (y, z)."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    def points(self, rng: np.random.Generator, count: int = 4000) -> Doubles:
+        y, z = rng.uniform(self.low, self.high, (count, 2)).T
+        return np.stack([np.full(count, 20.5), y, z], axis=1)
+
+
+def seen(ends: Doubles, scans: int = MANY) -> LiveEvidence:
+    """Evidence of rays that ended there, in each of so many scans."""
+    evidence = LiveEvidence(SIDE)
+    for number in range(1, scans + 1):
+        evidence.mark_surface(ends, Sighting(np.zeros(3), 0.2, 1, scan=number))
+    return evidence
+
+
+def near(evidence: LiveEvidence, points: Doubles) -> Bools:
+    return evidence.freeze().near_ends(points, REACH)
+
+
+def random_ends(seed: int, count: int) -> Doubles:
+    """Around a few places, so that voxels have neighbours and several ends; some are outside."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-1, SIDE + 1, (3, 3))
+    return places[rng.integers(3, size=count)] + rng.normal(0, rng.uniform(0.1, 2), (count, 3))
+
+
+def test_a_wall_ends_where_the_last_rays_did() -> None:
+    rng = np.random.default_rng(1)
+    wall = Wall((10.4, 30.0), (17.3, 34.0))
+    evidence = seen(wall.points(rng))
+    assert near(evidence, wall.points(rng)).all()
+    assert not near(evidence, Wall((10.0, 30.0), (10.2, 34.0)).points(rng)).any()
+    assert not near(evidence, Wall((17.6, 30.0), (18.0, 34.0)).points(rng)).any()
+
+
+def test_of_what_few_scans_saw_nothing_is_left_out() -> None:
+    """They may have missed it; as soon as a voxel beside was hit often, they would not have."""
+    rng = np.random.default_rng(6)
+    wall, rest = Wall((10.4, 30.0), (17.3, 34.0)), Wall((17.7, 30.0), (18.0, 34.0))
+    evidence = seen(wall.points(rng), scans=1)
+    assert near(evidence, rest.points(rng)).all()
+    beside = Wall((16.0, 30.0), (17.0, 34.0))
+    for number in range(2, MANY):
+        evidence.mark_surface(beside.points(rng), Sighting(np.zeros(3), 0.2, 2, scan=number))
+    assert not near(evidence, rest.points(rng)).any()
+    assert near(evidence, Wall((10.0, 30.0), (10.1, 34.0)).points(rng)).all()
+
+
+def test_it_goes_on_between_rays() -> None:
+    """Two lines of rays a voxel apart: nothing is missing between them, whatever rays there are."""
+    rng = np.random.default_rng(2)
+    lines = [Wall((10.0, z), (17.0, z + 0.1)).points(rng) for z in (30.2, 31.9)]
+    evidence = seen(np.concatenate(lines))
+    assert near(evidence, Wall((10.0, 30.2), (17.0, 32.0)).points(rng)).all()
+    assert not near(evidence, Wall((10.0, 32.6), (17.0, 33.0)).points(rng)).any()
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 10_000), count=st.integers(0, 200))
+def test_every_end_is_near(seed: int, count: int) -> None:
+    ends = random_ends(seed, count)
+    inside = ((ends >= 0) & (ends < SIDE)).all(axis=1)
+    assert seen(ends).freeze().near_ends(ends[inside], 0.0).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(0, 200),
+    scans=st.integers(1, MANY),
+    reach=st.floats(0, 1.5),
+)
+def test_all_ways_to_ask_agree(seed: int, count: int, scans: int, reach: float) -> None:
+    """As the server asks, as from a file, and with numpy alone."""
+    ends = random_ends(seed, count)
+    rng = np.random.default_rng(seed)
+    points = random_ends(seed, 500) + rng.normal(0, 0.3, (500, 3))
+    frozen = seen(ends, scans).freeze()
+    record = frozen.record()
+    slow = SeenBlocks(SETTINGS)
+    slow.add(record)
+    have = frozen.near_ends(points, reach)
+    np.testing.assert_array_equal(
+        FrozenEvidence.from_record(SIDE, record).near_ends(points, reach), have
+    )
+    np.testing.assert_array_equal(slow.near_ends(points, reach), have)
+    is_surface = frozen.status(points, reach) == 2
+    assert is_surface[have].all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 10_000), count=st.integers(1, 200))
+def test_margins_outlast_a_restart(seed: int, count: int) -> None:
+    ends = random_ends(seed, count)
+    record = seen(ends).record()
+    restored = LiveEvidence.from_record(SIDE, record)
+    np.testing.assert_array_equal(restored.record().margins, record.margins)
+    restored.mark_surface(ends, AGAIN)  # nothing is known to be wider
+    np.testing.assert_array_equal(restored.record().margins, record.margins)
+
+
+def test_new_rays_widen_what_was_seen_before_a_restart() -> None:
+    rng = np.random.default_rng(3)
+    wall, more = Wall((10.0, 30.0), (17.2, 34.0)), Wall((17.1, 30.0), (17.8, 34.0))
+    restored = LiveEvidence.from_record(SIDE, seen(wall.points(rng)).record())
+    assert not near(restored, Wall((17.5, 30.1), (17.8, 33.9)).points(rng)).any()
+    restored.mark_surface(more.points(rng), AGAIN)
+    assert near(restored, wall.points(rng)).all()
+    assert near(restored, more.points(rng)).all()
+
+
+def test_what_was_taken_back_is_forgotten() -> None:
+    """A wall goes, and a narrower one comes: it ends where the narrower one does."""
+    rng = np.random.default_rng(4)
+    sensor, evidence = np.array([5.3, 14.1, 32.2]), LiveEvidence(SIDE)
+    wide, narrow = Wall((11.0, 30.0), (16.8, 34.0)), Wall((11.0, 30.0), (16.2, 34.0))
+
+    def scan(number: int, ends: Doubles) -> None:
+        evidence.mark_surface(ends, Sighting(sensor, 0.2, number, scan=number))
+        passed = evidence.carve(sensor, ends, Reach(0.5, 2.5, number))
+        evidence.take_back(passed, Disbelief.of(scans=3, doubt=0.01))
+
+    for number in range(1, 11):
+        scan(number, wide.points(rng))
+    for number in range(11, 31):
+        ends = wide.points(rng)
+        scan(number, sensor + (ends - sensor) * 4)
+    assert not near(evidence, wide.points(rng)).any()
+    for number in range(31, 41):
+        scan(number, narrow.points(rng))
+    assert near(evidence, narrow.points(rng)).all()
+    assert not near(evidence, Wall((16.6, 30.1), (16.8, 33.9)).points(rng)).any()
+
+
+def test_a_record_without_margins_has_none() -> None:
+    rng = np.random.default_rng(5)
+    record = seen(Wall((10.4, 30.0), (17.3, 34.0)).points(rng)).record()
+    assert record.margins is not None
+    evidence = FrozenEvidence.from_record(SIDE, dataclasses.replace(record, margins=None))
+    assert evidence.near_ends(Wall((10.0, 30.0), (18.0, 34.0)).points(rng), REACH).all()
