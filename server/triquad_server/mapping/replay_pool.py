@@ -42,6 +42,7 @@ _BIN_LEAVES = 4.0
 _BINS = 1 << 18
 _AHEAD = 16  # places that are brought into the cache before their turn
 _NO_LIMIT = 1 << 62
+_ROOM = 1.25  # at most, of the capacity: it grows with the map
 
 RAY_BYTES = 4 * (COLUMNS + 2)
 """Of a ray, with where its origin and its bin are."""
@@ -393,7 +394,7 @@ class ReplayPool:
 
     def _extend(self, size: int) -> None:
         if size > len(self._rows):
-            room = min(self._capacity, max(size, 2 * len(self._rows)))
+            room = max(size, min(2 * len(self._rows), int(_ROOM * self._capacity)))
             used = slice(self._size)
             self._rows, self._origin_of, self._bins = (
                 with_room(self._rows[used], room),
@@ -407,9 +408,12 @@ class ReplayPool:
         """Add origins [K, 3], in place of those of no ray any more; returns the first one's row."""
         if self._origin_count + len(new) > len(self._origins):
             rays = self._origin_of[: self._size]
-            used, numbers = np.unique(rays[rays >= 0], return_inverse=True)
+            known = rays >= 0
+            is_used = np.zeros(len(self._origins), np.bool_)
+            is_used[rays[known]] = True
+            used = np.flatnonzero(is_used)
             roomy = with_room(self._origins[used], 2 * (len(used) + len(new)))
-            rays[rays >= 0] = numbers
+            rays[known] = (np.cumsum(is_used) - 1)[rays[known]]
             self._origins, self._origin_count = roomy, len(used)
             self._copy_to_device()
         first, self._origin_count = self._origin_count, self._origin_count + len(new)

@@ -17,12 +17,12 @@ from triquad_format.records.region import Evidence as EvidenceRecord
 from triquad_format.records.status import Status
 
 from triquad_map.compiled.evidence.margins import (
-    MOST_HITS,
     SeenMargins,
     margins_that_count,
     near_ends,
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.evidence.support import MOST_HITS
 from triquad_map.compiled.evidence.unknown_search import find_unknown
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (

@@ -215,8 +215,7 @@ class LiveEvidence:
             surface, free = (mask[: self.blocks].copy() for mask in masks)
             self._frozen = FrozenEvidence(
                 SeenVoxels(side, self._blocks.freeze(), surface, free),
-                self._observations.levels(surface),
-                *self._observations.margins(surface),
+                *self._observations.support(surface),
                 self._observations.seen_s(self.blocks),
             )
         return self._frozen

@@ -10,45 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import BLOCK_BYTES
 
-from triquad_map.compiled.evidence.observed import EIGHTHS, Observed, Voxel
+from triquad_map.compiled.evidence.observed import Voxel
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, is_set
+from triquad_map.compiled.voxel_index import LOW, byte_of, find_block, is_set
 from triquad_map.surface import MARGIN_STEP
 
 _SIDES = 6
 
-MOST_HITS = 255
-
 _CHANCE = 0.1
 """A margin counts where the chance is less that all scans missed a surface that goes on."""
-
-
-@kernel()
-def fill_margins(surface: Bytes, observed: Observed, hits: Bytes, margins: Bytes) -> None:
-    """Fill in ``hits`` [S] and ``margins`` [S, 6] of the voxels of ``surface``.
-
-    Margins are told as less by an eighth of a voxel at least.
-    """
-    at = 0
-    for block in range(len(surface)):
-        place = observed.places[block]
-        for byte in range(BLOCK_BYTES):
-            bits = int(surface[block, byte])
-            if bits == 0:
-                continue
-            for z in range(BLOCK_VOXELS):
-                if bits >> z & 1:
-                    voxel = observed.voxels[observed.rows[place, byte << SHIFT | z]]
-                    hits[at] = min(voxel.hits, MOST_HITS)
-                    for axis in range(3):
-                        beyond = EIGHTHS - 1 - voxel.highest[axis]
-                        margins[at, axis] = max(voxel.lowest[axis] - 1, 0) >> 1
-                        margins[at, axis + 3] = max(beyond - 1, 0) >> 1
-                    at += 1
 
 
 @kernel(inline="always")
@@ -79,7 +51,7 @@ class SeenMargins(NamedTuple):
 
     seen: SeenVoxels
     firsts: Longs  # [B] number of the first surface voxel of each block
-    hits: Bytes  # [S] scans of which rays ended in each voxel, up to ``MOST_HITS``
+    hits: Bytes  # [S] scans of which rays ended in each voxel
     margins: Bytes  # [S, 6]
 
 

@@ -6,8 +6,6 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import MARGIN_BITS, surface_counts, used_blocks
 
-from triquad_map.compiled.evidence.levels import fill_levels
-from triquad_map.compiled.evidence.margins import fill_margins
 from triquad_map.compiled.evidence.observed import (
     EIGHTHS,
     OBSERVED_VOXEL,
@@ -20,6 +18,7 @@ from triquad_map.compiled.evidence.observed import (
 from triquad_map.compiled.evidence.outcomes import outcome_codes, outcome_counts
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.evidence.sightings import Sighting, record_ends
+from triquad_map.compiled.evidence.support import Support, fill_support
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import SHIFT, with_room
 from triquad_map.surface import LEAST_STRENGTH, SurfelKind, Surfels
@@ -151,13 +150,15 @@ class Observations:
         """
         _set_discs(voxels, surfels.offsets, surfels.normals, surfels.kinds, seen, self.arrays)
 
-    def levels(self, surface: Bytes) -> Bytes:
-        """The level of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
+    def support(self, surface: Bytes) -> Support:
+        """What is told of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
         used = used_blocks(surface)
         surface, places = surface[used], self.arrays.places[used]
-        levels = np.empty(int(surface_counts(surface).sum()), np.uint8)
-        fill_levels(surface, self.arrays._replace(places=places), levels)
-        return levels
+        count = int(surface_counts(surface).sum())
+        margins = np.empty((count, len(MARGIN_BITS)), np.uint8)
+        support = Support(np.empty(count, np.uint8), np.empty(count, np.uint8), margins)
+        fill_support(surface, self.arrays._replace(places=places), support)
+        return support
 
     def outcomes(self, surface: Bytes) -> Bytes:
         """Codes [S, 3] of what became of rays at each voxel set in ``surface``, in their order."""
@@ -166,18 +167,6 @@ class Observations:
         rows = self.arrays.rows[self.arrays.places[used]][ended]
         voxels = self.arrays.voxels[rows]
         return outcome_codes(np.stack([voxels[name] for name in _RECORD], axis=1))
-
-    def margins(self, surface: Bytes) -> tuple[Bytes, Bytes]:
-        """Hits [S] and margins [S, 6] of each voxel set in ``surface``, in their order.
-
-        See :class:`triquad_map.compiled.evidence.margins.SeenMargins`.
-        """
-        used = used_blocks(surface)
-        surface, places = surface[used], self.arrays.places[used]
-        count = int(surface_counts(surface).sum())
-        hits, margins = np.empty(count, np.uint8), np.empty((count, len(MARGIN_BITS)), np.uint8)
-        fill_margins(surface, self.arrays._replace(places=places), hits, margins)
-        return hits, margins
 
     def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""

@@ -1,0 +1,66 @@
+"""What rays tell of each surface voxel: how well it is supported, and where in it they ended."""
+
+from typing import NamedTuple
+
+from triquad_format.records.arrays import Bytes
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES
+
+from triquad_map.compiled.evidence.observed import EIGHTHS, Observed, ObservedVoxel
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.voxel_index import SHIFT
+from triquad_map.surface import LEAST_STRENGTH, LEVELS, SECTORS_COUNTED
+
+MOST_HITS = 255
+
+
+class Support(NamedTuple):
+    """What rays tell of surface voxels [S], as kernels take it."""
+
+    levels: Bytes  # [S] how well each is supported
+    hits: Bytes  # [S] scans of which rays ended in it, up to ``MOST_HITS``
+    margins: Bytes  # [S, 6] quarters of it on each side, at the end of which no ray ended
+
+
+@kernel(inline="always")
+def _level(voxel: ObservedVoxel) -> int:
+    """The level of a voxel; each scan in a row that contradicts it takes one off."""
+    sectors = 0
+    for sector in range(8):
+        sectors += voxel.sectors >> sector & 1
+    strength = voxel.weight * (0.5 + 0.5 * min(SECTORS_COUNTED, max(1, sectors)))
+    level = 0
+    while level < LEVELS - 1 and strength >= LEAST_STRENGTH * (1 << level):
+        level += 1
+    return max(min(1, level), level - int(voxel.pass_scans))
+
+
+@kernel(inline="always")
+def _margin(eighths: int) -> int:
+    """The margin of a side beside which no ray ended in so many eighths of the voxel.
+
+    It is told as less by an eighth at least.
+    """
+    return max(eighths - 1, 0) >> 1
+
+
+@kernel()
+def fill_support(surface: Bytes, observed: Observed, support: Support) -> None:
+    """Fill in the ``support`` of the voxels of ``surface``, in their order."""
+    at = 0
+    for block in range(len(surface)):
+        place = observed.places[block]
+        for byte in range(BLOCK_BYTES):
+            bits = int(surface[block, byte])
+            if bits == 0:
+                continue
+            for z in range(BLOCK_VOXELS):
+                if bits >> z & 1:
+                    voxel = observed.voxels[observed.rows[place, byte << SHIFT | z]]
+                    support.levels[at] = _level(voxel)
+                    support.hits[at] = min(voxel.hits, MOST_HITS)
+                    for axis in range(3):
+                        beyond = EIGHTHS - 1 - voxel.highest[axis]
+                        support.margins[at, axis] = _margin(voxel.lowest[axis])
+                        support.margins[at, axis + 3] = _margin(beyond)
+                    at += 1
