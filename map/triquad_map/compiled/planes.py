@@ -32,7 +32,7 @@ def add_points(m: Doubles, at: tuple[float, float, float], count: float) -> None
 
 
 @kernel()
-def plane_normal(m: Doubles, normal: Doubles) -> bool:
+def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
     """The unit normal, of either sign, of the plane of points with the moments ``m``.
 
     False: they lie in none, and ``normal`` [3] means nothing.
@@ -59,14 +59,15 @@ def plane_normal(m: Doubles, normal: Doubles) -> bool:
     if least > _MAX_THICKNESS**2 * middle or middle < _MIN_WIDTH**2 * greatest:
         return False
     # The eigenvector is orthogonal to the rows of (A - least I): take their longest cross product.
-    rows = np.array([[xx - least, xy, xz], [xy, yy - least, yz], [xz, yz, zz - least]])
+    rows = ((xx - least, xy, xz), (xy, yy - least, yz), (xz, yz, zz - least))
     longest = 0.0
     for i in range(3):
-        cross = np.cross(rows[i], rows[(i + 1) % 3])
-        length = (cross * cross).sum()
-        if length > longest:
-            longest = length
-            normal[:] = cross
+        u, v = rows[i], rows[(i + 1) % 3]
+        x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+        squared = x * x + y * y + z * z
+        if squared > longest:
+            longest = squared
+            normal[0], normal[1], normal[2] = x, y, z
     if longest == 0.0:
         return False
     normal /= np.sqrt(longest)

@@ -56,10 +56,10 @@ def _add(
 
 
 @kernel()
-def _gather(row: int, cell_m: float, index: Index, moments: Floats, total: Doubles) -> None:
+def _gather(row: int, cell_m: float, index: Index, moments: Floats) -> tuple[float, ...]:
     """Sum the moments of the 27 cells around that of a row, relative to its centre."""
-    total[:] = 0
     x, y, z = unpack(index.row_keys[row])
+    n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
@@ -68,17 +68,18 @@ def _gather(row: int, cell_m: float, index: Index, moments: Floats, total: Doubl
                     continue
                 m = moments[near]
                 a, b, c = i * cell_m, j * cell_m, k * cell_m
-                n = m[0]
-                total[0] += n
-                total[1] += m[1] + n * a
-                total[2] += m[2] + n * b
-                total[3] += m[3] + n * c
-                total[4] += m[4] + 2 * a * m[1] + n * a * a
-                total[5] += m[5] + a * m[2] + b * m[1] + n * a * b
-                total[6] += m[6] + a * m[3] + c * m[1] + n * a * c
-                total[7] += m[7] + 2 * b * m[2] + n * b * b
-                total[8] += m[8] + b * m[3] + c * m[2] + n * b * c
-                total[9] += m[9] + 2 * c * m[3] + n * c * c
+                count, mx, my, mz = float(m[0]), float(m[1]), float(m[2]), float(m[3])
+                n += count
+                sx += mx + count * a
+                sy += my + count * b
+                sz += mz + count * c
+                xx += m[4] + 2 * a * mx + count * a * a
+                xy += m[5] + a * my + b * mx + count * a * b
+                xz += m[6] + a * mz + c * mx + count * a * c
+                yy += m[7] + 2 * b * my + count * b * b
+                yz += m[8] + b * mz + c * my + count * b * c
+                zz += m[9] + 2 * c * mz + count * c * c
+    return n, sx, sy, sz, xx, xy, xz, yy, yz, zz
 
 
 @kernel()
@@ -101,10 +102,9 @@ def _outdated(rows: Ints, normals: Doubles, moments: Floats, basis: Floats) -> I
 @kernel()
 def _estimate(rows: Ints, cell_m: float, index: Index, moments: Floats, normals: Floats) -> None:
     """Set the normals [cells, 3] of cells; NaN where there is no plane."""
-    total, normal = np.empty(MOMENTS), np.empty(3)
+    normal = np.empty(3)
     for row in rows:
-        _gather(row, cell_m, index, moments, total)
-        if not plane_normal(total, normal):
+        if not plane_normal(_gather(row, cell_m, index, moments), normal):
             normal[:] = np.nan
         normals[row] = normal
 
