@@ -296,9 +296,15 @@ class LiveRegion:
 
     @property
     def batch(self) -> int:
-        """Samples of a step: fewer where little learns, or it would take too few steps."""
-        wanted = self.field.vertices_that_learn // _VERTICES_PER_SAMPLE
-        return min(self._training.batch, max(_LEAST_BATCH, wanted))
+        """Samples of a step: fewer where little learns, or it would take too few steps.
+
+        And half while scans stream in: of as many samples, more and smaller steps learn sooner.
+        """
+        most = self._training.batch
+        wanted = min(most, self.field.vertices_that_learn // _VERTICES_PER_SAMPLE)
+        if self.budget.learns_newest:
+            wanted //= 2
+        return min(most, max(_LEAST_BATCH, wanted))
 
     def train(self) -> float | Tensor:
         """One optimiser step; returns the loss: to read it on a GPU waits for the step."""

@@ -31,6 +31,11 @@ class TrainingBudget:
         self._repair = 0  # and those in places that have forgotten
         self._new_rays = 0  # since nothing was owed
 
+    @property
+    def learns_newest(self) -> bool:
+        """Whether rays of the newest scan have yet to be learnt from."""
+        return self._fresh > 0
+
     def add(self, rays: int) -> None:
         """There are new rays to learn from."""
         if self.samples == 0:

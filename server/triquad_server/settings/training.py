@@ -14,7 +14,8 @@ class TrainingSettings(BaseModel):
 
     batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
     """Samples per step, at most: it is one for each 14 vertices of a region, and at least 4096, so
-    that a street learns alike in one region and across several."""
+    that a street learns alike in one region and across several. While scans stream in, it is half
+    of that: of as many samples, more and smaller steps learn sooner."""
 
     learning_rate: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Learning rate of Adam, before it cools."""
@@ -35,7 +36,7 @@ class TrainingSettings(BaseModel):
     pool_bytes: Annotated[int, Field(ge=10_000, le=2**50)] = 500_000_000
     """Bytes of all rays that are kept; a map too large for that keeps fewer for each voxel."""
 
-    fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.25
     """Share of a batch that is drawn from the newest scans while they stream in."""
 
     samples_per_ray: Annotated[float, Field(ge=0, le=1000)] = 48.0

@@ -43,7 +43,7 @@ def measure_core(made: BenchStreet) -> list[Figure]:
             seconds(partial(mapper.ingest, scan.points, scan.world_from_sensor))
             for scan in made.scans
         ]
-        for _ in range(200):
+        for _ in range(400):  # so that no rays are new any more
             mapper.train()
         epoch = mapper.publish()
         points = seen_points(epoch, made, np.random.default_rng(0))
