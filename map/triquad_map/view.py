@@ -84,5 +84,6 @@ class MeshedView(MapView, Protocol):
         """Whether points [N, 3] lie where rays ended.
 
         That is within ``reach_m`` of a voxel in which they did, on each axis, and on no side of it
-        beyond the last end, unless the surface goes on in a voxel there.
+        beyond the last end, unless the surface goes on in a voxel there, or so few scans hit it
+        that all may have missed what lies beyond.
         """

@@ -98,7 +98,8 @@ class Evidence:
     """[S, 6] On each side of each surface voxel, how many quarters of it lie beyond all ends.
 
     In the order of :func:`seen_voxels`; the sides towards lesser x, y, z, then towards greater
-    ones. 0 as well where the surface goes on beyond that side; ``None``: not known.
+    ones. 0 as well where the surface goes on beyond that side, or too few scans hit the voxel to
+    tell; ``None``: not known.
     """
 
 

@@ -91,9 +91,10 @@ class TrainingBudget:
 
     def spend(self, step: Step) -> None:
         """A step was taken."""
-        self._fresh -= step.fresh
         self._repair -= step.repair
         self.samples = max(0, self.samples - step.samples)
+        # Of a tiny share no batch has a whole sample: the rest ends with the budget.
+        self._fresh = self._fresh - step.fresh if self.samples else 0
 
     def _cooling(self, rays: int) -> float:
         """Share of the learning rate: falls as the budget is used up, so that the field settles.

@@ -52,6 +52,19 @@ def test_as_many_samples_are_on_new_rays_as_the_setting_says() -> None:
     assert fresh == 50_000
 
 
+def test_the_newest_scan_is_learnt_from_for_a_while_whatever_its_share() -> None:
+    for share in (0.5, 1e-5):
+        budget = TrainingBudget(SETTINGS.model_copy(update={"fresh_share": share}))
+        budget.limit(10**12)
+        budget.add(10_000)
+        learnt = [budget.learns_newest]
+        while budget.samples:
+            budget.spend(budget.next_step(BATCH, 10_000))
+            learnt.append(budget.learns_newest)
+        assert learnt[0]
+        assert not learnt[-1]
+
+
 def test_no_more_is_owed_than_may_be_and_the_rest_is_counted() -> None:
     budget = budget_of(10_000, most=30_000)
     assert (budget.samples, budget.discarded) == (30_000, 70_000)
