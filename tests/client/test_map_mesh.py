@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.exact_maps import SEEN_M, exact_map, table
+from scipy.spatial import cKDTree
+from support.exact_maps import SEEN_M, exact_map, flat, table
+from support.map_records import with_margins
 from triquad_client import ClosedError, InvalidInputError, Mesh, OfflineMap, open_map
 from triquad_client.offline import map_mesh
 from triquad_format.mapfile.writer import write_map
@@ -71,6 +73,22 @@ def test_far_regions_are_meshed_as_near_ones() -> None:
 
     near, far = (mesh_of(at(index), cell_m=0.2) for index in (0, 2**31 - 1))
     assert len(near.faces) == len(far.faces) > 10_000
+
+
+def test_surface_is_where_the_mesh_has_faces() -> None:
+    with OfflineMap(with_margins(exact_map(flat(0.1)))) as offline:
+        middles = centroids(offline.mesh())
+        assert offline.has_surface(middles).all()
+        x, y = np.random.default_rng(0).uniform(-SEEN_M - 1, SEEN_M + 1, (2, 2_000))
+        points = np.stack([x, y, np.full(len(x), 0.1)], axis=1)
+        has = offline.has_surface(points)
+        with pytest.raises(InvalidInputError, match="points"):
+            offline.has_surface(points[:, :2])
+    to_face_m, _ = cKDTree(middles).query(points)
+    assert to_face_m[has].max() < 0.15, "cells of 0.1 m"
+    beside = np.abs(points[:, :2]).max(axis=1) > SEEN_M + 0.05
+    assert not has[beside].any()
+    assert has[~beside].mean() > 0.7
 
 
 def test_progress_is_told() -> None:

@@ -29,7 +29,7 @@ MAX_FACES = 50_000_000
 BLOCK_CELLS = 64
 """Along each side of a block, as in the tiles of a server's mesh."""
 
-_REACH_LEAVES = 0.1  # how far beside a voxel with seen surface the middle of a face may lie
+REACH_LEAVES = 0.1  # how far beside a voxel with seen surface the middle of a face may lie
 _CELL_LEAVES = 0.5
 
 Report = Callable[[int, int], None]
@@ -70,7 +70,7 @@ class MeshBlocks:
         self.side_m = BLOCK_CELLS * cell_m
         """Of a block."""
         self._leaf_m = seen.settings.leaf_m
-        self._reach_m = (0.5 + _REACH_LEAVES) * self._leaf_m + cell_m / 2  # to a cell's middle
+        self._reach_m = (0.5 + REACH_LEAVES) * self._leaf_m + cell_m / 2  # to a cell's middle
         middles = surface_voxels(seen)
         margin_m = 2 * self._reach_m
         if fill_m > 0:
@@ -112,7 +112,7 @@ class MeshBlocks:
         surface = _marched(volume, cells)
         vertices = (origin + surface.vertices) * self.cell_m
         middles = vertices[surface.faces].mean(axis=1)
-        reach_m = _REACH_LEAVES * self._leaf_m
+        reach_m = REACH_LEAVES * self._leaf_m
         seen = are_seen(self._view, middles, self.cell_m, reach_m)
         if self._fill_m == 0:
             return Mesh(vertices, surface.faces[seen], self._view.epoch)

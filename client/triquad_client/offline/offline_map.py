@@ -6,22 +6,30 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import ArrayLike
 from triquad_format.errors import RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.reader import read_map_file
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_map.questions.answers import Answers, QuestionLimits
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
 
+from triquad_client import checks
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.call import Batch, BlockingDriver, Call, ResultT
-from triquad_client.offline.map_mesh import MeshBlocks, Report, map_mesh, mesh_blocks
+from triquad_client.offline.map_mesh import (
+    REACH_LEAVES,
+    MeshBlocks,
+    Report,
+    map_mesh,
+    mesh_blocks,
+)
 
 _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
 """Nobody else waits."""
@@ -133,6 +141,19 @@ class OfflineMap(MapQueries):
     def surface_voxels(self) -> Doubles:
         """Middles [N, 3] of the voxels in which rays ended, metres, map frame."""
         return surface_voxels(self._seen)
+
+    def has_surface(self, points: ArrayLike) -> Bools:
+        """Whether :meth:`mesh` may have faces [N] at ``points`` [N, 3], metres, map frame.
+
+        It has where the field is zero within a tenth of a leaf of a voxel in which rays ended, and
+        not beside where they ended in it.
+
+        Raises:
+            InvalidInputError: the points are not [N, 3], or not finite.
+            ClosedError: the map was closed.
+        """
+        view = self._opened().view
+        return view.near_ends(checks.query_points(points), REACH_LEAVES * self.leaf_m)
 
     def _answer(self, call: Call[ResultT]) -> ResultT:
         return self._opened().run(call)

@@ -116,7 +116,8 @@ def surface_points(opened: "OfflineMap") -> Doubles:
     """Points ``[N, 3]`` where the field is zero, at most one for each voxel where rays ended.
 
     The middles of these voxels are moved along the gradient by Newton's method. Those that have
-    not come to a zero within a voxel's diagonal, at which the map says ``SURFACE``, are left out.
+    not come to a zero within a voxel's diagonal, and to one where the mesh may have faces, are left
+    out: beside where rays ended the field may cross zero anywhere.
     """
     leaf_m = opened.leaf_m
     middles = opened.surface_voxels()
@@ -126,7 +127,7 @@ def surface_points(opened: "OfflineMap") -> Doubles:
     for _ in range(_STEPS):
         answer = opened.query_sdf(points[under_way], gradient=True)
         there = np.abs(answer.sdf) <= NEAR_ENOUGH_M
-        arrived[under_way[there & (answer.status == Status.SURFACE)]] = True
+        arrived[under_way[there]] = True
         sdf, gradient, under_way = answer.sdf[~there], answer.gradient[~there], under_way[~there]
         slope = np.maximum(np.linalg.norm(gradient, axis=1), _LEAST_SLOPE)
         length = np.minimum(np.abs(sdf) / slope, leaf_m / 2)
@@ -134,7 +135,7 @@ def surface_points(opened: "OfflineMap") -> Doubles:
         distance = np.linalg.norm(points[under_way] - middles[under_way], axis=1)
         under_way = under_way[distance <= math.sqrt(3) * leaf_m]
     found: Doubles = points[arrived]
-    return found
+    return found[opened.has_surface(found)]
 
 
 def print_diff(diff: MapDiff, limit: int) -> None:
