@@ -72,6 +72,26 @@ def test_a_wall_through_which_rays_pass_is_taken_back(rng: np.random.Generator) 
     assert (frozen.status(wall, reach=0.0) == 1).mean() > 0.99  # free
 
 
+def test_single_rays_that_end_where_a_wall_was_are_no_new_surface(
+    rng: np.random.Generator,
+) -> None:
+    watched = Watched()
+    wall = panel(rng, WALL_X)
+    for _ in range(10):
+        watched.scan(wall)
+    while watched.believed(wall) > 0:
+        watched.scan(behind(wall, 200.5))
+
+    def new_surface(ends: Doubles) -> int:
+        watched.scans += 1
+        sighting = Sighting(SENSOR, 0.2, watched.scans, scan=watched.scans)
+        return watched.evidence.new_surface(watched.evidence.mark_surface(ends, sighting), 10)
+
+    strays = wall[:5]
+    assert new_surface(strays) == 0
+    assert [new_surface(strays) for _ in range(3)] == [0, 5, 5]
+
+
 def test_a_wall_that_rays_reach_stays_for_ever(rng: np.random.Generator) -> None:
     watched, facing = Watched(), np.array([1.0, 0, 0])
     for _ in range(100):

@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from support.exact_maps import SETTINGS, exact_map, flat, table
 from support.small_world import settings, settle, world
+from triquad_format.records.region import seen_voxels
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
 from triquad_server.epochs.epoch import Epoch
@@ -230,6 +231,35 @@ def test_a_few_voxels_count_where_the_surface_left_them(height_m: float, tiles: 
     cache.refresh(ground(table(0.21, height_m, 1.6)))
     made = make_all(cache)
     assert {x for x, _, _ in made} == {y for _, y, _ in made} == tiles
+
+
+def cut(quarters: int) -> Epoch:
+    """A ground in whose last voxels towards greater x no ray ended so far from that side."""
+    record = exact_map(flat(0.3), epoch=next(_EPOCHS))
+    region = record.regions[0]
+    voxels = seen_voxels(region.evidence, region.evidence.surface)
+    margins = np.zeros((len(voxels), 6), np.uint8)
+    margins[voxels[:, 0] == voxels[:, 0].max(), 3] = quarters
+    region = replace(region, evidence=replace(region.evidence, margins=margins))
+    return Mapper(
+        "test", Settings(field=SETTINGS, mesh=MESH), "cpu", replace(record, regions=(region,))
+    ).publish()
+
+
+def test_tiles_follow_where_within_voxels_the_surface_ends() -> None:
+    cache = TileCache(MESH, TEAM)
+    cache.refresh(cut(0))
+    first = make_all(cache)
+    last = max(x for x, _, _ in surfaces(cache))
+    at_edge = {index for index in first if index[0] == last}
+    for quarters, changes in ((1, False), (3, True), (2, False), (0, True)):
+        before = surfaces(cache)
+        cache.refresh(cut(quarters))
+        made = set(make_all(cache))
+        assert bool(made) == changes
+        assert made <= at_edge
+        if made:
+            assert set(before) & at_edge <= made
 
 
 def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:

@@ -6,23 +6,22 @@ answers as if it had been seen. Only a 3-D record can tell such ghosts from surf
 All coordinates here are voxel coordinates of the region (see :mod:`triquad_format.records.region`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.region import MARGIN_BITS, seen_voxels, surface_counts
+from triquad_format.records.region import MARGIN_BITS, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
 from triquad_format.records.status import Status
 
 from triquad_map.compiled.evidence.margins import (
-    SeenMargins,
+    SurfaceEnds,
     margins_that_count,
     near_ends,
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.evidence.support import MOST_HITS
 from triquad_map.compiled.evidence.unknown_search import find_unknown
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (
@@ -93,8 +92,8 @@ class FrozenEvidence:
 
     seen: SeenVoxels
     levels: Bytes  # [S] how well each voxel in ``surface`` is supported, in their order
-    hits: Bytes  # [S] scans of which rays ended in each, and
-    margins: Bytes  # [S, 6] their margins, whether they count or not
+    scans: Bytes | None  # [S] of which rays ended in each; None: what is beyond them counts
+    beyond: Bytes  # [S, 6] quarters of each on each side, at the end of which none did
     seen_s: Longs  # [B] when a ray last ended in each block, seconds since 1970; 0: never
 
     @property
@@ -108,9 +107,12 @@ class FrozenEvidence:
         counts = surface_counts(self.surface)
         return np.cumsum(counts) - counts
 
-    @property
-    def _seen_margins(self) -> SeenMargins:
-        return SeenMargins(self.seen, self._firsts, self.hits, self.margins)
+    @cached_property
+    def margins(self) -> Bytes:
+        """[S, 6] Quarters of each voxel on each side where the surface ends; 0: it goes on."""
+        if self.scans is None:
+            return self.beyond
+        return margins_that_count(self.seen, SurfaceEnds(self._firsts, self.scans, self.beyond))
 
     @property
     def cells(self) -> Longs:
@@ -128,7 +130,7 @@ class FrozenEvidence:
 
     def near_ends(self, voxels: Doubles, reach: float) -> Bools:
         """Where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
-        return near_ends(voxels, reach, self._seen_margins)
+        return near_ends(voxels, reach, self.seen, self._firsts, self.margins)
 
     def ended_in(self, voxels: Longs) -> Bools:
         """Whether rays ended in ``voxels`` [N, 3]."""
@@ -160,17 +162,15 @@ class FrozenEvidence:
         voxels = runs + np.arange(len(runs))
         # In whole minutes: else each scan would change every part that it sees.
         seen_s = np.where(counts > 0, self.seen_s // _SEEN_STEP_S * _SEEN_STEP_S, 0)
-        record = EvidenceRecord(
+        return EvidenceRecord(
             codes[order],
             surface[used],
             free[used],
             levels=self.levels[voxels],
             seen_s=seen_s[used],
             outcomes=None if outcomes is None else outcomes[voxels],
+            margins=self.margins[voxels],
         )
-        ended_in = seen_voxels(record, record.surface)
-        margins = margins_that_count(ended_in, voxels, self._seen_margins)
-        return replace(record, margins=margins)
 
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "FrozenEvidence":
@@ -184,6 +184,6 @@ class FrozenEvidence:
         margins = record.margins
         if margins is None:
             margins = np.zeros((len(levels), len(MARGIN_BITS)), np.uint8)
-        hits = np.full(len(levels), MOST_HITS, np.uint8)  # those that a file tells count
         masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
-        return cls(SeenVoxels(side, index, *masks), levels, hits, margins, seen_s)
+        seen = SeenVoxels(side, index, *masks)
+        return cls(seen, levels, scans=None, beyond=margins, seen_s=seen_s)

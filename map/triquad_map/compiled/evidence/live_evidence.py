@@ -29,7 +29,7 @@ _MIN_CAPACITY = 256
 _FIELD_FREE = 0.3
 """A field of more voxels than this, where a surface was seen, shows none."""
 
-_LEAST_HITS = 3  # scans in which new surface was seen
+_LEAST_SCANS = 3  # in which new surface was seen
 
 
 class Marks(NamedTuple):
@@ -110,8 +110,8 @@ class LiveEvidence:
             return 0
         age = voxels["hit_scan"][rows].max() - voxels["first_scan"][rows] + 1
         rows, age = rows[age <= scans], age[age <= scans]
-        hits = voxels["hits"][rows]
-        return len(np.unique(rows[(hits >= _LEAST_HITS) & (2 * hits >= age)]))
+        scans = voxels["scans"][rows].astype(np.int64)
+        return len(np.unique(rows[(scans >= _LEAST_SCANS) & (2 * scans >= age)]))
 
     def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
         """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].

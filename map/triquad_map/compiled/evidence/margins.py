@@ -6,53 +6,129 @@ where the surface does not go on beyond that side: in between, few rays leave ga
 only where rays would have ended in it: by as many scans as hit the voxel, or one beside it.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES
 
 from triquad_map.compiled.evidence.observed import Voxel
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import LOW, byte_of, find_block, is_set
+from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, is_set, unpack
 from triquad_map.surface import MARGIN_STEP
 
 _SIDES = 6
+_MARGINS = 4  # from 0 on
 
 _CHANCE = 0.1
 """A margin counts where the chance is less that all scans missed a surface that goes on."""
 
+_BEYOND = np.array([[1 << axis, 0, 8 << axis] for axis in range(3)])
+"""The bit of the side on which a voxel lies beside another one: less, level or greater, by axis."""
 
-@kernel(inline="always")
-def _is_surface(x: int, y: int, z: int, seen: SeenVoxels) -> bool:
-    row = find_block(seen.blocks, x, y, z, seen.side)
-    return row >= 0 and is_set(seen.surface, row, x, y, z) == 1
+_BITS_SET = np.array([byte.bit_count() for byte in range(256)], np.uint8)
+
+_LEAST_SCANS = np.array(
+    # A margin begins half a step earlier than it is told.
+    [math.ceil(math.log(_CHANCE) / math.log(1 - MARGIN_STEP * (m + 0.5))) for m in range(_MARGINS)]
+)
+"""So many scans would have hit a surface that goes on, by the margin."""
+
+Scans = NDArray[np.int16]
+
+
+class SurfaceEnds(NamedTuple):
+    """Where rays ended in surface voxels [S], as kernels take it."""
+
+    firsts: Longs  # [B] number of the first surface voxel of each block
+    scans: Bytes  # [S] of which rays ended in each voxel
+    beyond: Bytes  # [S, 6] quarters of it on each side, at the end of which none did
 
 
 @kernel()
-def _goes_on(voxel: Voxel, side: int, seen: SeenVoxels) -> bool:
-    """Whether any of the nine voxels beyond a side of one has surface."""
-    axis, away = side % 3, 1 if side >= 3 else -1
-    for u in range(-1, 2):
-        for v in range(-1, 2):
-            if axis == 0:
-                x, y, z = voxel[0] + away, voxel[1] + u, voxel[2] + v
-            elif axis == 1:
-                x, y, z = voxel[0] + u, voxel[1] + away, voxel[2] + v
-            else:
-                x, y, z = voxel[0] + u, voxel[1] + v, voxel[2] + away
-            if _is_surface(x, y, z, seen):
-                return True
-    return False
+def _add_block(row: int, shift: Voxel, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
+    """Add the voxels of a block that is ``shift`` blocks from the one in ``around``."""
+    number = ends.firsts[row]
+    for byte in range(BLOCK_BYTES):
+        bits = int(seen.surface[row, byte])
+        x = (byte >> SHIFT) + shift[0] * BLOCK_VOXELS + 1
+        y = (byte & LOW) + shift[1] * BLOCK_VOXELS + 1
+        if bits != 0 and 0 <= x < len(around) and 0 <= y < len(around):
+            at = number
+            for inner in range(BLOCK_VOXELS):
+                if bits >> inner & 1:
+                    z = inner + shift[2] * BLOCK_VOXELS + 1
+                    if 0 <= z < len(around):
+                        around[x, y, z] = 1 + ends.scans[at]
+                    at += 1
+        number += _BITS_SET[bits]
 
 
-class SeenMargins(NamedTuple):
-    """The margins of all surface voxels, and what tells whether they count, as kernels take it."""
+@kernel()
+def _fill_around(row: int, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
+    """What is known of a block's voxels and those beside it: scans and 1; 0: no surface."""
+    around[:] = 0
+    x, y, z = unpack(seen.blocks.row_keys[row])
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                corner = ((x + i) << SHIFT, (y + j) << SHIFT, (z + k) << SHIFT)
+                near = find_block(seen.blocks, corner[0], corner[1], corner[2], seen.side)
+                if near >= 0:
+                    _add_block(near, (i, j, k), seen, ends, around)
 
-    seen: SeenVoxels
-    firsts: Longs  # [B] number of the first surface voxel of each block
-    hits: Bytes  # [S] scans of which rays ended in each voxel
-    margins: Bytes  # [S, 6]
+
+@kernel()
+def _look_around(voxel: Voxel, around: Scans) -> tuple[int, int]:
+    """Scans that hit a voxel or one beside it, whichever was hit most, and where surface goes on.
+
+    A bit for each side tells whether any of the nine voxels beyond it has surface.
+    """
+    most = goes_on = 0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                known = int(around[voxel[0] + i - 1, voxel[1] + j - 1, voxel[2] + k - 1])
+                if known > 0:
+                    most = max(most, known - 1)
+                    goes_on |= _BEYOND[0, i] | _BEYOND[1, j] | _BEYOND[2, k]
+    return most, goes_on
+
+
+@kernel()
+def _fill_margins(voxel: Voxel, beyond: Bytes, around: Scans, margins: Bytes) -> None:
+    """Fill in the ``margins`` [6] of a voxel, whose place in ``around`` is given."""
+    scans, goes_on = _look_around(voxel, around)
+    for side in range(_SIDES):
+        if not goes_on >> side & 1 and scans >= _LEAST_SCANS[beyond[side]]:
+            margins[side] = beyond[side]
+
+
+@kernel()
+def margins_that_count(seen: SeenVoxels, ends: SurfaceEnds) -> Bytes:
+    """The margins [S, 6] of all surface voxels; 0: none counts."""
+    margins = np.zeros((len(ends.beyond), _SIDES), np.uint8)
+    side = BLOCK_VOXELS + 2
+    around = np.zeros((side, side, side), np.int16)
+    for row in range(len(seen.surface)):
+        number = ends.firsts[row]
+        known = False  # what lies around
+        for byte in range(BLOCK_BYTES):
+            bits = int(seen.surface[row, byte])
+            for inner in range(BLOCK_VOXELS if bits else 0):
+                if not bits >> inner & 1:
+                    continue
+                if not known:
+                    _fill_around(row, seen, ends, around)
+                    known = True
+                voxel = ((byte >> SHIFT) + 1, (byte & LOW) + 1, inner + 1)
+                _fill_margins(voxel, ends.beyond[number], around, margins[number])
+                number += 1
+    return margins
 
 
 @kernel()
@@ -60,59 +136,33 @@ def _number_of(row: int, voxel: Voxel, firsts: Longs, seen: SeenVoxels) -> int:
     """The number of a surface voxel, in the block ``row``, among all."""
     last = byte_of(voxel[0], voxel[1])
     number = firsts[row]
-    for byte in range(last + 1):
-        bits = int(seen.surface[row, byte])
-        if byte == last:
-            bits &= (1 << (voxel[2] & LOW)) - 1
-        while bits:
-            bits &= bits - 1
-            number += 1
-    return int(number)
+    for byte in range(last):
+        number += _BITS_SET[seen.surface[row, byte]]
+    below = int(seen.surface[row, last]) & (1 << (voxel[2] & LOW)) - 1
+    return int(number + _BITS_SET[below])
 
 
 @kernel()
-def _most_hits(voxel: Voxel, known: SeenMargins) -> int:
-    """Scans that hit a voxel or one of those around it, whichever was hit most."""
-    seen, most = known.seen, 0
-    for x in range(voxel[0] - 1, voxel[0] + 2):
-        for y in range(voxel[1] - 1, voxel[1] + 2):
-            for z in range(voxel[2] - 1, voxel[2] + 2):
-                row = find_block(seen.blocks, x, y, z, seen.side)
-                if row >= 0 and is_set(seen.surface, row, x, y, z):
-                    number = _number_of(row, (x, y, z), known.firsts, seen)
-                    most = max(most, int(known.hits[number]))
-    return most
-
-
-@kernel(inline="always")
-def _is_sure(margin: int, hits: int) -> bool:
-    """Whether so many scans would have hit a surface that goes on in a margin."""
-    left = 1 - MARGIN_STEP * (margin + 0.5)  # of the voxel: the margin begins so much earlier
-    return bool(left**hits < _CHANCE)
-
-
-@kernel()
-def _holds(point: Doubles, voxel: Voxel, number: int, known: SeenMargins) -> bool:
-    """Whether a point near a voxel lies in none of its margins that count."""
+def _holds(point: Doubles, voxel: Voxel, margins: Bytes) -> bool:
+    """Whether a point near a voxel lies in none of its ``margins`` [6]."""
     for side in range(_SIDES):
-        margin = known.margins[number, side]
         inside = point[side % 3] - voxel[side % 3]
         depth = inside if side < 3 else 1 - inside
-        if margin == 0 or depth >= margin * MARGIN_STEP or _goes_on(voxel, side, known.seen):
-            continue
-        if _is_sure(margin, _most_hits(voxel, known)):
+        if margins[side] > 0 and depth < margins[side] * MARGIN_STEP:
             return False
     return True
 
 
 @kernel()
-def near_ends(points: Doubles, reach: float, known: SeenMargins) -> Bools:
+def near_ends(
+    points: Doubles, reach: float, seen: SeenVoxels, firsts: Longs, margins: Bytes
+) -> Bools:
     """Whether ``points`` [N, 3] lie within ``reach`` of surface voxels, and not in their margins.
 
-    All is in voxels. The reach is on each axis, and beyond sides without a margin.
+    All is in voxels. The reach is on each axis, and beyond sides without a margin. ``firsts`` [B]
+    are the numbers of the first surface voxel of each block, ``margins`` [S, 6] those that count.
     """
     near = np.zeros(len(points), np.bool_)
-    seen = known.seen
     for i in range(len(points)):
         x0, y0, z0 = np.floor(points[i] - reach)
         x1, y1, z1 = np.floor(points[i] + reach)
@@ -122,23 +172,6 @@ def near_ends(points: Doubles, reach: float, known: SeenMargins) -> Bools:
                     row = -1 if near[i] else find_block(seen.blocks, x, y, z, seen.side)
                     if row >= 0 and is_set(seen.surface, row, x, y, z):
                         voxel = (x, y, z)
-                        number = _number_of(row, voxel, known.firsts, seen)
-                        near[i] = _holds(points[i], voxel, number, known)
+                        number = _number_of(row, voxel, firsts, seen)
+                        near[i] = _holds(points[i], voxel, margins[number])
     return near
-
-
-@kernel()
-def margins_that_count(voxels: Longs, numbers: Longs, known: SeenMargins) -> Bytes:
-    """The margins [S, 6] of ``voxels`` [S, 3], whose ``numbers`` [S] are known; 0: none counts."""
-    told = np.zeros((len(voxels), _SIDES), np.uint8)
-    for i in range(len(voxels)):
-        voxel = (voxels[i, 0], voxels[i, 1], voxels[i, 2])
-        hits = -1  # until a margin needs it
-        for side in range(_SIDES):
-            margin = known.margins[numbers[i], side]
-            if margin == 0 or _goes_on(voxel, side, known.seen):
-                continue
-            hits = _most_hits(voxel, known) if hits < 0 else hits
-            if _is_sure(margin, hits):
-                told[i, side] = margin
-    return told

@@ -8,6 +8,7 @@ from triquad_format.records.region import MARGIN_BITS, surface_counts, used_bloc
 
 from triquad_map.compiled.evidence.observed import (
     EIGHTHS,
+    MOST_SCANS,
     OBSERVED_VOXEL,
     Observed,
     is_flat,
@@ -155,8 +156,8 @@ class Observations:
         used = used_blocks(surface)
         surface, places = surface[used], self.arrays.places[used]
         count = int(surface_counts(surface).sum())
-        margins = np.empty((count, len(MARGIN_BITS)), np.uint8)
-        support = Support(np.empty(count, np.uint8), np.empty(count, np.uint8), margins)
+        beyond = np.empty((count, len(MARGIN_BITS)), np.uint8)
+        support = Support(np.empty(count, np.uint8), np.empty(count, np.uint8), beyond)
         fill_support(surface, self.arrays._replace(places=places), support)
         return support
 
@@ -217,6 +218,9 @@ class Observations:
             outcomes = np.zeros((len(levels), len(_RECORD)), np.uint8)
         for name, counts in zip(_RECORD, outcome_counts(outcomes).T, strict=True):
             voxels[name] = counts
+        # The margins that a file tells count, however few scans its hits stand for.
+        is_sure = margins.any(axis=1)
+        voxels["scans"] = np.where(is_sure, MOST_SCANS, np.minimum(voxels["hits"], MOST_SCANS))
         observations = cls(len(surface))
         observations._places, observations._rows = 1 + len(used), 1 + len(levels)
         observations.arrays = arrays

@@ -17,12 +17,13 @@ OBSERVED_VOXEL = np.dtype(
         ("normal", np.float32, 3),  # of the surface; 0 where it is not known or not flat
         ("lowest", np.uint8, 3),  # eighths of the voxel in which any of its rays ended, and
         ("highest", np.uint8, 3),  # the last of these, on each axis
+        ("scans", np.uint8),  # of which rays ended on the surface that is there now, to MOST_SCANS
         ("towards", np.float32, 3),  # from the last end to the sensor, voxels
         ("spread", np.float32),  # mean squared distance of the ends from their mean, voxels
         ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
         ("weight", np.float32),  # these rays, the near ones counting more
         ("sectors", np.int32),  # a bit for each eighth of the horizon looked from
-        ("hits", np.int32),  # scans of which rays ended there
+        ("hits", np.int32),  # scans of which rays ended there, whatever surface it was
         ("first_scan", np.int32),  # of which a ray ended on the surface that is there now
         ("hit_scan", np.int32),  # the last of which a ray ended there
         ("passed_scan", np.int32),  # the last of which a ray passed, and none ended there
@@ -36,6 +37,7 @@ OBSERVED_VOXEL = np.dtype(
 )
 
 EIGHTHS = 8
+MOST_SCANS = 255
 
 ObservedVoxel = Any
 """A record of OBSERVED_VOXEL."""
@@ -57,7 +59,7 @@ Vector = tuple[float, float, float]
 @kernel(inline="always")
 def forget_ends(voxel: ObservedVoxel) -> None:
     """From now on, no ray ended in a voxel."""
-    voxel.weight = voxel.ends = 0
+    voxel.weight = voxel.ends = voxel.scans = 0
     voxel.sectors = 0
     for axis in range(3):
         voxel.lowest[axis], voxel.highest[axis] = EIGHTHS - 1, 0

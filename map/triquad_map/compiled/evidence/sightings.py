@@ -10,6 +10,7 @@ from triquad_format.records.arrays import Doubles, Ints
 
 from triquad_map.compiled.evidence.observed import (
     EIGHTHS,
+    MOST_SCANS,
     Observed,
     ObservedVoxel,
     Vector,
@@ -60,6 +61,7 @@ def _begin_hit(voxel: ObservedVoxel, scan: int) -> None:
         return
     voxel.hit_scan = scan
     voxel.hits += 1
+    voxel.scans = min(voxel.scans + 1, MOST_SCANS)
     if voxel.ends > 0:  # else they passed while nothing was there
         voxel.earlier_passes += voxel.passes
         voxel.earlier_misses += voxel.misses

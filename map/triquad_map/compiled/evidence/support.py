@@ -11,15 +11,13 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import SHIFT
 from triquad_map.surface import LEAST_STRENGTH, LEVELS, SECTORS_COUNTED
 
-MOST_HITS = 255
-
 
 class Support(NamedTuple):
     """What rays tell of surface voxels [S], as kernels take it."""
 
     levels: Bytes  # [S] how well each is supported
-    hits: Bytes  # [S] scans of which rays ended in it, up to ``MOST_HITS``
-    margins: Bytes  # [S, 6] quarters of it on each side, at the end of which no ray ended
+    scans: Bytes  # [S] of which rays ended in it, up to ``MOST_SCANS``
+    beyond: Bytes  # [S, 6] quarters of it on each side, at the end of which no ray ended
 
 
 @kernel(inline="always")
@@ -36,10 +34,10 @@ def _level(voxel: ObservedVoxel) -> int:
 
 
 @kernel(inline="always")
-def _margin(eighths: int) -> int:
-    """The margin of a side beside which no ray ended in so many eighths of the voxel.
+def _quarters(eighths: int) -> int:
+    """How many quarters of a voxel are told of so many eighths in which no ray ended.
 
-    It is told as less by an eighth at least.
+    They are less by an eighth at least.
     """
     return max(eighths - 1, 0) >> 1
 
@@ -58,9 +56,9 @@ def fill_support(surface: Bytes, observed: Observed, support: Support) -> None:
                 if bits >> z & 1:
                     voxel = observed.voxels[observed.rows[place, byte << SHIFT | z]]
                     support.levels[at] = _level(voxel)
-                    support.hits[at] = min(voxel.hits, MOST_HITS)
+                    support.scans[at] = voxel.scans
                     for axis in range(3):
-                        beyond = EIGHTHS - 1 - voxel.highest[axis]
-                        support.margins[at, axis] = _margin(voxel.lowest[axis])
-                        support.margins[at, axis + 3] = _margin(beyond)
+                        above = EIGHTHS - 1 - voxel.highest[axis]
+                        support.beyond[at, axis] = _quarters(voxel.lowest[axis])
+                        support.beyond[at, axis + 3] = _quarters(above)
                     at += 1
