@@ -1,5 +1,7 @@
 """Surfels follow the field and the evidence, as if they were always made anew."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from support import small_world
@@ -175,6 +177,33 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
         np.testing.assert_allclose(nearest(surfels, points[:1]).distances, 3.0)
         assert rounds < 10
     assert rounds > 1
+
+
+def test_where_the_voxel_goes_in_which_its_surface_lay_a_voxel_has_its_own():
+    evidence = LiveEvidence(SIDE)
+    evidence.mark_surface(np.array([[20.9, 30.5, 30.5], [21.3, 30.5, 30.5], [40.5, 30.5, 30.5]]))
+    field = plane(np.array([1.0, 0, 0]), 21.3)
+    surfels = first_surfels(evidence.freeze(), field, 1)
+    kinds = [SurfelKind.NONE, SurfelKind.DISC, SurfelKind.POINT]
+    assert surfels.surfels.kinds.tolist() == kinds
+    evidence.clear(np.array([21.0, 30, 30]), np.array([22.0, 31, 31]))
+    after = surfels.updated(evidence.freeze(), field, 2, most=0)
+    anew = first_surfels(evidence.freeze(), field, 2)
+    assert after.surfels.kinds.tolist() == anew.surfels.kinds.tolist() == [SurfelKind.POINT] * 2
+    np.testing.assert_array_equal(after.surfels.offsets, anew.surfels.offsets)
+
+
+def test_what_rays_alone_show_each_further_ray_shows_better():
+    evidence = LiveEvidence(SIDE)
+    field = plane(np.array([1.0, 0, 0]), 21.3)
+    surfels = first_surfels(evidence.freeze(), field, 0)
+    for scan, x in enumerate([40.1, 40.6, 40.6, 40.6], start=1):
+        sighting = Sighting(np.array([63.0, 30.5, 30.5]), 0.2, stamp_s=1, scan=scan)
+        evidence.mark_surface(np.array([[x, 30.5, 30.5]]), sighting)
+        by_rays = partial(evidence.ray_surfels, since=1)
+        surfels = surfels.updated(evidence.freeze(), field, scan, most=0, by_rays=by_rays)
+    assert surfels.surfels.kinds.tolist() == [SurfelKind.RAY_POINT]
+    np.testing.assert_allclose(surfels.surfels.offsets[0], (0.475 - 0.5, 0, 0), atol=1e-5)
 
 
 def surfels_of(region, mapper_settings):

@@ -133,6 +133,7 @@ class LiveRegion:
         self.changed = True  # since it was last published
         self._restored = False  # and not published since: where surfaces lie is in the field alone
         self._scans = 0  # that it was seen in
+        self._scans_learnt = 0  # of these, those before it was trained last
         self._marks: Marks | None = None  # of the newest
         self._passed: list[Ints] = []  # where rays passed a surface since it was last published
         self._gone: list[Longs] = []  # voxels whose surface went since it was last published
@@ -314,6 +315,7 @@ class LiveRegion:
         loss = self._trainer.train(batch, step.rates)
         self.budget.spend(step)
         self._field_state = object()
+        self._scans_learnt = self._scans
         self._unjudged_samples += step.samples
         self.learnt.trained(step.samples / self.pool.rays_drawn_on)
         self._slopes.after(step)
@@ -441,7 +443,8 @@ class LiveRegion:
         is_fitted = before is not None and before.surfels_fitted_to is self._field_state
         if self.budget.samples or is_fitted:
             most = _SURFELS_REFITTED if self.budget.samples else 0
-            shown = partial(self.evidence.ray_surfels, since=self._scans - _NEW_SCANS)
+            since = max(1, self._scans_learnt - _NEW_SCANS)  # and not of before a restart
+            shown = partial(self.evidence.ray_surfels, since=since)
         if before is None:
             return first_surfels(evidence, field, epoch, shown)
         return before.surfels.updated(evidence, field, epoch, most=most, by_rays=shown)

@@ -25,9 +25,9 @@ NEW = {
 
 
 class Seen:
-    """A map of an empty place in which something has just been seen by one scan."""
+    """A map of an empty place in which something has just been seen, by one scan or a few."""
 
-    def __init__(self, solid: Solid, steps: int) -> None:
+    def __init__(self, solid: Solid, steps: int, scans: int = 1) -> None:
         mapper = Mapper("test", settings(samples_per_ray=6.0), "cpu")
         pose = np.eye(4)
         lidar = Lidar(columns=1024, elevation_min_deg=-45.0)
@@ -38,8 +38,10 @@ class Seen:
         settle(mapper)
         mapper.publish()
         self.scene = Scene((*WALLED, solid), WALLED_BOUNDS)
-        scan = lidar.scan(self.scene, pose, np.random.default_rng(99))
-        mapper.ingest(scan.points, pose, stamp_s=8)
+        for number in range(8, 8 + scans):
+            scan = lidar.scan(self.scene, pose, np.random.default_rng(91 + number))
+            mapper.ingest(scan.points, pose, stamp_s=number)
+            mapper.publish()
         for _ in range(steps):
             mapper.train()
         self.epoch: Epoch = mapper.publish()
@@ -98,3 +100,14 @@ def test_its_top_bears_and_never_what_lies_below(seen: Seen) -> None:
     assert stands.mean() > 0.8
     assert (np.abs(found.height_m - tops[:, 2])[stands] < VOXEL_M / 2).mean() > 0.95
     assert (found.height_m > 0.05).all()
+
+
+def test_what_is_not_trained_on_is_known_as_well_after_many_scans() -> None:
+    once, often = (Seen(NEW["box"], steps=0, scans=scans) for scans in (1, 15))
+    errors_m = []
+    for seen in (once, often):
+        points = once.hits + 0.1 * once.normals
+        found = distances(seen.epoch, points, DistanceOptions(2.0))
+        errors_m.append(np.abs(found.distance_m - once.scene.sdf(points)))
+    assert np.median(errors_m[1]) < 0.01
+    assert np.quantile(errors_m[1], 0.9) < 1.1 * np.quantile(errors_m[0], 0.9)

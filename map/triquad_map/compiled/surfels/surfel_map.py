@@ -20,7 +20,7 @@ from triquad_map.compiled.surfels.surfel_search import (
     SurfelIndex,
     find_nearest,
 )
-from triquad_map.compiled.voxel_index import LOW, SHIFT, VoxelIndex
+from triquad_map.compiled.voxel_index import LOW, SHIFT, VoxelIndex, keys_of
 from triquad_map.composition.region import NearestSurfels
 from triquad_map.surface import (
     SampleField,
@@ -34,6 +34,11 @@ from triquad_map.surface import (
 
 _FAR = 1e6  # voxels
 _NEVER = -1
+
+_UNLEARNT_REFITTED = 4_000
+"""Of surfels that rays alone show, with each epoch: there are few."""
+
+_AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 Rows = NDArray[np.intp]
 
@@ -201,7 +206,8 @@ class SurfelMap:
     ) -> "SurfelMap":
         """The surfels of a later epoch: new ones are fitted, and of the others the oldest.
 
-        At most so many of the others are fitted; ``None``: all.
+        At most so many of the others are fitted; ``None``: all. Those that rays alone show are
+        whatever ``most`` is, since further rays show them better.
         """
         fitted = _carried(self._fitted, evidence)
         rows = _outdated(fitted, most)
@@ -241,21 +247,29 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
     for name, array in vars(after.surfels).items():
         array[kept] = getattr(before.surfels, name)[rows]
     after.epochs[kept] = before.epochs[rows]
+    if len(rows) < len(before.epochs):
+        after.epochs[_beside(after, np.delete(old.voxels, rows, axis=0))] = _NEVER
     return after
+
+
+def _beside(fitted: _Fitted, gone: Longs) -> Rows:
+    """The surfels whose surface may have lain in voxels ``gone`` [N, 3] beside theirs."""
+    rows = np.flatnonzero(fitted.surfels.kinds == SurfelKind.NONE)
+    around = (gone[:, None] + _AROUND).reshape(-1, 3)
+    return rows[np.isin(keys_of(fitted.places.voxels[rows]), keys_of(around))]
 
 
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:
     """What was never fitted, and at most so many of the rest, those longest ago.
 
-    Half of these are what the field has still to learn, of which there is little: so it takes over
-    soon after it has.
+    What the field has still to learn goes first: so it takes over soon after it has.
     """
     if most is None:
         return np.arange(len(fitted.epochs))
     never = fitted.epochs == _NEVER
     unlearnt = ~never & (fitted.surfels.kinds >= SurfelKind.RAY_DISC)
-    first = _oldest(fitted, unlearnt, most // 2)
-    rest = _oldest(fitted, ~never & ~unlearnt, most - len(first))
+    first = _oldest(fitted, unlearnt, _UNLEARNT_REFITTED)
+    rest = _oldest(fitted, ~never & ~unlearnt, max(0, most - len(first)))
     return np.concatenate([np.flatnonzero(never), first, rest])
 
 
