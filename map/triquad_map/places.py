@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 
 _PLACE_LEAVES = 32.0  # side of a place
@@ -17,6 +17,15 @@ def place_keys(ends: NDArray[np.floating], settings: FieldSettings) -> Longs:
     cells = np.floor(ends / side_m).astype(np.int64) + (1 << (_AXIS_BITS - 1))
     keys: Longs = cells[:, 0] << 2 * _AXIS_BITS | cells[:, 1] << _AXIS_BITS | cells[:, 2]
     return keys
+
+
+def in_cube(ends: NDArray[np.floating], settings: FieldSettings) -> Bools:
+    """Whether rays [N] end in the region's cube, at ``ends`` [N, 3], metres from its centre.
+
+    Of one that crosses it and ends beside it, nothing is learnt where it ends.
+    """
+    inside: Bools = (np.abs(ends) < settings.region_side_m / 2).all(axis=1)
+    return inside
 
 
 @dataclass(frozen=True)

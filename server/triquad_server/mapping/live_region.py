@@ -23,6 +23,7 @@ from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples
+from triquad_map.places import in_cube
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 
 from triquad_server.array_memory import buffers_of, bytes_by_part
@@ -406,10 +407,11 @@ class LiveRegion:
 
     def _judge(self, field: FrozenField) -> None:
         """Find out where the field has forgotten what it knew, and have it learnt again."""
-        if len(self.held_out) == 0:
-            return
         self._unjudged_samples = self._unjudged_rays = 0
         rows = self.held_out.table.rows
+        rows = rows[in_cube(rows[:, END : END + 3], self._settings)]
+        if len(rows) == 0:
+            return
         ends = np.ascontiguousarray(rows[:, END : END + 3])
 
         def at_ends(points: Floats) -> Floats:

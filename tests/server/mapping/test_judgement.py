@@ -6,11 +6,12 @@ from support.small_world import settings, settle, settled_mapper, surface_error,
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT
-from triquad_map.places import place_keys
+from triquad_map.places import in_cube, place_keys
 from triquad_server.mapping.held_out import are_held_out, ends_in_steps
 from triquad_server.mapping.judgement import JudgedPlaces, Judgement
 from triquad_server.mapping.map_fit import map_fit
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.ray_table import END
 
 FIELD = FieldSettings()
 NOISE_M = 0.02
@@ -114,6 +115,18 @@ def test_rays_are_held_out_from_training_and_after_a_restart() -> None:
             assert not are_held_out(trained, settings().field).any()
         assert len(again.held_out) == pytest.approx(len(region.held_out), rel=0.01)
     assert sum(len(region.held_out) for region in mapper.regions) > 50
+
+
+def test_a_region_is_not_judged_by_rays_that_end_beside_it() -> None:
+    chosen = settings().model_copy(update={"field": FieldSettings(depth=6)})
+    mapper = settled_mapper(chosen, world())
+    mapper.publish()
+    ends = [region.held_out.table.rows[:, END : END + 3] for region in mapper.regions]
+    inside = sum(in_cube(of_region, chosen.field).sum() for of_region in ends)
+    assert inside < 0.95 * sum(map(len, ends))
+    fit = map_fit(mapper.regions)
+    assert fit is not None
+    assert fit.rays == inside
 
 
 def test_forgetting_is_found_told_and_repaired() -> None:

@@ -6,7 +6,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord, Region
 from triquad_format.records.replay_rays import are_held_out
 from triquad_map.field_fit import MapFit, PlaceFits, map_fit
-from triquad_map.places import Places
+from triquad_map.places import Places, in_cube
 from triquad_map.reference.evaluator import in_chunks
 from triquad_map.reference.region_field import RegionField
 
@@ -19,8 +19,8 @@ def recorded_fit(record: MapRecord) -> MapFit | None:
         if region.training is None:
             continue
         rays = region.training.rays
-        held_out = np.flatnonzero(are_held_out(rays.ends))
-        ends = rays.ends_m(settings)[held_out].astype(np.float32)
+        ends = rays.ends_m(settings)[are_held_out(rays.ends)].astype(np.float32)
+        ends = ends[in_cube(ends, settings)]
         if len(ends):
             fit = PlaceFits.of(Places.of(ends, settings), _field(region, settings, ends))
             fits.append((settings.region_centre(region.index), fit))
