@@ -36,6 +36,8 @@ _LEAST_RISE = 0.5
 _LEAST_RAYS = 24
 """Of a place by itself: those that have fewer are compared as one."""
 
+_NOISE = 0.1  # of rays, in leaves: where errors are less, few rays tell of it alone
+
 _TURNS = 4
 """Of one scan's rays in so many it is told where they end, of others the next time."""
 
@@ -125,15 +127,26 @@ class LearntPlaces:
         keys = self._seen
         rows = rows_of(keys, place_keys(self._ends, self._settings))
         is_seen = rows >= 0
-        groups = _with_few_as_one(rows[is_seen], len(keys))
-        group_of = groups[rows[is_seen]]
         now = field(np.ascontiguousarray(self._ends[is_seen])).astype(np.float64) ** 2
-        before = GroupMeans.of(self._squares[is_seen], group_of, len(keys) + 1)
-        after = GroupMeans.of(now, group_of, len(keys) + 1)
+        before = GroupMeans.of(self._squares[is_seen], rows[is_seen], len(keys))
+        after = GroupMeans.of(now, rows[is_seen], len(keys))
+        times = np.divide(after.means, before.means, out=np.ones(len(keys)), where=before.means > 0)
         told = (after.counts >= _LEAST_RAYS) & (before.means > 0)
-        times = np.divide(after.means, before.means, out=np.ones(len(told)), where=told)[groups]
-        told = told[groups]
+        few = after.counts < _LEAST_RAYS
+        if after.counts[few].sum() >= _LEAST_RAYS:
+            times[few] = self._times_of_few(before.means[few], after.means[few], after.counts[few])
+            told |= few
         self._follow(keys[told], times[told])
+
+    def _times_of_few(self, before: Doubles, after: Doubles, rays: Longs) -> float:
+        """How many times its mean square error before that after is, in places of few ``rays`` [P].
+
+        The logarithms are averaged: one place in which nothing can be learnt does not decide for
+        all.
+        """
+        noise = (_NOISE * self._settings.leaf_m) ** 2
+        logs = np.log((after + noise) / (before + noise))
+        return float(np.exp((logs * rays).sum() / rays.sum()))
 
     def _follow(self, keys: Longs, times: Doubles) -> None:
         """The errors of places became so many ``times`` what they were."""
@@ -171,9 +184,3 @@ class LearntPlaces:
         places["settled"] = np.where(is_first, now.means, places["settled"])
         least = np.maximum(_SURE * now.errors, _LEAST_RISE * places["settled"])
         return bool((enough & (now.means - places["settled"] > least)).any())
-
-
-def _with_few_as_one(place_of: Longs, places: int) -> Longs:
-    """The group of each of the places [P]: its own row, or P for all that have few rays."""
-    rays = np.bincount(place_of, minlength=places)
-    return np.where(rays >= _LEAST_RAYS, np.arange(places), places)

@@ -149,6 +149,21 @@ def test_places_of_few_rays_are_compared_as_one() -> None:
     assert not places.owing(scattered).any()
 
 
+def test_one_place_that_cannot_be_learnt_does_not_decide_for_all_that_have_few_rays() -> None:
+    places = LearntPlaces(FIELD)
+    scattered = RNG.uniform(-300, 300, (60, 3)).astype(np.float32)
+    owing = []
+    for step in range(8):
+        for _ in range(4):
+            places.see(scattered.astype(np.float64))
+        places.trained(VISITS)
+        said = np.full(60, max(0.025, 0.4 / 2**step))  # better by half four times
+        said[0] = 2.0  # as where leaves move
+        places.judge(scattered, said, lambda points, said=said: said[: len(points)], settled=False)
+        owing.append(places.owing(scattered).mean())
+    assert owing == [1.0] * 6 + [0.0] * 2
+
+
 def test_the_map_of_a_robot_at_rest_settles_and_learns_what_is_put_before_it() -> None:
     few = {"pool_rays": 60_000, "rays_per_voxel": 1, "max_budget_samples": 400_000}
     training = {"batch": 4096, "samples_per_voxel": 20, **few}
