@@ -107,7 +107,7 @@ def test_a_mesh_is_the_one_that_a_server_gives(map_file, tmp_path):
     for one, other in ((written, served), (served, written)):
         distances = cKDTree(other.vertices).query(one.vertices)[0]
         # But for cells that can be filled in several ways, and single faces at the border.
-        assert np.quantile(distances, 0.98) < 1e-4
+        assert np.quantile(distances, 0.99) < 1e-4
 
 
 def test_a_mesh_within_a_box(map_file, tmp_path):

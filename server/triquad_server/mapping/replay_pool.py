@@ -42,10 +42,10 @@ _BIN_LEAVES = 4.0
 _BINS = 1 << 18
 _AHEAD = 16  # places that are brought into the cache before their turn
 _NO_LIMIT = 1 << 62
-_ROOM = 1.25  # at most, of the capacity: it grows with the map
+_ROOM = 1.1  # at most, of the capacity: it grows with the map
 
-RAY_BYTES = 4 * (COLUMNS + 2)
-"""Of a ray, with where its origin and its bin are."""
+RAY_BYTES = math.ceil(_ROOM * 4 * (COLUMNS + 2))
+"""Of a ray, with where its origin and its bin are, and with the room beside it."""
 
 
 @kernel()

@@ -204,7 +204,7 @@ def test_a_restored_map_stays_until_rays_contradict_it() -> None:
     assert same.ended_in(voxels).mean() > 0.997
     watched.restart()
     watched.mapper.publish()
-    assert share(watched.scan(count=30), Status.SURFACE, front=True) < 0.05
+    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.05
 
 
 def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
