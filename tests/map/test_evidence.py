@@ -6,6 +6,7 @@ from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.evidence.sightings import Sighting
+from triquad_map.composition.region import Work
 from triquad_map.surface import LEVELS
 
 SIDE = 64
@@ -209,3 +210,24 @@ def test_voxels_marked_free_keep_their_surface() -> None:
     assert (status[at_surface] == Status.SURFACE).all()
     assert (status[inside & ~at_surface] == Status.FREE).all()
     assert (status[~inside] == Status.UNKNOWN).all()
+
+
+def test_threads_freeze_the_same_as_one() -> None:
+    ends = np.random.default_rng(4).uniform(0, SIDE, (20_000, 3))
+
+    def marked() -> LiveEvidence:
+        evidence = LiveEvidence(SIDE)
+        for scan in range(1, 4):
+            sighting = Sighting(np.full(3, 5.0 * scan), 0.2, scan, scan)
+            evidence.mark_surface(ends[:: 2 * scan], sighting)
+        return evidence
+
+    def in_parts(count: int, work: Work, least: int = 0) -> None:
+        assert count > least
+        for first in range(0, count, 100):
+            work(first, min(first + 100, count))
+
+    whole, parts = marked().freeze(), marked().freeze(in_parts)
+    for name in ("levels", "scans", "beyond"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+    assert len(np.unique(whole.levels)) > 2

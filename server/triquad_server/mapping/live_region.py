@@ -351,7 +351,7 @@ class LiveRegion:
             passed, rule = np.concatenate(self._passed), self._disbelief
             self._gone.append(self.evidence.take_back_unseen(passed, rule, samples))
             self._passed.clear()
-        evidence = self.evidence.freeze()
+        evidence = self.evidence.freeze(self._setup.team.split)
         surfels = self._surfels(evidence, samples, epoch, before)
         if self._restored:
             self.evidence.set_discs(surfels.voxels, surfels.surfels)

@@ -22,6 +22,8 @@ from triquad_map.compiled.evidence.ray_surfels import ray_surfels
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_ends
 from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
+from triquad_map.composition.field_view import in_one
+from triquad_map.composition.region import Split
 from triquad_map.surface import SampleField, Surfels
 
 _MIN_CAPACITY = 256
@@ -208,14 +210,14 @@ class LiveEvidence:
             self._seen.free[row] &= keep
         self._observations.forget(np.flatnonzero(near), self._seen.surface[: self.blocks])
 
-    def freeze(self) -> FrozenEvidence:
+    def freeze(self, split: Split = in_one) -> FrozenEvidence:
         """The evidence as it is now; the same object until anything changes."""
         if self._frozen is None:
             side, _, *masks = self._seen
             surface, free = (mask[: self.blocks].copy() for mask in masks)
             self._frozen = FrozenEvidence(
                 SeenVoxels(side, self._blocks.freeze(), surface, free),
-                *self._observations.support(surface),
+                *self._observations.support(surface, split),
                 self._observations.seen_s(self.blocks),
             )
         return self._frozen

@@ -22,11 +22,13 @@ from triquad_map.compiled.evidence.sightings import Sighting, record_ends
 from triquad_map.compiled.evidence.support import Support, fill_support
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import SHIFT, with_room
+from triquad_map.composition.region import Split
 from triquad_map.surface import LEAST_STRENGTH, SurfelKind, Surfels
 
 _VOXELS = BLOCK_VOXELS**3
 _MIN_CAPACITY = 64
 _MIN_ROWS = 1024
+_LEAST_BLOCKS = 64  # whose support a thread of its own tells sooner
 _DISC = int(SurfelKind.DISC)
 _DISC_ENDS, _DISC_SPREAD = 16.0, 0.15  # that a disc of the field stands for
 _FARTHEST_BESIDE = 0.75  # voxels from a voxel's middle to the disc of another one
@@ -151,14 +153,21 @@ class Observations:
         """
         _set_discs(voxels, surfels.offsets, surfels.normals, surfels.kinds, seen, self.arrays)
 
-    def support(self, surface: Bytes) -> Support:
+    def support(self, surface: Bytes, split: Split) -> Support:
         """What is told of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
         used = used_blocks(surface)
         surface, places = surface[used], self.arrays.places[used]
-        count = int(surface_counts(surface).sum())
+        starts = np.concatenate([[0], np.cumsum(surface_counts(surface))])
+        count = int(starts[-1])
         beyond = np.empty((count, len(MARGIN_BITS)), np.uint8)
         support = Support(np.empty(count, np.uint8), np.empty(count, np.uint8), beyond)
-        fill_support(surface, self.arrays._replace(places=places), support)
+
+        def work(first: int, last: int) -> None:
+            observed = self.arrays._replace(places=places[first:last])
+            part = Support(*(array[starts[first] : starts[last]] for array in support))
+            fill_support(surface[first:last], observed, part)
+
+        split(len(surface), work, least=_LEAST_BLOCKS)
         return support
 
     def outcomes(self, surface: Bytes) -> Bytes:
