@@ -5,7 +5,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import torch
 
 Buffers = Mapping[int, int]
 """Bytes of pieces of memory, by where they begin: arrays that share one count once."""
@@ -32,7 +31,7 @@ def buffers_of(part: object, without: Buffers = NO_BUFFERS) -> dict[int, int]:
         if isinstance(part, np.ndarray):
             root = _root(part)
             found[root.ctypes.data] = root.nbytes
-        elif isinstance(part, torch.Tensor):
+        elif hasattr(part, "untyped_storage"):  # a tensor, without need for torch
             storage = part.untyped_storage()
             found[storage.data_ptr()] = storage.nbytes()
         else:

@@ -9,13 +9,12 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 
 import numpy as np
-import torch
 from triquad_format.errors import SettingsError
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import MapRecord
 from triquad_map.questions.distance import DistanceOptions, distances
 
-from triquad_server.errors import ServerError
+from triquad_server.device import choose_device
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache
@@ -194,22 +193,6 @@ def _settings_of(record: MapRecord, settings: Settings) -> Settings:
             settings.field.leaf_m,
         )
     return kept
-
-
-def choose_device(wanted: str) -> str:
-    """The device to compute on: ``wanted``, or for "auto" a GPU where there is one.
-
-    Raises:
-        ServerError: there is no GPU, but one is wanted; or it is no device.
-    """
-    if wanted not in ("auto", "cpu", "cuda"):
-        raise ServerError(f"device {wanted!r}: use auto, cpu or cuda")
-    available = torch.cuda.is_available()
-    if wanted == "cuda" and not available:
-        raise ServerError("device cuda: no CUDA device is usable here; use cpu or auto")
-    if wanted == "auto":
-        return "cuda" if available else "cpu"
-    return wanted
 
 
 def _unless_stopped(stops: Stops, phases: Phases) -> Callable[[str], None]:

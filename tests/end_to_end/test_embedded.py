@@ -185,13 +185,23 @@ _FORGET = """
     servers.learn(client)
     watch = client.watch_mesh()
 """
+_USE_ALL = """
+    with server:
+        servers.learn(client)
+        client.settle(servers.WAIT_S)
+        client.query_sdf(servers.sphere(50), gradient=True)
+        client.query_distance(servers.sphere(50))
+        client.mesh()
+        client.checkpoint()
+        print("torch in memory:", "torch" in sys.modules)
+"""
 
 
 @contextmanager
 def program(body: str, *arguments: Path) -> Iterator["subprocess.Popen[str]"]:
     """A program that serves; killed at the end if it still runs."""
     command = [sys.executable, "-c", textwrap.dedent(_SERVE) + textwrap.dedent(body)]
-    folders = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    folders = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen(
         [*command, *map(str, arguments)],
         env=folders,
@@ -211,6 +221,13 @@ def read_until(process: "subprocess.Popen[str]", text: str) -> None:
         if text in line:
             return
     raise AssertionError(f"the program ended without {text!r}")
+
+
+def test_a_server_on_a_cpu_leaves_torch_alone(tmp_path, settings):
+    with program(_USE_ALL, tmp_path / "store", settings) as process:
+        out, errors = process.communicate(timeout=servers.WAIT_S)
+    assert process.returncode == 0, errors
+    assert "torch in memory: False" in out
 
 
 @pytest.mark.parametrize("signals", [1, 3])

@@ -72,6 +72,13 @@ def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(tmp_pa
         assert_same_map(before, ask(server.endpoint))
 
 
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="the system tells no mappings")
+def test_on_a_cpu_torch_stays_out_of_memory(arguments):
+    with servers.server_process(arguments) as server:
+        learn(server.endpoint)
+        assert "libtorch" not in Path(f"/proc/{server.process.pid}/maps").read_text()
+
+
 def test_a_restored_map_keeps_its_leaf_and_lengths_that_are_not_set_follow_it(arguments):
     with servers.server_process(arguments) as server:
         learn(server.endpoint)

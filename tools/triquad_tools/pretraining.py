@@ -7,7 +7,6 @@ import os
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server.engine.initial_mlp import PRETRAINED, random_mlp
@@ -25,9 +24,7 @@ _STREETS = range(1000, 1004)
 def main() -> None:
     """Learn one street after another, each with new features and the MLP of the one before."""
     field = Settings().field
-    mlp: Sequence[Floats] = [
-        part.numpy() for part in random_mlp(field, torch.Generator().manual_seed(0))
-    ]
+    mlp: Sequence[Floats] = random_mlp(field, np.random.default_rng(0))
     with progress("learning streets", len(_STREETS)) as report:
         for number, seed in enumerate(_STREETS):
             report(number, f"street {seed}")
@@ -52,8 +49,8 @@ def _begin_with(mlp: Sequence[Floats], field: LiveField) -> None:
     """Of the weights of Fourier features, which know a place, nothing is taken over."""
     field.mlp_steps = 0
     for part, values in zip(field.mlp, mlp, strict=True):
-        part.values[0] = torch.from_numpy(values)
-        part.steps.zero_()
+        part.values[0] = values
+        part.steps[:] = 0
     field.mlp[0].values[0, _features(field.settings) :] = 0
 
 

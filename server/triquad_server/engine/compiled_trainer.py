@@ -16,7 +16,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints
 from triquad_map.compiled.field.encoding import BATCH, PointBatch, add_feature_gradient, load
 from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
@@ -84,10 +83,10 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
     """A parameter's own memory, each row flattened."""
     count = len(parameter)
     return ParameterRows(
-        values=parameter.values.numpy().reshape(count, -1),
-        means=parameter.means.numpy().reshape(count, -1),
-        variances=parameter.variances.numpy().reshape(count, -1),
-        steps=parameter.steps.numpy(),
+        values=parameter.values.reshape(count, -1),
+        means=parameter.means.reshape(count, -1),
+        variances=parameter.variances.reshape(count, -1),
+        steps=parameter.steps,
     )
 
 
@@ -205,23 +204,30 @@ def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, 
 
 
 @kernel(fastmath=True)
-def _cross_entropy(batch: PointBatch, targets: Floats, share: float) -> float:
+def _squashed(logit: float, tail: float) -> float:
+    """A logit as a number in [0, 1]; its ``tail`` is ``exp(-abs(logit))``, which is never large."""
+    squashed: float = (np.float32(1) if logit >= 0 else tail) / (np.float32(1) + tail)
+    return squashed
+
+
+@kernel(fastmath=True)
+def _cross_entropy(batch: PointBatch, wanted: Floats, share: float) -> float:
     """Set the slopes of the batch's logits; returns the sum of the losses."""
     loss = 0.0
     batch.slopes[:] = 0
-    for t in range(len(targets)):
+    for t in range(len(wanted)):
         logit = batch.logits[t]
-        tail = np.exp(-abs(logit))  # never overflows
-        squashed = (np.float32(1) if logit >= 0 else tail) / (np.float32(1) + tail)
-        loss += max(logit, np.float32(0)) - logit * targets[t] + np.log1p(tail)
-        batch.slopes[t] = (squashed - targets[t]) * np.float32(share)
+        tail = np.exp(-abs(logit))
+        target = _squashed(wanted[t], np.exp(-abs(wanted[t])))
+        loss += max(logit, np.float32(0)) - logit * target + np.log1p(tail)
+        batch.slopes[t] = (_squashed(logit, tail) - target) * np.float32(share)
     return loss
 
 
 @kernel(fastmath=True)
 def _add_loss_gradient(
     points: Floats,
-    targets: Floats,
+    wanted: Floats,
     share: float,
     field: CompiledField,
     mlp_sums: Mlp,
@@ -229,11 +235,11 @@ def _add_loss_gradient(
     touched: Touched,
     step: int,
 ) -> tuple[int, float]:
-    """Add the gradient of the cross entropy between ``targets`` [N] and the squashed logits.
+    """Add the gradient of the cross entropy between ``wanted`` [N] and the logits, both squashed.
 
     Args:
         points: [N, 3] metres from the region's centre.
-        targets: [N] in [0, 1].
+        wanted: [N] the logits that there should be.
         share: weight of each sample.
         field: the field.
         mlp_sums: gradients of the MLP.
@@ -253,7 +259,7 @@ def _add_loss_gradient(
     for first in range(0, len(points), BATCH):
         count = load(batch, points, first)
         forward(batch, field)
-        loss += _cross_entropy(batch, targets[first : first + count], share)
+        loss += _cross_entropy(batch, wanted[first : first + count], share)
         backward(batch, field.mlp, w1_transposed, w2_transposed)
         add_weight_gradient(batch, mlp_sums)
         if levels > 0:
@@ -263,7 +269,7 @@ def _add_loss_gradient(
 
 
 class CompiledTrainer:
-    """Trains a field in compiled code, in its own memory, which is the CPU's."""
+    """Trains a field in compiled code, in its own memory, which is arrays."""
 
     def __init__(self, field: LiveField, sums: GradientSums, team: Team) -> None:
         self._field = field
@@ -272,15 +278,14 @@ class CompiledTrainer:
 
     def train(self, batch: Batch, rates: Rates) -> float:
         """One optimiser step; returns the loss before it."""
-        points = batch.points.numpy()
-        targets = torch.sigmoid(batch.labels / self._field.settings.logit_scale_m).numpy()
+        wanted = batch.labels / np.float32(self._field.settings.logit_scale_m)
         try:
-            return self._train(points, targets, rates)
+            return self._train(batch.points, wanted, rates)
         except BaseException:
             self._sums.clear()
             raise
 
-    def _train(self, points: Floats, targets: Floats, rates: Rates) -> float:
+    def _train(self, points: Floats, wanted: Floats, rates: Rates) -> float:
         field = make_field(self._field.settings, self._field.tree, self._field.arrays)
         sums = self._sums
         sums.begin(*field.features.shape)
@@ -292,7 +297,7 @@ class CompiledTrainer:
             mine = slice(*share(len(points), part))
             counts[part], losses[part] = _add_loss_gradient(
                 points[mine],
-                targets[mine],
+                wanted[mine],
                 1.0 / len(points),
                 field,
                 mlp_sums=mlp_sums[part],
@@ -311,7 +316,7 @@ class CompiledTrainer:
         if self._field.held is None:
             self._step_mlp(mlp_sums, compiled)
         sums, features = self._sums, _parameter_rows(self._field.features)
-        held = _NONE_HELD if self._field.held is None else self._field.held.numpy()
+        held = _NONE_HELD if self._field.held is None else self._field.held
         self._team.each(
             lambda part: _step_touched(
                 part, counts[part], sums.step, sums.touched, sums.features, features, held, compiled

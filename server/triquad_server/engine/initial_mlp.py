@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 
@@ -27,12 +25,12 @@ _STEPS = 1000
 class InitialMlp(NamedTuple):
     """What a region begins with."""
 
-    parts: list[Tensor]  # weights [in, out] and bias [out] of each layer in turn
+    parts: list[Floats]  # weights [in, out] and bias [out] of each layer in turn
     steps: int  # it counts as having taken
 
 
-def initial_mlp(settings: FieldSettings, generator: torch.Generator) -> InitialMlp:
-    """On the device of ``generator``, which draws what is not pretrained.
+def initial_mlp(settings: FieldSettings, generator: np.random.Generator) -> InitialMlp:
+    """What is not pretrained, ``generator`` draws.
 
     Pretrained it is where features, their deviation and the hidden layers are as by default.
     """
@@ -44,22 +42,22 @@ def initial_mlp(settings: FieldSettings, generator: torch.Generator) -> InitialM
     if stored["weights1"].shape != shape or stored["feature_std"] != settings.feature_std:
         return InitialMlp(random, steps=0)
     names = ("weights1", "bias1", "weights2", "bias2", "weights3", "bias3")
-    parts = [torch.tensor(stored[name], device=generator.device) for name in names]
-    of_features = parts[0].flatten(end_dim=1)
-    of_fourier = torch.zeros_like(random[0][len(of_features) :])
-    logits_per_leaf = settings.leaf_m / settings.logit_scale_m
+    parts = [stored[name] for name in names]
+    of_features = parts[0].reshape(-1, settings.hidden)
+    of_fourier = np.zeros_like(random[0][len(of_features) :])
+    logits_per_leaf = np.float32(settings.leaf_m / settings.logit_scale_m)
     last = [part * logits_per_leaf for part in parts[-2:]]
-    return InitialMlp([torch.cat([of_features, of_fourier]), *parts[1:-2], *last], _STEPS)
+    return InitialMlp([np.concatenate([of_features, of_fourier]), *parts[1:-2], *last], _STEPS)
 
 
-def random_mlp(settings: FieldSettings, generator: torch.Generator) -> list[Tensor]:
+def random_mlp(settings: FieldSettings, generator: np.random.Generator) -> list[Floats]:
     """Weights [in, out] and bias [out] of each layer in turn, as those of torch.nn.Linear."""
     hidden = settings.hidden
     mlp = []
     for inputs, outputs in ((settings.input_size, hidden), (hidden, hidden), (hidden, 1)):
         for size in ((inputs, outputs), (outputs,)):
-            uniform = torch.rand(size, generator=generator, device=generator.device) * 2 - 1
-            mlp.append(uniform * (1 / math.sqrt(inputs)))
+            uniform = generator.random(size, np.float32) * 2 - 1
+            mlp.append(uniform * np.float32(1 / math.sqrt(inputs)))
     return mlp
 
 

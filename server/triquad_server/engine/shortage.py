@@ -3,9 +3,8 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import torch
-
-_SAYS = "can't allocate memory"  # torch's allocator of the CPU has no error of its own
+_OF_A_GPU = "OutOfMemoryError"  # of torch, which is not imported where there is no GPU
+_OF_THE_CPU = "can't allocate memory"  # torch has no error of its own for it
 
 
 @contextmanager
@@ -13,9 +12,7 @@ def shortages() -> Iterator[None]:
     """Raise MemoryError where torch meets too little memory; around work, or as a decorator."""
     try:
         yield
-    except torch.OutOfMemoryError as error:  # of a GPU
-        raise MemoryError(str(error)) from error
     except RuntimeError as error:
-        if _SAYS not in str(error):
+        if type(error).__name__ != _OF_A_GPU and _OF_THE_CPU not in str(error):
             raise
         raise MemoryError(str(error)) from error

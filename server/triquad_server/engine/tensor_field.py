@@ -26,6 +26,8 @@ from triquad_map.compiled.field.quadtree import (
 from triquad_map.compiled.voxel_index import MULTIPLIER, longest_probe
 from triquad_map.composition.region import FieldValues
 
+from triquad_server.engine.live_field import LiveField
+
 _CHUNK = 131_072  # points that tensors are made for at a time
 
 
@@ -36,6 +38,13 @@ class FieldTensors:
     features: Tensor  # [rows, d] by the rows of the tree; row 0, of absent vertices, is zero
     mlp: tuple[Tensor, ...]  # weights [in, out] and bias [out] of each layer in turn
     frequencies: Tensor  # [m] of Fourier features, on coordinates normalised to [-1, 1]
+
+    @classmethod
+    def of(cls, field: LiveField) -> "FieldTensors":
+        """The numbers of a field as they are now; they change with it, arrays as well."""
+        features, mlp, frequencies = field.numbers
+        tensor = torch.as_tensor
+        return cls(tensor(features), tuple(map(tensor, mlp)), tensor(frequencies))
 
     @property
     def arrays(self) -> FieldArrays:
@@ -171,13 +180,14 @@ class TensorField:
     def gather(self, corners: Corners) -> Tensor:
         """Interpolated features [N, H * d], summed over the planes."""
         count, levels, around = corners.rows.shape
+        features = self.tensors.features
         summed = F.embedding_bag(
             corners.rows.view(-1, around),
-            self.tensors.features,
+            features,
             mode="sum",
             per_sample_weights=corners.weights.reshape(-1, around),
         )
-        return summed.view(count, -1)
+        return summed.view(count, levels * features.shape[1])
 
     def logits(self, points: Tensor, encoded: Tensor | None, mlp: tuple[Tensor, ...]) -> Tensor:
         """What ``mlp`` makes [N] of points and their interpolated features."""
@@ -193,7 +203,7 @@ class TensorField:
         """Fourier features [N, 6m] of coordinates normalised to [-1, 1] over the cube."""
         normalised = points / (self.settings.region_side_m / 2)
         angles = 2 * math.pi * normalised[:, :, None] * self.tensors.frequencies
-        angles = angles.reshape(len(points), -1)
+        angles = angles.reshape(len(points), 3 * len(self.tensors.frequencies))
         return torch.cat([angles.sin(), angles.cos()], 1)
 
     def _evaluate(self, points: Floats, gradient: bool) -> FieldValues:

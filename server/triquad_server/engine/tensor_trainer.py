@@ -1,20 +1,37 @@
 """Training a field on tensors, by automatic differentiation: any device, and the reference."""
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from triquad_server.engine.compiled_trainer import EPSILON
 from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
-from triquad_server.engine.tensor_field import Corners, TensorField
+from triquad_server.engine.tensor_field import Corners, FieldTensors, TensorField
+
+
+class ParameterTensors(NamedTuple):
+    """The memory of a parameter."""
+
+    values: Tensor  # [rows, ...]
+    means: Tensor  # likewise
+    variances: Tensor  # likewise
+    steps: Tensor  # [rows]
+
+    @classmethod
+    def of(cls, parameter: Parameter) -> "ParameterTensors":
+        """A parameter's own memory, be it tensors or arrays."""
+        parts = (parameter.values, parameter.means, parameter.variances, parameter.steps)
+        return cls(*map(torch.as_tensor, parts))
 
 
 class TensorTrainer:
-    """Trains a field by automatic differentiation, on the device where it is."""
+    """Trains a field by automatic differentiation, where it is: on a device, or in arrays."""
 
     def __init__(self, field: LiveField) -> None:
         self._field = field
-        self._tensor_field = TensorField(field.settings, field.tree, field.tensors)
+        self._tensor_field = TensorField(field.settings, field.tree, FieldTensors.of(field))
 
     def train(self, batch: Batch, rates: Rates) -> Tensor:
         """One optimiser step; returns the loss before it.
@@ -23,12 +40,15 @@ class TensorTrainer:
         (3QFP, equation 5).
         """
         field = self._up_to_date()
-        corners = field.around(batch.points)
+        points, labels = (
+            torch.as_tensor(part, device=field.device) for part in (batch.points, batch.labels)
+        )
+        corners = field.around(points)
         encoded = None if corners is None else field.gather(corners).requires_grad_()
         mlp = tuple(part.detach().requires_grad_() for part in field.tensors.mlp)
         with torch.enable_grad():
-            logits = field.logits(batch.points, encoded, mlp)
-            target = torch.sigmoid(batch.labels / field.settings.logit_scale_m)
+            logits = field.logits(points, encoded, mlp)
+            target = torch.sigmoid(labels / field.settings.logit_scale_m)
             loss = F.binary_cross_entropy_with_logits(logits, target)
             torch.autograd.backward(loss)
         if self._field.held is None:
@@ -41,21 +61,22 @@ class TensorTrainer:
         """The field with all vertices that it has now."""
         if len(self._tensor_field.tensors.features) != len(self._field.features):
             field = self._field
-            self._tensor_field = TensorField(field.settings, field.tree, field.tensors)
+            self._tensor_field = TensorField(field.settings, field.tree, FieldTensors.of(field))
         return self._tensor_field
 
     def _step_mlp(self, mlp: tuple[Tensor, ...], rates: Rates) -> None:
-        first_row = torch.zeros(1, dtype=torch.int64, device=self._field.device)
+        first_row = torch.zeros(1, dtype=torch.int64, device=self._tensor_field.device)
         share = self._field.next_mlp_share()
         mlp_rates = rates._replace(
             learning_rate=share * rates.learning_rate, young_rate=share * rates.young_rate
         )
         for parameter, weight in zip(self._field.mlp, mlp, strict=True):
             assert weight.grad is not None
-            step_rows(parameter, first_row, weight.grad[None], rates=mlp_rates)
+            tensors = ParameterTensors.of(parameter)
+            step_rows(tensors, first_row, weight.grad[None], rates=mlp_rates)
 
     def _step_features(self, corners: Corners, gradient: Tensor, rates: Rates) -> None:
-        features = self._field.features
+        features = ParameterTensors.of(self._field.features)
         size = features.values.shape[1]
         rows = corners.rows.view(-1)
         shares = gradient.view(-1, 1, size) * corners.weights.view(-1, corners.rows.shape[2], 1)
@@ -65,7 +86,7 @@ class TensorTrainer:
         touched[rows] = True
         touched[0] = False  # absent vertices stay zero
         if (held := self._field.held) is not None:
-            touched[: len(held)] &= ~held
+            touched[: len(held)] &= ~torch.as_tensor(held)
         if total.device.type == "cpu":
             chosen = touched.nonzero()[:, 0]
             step_rows(features, chosen, total[chosen], rates=rates)
@@ -73,7 +94,7 @@ class TensorTrainer:
             step_where(features, touched, total, rates=rates)
 
 
-def step_rows(parameter: Parameter, rows: Tensor, gradient: Tensor, rates: Rates) -> None:
+def step_rows(parameter: ParameterTensors, rows: Tensor, gradient: Tensor, rates: Rates) -> None:
     """One step of ``rows`` [T], all different, along their ``gradient`` [T, ...]."""
     parameter.steps[rows] += 1
     means = parameter.means[rows].lerp_(gradient, 1 - rates.mean_decay)
@@ -83,7 +104,7 @@ def step_rows(parameter: Parameter, rows: Tensor, gradient: Tensor, rates: Rates
     parameter.values[rows] -= _change(means, variances, parameter.steps[rows], rates=rates)
 
 
-def step_where(parameter: Parameter, mask: Tensor, gradient: Tensor, rates: Rates) -> None:
+def step_where(parameter: ParameterTensors, mask: Tensor, gradient: Tensor, rates: Rates) -> None:
     """As :func:`step_rows` for the rows where ``mask`` [rows] is set; ``gradient`` [rows, ...].
 
     It goes over all rows, but need not know how many are set, for which a GPU would have to be
@@ -103,4 +124,5 @@ def _change(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) -> Te
     age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
     mean = means / (1 - rates.mean_decay**age)
     deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()
-    return rates.by_age(age.clamp(max=LAST_AGE)) * mean / (deviation + EPSILON)
+    change: Tensor = rates.by_age(age.clamp(max=LAST_AGE)) * mean / (deviation + EPSILON)
+    return change

@@ -14,7 +14,8 @@ from triquad_map.composition.composed_view import ComposedView
 from triquad_map.composition.region import Split
 
 from triquad_server.array_memory import Buffers
-from triquad_server.engine.live_field import FrozenField, region_record
+from triquad_server.engine.field_record import region_record
+from triquad_server.engine.memory import FrozenField
 
 
 @dataclass(frozen=True)

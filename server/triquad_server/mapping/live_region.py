@@ -7,8 +7,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import torch
-from torch import Tensor
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
@@ -27,16 +25,10 @@ from triquad_map.places import in_cube
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 
 from triquad_server.array_memory import buffers_of, bytes_by_part
-from triquad_server.engine.compiled_trainer import CompiledTrainer
-from triquad_server.engine.live_field import (
-    FrozenField,
-    LiveField,
-    field_from_record,
-    initial_field,
-    region_record,
-    training_state,
-)
-from triquad_server.engine.tensor_trainer import TensorTrainer
+from triquad_server.engine.field_record import field_from_record, region_record, training_state
+from triquad_server.engine.live_field import LiveField, initial_field
+from triquad_server.engine.memory import ArrayMemory, FrozenField
+from triquad_server.engine.trainer import Loss, trainer_of
 from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.fair_share import FairShare
@@ -93,8 +85,6 @@ _FEW_GONE = 32
 """Where the surface of more voxels is gone, all of the region learns: rows that others use as well
 have to forget it."""
 
-_CPU = torch.device("cpu")
-
 
 class LiveRegion:
     """A region that is being mapped, by one thread. Everything public is in the map frame."""
@@ -117,8 +107,8 @@ class LiveRegion:
             seed=seed,
             team=setup.team,
         )
-        self.pool = new_pool(device=setup.device)
-        self.held_out = new_pool(device=_CPU)
+        self.pool = new_pool(memory=setup.memory)
+        self.held_out = new_pool(memory=ArrayMemory())
         self.places: JudgedPlaces | None = None
         """How well the field fits the rays that are held out, as it was judged last."""
 
@@ -142,24 +132,20 @@ class LiveRegion:
         self._disbelief = Disbelief.of(setup.change.scans, setup.change.doubt)
         self._settings = setup.field
         self._training = setup.training
-        self._trainer: CompiledTrainer | TensorTrainer = (
-            CompiledTrainer(field, setup.sums, setup.team)
-            if setup.device.type == "cpu"
-            else TensorTrainer(field)
-        )
+        self._trainer = trainer_of(field, setup.sums, setup.team)
 
     @classmethod
     def unseen(cls, index: RegionIndex, setup: RegionSetup) -> "LiveRegion":
         """A region of which nothing is known yet."""
         seed, _ = setup.seeds(index)
-        field = initial_field(setup.field, setup.device, seed)
+        field = initial_field(setup.field, setup.memory, seed)
         return cls(index, setup, field, LiveEvidence(1 << setup.field.depth))
 
     @classmethod
     def restore(cls, record: Region, setup: RegionSetup) -> "LiveRegion":
         """A region from its record; without training state its replay pool starts empty."""
         seed, _ = setup.seeds(record.index)
-        field = field_from_record(record, setup.field, setup.device, seed=seed)
+        field = field_from_record(record, setup.field, setup.memory, seed=seed)
         evidence = LiveEvidence.from_record(1 << setup.field.depth, record.evidence)
         region = cls(record.index, setup, field, evidence)
         region._restored = True
@@ -308,7 +294,7 @@ class LiveRegion:
             wanted //= 2
         return min(most, max(_LEAST_BATCH, wanted))
 
-    def train(self) -> float | Tensor:
+    def train(self) -> Loss:
         """One optimiser step; returns the loss: to read it on a GPU waits for the step."""
         self._focus.apply(self.batch)
         step = self.budget.next_step(self.batch, self.pool.rays_drawn_on)

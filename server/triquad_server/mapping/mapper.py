@@ -5,15 +5,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 
 from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.memory import memory_on
 from triquad_server.engine.shortage import shortages
+from triquad_server.engine.trainer import Loss
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
@@ -56,17 +56,13 @@ class Mapper:
         self._teams = teams or Teams()
         self._settings = settings
         self._field_settings = record.settings if record else settings.field
-        self._device = torch.device(device)
-        if self._device.type == "cpu":
-            # Its threads spin between operations, and would take the cores from the kernels.
-            torch.set_num_threads(1)
         self._normals = self._no_normals()
         self._setup = RegionSetup(
             field=self._field_settings,
             scan=settings.scan,
             change=settings.change,
             training=settings.training,
-            device=self._device,
+            memory=memory_on(device),
             sums=GradientSums(),
             team=self._teams.mapping,
         )
@@ -82,7 +78,7 @@ class Mapper:
         progress = record.progress if record else MapProgress()
         self.scans_taken = progress.scans_taken
         self.samples_trained = progress.samples_trained
-        self._loss: float | Tensor | None = progress.loss or None
+        self._loss: Loss | None = progress.loss or None
         for region in record.regions if record else ():
             self._regions[region.index] = live = LiveRegion.restore(region, self._setup)
             self._normals.restore(live.ray_ends())

@@ -14,9 +14,7 @@ samples: a ray that is trained on again teaches other points of itself.
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.quadtree import morton_code
@@ -58,20 +56,6 @@ class RayTable(NamedTuple):
     def of(self, chosen: Bools) -> "RayTable":
         """The ``chosen`` [N] rays, with all origins."""
         return RayTable(self.rows[chosen], self.origin_of[chosen], self.origins)
-
-
-class TensorTable(NamedTuple):
-    """A :class:`RayTable` on the device that trains."""
-
-    rows: Tensor
-    origin_of: Tensor  # int64
-    origins: Tensor
-
-    @classmethod
-    def of(cls, table: RayTable, device: torch.device) -> "TensorTable":
-        """A copy of a table."""
-        rows, origin_of, origins = (torch.from_numpy(part).to(device) for part in table)
-        return cls(rows, origin_of.long(), origins)
 
 
 class Placement(NamedTuple):
@@ -200,39 +184,6 @@ def samples_alone(points: Floats, labels: NDArray[np.floating]) -> RayTable:
     return RayTable(rows, np.full(len(rows), NO_ORIGIN, np.int32), no_origins)
 
 
-def draw_samples(
-    table: TensorTable, chosen: Tensor, placement: Placement, generator: torch.Generator
-) -> Batch:
-    """One sample on each of the rays ``chosen`` [B], on their device."""
-    rows, origin_of = table.rows[chosen], table.origin_of[chosen]
-    ends, values = rows[:, END : END + 3], rows[:, VALUE]
-    count, device = len(chosen), rows.device
-    kinds, places = torch.rand((2, count), generator=generator, device=device)
-    near = torch.randn(count, generator=generator, device=device)
-    near = (near * placement.spread_m).clamp(-placement.truncation_m, placement.truncation_m)
-    is_ray = origin_of >= 0
-    origins = ends if len(table.origins) == 0 else table.origins[origin_of.clamp(min=0)]
-    ways = torch.where(is_ray[:, None], ends - origins, torch.zeros_like(ends))
-    reach_m = ways.norm(dim=1)
-    directions = ways / reach_m.clamp(min=1e-12)[:, None]
-    half_side_m = placement.half_side_m
-    outside = ((ends + near[:, None] * directions).abs() >= half_side_m).any(dim=1)
-    faces = torch.stack([(side - ends) / directions for side in (-half_side_m, half_side_m)])
-    unbounded = torch.tensor([-torch.inf, torch.inf], device=device)[:, None, None]
-    faces = torch.where(directions == 0, unbounded, faces)  # there they are infinite or NaN
-    begin = (placement.free_from - 1) * reach_m
-    first = torch.maximum(begin, faces.amin(0).amax(1))
-    last = faces.amax(0).amin(1).clamp(max=placement.behind_m)
-    free = first + places * (last - first)
-    # Of a ray that leaves the cube, free space is as much less.
-    inside = ((last - first) / (placement.behind_m - begin).clamp(min=1e-12)).clamp(0, 1)
-    surface_share = placement.surface_share
-    kinds = kinds * (surface_share + (1 - surface_share) * inside)
-    offsets = torch.where((kinds < surface_share) & ~outside, near, free)
-    labels = torch.where(is_ray, -offsets * values.abs(), values)
-    return Batch(ends + torch.where(is_ray, offsets, 0.0)[:, None] * directions, labels)
-
-
 @kernel()
 def _draw(
     table: RayTable,
@@ -294,7 +245,7 @@ def _in_order(samples: Floats, cells: Longs) -> tuple[Floats, Floats]:
 def draw_ordered_samples(
     table: RayTable, chosen: Longs, placement: Placement, rng: np.random.Generator, team: Team
 ) -> Batch:
-    """As :func:`draw_samples` for the rays ``chosen`` [B], in compiled code.
+    """One sample on each of the rays ``chosen`` [B].
 
     Neighbours in space follow each other, and find in the cache what the last one fetched.
     """
@@ -319,4 +270,4 @@ def draw_ordered_samples(
 
     team.split(count, work)
     points, labels = _in_order(samples, cells)
-    return Batch(torch.from_numpy(points), torch.from_numpy(labels))
+    return Batch(points, labels)

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.memory import Memory
 from triquad_server.mapping.ray_table import Placement
 from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
@@ -20,7 +20,7 @@ class RegionSetup:
     scan: ScanSettings
     change: ChangeSettings
     training: TrainingSettings
-    device: torch.device
+    memory: Memory  # of the fields
     sums: GradientSums
     team: Team
 

@@ -6,10 +6,9 @@ take over.
 """
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.feature_rows import prefetch_row
@@ -26,6 +25,7 @@ from triquad_map.compiled.voxel_index import (
 from triquad_map.places import place_keys
 
 from triquad_server.engine.live_field import Batch
+from triquad_server.engine.memory import ArrayMemory, Memory
 from triquad_server.mapping.ray_table import (
     COLUMNS,
     END,
@@ -33,10 +33,11 @@ from triquad_server.mapping.ray_table import (
     VALUE,
     Placement,
     RayTable,
-    TensorTable,
     draw_ordered_samples,
-    draw_samples,
 )
+
+if TYPE_CHECKING:
+    from triquad_server.mapping.device_rays import DeviceRays
 
 _BIN_LEAVES = 4.0
 _BINS = 1 << 18
@@ -167,29 +168,25 @@ class ReplayPool:
         self,
         placement: Placement,
         settings: FieldSettings,
-        device: torch.device,
         seed: int,
         team: Team,
+        memory: Memory,
     ) -> None:
-        """No limit yet; ``team`` draws on the CPU, ``device`` does elsewhere."""
+        """No limit yet; ``team`` draws samples, unless ``memory`` is that of another device."""
         self._settings = settings
         self._capacity = _NO_LIMIT
         self._bin_m = _BIN_LEAVES * settings.leaf_m
         self._middle = float(1 << (settings.depth - 1))  # of the region, voxels
         self._team = team
         self.placement = placement
-        self._device = device
         self._size = 0
         self.discarded = 0  # rays so far, that gave way to others or were too many
         self._rng = np.random.default_rng(seed)
-        self._generator = torch.Generator(device).manual_seed(seed)
         self._rows = np.zeros((0, COLUMNS), np.float32)
         self._origin_of = np.zeros(0, np.int32)
         self._origins = np.zeros((0, 3), np.float32)
         self._origin_count = 0
-        # Copies of the rays, and of the newest places, where training is on another device.
-        self._on_device: TensorTable | None = None
-        self._fresh_on_device = torch.zeros(0, dtype=torch.int64, device=device)
+        self._on_device = _rays_on_device(memory, placement, seed)
         self._bins = np.zeros(0, np.int32)
         self._occupancy = np.zeros(_BINS, np.int32)
         self._fresh = np.zeros(0, np.int64)
@@ -235,12 +232,7 @@ class ReplayPool:
             self._occupancy,
         )
         if self._on_device is not None:
-            changed, added = torch.from_numpy(places), TensorTable.of(new, self._device)
-            self._on_device.rows[changed] = added.rows
-            self._on_device.origin_of[changed] = added.origin_of
-            self._on_device = self._on_device._replace(origins=added.origins)
-            if fresh:
-                self._fresh_on_device = changed.to(self._device)
+            self._on_device.put(places, new)
         if fresh:
             self._fresh = places
 
@@ -269,13 +261,12 @@ class ReplayPool:
 
         ``fresh`` of them are on the newest, and ``attended`` in the places that are attended to.
         """
-        if self._on_device is not None:
-            chosen = self._choose(count, fresh, attended)
-            return draw_samples(self._on_device, chosen, self.placement, self._generator)
         places = self._at_random(count, fresh)
         if attended and len(self._attended):
             rows = self._rng.integers(len(self._attended), size=min(attended, count - fresh))
             places[fresh : fresh + attended] = self._attended[rows]
+        if self._on_device is not None:
+            return self._on_device.draw(places)
         return self.draw_on(places)
 
     def draw_on(self, places: Longs) -> Batch:
@@ -299,9 +290,7 @@ class ReplayPool:
         """The rays at ``places`` [N] have these ``slopes`` [N], which no normal told."""
         self._rows[places, VALUE] = -slopes
         if self._on_device is not None:
-            changed = torch.from_numpy(places).to(self._device)
-            told = torch.from_numpy(self._rows[places, VALUE])
-            self._on_device.rows[changed, VALUE] = told.to(self._device)
+            self._on_device.set_values(places, self._rows[places, VALUE])
 
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
@@ -344,19 +333,6 @@ class ReplayPool:
             places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
         return places
 
-    def _choose(self, count: int, fresh: int, attended: int) -> Tensor:
-        """Places [count] at random, on the device."""
-        places = self._random(self.rays_drawn_on, count)
-        if (in_focus := self._in_focus()) is not None:
-            places = torch.from_numpy(in_focus).to(self._device)[places]
-        if fresh and len(self._fresh):
-            places[:fresh] = self._fresh_on_device[self._random(len(self._fresh), fresh)]
-        if attended and len(self._attended):
-            rows = self._rng.integers(len(self._attended), size=min(attended, count - fresh))
-            drawn = torch.from_numpy(self._attended[rows]).to(self._device)
-            places[fresh : fresh + attended] = drawn
-        return places
-
     def _in_focus(self) -> Longs | None:
         """The places of the rays that are drawn on at random; None: all of them."""
         if self._blocks is None:
@@ -377,9 +353,6 @@ class ReplayPool:
             inside = _ending_in(self._blocks, self._settings.leaf_m, self._middle, rows)
             kept = self._focused[~is_other[self._focused]]
             self._focused = np.concatenate([kept, places[inside]])
-
-    def _random(self, below: int, count: int) -> Tensor:
-        return torch.randint(below, (count,), generator=self._generator, device=self._device)
 
     def _keep(self, places: Longs) -> None:
         # All or none, where memory is short; so below.
@@ -421,9 +394,8 @@ class ReplayPool:
         return first
 
     def _copy_to_device(self) -> None:
-        if self._device.type != "cpu":
-            whole = RayTable(self._rows, self._origin_of, self._origins)
-            self._on_device = TensorTable.of(whole, self._device)
+        if self._on_device is not None:
+            self._on_device.replace(RayTable(self._rows, self._origin_of, self._origins))
 
     def _best_to_push_out(self, count: int) -> Longs:
         half = self._size // 2
@@ -435,6 +407,15 @@ class ReplayPool:
         return _best_to_push_out(
             self._size, count, first, stride, offset, self._bins, self._occupancy
         )
+
+
+def _rays_on_device(memory: Memory, placement: Placement, seed: int) -> "DeviceRays | None":
+    """Room for a copy of rays where the field is that learns from them; None: it needs no copy."""
+    if isinstance(memory, ArrayMemory):
+        return None
+    from triquad_server.mapping.device_rays import DeviceRays
+
+    return DeviceRays(memory.device, placement, seed)
 
 
 def _coprime(size: int) -> int:

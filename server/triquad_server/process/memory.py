@@ -54,8 +54,8 @@ def give_back_free() -> None:
 def spare_from_collection() -> None:
     """Leave all objects that are there now out of every later garbage collection.
 
-    torch and numba make a quarter of a million, which stay: to go through them would stop all
-    threads for a tenth of a second.
+    numba alone makes a quarter of a million, which stay: to go through them would stop all threads
+    for a tenth of a second.
     """
     gc.collect()
     gc.freeze()

@@ -9,13 +9,20 @@ from triquad_map.compiled.field.encoding import load, locate, new_batch
 from triquad_map.compiled.field.field import make_field
 from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
-from triquad_server.engine.tensor_field import TensorField
-from triquad_server.engine.tensor_trainer import TensorTrainer, step_rows, step_where
+from triquad_server.engine.memory import ArrayMemory
+from triquad_server.engine.tensor_field import FieldTensors, TensorField
+from triquad_server.engine.tensor_trainer import (
+    ParameterTensors,
+    TensorTrainer,
+    step_rows,
+    step_where,
+)
 from triquad_server.process.threads import Teams
 
-CPU = torch.device("cpu")
+ARRAYS = ArrayMemory()
 RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99, young_rate=0.02)
 TEAM = Teams().mapping
+PARTS = ("values", "means", "variances", "steps")
 CASES = [
     FieldSettings(depth=8, frequencies=4),
     FieldSettings(depth=12),
@@ -26,7 +33,7 @@ CASES = [
 
 
 def trained(settings: FieldSettings) -> LiveField:
-    field = initial_field(settings, CPU, 3)
+    field = initial_field(settings, ARRAYS, 3)
     batch = samples(settings, 4000)
     field.grow(leaves(settings, batch))
     trainer = TensorTrainer(field)
@@ -36,26 +43,24 @@ def trained(settings: FieldSettings) -> LiveField:
 
 
 def in_tensors(field: LiveField) -> TensorField:
-    return TensorField(field.settings, field.tree, field.tensors)
+    return TensorField(field.settings, field.tree, FieldTensors.of(field))
 
 
 def leaves(settings: FieldSettings, batch: Batch) -> np.ndarray:
     """The leaves of the batch's points, which lie inside the cube."""
-    points = batch.points.numpy()
-    return np.floor(points / settings.leaf_m).astype(np.int64) + 2 ** (settings.depth - 1)
+    return np.floor(batch.points / settings.leaf_m).astype(np.int64) + 2 ** (settings.depth - 1)
 
 
 def samples(settings: FieldSettings, count: int, seed: int = 0) -> Batch:
-    generator = torch.Generator().manual_seed(seed)
     half = min(12.0, settings.region_side_m * 0.49)
-    points = (torch.rand((count, 3), generator=generator) * 2 - 1) * half
-    return Batch(points, 0.3 * torch.sin(points).sum(1))
+    points = np.random.default_rng(seed).uniform(-half, half, (count, 3)).astype(np.float32)
+    return Batch(points, np.float32(0.3) * np.sin(points).sum(axis=1))
 
 
 @pytest.mark.parametrize("settings", CASES)
 def test_values_and_gradients_are_equal(settings: FieldSettings) -> None:
     field = trained(settings)
-    points = samples(settings, 3000, seed=1).points.numpy()
+    points = samples(settings, 3000, seed=1).points
     slow = in_tensors(field).evaluate(points, gradient=True)
     fast = field.freeze().evaluate(points, gradient=True)
     np.testing.assert_allclose(fast.sdf, slow.sdf, atol=1e-5)
@@ -75,13 +80,13 @@ def test_a_training_step_is_equal(settings: FieldSettings) -> None:
     for step in range(3):
         loss = float(reference.train(batch, RATES))
         assert trainer.train(batch, RATES) == pytest.approx(loss, rel=1e-4), step
-    assert torch.equal(slow.features.steps, fast.features.steps)
+    np.testing.assert_array_equal(fast.features.steps, slow.features.steps)
     # The gradient's moments are what the step is made of.
-    scale = float(slow.features.means.abs().max())
-    torch.testing.assert_close(fast.features.means, slow.features.means, atol=1e-3 * scale, rtol=0)
+    scale = float(np.abs(slow.features.means).max())
+    np.testing.assert_allclose(fast.features.means, slow.features.means, atol=1e-3 * scale)
     for part, other in zip(fast.mlp, slow.mlp, strict=True):
-        torch.testing.assert_close(part.means, other.means, atol=1e-4, rtol=1e-3)
-        torch.testing.assert_close(part.values, other.values, atol=1e-3, rtol=0)
+        np.testing.assert_allclose(part.means, other.means, atol=1e-4, rtol=1e-3)
+        np.testing.assert_allclose(part.values, other.values, atol=1e-3)
 
 
 @pytest.mark.parametrize("compiled", [True, False])
@@ -105,11 +110,11 @@ def test_an_old_decoder_moves_less_than_a_young_one(compiled: bool) -> None:
     for age in (0, 100_000):
         field = trained(settings)
         field.mlp_steps = age
-        before = [part.values.clone() for part in field.mlp]
+        before = [part.values.copy() for part in field.mlp]
         trainer = CompiledTrainer(field, GradientSums(), TEAM) if compiled else TensorTrainer(field)
         trainer.train(samples(settings, 4000, seed=2), RATES)
         pairs = zip(before, field.mlp, strict=True)
-        moved.append(sum(float((old - new.values).abs().sum()) for old, new in pairs))
+        moved.append(sum(float(np.abs(old - new.values).sum()) for old, new in pairs))
     young, old = moved
     assert 0.01 * young < old < 0.05 * young
 
@@ -125,19 +130,18 @@ def test_what_is_held_stays_as_it_is_and_all_else_learns_as_ever(compiled: bool)
     for field in (held_in, free):
         trainer = CompiledTrainer(field, GradientSums(), TEAM) if compiled else TensorTrainer(field)
         trainer.train(batch, RATES)
-    stay = torch.zeros(len(before.features), dtype=torch.bool)
-    stay[: len(rows)] = torch.from_numpy(rows)
-    for held, old, new in zip(
-        *(vars(f.features).values() for f in (held_in, before, free)), strict=True
-    ):
-        if isinstance(held, torch.Tensor):
-            assert torch.equal(held[stay], old[stay])
-            torch.testing.assert_close(held[~stay], new[~stay])
-    moved = [not torch.equal(x.values, y.values) for x, y in zip(before.mlp, free.mlp, strict=True)]
+    stay = np.zeros(len(before.features), np.bool_)
+    stay[: len(rows)] = rows
+    for part in PARTS:
+        held, old, new = (getattr(f.features, part) for f in (held_in, before, free))
+        np.testing.assert_array_equal(held[stay], old[stay])
+        np.testing.assert_allclose(held[~stay], new[~stay], rtol=1e-5, atol=1e-7)
+    pairs = zip(before.mlp, free.mlp, strict=True)
+    moved = [not np.array_equal(x.values, y.values) for x, y in pairs]
     kept = [
-        torch.equal(getattr(x, of), getattr(y, of))
+        np.array_equal(getattr(x, of), getattr(y, of))
         for x, y in zip(before.mlp, held_in.mlp, strict=True)
-        for of in ("values", "means", "variances", "steps")
+        for of in PARTS
     ]
     assert all(moved)
     assert all(kept)
@@ -160,7 +164,7 @@ def test_the_faces_of_the_cube_are_no_trap(levels: int) -> None:
     """Where rounding takes a point just outside, no vertex is looked for beyond its block."""
     for leaf_m in np.linspace(0.1, 0.5, 201):
         settings = FieldSettings(leaf_m=float(leaf_m), depth=6, feature_levels=levels, hidden=4)
-        field = initial_field(settings, CPU, 3)
+        field = initial_field(settings, ARRAYS, 3)
         compiled = make_field(settings, field.tree, field.arrays)
         face = np.float32(-settings.region_side_m / 2)
         points = np.array([[face, face, face], [0, face, face], [face, 0, 0]], np.float32)
@@ -182,8 +186,8 @@ def test_no_points_give_no_values() -> None:
 
 def test_a_step_over_all_rows_is_that_of_the_chosen() -> None:
     generator = torch.Generator().manual_seed(0)
-    values = torch.randn((50, 8), generator=generator)
-    chosen, masked = Parameter(values), Parameter(values)
+    values = np.random.default_rng(0).standard_normal((50, 8), np.float32)
+    chosen, masked = (ParameterTensors.of(Parameter(values, ARRAYS)) for _ in range(2))
     for _ in range(5):
         mask = torch.rand(50, generator=generator) < 0.4
         gradient = torch.randn((50, 8), generator=generator)

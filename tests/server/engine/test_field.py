@@ -9,18 +9,14 @@ from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_server.engine.live_field import (
-    Batch,
-    LiveField,
-    Rates,
-    field_from_record,
-    initial_field,
-    region_record,
-)
-from triquad_server.engine.tensor_field import TensorField
+from triquad_server.engine.field_record import field_from_record, region_record
+from triquad_server.engine.live_field import Batch, LiveField, Rates, initial_field
+from triquad_server.engine.memory import memory_on
+from triquad_server.engine.tensor_field import FieldTensors, TensorField
+from triquad_server.engine.tensor_memory import TensorMemory
 from triquad_server.engine.tensor_trainer import TensorTrainer
 
-CPU = torch.device("cpu")
+TENSORS = TensorMemory("cpu")
 RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99, young_rate=0.02)
 
 
@@ -29,7 +25,7 @@ def small(encoding: str = "both", depth: int = 8) -> FieldSettings:
 
 
 def grown(settings: FieldSettings, seed: int = 0, points: int = 300) -> LiveField:
-    field = initial_field(settings, CPU, seed)
+    field = initial_field(settings, TENSORS, seed)
     generator = torch.Generator().manual_seed(seed)
     half = settings.region_side_m / 2
     field.grow(
@@ -45,7 +41,7 @@ def leaves(settings: FieldSettings, points: torch.Tensor) -> np.ndarray:
 
 
 def in_tensors(field: LiveField) -> TensorField:
-    return TensorField(field.settings, field.tree, field.tensors)
+    return TensorField(field.settings, field.tree, FieldTensors.of(field))
 
 
 def train(field: LiveField, points: torch.Tensor, labels: torch.Tensor) -> None:
@@ -81,7 +77,7 @@ def slow_sdf(field: LiveField, point: np.ndarray) -> float:
         angles = [
             2 * math.pi * s * q
             for q in point / (settings.region_side_m / 2)
-            for s in field.frequencies.tolist()
+            for s in field.arrays.frequencies.tolist()
         ]
         inputs.extend([math.sin(a) for a in angles] + [math.cos(a) for a in angles])
     x = np.array(inputs)
@@ -126,7 +122,7 @@ def test_the_field_is_continuous_across_cells() -> None:
 
 def test_vertices_are_those_of_the_nodes_that_points_project_into() -> None:
     settings = small()
-    field = initial_field(settings, CPU, 0)
+    field = initial_field(settings, TENSORS, 0)
     field.grow(np.array([[70, 80, 90]]))
     assert field.vertices == 3 * settings.feature_levels * 4
     field.grow(np.array([[70, 80, 90]] * 3))
@@ -135,7 +131,7 @@ def test_vertices_are_those_of_the_nodes_that_points_project_into() -> None:
 
 def test_the_tree_holds_the_vertices_of_all_nodes_and_no_others() -> None:
     settings = small(depth=7)
-    field = initial_field(settings, CPU, 0)
+    field = initial_field(settings, TENSORS, 0)
     rng = np.random.default_rng(0)
     chosen = rng.integers(0, 2**settings.depth, (3000, 3))
     for part in np.array_split(chosen, 7):
@@ -179,7 +175,7 @@ def test_growing_keeps_values_and_optimiser_state() -> None:
 @pytest.mark.parametrize("encoding", ["both", "features", "fourier"])
 def test_training_learns_a_plane(encoding: str) -> None:
     settings = small(encoding, depth=7)
-    field = initial_field(settings, CPU, 1)
+    field = initial_field(settings, TENSORS, 1)
     generator = torch.Generator().manual_seed(1)
     ground = (torch.rand((4000, 3), generator=generator) * 2 - 1) * torch.tensor([6.0, 6.0, 0.0])
     field.grow(leaves(settings, ground))
@@ -220,7 +216,7 @@ def test_the_gpu_gives_the_same_values() -> None:
     record = region_record(
         (0, 0, 0), field, LiveEvidence(1 << field.settings.depth).freeze(), training=None
     )
-    other = field_from_record(record, field.settings, torch.device("cuda"), seed=0)
+    other = field_from_record(record, field.settings, memory_on("cuda"), seed=0)
     points = (torch.rand((500, 3)) * 2 - 1).numpy() * 7
     expected = field.freeze().evaluate(points, gradient=True)
     values = other.freeze().evaluate(points, gradient=True)

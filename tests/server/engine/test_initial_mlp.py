@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server.engine.initial_mlp import random_mlp
 from triquad_server.engine.live_field import Batch, LiveField, Rates, initial_field
+from triquad_server.engine.memory import ArrayMemory
 from triquad_server.engine.tensor_trainer import TensorTrainer
 
-CPU = torch.device("cpu")
+ARRAYS = ArrayMemory()
 DEFAULT = FieldSettings(depth=8)
 RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99, young_rate=0.01)
 RADIUS = 9.0  # of the ball that is learnt, leaves
@@ -19,14 +19,14 @@ RADIUS = 9.0  # of the ball that is learnt, leaves
 @pytest.mark.parametrize("leaf_m", [0.01, 0.05, 0.2])
 def test_a_new_region_learns_quicker_than_one_that_begins_at_random(leaf_m: float) -> None:
     settings = replace(DEFAULT, leaf_m=leaf_m)
-    pretrained = [error_leaves(initial_field(settings, CPU, seed)) for seed in range(6)]
+    pretrained = [error_leaves(initial_field(settings, ARRAYS, seed)) for seed in range(6)]
     at_random = [error_leaves(begun_at_random(settings, seed)) for seed in range(6)]
     assert np.mean(pretrained) < 0.95 * np.mean(at_random)
 
 
 @pytest.mark.parametrize(("hidden", "age"), [(32, 1000), (16, 0)], ids=["pretrained", "random"])
 def test_what_is_pretrained_is_no_longer_young(hidden: int, age: int) -> None:
-    field = initial_field(replace(DEFAULT, hidden=hidden), CPU, 1)
+    field = initial_field(replace(DEFAULT, hidden=hidden), ARRAYS, 1)
     assert field.mlp_steps == age
     assert all((part.steps == age).all() for part in field.mlp)
 
@@ -35,7 +35,7 @@ def test_it_begins_alike_whatever_the_leaf_and_the_scale_of_the_logits() -> None
     fine = replace(DEFAULT, leaf_m=DEFAULT.leaf_m / 4, logit_scale_m=DEFAULT.logit_scale_m / 3)
     points = near_the_ball(np.random.default_rng(0), 500)
     first, second = (
-        leaves_at(grown(initial_field(settings, CPU, 1)), points) for settings in (DEFAULT, fine)
+        leaves_at(grown(initial_field(settings, ARRAYS, 1)), points) for settings in (DEFAULT, fine)
     )
     assert np.ptp(first) > 0.01
     np.testing.assert_allclose(second, first, rtol=1e-3, atol=1e-5)
@@ -59,24 +59,24 @@ def test_it_begins_alike_whatever_the_leaf_and_the_scale_of_the_logits() -> None
     ],
 )
 def test_other_shapes_begin_at_random(settings: FieldSettings) -> None:
-    one, other = (initial_field(settings, CPU, seed).arrays.mlp for seed in (1, 2))
+    one, other = (initial_field(settings, ARRAYS, seed).arrays.mlp for seed in (1, 2))
     assert not any(np.array_equal(*parts) for parts in zip(one, other, strict=True))
 
 
 def test_without_fourier_features_it_begins_alike() -> None:
     points = near_the_ball(np.random.default_rng(0), 500)
     both, features = (
-        grown(initial_field(replace(DEFAULT, encoding=encoding), CPU, 1))
+        grown(initial_field(replace(DEFAULT, encoding=encoding), ARRAYS, 1))
         for encoding in ("both", "features")
     )
-    features.features.values.copy_(both.features.values)
+    features.features.values[:] = both.features.values
     np.testing.assert_allclose(leaves_at(features, points), leaves_at(both, points), atol=1e-5)
 
 
 def begun_at_random(settings: FieldSettings, seed: int) -> LiveField:
-    generator = torch.Generator().manual_seed(seed)
-    frequencies = initial_field(settings, CPU, seed).frequencies
-    return LiveField(settings, frequencies, random_mlp(settings, generator), 0, generator)
+    generator = np.random.default_rng(seed)
+    frequencies = initial_field(settings, ARRAYS, seed).arrays.frequencies
+    return LiveField(settings, frequencies, random_mlp(settings, generator), 0, generator, ARRAYS)
 
 
 def grown(field: LiveField) -> LiveField:
@@ -102,7 +102,7 @@ def error_leaves(field: LiveField) -> float:
     for _ in range(30):
         points = near_the_ball(rng, 1024)
         labels = np.linalg.norm(points, axis=1) - RADIUS
-        samples = torch.from_numpy(np.column_stack([points, labels]) * leaf_m).float()
+        samples = (np.column_stack([points, labels]) * leaf_m).astype(np.float32)
         trainer.train(Batch(samples[:, :3], samples[:, 3]), RATES)
     points = near_the_ball(rng, 4096)
     return float(np.abs(leaves_at(field, points) - np.linalg.norm(points, axis=1) + RADIUS).mean())

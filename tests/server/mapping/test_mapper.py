@@ -2,13 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from support.small_world import World, settings, settle, settled_mapper, surface_error, world
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
 from triquad_sensors.pose import moved
 from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.memory import ArrayMemory
 from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
@@ -245,15 +245,15 @@ def test_neighbouring_regions_start_differently() -> None:
         scan=chosen.scan,
         change=chosen.change,
         training=chosen.training,
-        device=torch.device("cpu"),
+        memory=ArrayMemory(),
         sums=GradientSums(),
         team=Teams().mapping,
     )
     indices = [(x, y, 0) for x in range(-3, 3) for y in range(-3, 3)]
-    starts = [LiveRegion.unseen(index, setup).field.frequencies for index in indices]
+    starts = [LiveRegion.unseen(index, setup).field.arrays.frequencies for index in indices]
     assert len({tuple(start.tolist()) for start in starts}) == len(indices)
-    again = LiveRegion.unseen(indices[0], setup).field.frequencies
-    assert torch.equal(again, starts[0])
+    again = LiveRegion.unseen(indices[0], setup).field.arrays.frequencies
+    assert np.array_equal(again, starts[0])
 
 
 def test_a_refused_scan_changes_nothing() -> None:

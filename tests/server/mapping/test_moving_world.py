@@ -161,9 +161,9 @@ def test_no_ray_that_ended_there_is_trained_on_again() -> None:
     watched.scan(count=10)
     region = max(watched.mapper.regions, key=lambda region: len(region.pool))
     samples = region.pool.draw_on(np.arange(len(region.pool)))
-    points = samples.points.numpy() + region.centre
+    points = samples.points + region.centre
     inside = (np.abs(points - CENTRE) < HALF - 0.25).all(axis=1)
-    assert (samples.labels.numpy()[inside] > 0).all()
+    assert (samples.labels[inside] > 0).all()
 
 
 def test_what_stands_keeps_its_surface() -> None:

@@ -3,12 +3,11 @@ import pytest
 import torch
 from triquad_server.engine.live_field import Batch
 from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.device_rays import TensorTable, draw_samples
 from triquad_server.mapping.ray_table import (
     Placement,
     RayTable,
-    TensorTable,
     draw_ordered_samples,
-    draw_samples,
     rays_through,
 )
 from triquad_server.process.threads import Teams
@@ -45,8 +44,9 @@ def draw(engine: str, table: RayTable, chosen: np.ndarray, placement: Placement)
     if engine == "compiled":
         return draw_ordered_samples(table, chosen, placement, np.random.default_rng(1), TEAM)
     generator = torch.Generator().manual_seed(1)
-    on_device = TensorTable.of(table, torch.device("cpu"))
-    return draw_samples(on_device, torch.from_numpy(chosen), placement, generator)
+    on_device = TensorTable.of(table, "cpu")
+    batch = draw_samples(on_device, torch.from_numpy(chosen), placement, generator)
+    return Batch(batch.points.numpy(), batch.labels.numpy())
 
 
 ENGINES = pytest.mark.parametrize("engine", ["compiled", "tensors"])
@@ -59,8 +59,8 @@ def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> Non
     down = np.tile([0.0, 0.0, -1.0], (500, 1))
     table = kept(rays, down, CENTRE, placed(settings))
     batch = draw(engine, table, np.arange(500).repeat(20), placed(settings))
-    heights = batch.points[:, 2].numpy() + CENTRE[2]
-    labels = batch.labels.numpy()
+    heights = batch.points[:, 2] + CENTRE[2]
+    labels = batch.labels
     assert abs(labels - heights).max() < 0.05, "up to the least cosine"
     far = np.abs(labels) > 1e-3
     assert (np.sign(labels) == np.sign(heights))[far].all(), "positive above the ground"
@@ -72,10 +72,10 @@ def test_without_normals_the_label_is_the_distance_along_the_ray(engine: str) ->
     rays = rays_to_ground(1)
     table = kept(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
     batch = draw(engine, table, np.zeros(3000, np.int64), placed(settings))
-    points = batch.points.numpy() + CENTRE
+    points = batch.points + CENTRE
     distance = np.linalg.norm(points - rays.ends[0], axis=1)
-    np.testing.assert_allclose(np.abs(batch.labels.numpy()), distance, atol=1e-4)
-    assert (np.sign(batch.labels.numpy()) == np.sign(points[:, 2]))[distance > 1e-3].all()
+    np.testing.assert_allclose(np.abs(batch.labels), distance, atol=1e-4)
+    assert (np.sign(batch.labels) == np.sign(points[:, 2]))[distance > 1e-3].all()
 
 
 @ENGINES
@@ -85,7 +85,7 @@ def test_samples_lie_where_the_settings_say(engine: str) -> None:
     range_m = np.linalg.norm(rays.ends[0] - rays.origin)
     table = kept(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
     batch = draw(engine, table, np.zeros(20_000, np.int64), placed(settings))
-    reach = np.linalg.norm(batch.points.numpy() + CENTRE - rays.origin, axis=1)
+    reach = np.linalg.norm(batch.points + CENTRE - rays.origin, axis=1)
     assert reach.min() >= 0.3 * range_m - 1e-4
     assert reach.max() <= range_m + 0.8 + 1e-4
     near = np.abs(reach - range_m) <= 0.3
@@ -103,7 +103,7 @@ def test_samples_stay_inside_the_cube(engine: str) -> None:
     ending = (np.abs(rays.ends) < half).all(axis=1).sum()
     assert len(table) > ending, "rays that only pass through teach free space"
     batch = draw(engine, table, np.arange(len(table)).repeat(10), placed(settings, half))
-    assert np.abs(batch.points.numpy()).max() <= half + 1e-4
+    assert np.abs(batch.points).max() <= half + 1e-4
 
 
 def test_rays_that_miss_the_cube_teach_nothing() -> None:
@@ -129,8 +129,8 @@ def test_two_regions_draw_together_what_one_would(engine: str) -> None:
         unknown = np.full((len(rays.ends), 3), np.nan)
         table = kept(rays, unknown, centre, placement)
         batch = draw(engine, table, np.arange(len(table)), placement)
-        points = batch.points.numpy() + centre
-        near = np.abs(batch.labels.numpy()) < settings.truncation_m
+        points = batch.points + centre
+        near = np.abs(batch.labels) < settings.truncation_m
         free, _ = np.histogram(points[~near, 0], np.arange(0, 25, 4))
         surface, _ = np.histogram(points[near, 0], np.arange(0, 25, 4))
         counts.append(np.array([free, surface]))

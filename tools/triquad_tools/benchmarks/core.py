@@ -3,16 +3,14 @@
 The baseline is the engine of tensors with automatic differentiation, on all cores.
 """
 
-import os
 import statistics
 from functools import partial
 
 import numpy as np
-import torch
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_server.engine.live_field import Batch, Rates
-from triquad_server.engine.tensor_field import TensorField
+from triquad_server.engine.tensor_field import FieldTensors, TensorField
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.launch import warm_up
@@ -48,13 +46,10 @@ def measure_core(made: BenchStreet) -> list[Figure]:
         epoch = mapper.publish()
         points = seen_points(epoch, made, np.random.default_rng(0))
         region = max(mapper.regions, key=lambda region: region.field.parameters)
-        # The mapper leaves torch one thread; the baseline may use all.
-        torch.set_num_threads(os.cpu_count() or 1)
         report(1, "training")
         figures = _training(region, settings)
         report(2, "queries")
         figures += _queries(epoch, region, points)
-        torch.set_num_threads(1)
         report(3, "publishing")
         figures.append(_publishing(mapper))
         report(4, "done")
@@ -86,7 +81,7 @@ def _training(region: LiveRegion, settings: Settings) -> list[Figure]:
 
     def baseline() -> None:
         batch = region.pool.draw(region.batch, 0)
-        order = torch.from_numpy(rng.permutation(region.batch))  # tensors do not put it in order
+        order = rng.permutation(region.batch)  # tensors do not put it in order
         trainer.train(Batch(batch.points[order], batch.labels[order]), rates)
 
     step = compare(region.train, baseline, _ROUNDS, repeats=15)
@@ -99,7 +94,7 @@ def _training(region: LiveRegion, settings: Settings) -> list[Figure]:
 def _queries(epoch: Epoch, region: LiveRegion, points: Doubles) -> list[Figure]:
     local = (points - region.centre).astype(np.float32)
     field, team = region.field, Teams().answers
-    slow, fast = TensorField(field.settings, field.tree, field.tensors), field.freeze()
+    slow, fast = TensorField(field.settings, field.tree, FieldTensors.of(field)), field.freeze()
 
     def ratio(gradient: bool) -> float:
         def evaluate(first: int, last: int) -> None:

@@ -7,10 +7,11 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
+from triquad_server.device import choose_device
 from triquad_server.errors import StoreError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
-from triquad_server.launch import choose_device, warm_up
+from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings

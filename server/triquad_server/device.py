@@ -1,0 +1,46 @@
+"""The device on which a server computes."""
+
+import ctypes
+import importlib.util
+import sys
+
+from triquad_server.errors import ServerError
+
+_DRIVERS = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
+
+
+def choose_device(wanted: str) -> str:
+    """The device to compute on: ``wanted``, or for "auto" a GPU where there is one.
+
+    Raises:
+        ServerError: there is no GPU, but one is wanted; or it is no device.
+    """
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise ServerError(f"device {wanted!r}: use auto, cpu or cuda")
+    if wanted == "cpu":
+        return "cpu"
+    if _has_driver() and _cuda_is_usable():
+        return "cuda"
+    if wanted == "cuda":
+        raise ServerError("device cuda: no CUDA device is usable here; use cpu or auto")
+    return "cpu"
+
+
+def _has_driver() -> bool:
+    """Whether there may be a GPU, found out without torch, which takes 200 MB and a second."""
+    driver = _DRIVERS.get(sys.platform)
+    if driver is None:
+        return False
+    try:
+        ctypes.CDLL(driver)
+    except OSError:
+        return False
+    return True
+
+
+def _cuda_is_usable() -> bool:
+    if importlib.util.find_spec("torch") is None:
+        return False
+    import torch
+
+    return torch.cuda.is_available()

@@ -1,0 +1,39 @@
+"""Fields in tensors, on any device: the memory of the reference engine."""
+
+import torch
+from torch import Tensor
+from triquad_format.records.field_settings import FieldSettings
+from triquad_map.compiled.field.quadtree import FrozenQuadtree
+
+from triquad_server.engine.memory import Array, FieldNumbers
+from triquad_server.engine.tensor_field import FieldTensors, TensorField
+
+
+class TensorMemory:
+    """Tensors on one device."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+
+    def put(self, array: Array) -> Tensor:
+        """A copy of an array."""
+        return torch.tensor(array, device=self.device)
+
+    def room(self, count: int, like: Tensor) -> Tensor:
+        """So many rows as those of ``like``, in which nothing is written yet."""
+        return like.new_empty((count, *like.shape[1:]))
+
+    def copy(self, rows: Tensor) -> Tensor:
+        """A copy of rows."""
+        return rows.clone()
+
+    def array(self, rows: Tensor) -> Array:
+        """Rows as an array; from another device, it is a copy, for which all work there ends."""
+        array: Array = rows.cpu().numpy()
+        return array
+
+    def field(
+        self, settings: FieldSettings, tree: FrozenQuadtree, numbers: FieldNumbers
+    ) -> TensorField:
+        """The field in tensors."""
+        return TensorField(settings, tree, FieldTensors(*numbers))

@@ -1,0 +1,95 @@
+"""Fields in arrays and in tensors are the same, however they grow and are kept."""
+
+import numpy as np
+import pytest
+from support import small_world
+from triquad_format.records.field_settings import FieldSettings
+from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.live_field import Batch, LiveField, Rates, initial_field
+from triquad_server.engine.memory import ArrayMemory, Memory
+from triquad_server.engine.tensor_memory import TensorMemory
+from triquad_server.engine.trainer import trainer_of
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.process.threads import Teams
+
+SETTINGS = FieldSettings(depth=8, frequencies=4)
+RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99, young_rate=0.02)
+IN_TENSORS = "cpu:0"  # as on a GPU, but where there is none
+MEMORIES = (ArrayMemory(), TensorMemory(IN_TENSORS))
+PARTS = ("values", "means", "variances", "steps")
+POINTS = np.random.default_rng(0).uniform(-12, 12, (2000, 3)).astype(np.float32)
+TEAM = Teams().mapping
+
+
+def grown(memory: Memory) -> LiveField:
+    """A field that grew twice and was trained between and after."""
+    field = initial_field(SETTINGS, memory, 3)
+    for points in np.split(POINTS, 2):
+        field.grow(np.floor(points / SETTINGS.leaf_m).astype(np.int64) + 128)
+        train(field)
+    return field
+
+
+def train(field: LiveField) -> None:
+    batch = Batch(POINTS, 0.3 * np.sin(POINTS).sum(axis=1))
+    float(trainer_of(field, GradientSums(), TEAM).train(batch, RATES))
+
+
+def parts(field: LiveField) -> dict[str, np.ndarray]:
+    """The numbers of the features and of their optimiser, copied."""
+    memory = field.memory
+    return {part: memory.array(getattr(field.features, part)).copy() for part in PARTS}
+
+
+def test_they_start_grow_and_learn_alike() -> None:
+    arrays, tensors = map(grown, MEMORIES)
+    assert arrays.vertices == tensors.vertices
+    mine, other = parts(arrays), parts(tensors)
+    np.testing.assert_array_equal(mine["steps"], other["steps"])
+    for part in ("values", "means", "variances"):
+        # At a kink, rounding may choose the other side: all but a few must agree.
+        error = np.abs(mine[part] - other[part])
+        assert np.quantile(error, 0.999) < 1e-3 * np.abs(other[part]).max(), part
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_growing_keeps_values_and_optimiser_state(memory: Memory) -> None:
+    field = grown(memory)
+    before, count = parts(field), len(field.features)
+    side = np.arange(60, 90)
+    field.grow(np.stack(np.meshgrid(side, side, [200]), -1).reshape(-1, 3))
+    assert len(field.features) > count
+    after = parts(field)
+    for part in PARTS:
+        np.testing.assert_array_equal(after[part][:count], before[part], err_msg=part)
+        assert part == "values" or not after[part][count:].any()
+    assert after["values"][count:].any()
+    train(field)
+    assert parts(field)["steps"].max() == 3, "the grown parameter is the one that is trained"
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_a_frozen_field_stays_and_a_live_view_does_not(memory: Memory) -> None:
+    field = grown(memory)
+    frozen, view = field.freeze(), field.live_view()
+    before = frozen.evaluate(POINTS, gradient=False).sdf
+    train(field)
+    np.testing.assert_array_equal(frozen.evaluate(POINTS, gradient=False).sdf, before)
+    assert (view.evaluate(POINTS, gradient=False).sdf != before).any()
+
+
+@pytest.mark.parametrize(("device", "other"), [("cpu", IN_TENSORS), (IN_TENSORS, "cpu")])
+def test_a_map_is_learnt_in_either_and_goes_on_in_the_other(device: str, other: str) -> None:
+    world, settings = small_world.world(3), small_world.settings()
+    mapper = small_world.settled_mapper(settings, world, device)
+    epoch = mapper.publish()
+    assert small_world.surface_error(epoch, world) < 0.02
+    again = Mapper("test", settings, other, mapper.changes_since(None).record)
+    points = world.hits[:2000]
+    before, after = (e.query(points, gradient=True) for e in (epoch, again.publish()))
+    np.testing.assert_allclose(after.sdf, before.sdf, atol=2e-3)
+    np.testing.assert_array_equal(after.status, before.status)
+    for scan in world.scans:
+        again.ingest(scan.points, scan.world_from_sensor)
+    small_world.settle(again)
+    assert small_world.surface_error(again.publish(), world) < 0.02
