@@ -8,6 +8,7 @@ a byte holds the 8 voxels of one column along z.
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
@@ -15,7 +16,7 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_map.compiled.kernel import kernel
 
 EMPTY = np.int64(-1)
-MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed number
+_MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed number
 CELL_LIMIT = 1 << 20
 """Cells lie in ``[-CELL_LIMIT, CELL_LIMIT)`` on each axis."""
 
@@ -55,11 +56,20 @@ def unpack(key: int) -> tuple[int, int, int]:
     )
 
 
+@register_jitable
+def home_slot(key: Any, mask: int) -> Any:
+    """Where a key is looked for first: a number, or an array or tensor of int64.
+
+    What is multiplied carries to higher bits only, and a key has the x of its cell from bit 42 on.
+    """
+    return (key * _MULTIPLIER >> 40) & mask
+
+
 @kernel(inline="always")
 def find_slot(keys: Longs, key: int) -> int:
     """Slot that holds ``key``, or the empty slot where it belongs."""
     mask = len(keys) - 1
-    slot: int = ((key * MULTIPLIER) >> 32) & mask
+    slot: int = home_slot(key, mask)
     while keys[slot] != key and keys[slot] != EMPTY:
         slot = (slot + 1) & mask
     return slot
@@ -100,7 +110,7 @@ def longest_probe(index: Index) -> int:
     longest = 0
     for slot in range(len(index.keys)):
         if index.keys[slot] != EMPTY:
-            home = ((index.keys[slot] * MULTIPLIER) >> 32) & mask
+            home = home_slot(index.keys[slot], mask)
             longest = max(longest, ((slot - home) & mask) + 1)
     return longest
 

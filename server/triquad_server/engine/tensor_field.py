@@ -23,7 +23,7 @@ from triquad_map.compiled.field.quadtree import (
     LiveQuadtree,
     morton_code,
 )
-from triquad_map.compiled.voxel_index import MULTIPLIER, longest_probe
+from triquad_map.compiled.voxel_index import home_slot, longest_probe
 from triquad_map.composition.region import FieldValues
 
 from triquad_server.engine.live_field import LiveField
@@ -106,7 +106,7 @@ class CornerIndex:
         block = block.clamp(0, side - 1)
         keys = morton_code(block[:, 0], block[:, 1]) + (plane << PLANE_BITS)
         mask = len(self._keys) - 1
-        slots = ((keys * MULTIPLIER) >> 32) & mask
+        slots = home_slot(keys, mask)
         numbers = torch.zeros_like(self._numbers[slots])
         for _ in range(self._probes):
             numbers = torch.where(self._keys[slots] == keys, self._numbers[slots], numbers)
