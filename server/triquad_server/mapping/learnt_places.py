@@ -36,6 +36,10 @@ _LEAST_RISE = 0.5
 _LEAST_RAYS = 24
 """Of a place by itself: those that have fewer are compared as one."""
 
+_FEW_OWING = 0.01
+"""Where a smaller share of a scan's rays end in places that are not learnt, these owe nothing
+either: in a place of few rays, chance alone makes the error fall now and then."""
+
 _NOISE = 0.1  # of rays, in leaves: where errors are less, few rays tell of it alone
 
 _TURNS = 4
@@ -86,10 +90,13 @@ class LearntPlaces:
             self._seen = np.union1d(self._seen, keys[new])
 
     def owing(self, ends: Doubles | Floats) -> Bools:
-        """Which rays [N] owe training, that end at ``ends`` [N, 3]."""
+        """Which rays [N] of a scan owe training, that end at ``ends`` [N, 3]."""
         if len(self._learnt) == 0:
             return np.ones(len(ends), np.bool_)
-        return rows_of(self._learnt, place_keys(ends, self._settings)) < 0
+        owing = rows_of(self._learnt, place_keys(ends, self._settings)) < 0
+        if owing.sum() < _FEW_OWING * len(owing):
+            owing[:] = False
+        return owing
 
     def lose(self, points: Doubles) -> None:
         """Surface went from ``points`` [N, 3], one in each voxel."""

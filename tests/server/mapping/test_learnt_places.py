@@ -149,6 +149,13 @@ def test_places_of_few_rays_are_compared_as_one() -> None:
     assert not places.owing(scattered).any()
 
 
+def test_few_rays_elsewhere_owe_nothing_and_more_do() -> None:
+    places, elsewhere = learnt(), ALL[FIRST] + 50.0
+    assert not places.owing(np.concatenate([ALL, elsewhere[:5]])).any()
+    owing = places.owing(np.concatenate([ALL, elsewhere[:50]]))
+    assert owing.sum() == owing[len(ALL) :].sum() == 50
+
+
 def test_one_place_that_cannot_be_learnt_does_not_decide_for_all_that_have_few_rays() -> None:
     places = LearntPlaces(FIELD)
     scattered = RNG.uniform(-300, 300, (60, 3)).astype(np.float32)
