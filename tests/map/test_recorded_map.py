@@ -12,8 +12,9 @@ from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.recorded_view import RecordedView
-from triquad_map.compiled.surfels.surfel_map import surfel_index, surfel_places
+from triquad_map.compiled.surfels.surfel_map import surfel_places
 from triquad_map.compiled.surfels.surfel_search import find_nearest
+from triquad_map.compiled.surfels.surfel_tree import surfel_tree
 from triquad_map.composition.composed_view import no_surfels
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
@@ -70,7 +71,7 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
     points = rng.uniform(-20, 84, (400, 3))
     points[:200] = rng.uniform(0, 64, (200, 3)) * (1, 1, 0.3)
     fast = no_surfels(np.full(400, reach))
-    find_nearest(points, surfel_index(places, surfels), fast)
+    find_nearest(points, surfel_tree(places.shape, places.voxels, surfels), fast)
     slow = no_surfels(np.full(400, reach))
     count = len(places.voxels)
     cloud = SurfelCloud(places.voxels, surfels, np.ones(count), np.zeros(count, int))
