@@ -70,6 +70,7 @@ class Room(NamedTuple):
     kept: Ints  # [_KEPT] leaves that may hold surfels that count in the direction
     nearest: Floats  # [_KEPT] square of the distance to the nearest surfel of each
     squares: Floats  # [_KEPT, LANES] and to all
+    order: Ints  # [_KEPT] in which they count
     waiting: Ints  # [_WAITING] leaves and nodes that may hold nearer surfels, the nearest last
     away: Floats  # [_WAITING] squares of the distances to their boxes
     aside: Floats  # [LANES] room for those of a few boxes
@@ -215,6 +216,24 @@ def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
 
 
 @kernel(fastmath=True, inline="always")
+def _put_in_order(room: Room, kept: int, far: float) -> int:
+    """Order the kept leaves of which a surfel is so near; how many they are.
+
+    In which order they were met hangs on other points, and so would the last digit of a sum.
+    """
+    count = 0
+    for k in range(kept):
+        if room.nearest[k] <= far:
+            place = count
+            while place > 0 and room.kept[room.order[place - 1]] > room.kept[k]:
+                room.order[place] = room.order[place - 1]
+                place -= 1
+            room.order[place] = k
+            count += 1
+    return count
+
+
+@kernel(fastmath=True, inline="always")
 def _write_found(
     tree: SurfelTree, at: Place, found: Found, room: Room, i: int, nearest: NearestSurfels
 ) -> None:
@@ -222,14 +241,14 @@ def _write_found(
     best = np.sqrt(found.square)
     far = (best + _SMOOTHING) ** 2
     weights, x, y, z = fill(0.0), fill(0.0), fill(0.0), fill(0.0)
-    for k in range(found.kept):
-        if room.nearest[k] <= far:
-            farther = (root(load(room.squares, (k, 0))) - fill(best)) * fill(1 / _SMOOTHING)
-            weight = larger(fill(1.0) - farther, fill(0.0))
-            weight = weight * weight
-            a, b, c = _closest_offset(tree, room.kept[k], at)
-            weights = weights + weight
-            x, y, z = x + weight * a, y + weight * b, z + weight * c
+    for turn in range(_put_in_order(room, found.kept, far)):
+        k = room.order[turn]
+        farther = (root(load(room.squares, (k, 0))) - fill(best)) * fill(1 / _SMOOTHING)
+        weight = larger(fill(1.0) - farther, fill(0.0))
+        weight = weight * weight
+        a, b, c = _closest_offset(tree, room.kept[k], at)
+        weights = weights + weight
+        x, y, z = x + weight * a, y + weight * b, z + weight * c
     share = 1 / total(weights)
     nearest.means[i, 0] = at[0] - total(x) * share
     nearest.means[i, 1] = at[1] - total(y) * share
@@ -299,12 +318,13 @@ def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> 
 
     Points are leaf coordinates of the region and may lie outside of it.
     """
-    if len(tree.children) < 2:
+    if len(points) == 0 or len(tree.children) < 2:
         return
     room = Room(
         np.empty(_KEPT, np.int32),
         np.empty(_KEPT, np.float32),
         np.empty((_KEPT, LANES), np.float32),
+        np.empty(_KEPT, np.int32),
         np.empty(_WAITING, np.int32),
         np.empty(_WAITING, np.float32),
         np.empty(LANES, np.float32),
