@@ -12,8 +12,9 @@ from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.recorded_view import RecordedView
-from triquad_map.compiled.surfels.surfel_map import surfel_index, surfel_places
+from triquad_map.compiled.surfels.surfel_map import surfel_places
 from triquad_map.compiled.surfels.surfel_search import find_nearest
+from triquad_map.compiled.surfels.surfel_tree import surfel_tree
 from triquad_map.composition.composed_view import no_surfels
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
@@ -69,12 +70,7 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
     surfels = random_surfels(rng, len(places.voxels))
     points = rng.uniform(-20, 84, (400, 3))
     points[:200] = rng.uniform(0, 64, (200, 3)) * (1, 1, 0.3)
-    fast = no_surfels(np.full(400, reach))
-    find_nearest(points, surfel_index(places, surfels), fast)
-    slow = no_surfels(np.full(400, reach))
-    count = len(places.voxels)
-    cloud = SurfelCloud(places.voxels, surfels, np.ones(count), np.zeros(count, int))
-    cloud.find_nearest(points, slow)
+    fast, slow = nearest_both_ways(places, surfels, points, reach)
     np.testing.assert_allclose(fast.distances, slow.distances, atol=1e-4)
     np.testing.assert_array_equal(fast.rows >= 0, slow.rows >= 0)
     hit = slow.rows >= 0
@@ -84,6 +80,74 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
     same = hit & (fast.rows == slow.rows)
     assert (same == hit).mean() > 0.99  # but for ties
     np.testing.assert_allclose(fast.means[hit], slow.means[hit], atol=1e-3)
+
+
+def nearest_both_ways(places, surfels, points, reach):
+    """What compiled code finds, and what the reference does."""
+    fast, slow = (no_surfels(np.full(len(points), reach)) for _ in range(2))
+    find_nearest(points, surfel_tree(places.shape, places.voxels, surfels), fast)
+    count = len(places.voxels)
+    cloud = SurfelCloud(places.voxels, surfels, np.ones(count), np.zeros(count, int))
+    cloud.find_nearest(points, slow)
+    return fast, slow
+
+
+@pytest.mark.parametrize("reach", [30.0, 1e4])
+def test_the_nearest_surfel_is_the_same_where_surfaces_are_far_apart(reach):
+    rng = np.random.default_rng(7)
+    live = LiveEvidence(4096)
+    middles = rng.uniform(100, 3996, (12, 3))
+    live.mark_surface(middles[rng.integers(12, size=3000)] + rng.uniform(-6, 6, (3000, 3)))
+    evidence = live.freeze()
+    places = surfel_places(evidence.cells, evidence.surface)
+    surfels = random_surfels(rng, len(places.voxels))
+    near = middles[rng.integers(12, size=200)] + rng.uniform(-40, 40, (200, 3))
+    points = np.concatenate([near, rng.uniform(-900, 5000, (200, 3))])
+    fast, slow = nearest_both_ways(places, surfels, points, reach)
+    np.testing.assert_allclose(fast.distances, slow.distances, atol=2e-3)
+    hit = slow.rows >= 0
+    np.testing.assert_array_equal(fast.rows >= 0, hit)
+    gaps = np.linalg.norm(points - fast.means, axis=1)[hit]
+    np.testing.assert_allclose(gaps, np.linalg.norm(points - slow.means, axis=1)[hit], atol=0.02)
+
+
+def test_of_more_surfels_than_count_in_the_direction_the_nearest_is_found():
+    rng = np.random.default_rng(8)
+    middle = np.full(3, 32.0)
+    live = LiveEvidence(64)
+    directions = rng.normal(size=(60_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    live.mark_surface(middle + 25.0 * directions)  # as seen from inside a ball
+    evidence = live.freeze()
+    places = surfel_places(evidence.cells, evidence.surface)
+    away = places.voxels + 0.5 - middle
+    lengths = np.linalg.norm(away, axis=1, keepdims=True)
+    offsets = (25.0 / lengths - 1.0) * away
+    kinds = np.full(len(away), SurfelKind.DISC, np.uint8)
+    surfels = Surfels(offsets.astype(np.float32), (-away / lengths).astype(np.float32), kinds)
+    points = middle + rng.normal(size=(50, 3)) * 0.02
+    fast, slow = nearest_both_ways(places, surfels, points, 60.0)
+    np.testing.assert_allclose(fast.distances, slow.distances, atol=1e-4)
+    assert np.isfinite(fast.means).all()
+    assert (np.linalg.norm(fast.means - middle, axis=1) < 25.5).all()
+
+
+def test_what_is_found_for_a_point_hangs_on_no_other_point():
+    rng = np.random.default_rng(9)
+    live = LiveEvidence(64)
+    live.mark_surface(rng.uniform(0, 64, (3000, 3)) * (1, 1, 0.1))
+    evidence = live.freeze()
+    places = surfel_places(evidence.cells, evidence.surface)
+    surfels = random_surfels(rng, len(places.voxels))
+    tree = surfel_tree(places.shape, places.voxels, surfels)
+    points = rng.uniform(-10, 74, (300, 3))
+    together = no_surfels(np.full(300, 50.0))
+    find_nearest(points, tree, together)
+    for order in (rng.permutation(300), *np.arange(300)[:, None]):
+        found = no_surfels(np.full(len(order), 50.0))
+        find_nearest(points[order], tree, found)
+        for mine, wanted in zip(found, together, strict=True):
+            np.testing.assert_array_equal(mine, wanted[order])
 
 
 def random_surfels(rng, count):

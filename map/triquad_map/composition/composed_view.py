@@ -4,18 +4,22 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.composition.field_view import FieldView, in_one
-from triquad_map.composition.region import MapRegion, NearestSurfels, Split
+from triquad_map.composition.region import MapRegion, NearestSurfels, RegionSurfels, Split
 from triquad_map.surface import SurfelKind
 from triquad_map.view import NearestSurface, NearestUnknown
 
+Rows = NDArray[np.intp]
+
 _FARTHEST_CELL = 1 << 20
-_LEAST_SEARCHES = 1024
+_LEAST_SEARCHES = 128
 """Points for which it is worth while to start another thread that searches."""
 
+_RAY_DISC = int(SurfelKind.RAY_DISC)
 _HALF_LIFE_S = 86_400.0
 """While the rest of the map was seen again, confidence in what was not halves in this time."""
 
@@ -56,12 +60,18 @@ class ComposedView(FieldView):
         )
         # Here, not in the threads of the split: to make surfels may take all of these.
         near = [
-            region for region in self._regions_near(points, max_distance_m) if len(region.surfels)
+            (region, region.surfels)
+            for region in self._regions_near(points, max_distance_m)
+            if len(region.surfels)
         ]
 
         def work(first: int, last: int) -> None:
-            for region in near:
-                self._improve_surface(nearest, points, part=range(first, last), region=region)
+            part = slice(first, last)
+            mine = NearestSurface(**{name: array[part] for name, array in vars(nearest).items()})
+            for region, surfels in near:
+                alone = len(near) == 1  # then the search itself finds out soonest what is far away
+                rows = slice(None) if alone else self._rows_near(points[part], mine, region)
+                self._improve_surface(mine, points[part], rows, region.centre, surfels)
 
         self._split(count, work, _LEAST_SEARCHES)
         return nearest
@@ -85,40 +95,53 @@ class ComposedView(FieldView):
         """Regions that come within ``reach_m`` of the box around the points [N, 3]."""
         if not len(points):
             return
-        low, high = points.min(axis=0) - reach_m, points.max(axis=0) + reach_m
+        places = np.ascontiguousarray(points.T)  # ten times as fast as along the other axis
+        low, high = places.min(axis=1) - reach_m, places.max(axis=1) + reach_m
         half = self._settings.region_side_m / 2
         for region in self.region_views:
             if (region.centre - half <= high).all() and (region.centre + half >= low).all():
                 yield region
 
+    def _rows_near(self, points: Doubles, nearest: NearestSurface, region: MapRegion) -> Rows:
+        """Which of the points [N, 3] lie nearer to a region than to what is found so far."""
+        offsets = np.abs(points - region.centre)
+        beyond = np.maximum(offsets - self._settings.region_side_m / 2, 0.0)
+        return np.flatnonzero(np.einsum("ij,ij->i", beyond, beyond) < nearest.distance**2)
+
     def _improve_surface(
-        self, nearest: NearestSurface, points: Doubles, part: range, region: MapRegion
+        self,
+        nearest: NearestSurface,
+        points: Doubles,
+        rows: Rows | slice,
+        centre: Doubles,
+        surfels: RegionSurfels,
     ) -> None:
-        """Take what is nearer in a region to the ``part`` of the points."""
-        leaf_m, half_m = self._settings.leaf_m, self._settings.region_side_m / 2
-        offsets = points[part.start : part.stop] - region.centre
-        limits = nearest.distance[part.start : part.stop]
-        beyond = np.maximum(np.abs(offsets) - half_m, 0.0)
-        near = np.flatnonzero((beyond**2).sum(axis=1) < limits**2)
-        if not len(near):
-            return
-        found = no_surfels(limits[near] / leaf_m)
-        surfels = region.surfels
-        surfels.find_nearest(self._settings.leaf_coordinates(offsets[near]), found)
-        hits = np.flatnonzero(found.rows >= 0)
-        rows, to = found.rows[hits], near[hits] + part.start
-        corner = region.centre - half_m
-        nearest.found[to] = True
-        nearest.distance[to] = found.distances[hits] * leaf_m
-        nearest.point[to] = corner + found.closest[hits] * leaf_m
-        nearest.mean[to] = corner + found.means[hits] * leaf_m
-        age_s = np.maximum(self._newest_s - surfels.seen_s[rows], 0)
-        faded = 0.5 ** (age_s / _HALF_LIFE_S)
-        nearest.confidence[to] = surfels.confidence[rows] * faded.astype(np.float32)
-        kinds = surfels.surfels.kinds[rows]
-        nearest.learnt[to] = kinds < SurfelKind.RAY_DISC
-        facing = (kinds == SurfelKind.RAY_DISC)[:, None]
-        nearest.normal[to] = np.where(facing, surfels.surfels.normals[rows], 0.0)
+        """Take what is nearer in a region to some ``rows`` of the points."""
+        leaf_m = self._settings.leaf_m
+        found = no_surfels(nearest.distance[rows] / leaf_m)
+        surfels.find_nearest(self._settings.leaf_coordinates(points[rows] - centre), found)
+        hits = found.rows >= 0
+        if not hits.all():  # mostly they are, and nothing has to be picked out
+            rows = np.flatnonzero(hits) if isinstance(rows, slice) else rows[hits]
+            found = NearestSurfels(
+                distances=found.distances[hits],
+                closest=found.closest[hits],
+                means=found.means[hits],
+                rows=found.rows[hits],
+            )
+        corner = centre - self._settings.region_side_m / 2
+        nearest.found[rows] = True
+        nearest.distance[rows] = found.distances * leaf_m
+        nearest.point[rows] = found.closest * leaf_m + corner
+        nearest.mean[rows] = found.means * leaf_m + corner
+        age_s = np.maximum(self._newest_s - surfels.seen_s[found.rows], 0)
+        faded = np.exp2(age_s / -_HALF_LIFE_S)
+        nearest.confidence[rows] = surfels.confidence[found.rows] * faded
+        kinds = surfels.surfels.kinds[found.rows]
+        nearest.learnt[rows] = kinds < _RAY_DISC
+        facing = (kinds == _RAY_DISC)[:, None]
+        normals = surfels.surfels.normals
+        nearest.normal[rows] = np.where(facing, normals[found.rows], 0.0) if facing.any() else 0.0
 
     def _improve_unknown(self, found: NearestUnknown, points: Doubles) -> None:
         """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""

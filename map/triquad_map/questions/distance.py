@@ -16,6 +16,9 @@ from triquad_map.questions.joined import joined
 from triquad_map.surface import DISC_RADIUS
 from triquad_map.view import MapView, NearestSurface
 
+# Arrays take numbers sooner than they take members of an enumeration.
+_SURFACE, _UNKNOWN = int(Status.SURFACE), int(Status.UNKNOWN)
+
 _FIELD_VOXELS = 0.5
 """Up to here the trained field counts alone."""
 
@@ -25,6 +28,7 @@ _SURFEL_VOXELS = 1.5
 _WIDENED_VOXELS = float(np.sqrt(0.5)) - DISC_RADIUS
 """From the rim of a disc to where it meets those of the voxels beside it, at their corners."""
 
+_NO_LENGTH_M = 1e-6
 
 _PART_POINTS = 1 << 15
 """Points that are answered together: meanwhile each takes ten times the bytes of its answer."""
@@ -114,9 +118,10 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
 def _distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
     nearest = view.nearest_surface(points, options.max_distance_m)
     status = view.status(points)
-    gradient = np.where(nearest.found[:, None], _unit(points - nearest.mean, 0.0), 0.0)
+    gradient = _unit(points - nearest.mean)
+    gradient[~nearest.found] = 0.0
     distance = nearest.distance.copy()
-    near = nearest.found & (distance < _SURFEL_VOXELS * view.voxel_m) & (status == Status.SURFACE)
+    near = (distance < _SURFEL_VOXELS * view.voxel_m) & (status == _SURFACE) & nearest.found
     learnt, unlearnt = np.flatnonzero(near & nearest.learnt), np.flatnonzero(near & ~nearest.learnt)
     _join_field(view, points, learnt, distance=distance, gradient=gradient)
     _join_rays(view, points, unlearnt, nearest=nearest, distance=distance, gradient=gradient)
@@ -133,7 +138,7 @@ def _distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dist
         gradient=gradient.astype(np.float32),
         found=nearest.found,
         status=status,
-        confidence=np.where(status == Status.UNKNOWN, np.float32(0), nearest.confidence),
+        confidence=np.where(status == _UNKNOWN, np.float32(0), nearest.confidence),
         epoch=view.epoch,
         _surface_point=surface_point,
         _unknown_distance_m=None if unknown is None else unknown.distance.astype(np.float32),
@@ -154,7 +159,7 @@ def with_unknown(answer: Distances, points: Doubles, unknown: Unknown) -> Distan
     nearer = answer.unknown_distance_m < answer.distance_m
     if unknown is Unknown.ERROR:
         refuse_unknown("point", nearer)
-    gradient = _unit(points - answer.unknown_point, 0.0)
+    gradient = _unit(points - answer.unknown_point)
     surface_point = answer._surface_point
     if surface_point is not None:
         surface_point = np.where(nearer[:, None], answer.unknown_point, surface_point)
@@ -179,8 +184,7 @@ def _join_field(
     usable = np.isfinite(field.sdf) & (np.abs(field.gradient).max(axis=1) > 0)
     rows = rows[usable]
     value = field.sdf[usable].astype(np.float64)
-    slope = field.gradient[usable].astype(np.float64)
-    slope /= np.linalg.norm(slope, axis=1, keepdims=True)
+    slope = _unit(field.gradient[usable].astype(np.float64))
     share = _surfel_share(view, distance[rows])
     side = np.where(value < 0, -1.0, 1.0)
     # The field is no more than a bound where it saturates.
@@ -212,7 +216,7 @@ def _join_rays(
     is_point = ~normal.any(axis=1)
     close[is_point] = distance[rows[is_point]] - DISC_RADIUS * view.voxel_m
     feet = points[rows] - height[:, None] * normal
-    ended = view.status(feet, reach_m=0.0) == Status.SURFACE  # else beyond an edge
+    ended = view.status(feet, reach_m=0.0) == _SURFACE  # else beyond an edge
     behind = ended & (height < 0) & (height > -_FIELD_VOXELS * view.voxel_m) & (beyond == 0)
     side = np.where(behind, -1.0, 1.0)
     share = _surfel_share(view, distance[rows])
@@ -231,7 +235,11 @@ def _surfel_share(view: MapView, distance: Doubles) -> Doubles:
     return np.asarray(share * share * (3.0 - 2.0 * share), np.float64)
 
 
-def _unit(vectors: Doubles, otherwise: Doubles | float) -> Doubles:
+def _unit(vectors: Doubles, otherwise: Doubles | float = 0.0) -> Doubles:
     """The directions [N, 3] of ``vectors`` [N, 3]; ``otherwise`` where they have no length."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.where(lengths > 1e-6, vectors / np.maximum(lengths, 1e-6), otherwise)
+    lengths = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    directions: Doubles = vectors / np.maximum(lengths, _NO_LENGTH_M)[:, None]
+    short = lengths <= _NO_LENGTH_M
+    if short.any():
+        directions[short] = np.broadcast_to(otherwise, vectors.shape)[short]
+    return directions

@@ -1,11 +1,13 @@
 """``triquad-bench`` of planners: one, sixteen at once while a lidar streams, and a frozen one."""
 
 import signal
+import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 
 import numpy as np
 import zenoh
@@ -13,11 +15,13 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import keys
 from triquad_format.wire.zenoh_config import QUIET, put
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.view import MapView
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.answers import REACH_M, measure_answers
-from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.figures import Figure, seconds
 from triquad_tools.benchmarks.ground import ground_latency, ground_points, measure_ground
 from triquad_tools.benchmarks.served import MAP, Served, latency_figures, served, stream
 from triquad_tools.benchmarks.street import BenchStreet
@@ -27,6 +31,8 @@ from triquad_tools.recordings.publishing import wait_until_settled
 Points = Doubles
 
 _ASKED = 1_000
+_ASKED_AT_ONCE = 100_000
+_ROUNDS = 5
 _CLIENTS = 16
 _SETTLE_LIMIT_S = 600.0
 _WARM_S = 3.0  # until sixteen processes have started
@@ -43,7 +49,7 @@ with triquad_client.connect(sys.argv[1], sys.argv[2], timeout_s=60.0) as client:
 def measure_planners(made: BenchStreet) -> list[Figure]:
     """Figures of answers, and of how soon they come."""
     with served() as server:
-        points = _planner_points(made)
+        points = _planner_points(made, _ASKED)
         figures = _one(server, made, points[0])
         figures += _sixteen(server, made, points)
         figures += _beside_frozen(server, points[0])
@@ -52,14 +58,36 @@ def measure_planners(made: BenchStreet) -> list[Figure]:
         server.client.download_map(server.folder / "map.triquad")
         record = read_map(server.folder / "map.triquad")
     view = Mapper(MAP, Settings(), "cpu", record=record).publish()
+    figures = _in_process(made, view) + figures
     return measure_answers(made, record, view) + measure_ground(made, view) + figures
 
 
-def _planner_points(made: BenchStreet) -> list[Points]:
-    """What each planner asks: points around one place of the drive each."""
+def _in_process(made: BenchStreet, view: MapView) -> list[Figure]:
+    """How soon distances are known, without a network and while nothing else is done."""
+    options = DistanceOptions(REACH_M)
+
+    def typical_s(asked: Sequence[Points]) -> float:
+        distances(view, asked[0], options)
+        times = [seconds(partial(distances, view, each, options)) for each in asked]
+        return statistics.median(times)
+
+    few = _planner_points(made, _ASKED)
+    many = np.concatenate(_planner_points(made, _ASKED_AT_ONCE // _CLIENTS))
+    many = np.random.default_rng(0).permutation(many)
+    rate = len(many) / typical_s([many] * _ROUNDS) / 1e6
+    return [
+        Figure(f"{_ASKED} distances to {REACH_M:g} m with gradient, in process",
+               1e3 * typical_s(few * _ROUNDS), "ms"),
+        Figure(f"{len(many)} distances in one request, in process", rate, "M points/s",
+               at_least=1.5),
+    ]  # fmt: skip
+
+
+def _planner_points(made: BenchStreet, count: int) -> list[Points]:
+    """What each planner asks: ``count`` points around one place of the drive."""
     rng = np.random.default_rng(0)
     poses = made.drive.poses[np.arange(_CLIENTS) * len(made.drive.poses) // _CLIENTS]
-    return [pose[:3, 3] + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (_ASKED, 3)) for pose in poses]
+    return [pose[:3, 3] + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (count, 3)) for pose in poses]
 
 
 def _trained_per_s(server: Served, made: BenchStreet, title: str) -> float:

@@ -7,20 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.surfels.surfel_search import (
-    GROUP_SHIFT,
-    BlockGroups,
-    SurfelIndex,
-    find_nearest,
-)
-from triquad_map.compiled.voxel_index import LOW, SHIFT, VoxelIndex, keys_of
+from triquad_map.compiled.surfels.surfel_search import find_nearest
+from triquad_map.compiled.surfels.surfel_tree import TreeShape, surfel_tree, tree_shape
+from triquad_map.compiled.voxel_index import LOW, SHIFT, keys_of
 from triquad_map.composition.region import NearestSurfels
 from triquad_map.surface import (
     SampleField,
@@ -32,7 +27,6 @@ from triquad_map.surface import (
     support_confidence,
 )
 
-_FAR = 1e6  # voxels
 _NEVER = -1
 
 _UNLEARNT_REFITTED = 4_000
@@ -50,7 +44,7 @@ class SurfelPlaces:
     surface: Bytes  # [blocks, BLOCK_BYTES] these voxels
     starts: Ints  # [blocks + 1] first surfel of each block
     voxels: Longs  # [S, 3] voxel of each surfel
-    groups: BlockGroups
+    shape: TreeShape
 
 
 def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
@@ -59,21 +53,7 @@ def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
     used = np.flatnonzero(counts)  # most blocks are of open air
     voxels = surfel_voxels(cells[used], surface[used], int(starts[-1]))
-    return SurfelPlaces(surface, starts, voxels, block_groups(cells, surface, used))
-
-
-def surfel_index(places: SurfelPlaces, surfels: Surfels) -> SurfelIndex:
-    """The ``surfels`` [S] that stand in some places."""
-    positions = (places.voxels % BLOCK_VOXELS).astype(np.float32)
-    positions += surfels.offsets + np.float32(0.5)
-    positions[surfels.kinds == SurfelKind.NONE] = _FAR
-    return SurfelIndex(
-        groups=places.groups,
-        starts=places.starts,
-        positions=np.ascontiguousarray(positions.T),
-        normals=surfels.normals,
-        kinds=surfels.kinds,
-    )
+    return SurfelPlaces(surface, starts, voxels, tree_shape(cells, surface, starts))
 
 
 @kernel()
@@ -120,46 +100,6 @@ def moved_rows(before: Bytes, before_starts: Ints, now: Bytes, count: int) -> In
     return rows
 
 
-@kernel()
-def _block_boxes(cells: Longs, surface: Bytes, rows: Longs) -> Ints:
-    """The boxes [M, 6] around the seen surface of some blocks."""
-    boxes = np.empty((len(rows), 6), np.int32)
-    for i, row in enumerate(rows):
-        for axis in range(3):
-            boxes[i, axis], boxes[i, axis + 3] = BLOCK_VOXELS, 0
-        for byte in range(BLOCK_BYTES):
-            for z in range(BLOCK_VOXELS):
-                if surface[row, byte] >> z & 1:
-                    for axis, place in enumerate((byte >> SHIFT, byte & LOW, z)):
-                        boxes[i, axis] = min(boxes[i, axis], place)
-                        boxes[i, axis + 3] = max(boxes[i, axis + 3], place + 1)
-        for side in range(6):
-            boxes[i, side] += cells[row, side % 3] << SHIFT
-    return boxes
-
-
-def block_groups(cells: Longs, surface: Bytes, used: NDArray[np.intp]) -> BlockGroups:
-    """The blocks ``used`` [N], of those at ``cells`` [blocks, 3], in groups.
-
-    They are those that hold any of ``surface`` [blocks, BLOCK_BYTES].
-    """
-    codes, owners = np.unique(morton.encode(cells[used] >> GROUP_SHIFT), return_inverse=True)
-    order = np.argsort(owners, kind="stable")
-    starts = np.searchsorted(owners[order], np.arange(len(codes) + 1))
-    boxes = _block_boxes(cells, surface, used[order])
-    around = np.zeros((len(codes), 6), np.int32)
-    if len(codes):
-        around[:, :3] = np.minimum.reduceat(boxes[:, :3], starts[:-1])
-        around[:, 3:] = np.maximum.reduceat(boxes[:, 3:], starts[:-1])
-    return BlockGroups(
-        places=VoxelIndex.of_cells(morton.decode(codes, 3)).arrays,
-        boxes=around,
-        starts=starts.astype(np.int32),
-        members=used[order].astype(np.int32),
-        member_boxes=np.ascontiguousarray(boxes.T, np.float32),
-    )
-
-
 @dataclass(frozen=True)
 class _Fitted:
     """Surfels in their places, and the epoch in which each was fitted last."""
@@ -175,9 +115,10 @@ class SurfelMap:
     def __init__(self, evidence: FrozenEvidence, fitted: _Fitted) -> None:
         """Use :func:`first_surfels` or :meth:`updated`."""
         self._fitted = fitted
-        self._index = surfel_index(fitted.places, fitted.surfels)
+        places = fitted.places
+        self._tree = surfel_tree(places.shape, places.voxels, fitted.surfels)
         self.confidence = support_confidence(evidence.levels, fitted.surfels.kinds)
-        self.seen_s = np.repeat(evidence.seen_s, np.diff(fitted.places.starts))
+        self.seen_s = np.repeat(evidence.seen_s, np.diff(places.starts))
 
     def __len__(self) -> int:
         return len(self._fitted.epochs)
@@ -194,7 +135,7 @@ class SurfelMap:
 
     def find_nearest(self, points: Doubles, found: NearestSurfels) -> None:
         """Improve ``found`` where a surfel lies nearer to leaf coordinates ``points`` [N, 3]."""
-        find_nearest(points, self._index, found)
+        find_nearest(points, self._tree, found)
 
     def updated(
         self,

@@ -1,273 +1,341 @@
 """The search for the nearest surfel.
 
-Groups of blocks first, cubes of 4 x 4 x 4, so that empty space costs nothing; then their blocks,
-then the surfels of a block, each level by the boxes around what it holds. All of it becomes one
-function, and arrays are in local variables where a loop uses them: to pass them on, or to reach
-into tuples for them, takes longer than the arithmetic.
+From the root of the tree down, the nearest box first, and no box that lies farther than the
+nearest surfel so far. Boxes and surfels are looked at eight at a time. The surfel that was found
+for the point before is a first bound, so points are taken in an order in which neighbours follow
+each other. All of it becomes one function: to call others takes longer than the arithmetic.
 """
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints
-from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.arrays import Doubles, Floats, Ints
 
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import CELL_LIMIT, LOW, Index, find_row, pack, unpack
-from triquad_map.composition.region import NearestSurfels
-from triquad_map.surface import DISC_RADIUS, OUTSIDE, SMOOTHING, SurfelKind
-
-GROUP_SHIFT = 2
-_GROUP_VOXELS = float(BLOCK_VOXELS << GROUP_SHIFT)
-
-_STEPS = np.array(
-    sorted(itertools.product((-1, 0, 1), repeat=3), key=lambda step: np.abs(step).sum())
+from triquad_map.compiled.lanes import (
+    LANES,
+    Lanes,
+    at_most,
+    fill,
+    larger,
+    least,
+    load,
+    lowest_bit,
+    root,
+    store,
+    total,
 )
-"""To the groups at and beside a place [27, 3], the near ones first."""
+from triquad_map.compiled.surfels.surfel_tree import (
+    CORNER,
+    NORMAL_X,
+    NORMAL_Y,
+    NORMAL_Z,
+    RADIUS,
+    SurfelTree,
+    X,
+    Y,
+    Z,
+)
+from triquad_map.compiled.voxel_index import CELL_LIMIT
+from triquad_map.composition.region import NearestSurfels
+from triquad_map.surface import SMOOTHING
 
-_NEIGHBOURS = len(_STEPS)
 _FARTHEST = CELL_LIMIT / 2
-_DISC, _RAY_DISC = int(SurfelKind.DISC), int(SurfelKind.RAY_DISC)
-_RADIUS = np.float32(DISC_RADIUS)
 
-_CANDIDATES = 128
-"""How many surfels are remembered for the direction."""
+_ROUNDING = 2.0**-21
+"""By how much, of their coordinates, boxes and points are off at most in single precision."""
+
+_SMOOTHING = np.float32(SMOOTHING)
+_KEPT = 128
+"""How many leaves are remembered for the direction."""
+
+_WAITING = 1024
+"""Room for boxes that may have to be opened: seven levels of nodes with 64 below each, and more."""
 
 _NONE = -1
+_NO_LENGTH = np.float32(1e-9)
 
-# The numbers of ``Search.found``.
-_SURFEL, _MEMBER, _COUNT = range(3)
+_CELL_BITS = 7  # of each coordinate of the cells by which points are put in order
+_DIGIT_BITS = 11  # of a cell's code that are counted at a time
+_DIGIT = (1 << _DIGIT_BITS) - 1
+_DIGITS = 2
 
 Place = tuple[float, float, float]
+Vectors = tuple[Lanes, Lanes, Lanes]
 
 
-class BlockGroups(NamedTuple):
-    """The blocks that hold seen surface, in groups, with the boxes around that.
+class Room(NamedTuple):
+    """Room for what is known while the nearest surfel of a point is searched for."""
 
-    A box is its least and its greatest corner, in voxels; surfels reach ``OUTSIDE`` of it.
-    """
-
-    places: Index  # of groups
-    boxes: Ints  # [groups, 6]
-    starts: Ints  # [groups + 1] first member of each
-    members: Ints  # [M] rows of blocks
-    member_boxes: Floats  # [6, M]
-
-
-class SurfelIndex(NamedTuple):
-    """Surfels as kernels take them."""
-
-    groups: BlockGroups
-    starts: Ints  # [blocks + 1] first surfel of each block
-    positions: Floats  # [3, surfels] from the block's corner, voxels; far away where there is none
-    normals: Floats  # [surfels, 3]
-    kinds: Bytes  # [surfels] SurfelKind
+    kept: Ints  # [_KEPT] leaves that may hold surfels that count in the direction
+    nearest: Floats  # [_KEPT] square of the distance to the nearest surfel of each
+    squares: Floats  # [_KEPT, LANES] and to all
+    order: Ints  # [_KEPT] in which they count
+    waiting: Ints  # [_WAITING] leaves and nodes that may hold nearer surfels, the nearest last
+    away: Floats  # [_WAITING] squares of the distances to their boxes
+    aside: Floats  # [LANES] room for those of a few boxes
 
 
-class Search(NamedTuple):
-    """What is known while the nearest surfel of a point is searched for."""
+class Found(NamedTuple):
+    """What was found for a point."""
 
-    best: Floats  # [1] square of the least distance
-    found: Ints  # [3] the nearest surfel, the block that holds it, and how many candidates
-    candidates: Ints  # [_CANDIDATES, 2] surfels that may count in the direction, and their blocks
-    nearness: Floats  # [_CANDIDATES] squares of their distances
-    squares: Floats  # [BLOCK_VOXELS**3] room for those of a block's surfels
-    away: Floats  # [blocks of a group] and for those of blocks
+    leaf: int  # that holds the nearest surfel, ``_NONE``: there is none
+    lane: int  # of this leaf
+    square: float  # of the distance to it
+    kept: int  # leaves
 
 
 @kernel(fastmath=True, inline="always")
-def _wider(square: float, by: float) -> float:
-    """Square of a distance that is larger ``by`` so much."""
-    reach = np.sqrt(square) + np.float32(by)
-    wider: float = np.float32(reach * reach)
-    return wider
+def _from_surfels(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
+    """From the middles of a leaf's surfels to a place."""
+    surfels = tree.surfels
+    x = fill(at[0] - surfels[leaf, CORNER, 0]) - load(surfels, (leaf, X, 0))
+    y = fill(at[1] - surfels[leaf, CORNER, 1]) - load(surfels, (leaf, Y, 0))
+    z = fill(at[2] - surfels[leaf, CORNER, 2]) - load(surfels, (leaf, Z, 0))
+    return x, y, z
 
 
 @kernel(fastmath=True, inline="always")
-def _sifted(search: Search, limit: float) -> int:
-    """Keep the candidates that are nearer than the root of ``limit``; how many they are."""
-    candidates, nearness = search.candidates, search.nearness
+def _normals(tree: SurfelTree, leaf: int) -> Vectors:
+    surfels = tree.surfels
+    return (
+        load(surfels, (leaf, NORMAL_X, 0)),
+        load(surfels, (leaf, NORMAL_Y, 0)),
+        load(surfels, (leaf, NORMAL_Z, 0)),
+    )
+
+
+@kernel(fastmath=True, inline="always")
+def _squares(tree: SurfelTree, leaf: int, at: Place) -> Lanes:
+    """Squares of the distances from a place to a leaf's surfels."""
+    x, y, z = _from_surfels(tree, leaf, at)
+    u, v, w = _normals(tree, leaf)
+    height = x * u + y * v + z * w
+    height = height * height
+    beside = root(larger(x * x + y * y + z * z - height, fill(0.0)))
+    beyond = larger(beside - load(tree.surfels, (leaf, RADIUS, 0)), fill(0.0))
+    return height + beyond * beyond
+
+
+@kernel(fastmath=True)
+def _sifted(room: Room, limit: float) -> int:
+    """Of all kept leaves keep those of which a surfel is so near; how many they are."""
     count = 0
-    for i in range(_CANDIDATES):
-        if nearness[i] <= limit:
-            nearness[count] = nearness[i]
-            candidates[count, 0], candidates[count, 1] = candidates[i, 0], candidates[i, 1]
+    for i in range(_KEPT):
+        if room.nearest[i] <= limit:
+            room.kept[count], room.nearest[count] = room.kept[i], room.nearest[i]
+            room.squares[count] = room.squares[i]
             count += 1
     return count
 
 
 @kernel(fastmath=True, inline="always")
-def _disc_square(a: float, b: float, c: float, normal: Floats, square: float) -> float:
-    """Square of the distance to a disc, of whose middle a place is ``(a, b, c)`` off."""
-    height = a * normal[0] + b * normal[1] + c * normal[2]
-    beside = square - height * height
-    square = height * height
-    if beside > _RADIUS * _RADIUS:
-        beyond = np.sqrt(beside) - _RADIUS
-        square += beyond * beyond
-    return square
+def _limit(distance: float, at: Place) -> float:
+    """Square of the distance up to which surfels may count, where one is so near."""
+    farthest = max(abs(at[0]), abs(at[1]), abs(at[2])) + distance
+    reach = np.float32(distance + SMOOTHING + _ROUNDING * farthest)
+    limit: float = reach * reach
+    return limit
 
 
 @kernel(fastmath=True, inline="always")
-def _search_block(index: SurfelIndex, member: int, at: Place, search: Search) -> None:
-    """Search the surfels of a block. All is relative to its corner, in single precision."""
-    row, boxes = index.groups.members[member], index.groups.member_boxes
-    x = np.float32(at[0] - (int(boxes[0, member]) & ~LOW))
-    y = np.float32(at[1] - (int(boxes[1, member]) & ~LOW))
-    z = np.float32(at[2] - (int(boxes[2, member]) & ~LOW))
-    start, count = index.starts[row], index.starts[row + 1] - index.starts[row]
-    # Slices of their own, which the compiler makes vector instructions of.
-    xs = index.positions[0, start : start + count]
-    ys = index.positions[1, start : start + count]
-    zs = index.positions[2, start : start + count]
-    normals, kinds, squares = index.normals, index.kinds, search.squares
-    for i in range(count):
-        a, b, c = x - xs[i], y - ys[i], z - zs[i]
-        squares[i] = a * a + b * b + c * c
-    best, known = search.best[0], search.found[_COUNT]
-    near, far = _wider(best, SMOOTHING), _wider(best, SMOOTHING + DISC_RADIUS)
-    sifted = best
-    for i in range(count):
-        if squares[i] > far:
+def _open(tree: SurfelTree, node: int, at: Place, limit: float, room: Room, count: int) -> int:
+    """Add what lies below a node to the ``count`` leaves and nodes that wait; how many they are."""
+    boxes, waiting, away = tree.boxes, room.waiting, room.away
+    zero, limits = fill(0.0), fill(limit)
+    x, y, z = fill(at[0]), fill(at[1]), fill(at[2])
+    before, last = count, tree.children[node + 1]
+    for first in range(tree.children[node], last, LANES):
+        a = larger(larger(load(boxes, (0, first)) - x, x - load(boxes, (3, first))), zero)
+        b = larger(larger(load(boxes, (1, first)) - y, y - load(boxes, (4, first))), zero)
+        c = larger(larger(load(boxes, (2, first)) - z, z - load(boxes, (5, first))), zero)
+        squares = a * a + b * b + c * c
+        store(room.aside, (0,), squares)
+        near = at_most(squares, limits)
+        if last - first < LANES:
+            near &= (1 << (last - first)) - 1
+        while near:
+            lane = lowest_bit(near)
+            near &= near - 1
+            box, square = first + lane, room.aside[lane]
+            waiting[count], away[count] = box, square
+            if count > before and away[count - 1] < square:
+                waiting[count], away[count] = waiting[count - 1], away[count - 1]
+                waiting[count - 1], away[count - 1] = box, square
+            count += 1
+    return count
+
+
+@kernel(fastmath=True, inline="always")
+def _search(tree: SurfelTree, at: Place, distance: float, limit: float, room: Room) -> Found:
+    """Search all surfels that are nearer than ``distance``, or count in the direction.
+
+    Those that count are nearer than the root of ``limit``.
+    """
+    leaves = len(tree.leaves) - 1
+    best, leaf, lane, kept = np.float32(distance * distance), _NONE, 0, 0
+    room.waiting[0], room.away[0] = leaves + len(tree.children) - 2, 0.0
+    count = 1
+    while count > 0:
+        count -= 1
+        if room.away[count] > limit:
             continue
-        surfel, square = start + i, squares[i]
-        if kinds[surfel] == _DISC or kinds[surfel] == _RAY_DISC:
-            square = _disc_square(x - xs[i], y - ys[i], z - zs[i], normals[surfel], square)
-        if square > near:
+        box = room.waiting[count]
+        if box >= leaves:
+            count = _open(tree, box - leaves, at, limit, room, count)
             continue
-        if known == _CANDIDATES and best < sifted:
-            known, sifted = _sifted(search, near), best
-        if known < _CANDIDATES:
-            search.candidates[known, 0], search.candidates[known, 1] = surfel, member
-            search.nearness[known] = square
-            known += 1
-        if square < best:
-            best = square
-            search.found[_SURFEL], search.found[_MEMBER] = surfel, member
-            near, far = _wider(best, SMOOTHING), _wider(best, SMOOTHING + DISC_RADIUS)
-    search.best[0], search.found[_COUNT] = best, known
+        squares = _squares(tree, box, at)
+        nearest = least(squares)
+        if nearest > limit:
+            continue
+        if kept == _KEPT:
+            kept = _sifted(room, limit)
+        if nearest < best:
+            best, leaf = nearest, box
+            lane = lowest_bit(at_most(squares, fill(nearest)))
+            limit = min(limit, _limit(np.sqrt(nearest), at))
+            kept = min(kept, _KEPT - 1)
+        if kept < _KEPT:
+            room.kept[kept], room.nearest[kept] = box, nearest
+            store(room.squares, (kept, 0), squares)
+            kept += 1
+    return Found(leaf, lane, best, kept)
 
 
 @kernel(fastmath=True, inline="always")
-def _search_group(index: SurfelIndex, group: int, at: Place, search: Search) -> None:
-    """Search the blocks of a group, the nearest first."""
-    first, last = index.groups.starts[group], index.groups.starts[group + 1]
-    boxes, away = index.groups.member_boxes, search.away
-    x0, y0, z0 = boxes[0, first:last], boxes[1, first:last], boxes[2, first:last]
-    x1, y1, z1 = boxes[3, first:last], boxes[4, first:last], boxes[5, first:last]
-    x, y, z = np.float32(at[0]), np.float32(at[1]), np.float32(at[2])
-    zero = np.float32(0)
-    for i in range(last - first):
-        a = max(x0[i] - x, x - x1[i], zero)
-        b = max(y0[i] - y, y - y1[i], zero)
-        c = max(z0[i] - z, z - z1[i], zero)
-        away[i] = a * a + b * b + c * c
-    begin = 0
-    for i in range(1, last - first):
-        if away[i] < away[begin]:
-            begin = i
-    limit = _wider(search.best[0], SMOOTHING + OUTSIDE)
-    for turn in range(-1, last - first):
-        i = begin if turn < 0 else turn
-        if turn != begin and away[i] <= limit:
-            _search_block(index, first + i, at, search)
-            limit = _wider(search.best[0], SMOOTHING + OUTSIDE)
-
-
-@kernel(inline="always")
-def _reaches(index: SurfelIndex, group: int, at: Place, search: Search) -> bool:
-    """Whether a group may hold a surfel that counts."""
-    boxes = index.groups.boxes
-    a = max(boxes[group, 0] - at[0], at[0] - boxes[group, 3], 0.0)
-    b = max(boxes[group, 1] - at[1], at[1] - boxes[group, 4], 0.0)
-    c = max(boxes[group, 2] - at[2], at[2] - boxes[group, 5], 0.0)
-    return bool(a * a + b * b + c * c <= _wider(search.best[0], SMOOTHING + OUTSIDE))
+def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
+    """From the points of a leaf's surfels that are nearest to a place to that place."""
+    x, y, z = _from_surfels(tree, leaf, at)
+    u, v, w = _normals(tree, leaf)
+    height = x * u + y * v + z * w
+    u, v, w = height * u, height * v, height * w
+    x, y, z = x - u, y - v, z - w
+    beside = larger(root(x * x + y * y + z * z), fill(_NO_LENGTH))
+    share = larger(fill(1.0) - load(tree.surfels, (leaf, RADIUS, 0)) / beside, fill(0.0))
+    return u + share * x, v + share * y, w + share * z
 
 
 @kernel(fastmath=True, inline="always")
-def _search(index: SurfelIndex, at: Place, search: Search) -> None:
-    """Search the groups around a point, then at all others."""
-    places = index.groups.places
-    x = int(np.floor(at[0] / _GROUP_VOXELS))
-    y = int(np.floor(at[1] / _GROUP_VOXELS))
-    z = int(np.floor(at[2] / _GROUP_VOXELS))
-    for turn in range(_NEIGHBOURS + len(index.groups.boxes)):
-        if turn < _NEIGHBOURS:
-            key = pack(x + _STEPS[turn, 0], y + _STEPS[turn, 1], z + _STEPS[turn, 2])
-            group = find_row(places, key)
-        elif _wider(search.best[0], SMOOTHING) <= _GROUP_VOXELS * _GROUP_VOXELS:
-            break
-        else:
-            group = turn - _NEIGHBOURS
-            a, b, c = unpack(places.row_keys[group])
-            if max(abs(a - x), abs(b - y), abs(c - z)) <= 1:  # searched already
-                continue
-        if group >= 0 and _reaches(index, group, at, search):
-            _search_group(index, group, at, search)
+def _put_in_order(room: Room, kept: int, far: float) -> int:
+    """Order the kept leaves of which a surfel is so near; how many they are.
+
+    In which order they were met hangs on other points, and so would the last digit of a sum.
+    """
+    count = 0
+    for k in range(kept):
+        if room.nearest[k] <= far:
+            place = count
+            while place > 0 and room.kept[room.order[place - 1]] > room.kept[k]:
+                room.order[place] = room.order[place - 1]
+                place -= 1
+            room.order[place] = k
+            count += 1
+    return count
 
 
-@kernel(inline="always")
-def _closest_point(index: SurfelIndex, surfel: int, member: int, at: Place) -> Place:
-    """The point of a surfel that is nearest to a place."""
-    boxes = index.groups.member_boxes
-    qx = (int(boxes[0, member]) & ~LOW) + float(index.positions[0, surfel])
-    qy = (int(boxes[1, member]) & ~LOW) + float(index.positions[1, surfel])
-    qz = (int(boxes[2, member]) & ~LOW) + float(index.positions[2, surfel])
-    if index.kinds[surfel] != _DISC and index.kinds[surfel] != _RAY_DISC:
-        return qx, qy, qz
-    nx, ny, nz = index.normals[surfel, 0], index.normals[surfel, 1], index.normals[surfel, 2]
-    a, b, c = at[0] - qx, at[1] - qy, at[2] - qz
-    height = a * nx + b * ny + c * nz
-    a, b, c = a - height * nx, b - height * ny, c - height * nz
-    share = min(1.0, DISC_RADIUS / max(np.sqrt(a * a + b * b + c * c), 1e-9))
-    return qx + share * a, qy + share * b, qz + share * c
-
-
-@kernel()
+@kernel(fastmath=True, inline="always")
 def _write_found(
-    index: SurfelIndex, at: Place, search: Search, i: int, nearest: NearestSurfels
+    tree: SurfelTree, at: Place, found: Found, room: Room, i: int, nearest: NearestSurfels
 ) -> None:
     """Write what was found for point ``i``."""
-    best = np.sqrt(search.best[0])
-    surfel = search.found[_SURFEL]
-    closest = _closest_point(index, surfel, search.found[_MEMBER], at)
-    total, x, y, z = 1.0, closest[0], closest[1], closest[2]
-    for k in range(search.found[_COUNT]):
-        share = 1.0 - (np.sqrt(search.nearness[k]) - best) / SMOOTHING
-        if share > 0.0 and search.candidates[k, 0] != surfel:
-            a, b, c = _closest_point(index, search.candidates[k, 0], search.candidates[k, 1], at)
-            weight = share * share
-            total += weight
-            x, y, z = x + weight * a, y + weight * b, z + weight * c
+    best = np.sqrt(found.square)
+    far = (best + _SMOOTHING) ** 2
+    weights, x, y, z = fill(0.0), fill(0.0), fill(0.0), fill(0.0)
+    for turn in range(_put_in_order(room, found.kept, far)):
+        k = room.order[turn]
+        farther = (root(load(room.squares, (k, 0))) - fill(best)) * fill(1 / _SMOOTHING)
+        weight = larger(fill(1.0) - farther, fill(0.0))
+        weight = weight * weight
+        a, b, c = _closest_offset(tree, room.kept[k], at)
+        weights = weights + weight
+        x, y, z = x + weight * a, y + weight * b, z + weight * c
+    share = 1 / total(weights)
+    nearest.means[i, 0] = at[0] - total(x) * share
+    nearest.means[i, 1] = at[1] - total(y) * share
+    nearest.means[i, 2] = at[2] - total(z) * share
+    x, y, z = _closest_offset(tree, found.leaf, at)
+    for axis, offsets in enumerate((x, y, z)):
+        store(room.aside, (0,), offsets)
+        nearest.closest[i, axis] = at[axis] - room.aside[found.lane]
     nearest.distances[i] = best
-    nearest.rows[i] = surfel
-    nearest.closest[i, 0], nearest.closest[i, 1], nearest.closest[i, 2] = closest
-    nearest.means[i, 0] = x / total
-    nearest.means[i, 1] = y / total
-    nearest.means[i, 2] = z / total
+    nearest.rows[i] = tree.order[tree.leaves[found.leaf] + found.lane]
 
 
-@kernel()
-def find_nearest(points: Doubles, index: SurfelIndex, nearest: NearestSurfels) -> None:
+@kernel(fastmath=True, inline="always")
+def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> float:
+    """As :func:`_limit`, from how far is searched and a leaf that may be near."""
+    if leaf != _NONE:
+        x, y, z = _from_surfels(tree, leaf, at)
+        distance = min(distance, np.sqrt(least(x * x + y * y + z * z)))
+    return _limit(distance, at)
+
+
+@kernel(fastmath=True, inline="always")
+def _spread(cell: int) -> int:
+    """Every third bit of a Morton code."""
+    code = 0
+    for bit in range(_CELL_BITS):
+        code |= (cell >> bit & 1) << 3 * bit
+    return code
+
+
+@kernel(fastmath=True)
+def _cell_codes(points: Doubles) -> Ints:
+    """Morton codes [N] of the points' cells, of which there are so many along the longest side."""
+    codes = np.zeros(len(points), np.int32)
+    low = np.array([points[:, axis].min() for axis in range(3)])
+    side = max([points[:, axis].max() - low[axis] for axis in range(3)])
+    scale = (1 << _CELL_BITS) / max(side, 1.0) * (1 - 1e-9)
+    for i in range(len(points)):
+        for axis in range(3):
+            codes[i] |= _spread(int((points[i, axis] - low[axis]) * scale)) << axis
+    return codes
+
+
+@kernel(fastmath=True)
+def _spatial_order(points: Doubles) -> Ints:
+    """The numbers of points [N, 3] in an order in which neighbours mostly follow each other."""
+    codes = _cell_codes(points)
+    order = np.arange(len(points)).astype(np.int32)
+    for digit in range(_DIGITS):
+        shift = digit * _DIGIT_BITS
+        places = np.zeros((1 << _DIGIT_BITS) + 1, np.int32)
+        for code in codes:
+            places[(code >> shift & _DIGIT) + 1] += 1
+        for value in range(1 << _DIGIT_BITS):
+            places[value + 1] += places[value]
+        before, order = order, np.empty_like(order)
+        for i in before:
+            value = codes[i] >> shift & _DIGIT
+            order[places[value]] = i
+            places[value] += 1
+    return order
+
+
+@kernel(fastmath=True)
+def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> None:
     """Improve ``nearest`` where a surfel of the region lies nearer to ``points`` [N, 3].
 
     Points are leaf coordinates of the region and may lie outside of it.
     """
-    search = Search(
-        np.empty(1, np.float32),
-        np.empty(3, np.int32),
-        np.empty((_CANDIDATES, 2), np.int32),
-        np.empty(_CANDIDATES, np.float32),
-        np.empty(BLOCK_VOXELS**3, np.float32),
-        np.empty(1 << 3 * GROUP_SHIFT, np.float32),
+    if len(points) == 0 or len(tree.children) < 2:
+        return
+    room = Room(
+        np.empty(_KEPT, np.int32),
+        np.empty(_KEPT, np.float32),
+        np.empty((_KEPT, LANES), np.float32),
+        np.empty(_KEPT, np.int32),
+        np.empty(_WAITING, np.int32),
+        np.empty(_WAITING, np.float32),
+        np.empty(LANES, np.float32),
     )
-    for i in range(len(points)):
+    before = _NONE
+    for i in _spatial_order(points):
         at = (points[i, 0], points[i, 1], points[i, 2])
         if not max(abs(at[0]), abs(at[1]), abs(at[2])) < _FARTHEST:
             continue
-        search.best[0] = nearest.distances[i] ** 2
-        search.found[_SURFEL], search.found[_COUNT] = _NONE, 0
-        _search(index, at, search)
-        if search.found[_SURFEL] != _NONE:
-            _write_found(index, at, search, i, nearest)
+        limit = _first_limit(tree, at, nearest.distances[i], before)
+        found = _search(tree, at, nearest.distances[i], limit, room)
+        if found.leaf != _NONE:
+            _write_found(tree, at, found, room, i, nearest)
+            before = found.leaf

@@ -1,0 +1,179 @@
+"""Eight numbers at once, as kernels compute with them.
+
+The compiler makes vector instructions of long loops, but not of loops over eight numbers, nor does
+it find by itself the few of them that are small enough. So here a vector of the processor is a
+type of its own: ``+ - * /`` of two of them go lane by lane, and so do the functions below.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any, TypeAlias, cast
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+LANES = 8
+
+Lanes: TypeAlias = Any
+"""[LANES] numbers in single precision."""
+
+# The stub has it as if callers passed the typing context, which they do not.
+_kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., Any]]", intrinsic)
+
+_FLOAT, _INT32, _INT64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+_VECTOR = ir.VectorType(_FLOAT, LANES)
+_FAST = ("fast",)
+
+
+class _LanesType(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+
+_KIND = _LanesType()
+
+
+@register_model(_LanesType)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _VECTOR)  # type: ignore[no-untyped-call]
+
+
+def _define(operation: Callable[[Any, Any], Any], instruction: str) -> None:
+    """Have an operator of two vectors be an instruction."""
+
+    class Template(AbstractTemplate):
+        key = operation
+
+        def generic(self, args: Any, _: Any) -> Any:
+            return _KIND(*args) if args == (_KIND, _KIND) else None
+
+    def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
+        return getattr(builder, instruction)(*args, flags=_FAST)
+
+    infer_global(operation)(Template)
+    lower_builtin(operation, _LanesType, _LanesType)(generate)
+
+
+_define(operator.add, "fadd")
+_define(operator.sub, "fsub")
+_define(operator.mul, "fmul")
+_define(operator.truediv, "fdiv")
+
+
+def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
+    kind = ir.FunctionType(result, [arg.type for arg in args])
+    function = cgutils.get_or_insert_function(builder.module, kind, name)
+    return builder.call(function, args, fastmath=_FAST if result is not _INT64 else ())
+
+
+def _address(context: Any, builder: Any, kinds: Any, args: Any) -> Any:
+    """Where the lanes from ``array[place]`` on lie, given the array and the place."""
+    array = context.make_array(kinds[0])(context, builder, args[0])
+    numbers = cgutils.unpack_tuple(builder, args[1])
+    indices = [
+        context.cast(builder, number, kind, types.intp)
+        for number, kind in zip(numbers, kinds[1], strict=True)
+    ]
+    element = cgutils.get_item_pointer(context, builder, kinds[0], array, indices, wraparound=False)
+    return builder.bitcast(element, _VECTOR.as_pointer())
+
+
+@_kernel_code
+def load(_: Any, array: Any, place: Any) -> Any:
+    """The lanes from ``array[place]`` on; a place has an index for each axis."""
+
+    def generate(context: Any, builder: Any, kind: Any, args: Any) -> Any:
+        return builder.load(_address(context, builder, kind.args, args), align=4)
+
+    return _KIND(array, place), generate
+
+
+@_kernel_code
+def store(_: Any, array: Any, place: Any, lanes: Any) -> Any:
+    """Put ``lanes`` into ``array[place]`` and what follows."""
+
+    def generate(context: Any, builder: Any, kind: Any, args: Any) -> Any:
+        builder.store(args[2], _address(context, builder, kind.args, args), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, place, lanes), generate
+
+
+@_kernel_code
+def fill(_: Any, number: Any) -> Any:
+    """The same number in all lanes."""
+
+    def generate(context: Any, builder: Any, kind: Any, args: Any) -> Any:
+        single = context.cast(builder, args[0], kind.args[0], types.float32)
+        undefined = ir.Constant(_VECTOR, ir.Undefined)
+        first = builder.insert_element(undefined, single, ir.Constant(_INT32, 0))
+        lanes = ir.Constant(ir.VectorType(_INT32, LANES), [0] * LANES)
+        return builder.shuffle_vector(first, undefined, lanes)
+
+    return _KIND(number), generate
+
+
+@_kernel_code
+def larger(_: Any, first: Any, second: Any) -> Any:
+    """The larger number of each lane."""
+
+    def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", *args, flags=_FAST), *args)
+
+    return _KIND(first, second), generate
+
+
+@_kernel_code
+def root(_: Any, lanes: Any) -> Any:
+    """The square roots."""
+
+    def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
+        return _call(builder, f"llvm.sqrt.v{LANES}f32", _VECTOR, args)
+
+    return _KIND(lanes), generate
+
+
+@_kernel_code
+def least(_: Any, lanes: Any) -> Any:
+    """The least number of all."""
+
+    def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
+        return _call(builder, f"llvm.vector.reduce.fmin.v{LANES}f32", _FLOAT, args)
+
+    return types.float32(lanes), generate
+
+
+@_kernel_code
+def total(_: Any, lanes: Any) -> Any:
+    """Their sum."""
+
+    def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
+        args = [ir.Constant(_FLOAT, 0.0), *args]
+        return _call(builder, f"llvm.vector.reduce.fadd.v{LANES}f32", _FLOAT, args)
+
+    return types.float32(lanes), generate
+
+
+@_kernel_code
+def at_most(_: Any, lanes: Any, limit: Any) -> Any:
+    """In which lanes numbers are at most those of ``limit``, as bits, the lowest for lane 0."""
+
+    def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
+        bits = builder.bitcast(builder.fcmp_ordered("<=", *args), ir.IntType(LANES))
+        return builder.zext(bits, _INT64)
+
+    return types.int64(lanes, limit), generate
+
+
+@_kernel_code
+def lowest_bit(_: Any, bits: Any) -> Any:
+    """Number of the lowest bit that is set; there is one."""
+
+    def generate(context: Any, builder: Any, kind: Any, args: Any) -> Any:
+        wide = context.cast(builder, args[0], kind.args[0], types.int64)
+        return _call(builder, "llvm.cttz.i64", _INT64, [wide, ir.Constant(ir.IntType(1), 1)])
+
+    return types.int64(bits), generate
