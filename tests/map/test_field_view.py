@@ -1,5 +1,7 @@
 """Each point is answered for by the region whose centre is nearest; fields are blended between."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,6 +31,15 @@ class NumberedRegion:
     def status(self, voxels: np.ndarray, reach: float) -> np.ndarray:
         return np.full(len(voxels), self.number, np.uint8)
 
+    def surface_in_grid(self, axes: Sequence[np.ndarray], reach: float) -> np.ndarray:
+        x, y, z = np.ix_(*(np.floor(axis).astype(np.int64) for axis in axes))
+        return np.asarray((x + y + z + self.number) % 3 == 0)
+
+    def has_surface(self, point: np.ndarray) -> bool:
+        """Whether the grid has, at a point of the map frame."""
+        voxel = np.floor(FIELD.leaf_coordinates(point - self.centre)).astype(np.int64)
+        return (int(voxel.sum()) + self.number) % 3 == 0
+
 
 def view_of(regions: list[RegionIndex]) -> FieldView:
     numbered = [NumberedRegion(number, index) for number, index in enumerate(regions, start=10)]
@@ -51,6 +62,23 @@ def test_every_point_has_the_status_that_the_nearest_region_gives(
     assert answer.status.tolist() == expected
     owned = np.array(expected) >= 10
     assert np.isfinite(answer.sdf[owned]).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.01, 1.0))
+def test_every_point_of_a_grid_is_told_of_by_the_region_that_owns_it(
+    seed: int, spread: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(-PITCH_M, 3 * PITCH_M, 3)
+    axes = low[:, None] + np.arange(6) * rng.uniform(0.1, 1.0) * spread * PITCH_M
+    surface = view_of(REGIONS).surface_in_grid(axes, 0.1)
+    for at in np.ndindex(surface.shape):
+        point = np.array([axis[i] for axis, i in zip(axes, at, strict=True)])
+        owner = tuple(np.floor(point / PITCH_M + 0.5).astype(int).tolist())
+        number = 10 + REGIONS.index(owner) if owner in REGIONS else None
+        expected = number is not None and NumberedRegion(number, owner).has_surface(point)
+        assert surface[at] == expected
 
 
 def test_the_field_is_blended_where_regions_overlap_and_only_there() -> None:

@@ -126,6 +126,29 @@ def test_all_ways_to_ask_agree(seed: int, count: int, scans: int, reach: float) 
     assert is_surface[have].all()
 
 
+@settings(max_examples=100, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(0, 200),
+    step=st.sampled_from([0.25, 0.5, 1.0, 1.7]),
+    reach=st.sampled_from([0.0, 0.25, 0.35, 1.0]),
+)
+def test_a_grid_has_surface_where_its_points_have(
+    seed: int, count: int, step: float, reach: float
+) -> None:
+    ends = random_ends(seed, count)
+    rng = np.random.default_rng(seed)
+    first = random_ends(seed, 1)[0] - rng.uniform(0, 20, 3) * step
+    axes = [low + step * np.arange(rng.integers(30)) for low in np.round(4 * first) / 4]
+    frozen = seen(ends, 1).freeze()
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    expected = frozen.status(points.reshape(-1, 3), reach).reshape(points.shape[:-1]) == 2
+    np.testing.assert_array_equal(frozen.surface_in_grid(axes, reach), expected)
+    slow = SeenBlocks(SETTINGS)
+    slow.add(frozen.record())
+    np.testing.assert_array_equal(slow.surface_in_grid(axes, reach), expected)
+
+
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 200), scans=st.integers(1, MANY))
 def test_margins_outlast_a_restart(seed: int, count: int, scans: int) -> None:

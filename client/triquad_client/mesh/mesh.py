@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import InvalidInputError
-from triquad_format.records.arrays import Bools, Doubles, Ints
+from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.wire import keys
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
 
@@ -178,19 +178,28 @@ def joined(
 
     Where the tiles are ``marked``, all tell which faces fill holes.
     """
-    starts = np.cumsum([0, *(len(tile.vertices) for tile in tiles)])
-    shifted = [tile.faces + int(start) for tile, start in zip(tiles, starts, strict=False)]
-    marks = [tile.filled for tile in tiles if tile.filled is not None]
+    cut = [_within(tile, box) for tile in tiles]
+    starts = np.cumsum([0, *(len(tile.vertices) for tile in cut)])
+    shifted = [tile.faces + np.int32(start) for tile, start in zip(cut, starts, strict=False)]
+    marks = [tile.filled for tile in cut if tile.filled is not None]
     whole = welded(
-        np.concatenate([np.zeros((0, 3)), *(tile.vertices for tile in tiles)]),
-        np.concatenate([np.zeros((0, 3), np.int32), *shifted]).astype(np.int32),
+        np.concatenate([np.zeros((0, 3)), *(tile.vertices for tile in cut)]),
+        np.concatenate([np.zeros((0, 3), np.int32), *shifted]),
         tile_side_m,
         filled=np.concatenate([np.zeros(0, np.bool_), *marks]) if marked else None,
     )
-    centroids = whole.vertices[whole.faces].mean(axis=1)
-    inside = ((centroids >= box[0]) & (centroids <= box[1])).all(axis=1)
-    filled = None if whole.filled is None else whole.filled[inside]
-    return compacted(whole.vertices, whole.faces[inside], epoch, filled)
+    return dataclasses.replace(whole, epoch=epoch)
+
+
+def _within(tile: Mesh, box: tuple[Doubles, Doubles]) -> Mesh:
+    """The faces of a tile whose centroids lie in a box; all of its vertices stay."""
+    low, high = box
+    if ((tile.vertices >= low) & (tile.vertices <= high)).all():
+        return tile
+    centroids = tile.vertices[tile.faces].mean(axis=1)
+    inside = ((centroids >= low) & (centroids <= high)).all(axis=1)
+    filled = None if tile.filled is None else tile.filled[inside]
+    return dataclasses.replace(tile, faces=tile.faces[inside], filled=filled)
 
 
 def welded(vertices: Doubles, faces: Ints, tile_side_m: float, filled: Bools | None = None) -> Mesh:
@@ -200,11 +209,12 @@ def welded(vertices: Doubles, faces: Ints, tile_side_m: float, filled: Bools | N
     the same; ``filled`` [F] is as of :class:`Mesh`.
     """
     steps = vertices / tile_side_m
-    border = (np.abs(steps - np.round(steps)) < WELD_M / tile_side_m).any(axis=1)
-    shared = np.flatnonzero(border)
-    target = np.arange(len(vertices))
+    steps -= np.rint(steps)
+    near = np.abs(steps, out=steps) < WELD_M / tile_side_m
+    shared = np.flatnonzero(near[:, 0] | near[:, 1] | near[:, 2])
+    target = np.arange(len(vertices), dtype=np.int32)
     target[shared] = shared[_representatives(vertices[shared])]
-    joined = target[faces]
+    joined = target.take(faces)
     a, b, c = joined.T
     kept = (a != b) & (b != c) & (c != a)
     return compacted(vertices, joined[kept], filled=None if filled is None else filled[kept])
@@ -219,18 +229,30 @@ def compacted(
     """The mesh without vertices that no face uses."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
-    number = np.cumsum(used) - 1
-    return Mesh(vertices[used], number[faces].astype(np.int32).reshape(-1, 3), epoch, filled)
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return Mesh(vertices[used], number.take(faces).reshape(-1, 3), epoch, filled)
 
 
 def _representatives(points: Doubles) -> NDArray[np.intp]:
     """For each point [N, 3], the index of the point that stands for it."""
     chosen = np.arange(len(points))
     for shift in _SHIFTS:
-        cells = np.floor(points[chosen] / WELD_M + shift).astype(np.int64)
-        _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-        chosen = chosen[first[inverse.reshape(-1)]]
+        left, at = np.unique(chosen, return_inverse=True)
+        names = _names(np.floor(points[left] / WELD_M + shift).astype(np.int64))
+        _, first, inverse = np.unique(names, return_index=True, return_inverse=True)
+        chosen = left[first[inverse]][at]
     return chosen
+
+
+def _names(cells: Longs) -> Longs:
+    """A number for each of cells [N, 3], the same one for the same cell alone."""
+    if len(cells) == 0:
+        return np.zeros(0, np.int64)
+    x, y, z = (axis - axis.min() for axis in cells.T)
+    # By way of the columns in use: 64 bits would not do for all cells of a large map.
+    _, columns = np.unique(x * (y.max() + 1) + y, return_inverse=True)
+    names: Longs = columns * (z.max() + 1) + z
+    return names
 
 
 def _ply(mesh: Mesh) -> bytes:

@@ -101,6 +101,25 @@ class FieldView:
         self._split(len(points), work)
         return status
 
+    def surface_in_grid(self, axes: Doubles, reach_m: float) -> Bools:
+        """Which points [S, S, S] of a grid have the status ``SURFACE``, as :meth:`status` has it.
+
+        ``axes`` [3, S] are their coordinates on each axis, increasing, metres, map frame.
+        """
+        reach = reach_m / self._settings.leaf_m
+        surface = np.zeros(axes.shape[1:] * 3, np.bool_)
+        cells = np.floor(axes / self._settings.region_pitch_m + 0.5)
+        for region in self._field_regions:
+            owned = [
+                slice(*np.searchsorted(axis, (at, at + 1)))
+                for axis, at in zip(cells, region.index, strict=True)
+            ]
+            if all(own.start < own.stop for own in owned):
+                voxels = self._settings.leaf_coordinates(axes - region.centre[:, None])
+                mine = [axis[own] for axis, own in zip(voxels, owned, strict=True)]
+                surface[tuple(owned)] = region.evidence.surface_in_grid(mine, reach)
+        return surface
+
     def near_ends(self, points: Doubles, reach_m: float) -> Bools:
         """Whether points [N, 3] lie where rays ended; see :class:`triquad_map.view.MeshedView`."""
         reach = reach_m / self._settings.leaf_m

@@ -1,7 +1,7 @@
 """What one region of a map can do; the composition is put together from this alone."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -37,6 +37,12 @@ class SeenSpace(Protocol):
         """Values of :class:`Status` [N] at leaf coordinates [N, 3].
 
         ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
+        """
+
+    def surface_in_grid(self, axes: Sequence[Doubles], reach: float) -> Bools:
+        """Which points [X, Y, Z] of a grid have the status ``SURFACE``, as :meth:`status` has it.
+
+        ``axes`` are their leaf coordinates [X], [Y] and [Z], increasing.
         """
 
     def near_ends(self, voxels: Doubles, reach: float) -> Bools:

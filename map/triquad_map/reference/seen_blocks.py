@@ -1,7 +1,7 @@
 """What rays have shown of a region, found with numpy alone."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,12 @@ class SeenBlocks:
         for step in itertools.product(steps, repeat=3):
             status[self.ended_in(np.minimum(low + step, high))] = Status.SURFACE
         return status
+
+    def surface_in_grid(self, axes: Sequence[Doubles], reach: float) -> Bools:
+        """Where a grid has surface; see :class:`triquad_map.composition.region.SeenSpace`."""
+        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        surface = self.status(places.reshape(-1, 3), reach) == Status.SURFACE
+        return np.asarray(surface.reshape(places.shape[:-1]))
 
     def ended_in(self, voxels: Longs) -> Bools:
         """Whether rays ended in ``voxels`` [N, 3]."""

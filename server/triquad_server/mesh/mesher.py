@@ -6,6 +6,7 @@ times: the later one takes over the values of the earlier one there. Only faces 
 saw a surface are kept: elsewhere the field has zeros that no ray taught it.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.cells import cells_of_boxes
-from triquad_format.records.status import Status
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import STEPS, TileSurface
 from triquad_map.compiled.kernel import kernel
@@ -38,7 +38,7 @@ class TileLattice:
     cell_m: float
     cells: int  # along the side of a tile, the same on all levels
     reach_m: float  # centres of faces lie at most this far from voxels with seen surface
-    group: int  # cells along the side of the groups that are searched first
+    group: int  # cells along the side of the groups in whose order faces come
 
     @property
     def tile_side_m(self) -> float:
@@ -62,7 +62,10 @@ class TileLattice:
         """
         first = np.floor((low - margin_m) / self.tile_side_m).astype(np.int64)
         last = np.floor((high + margin_m) / self.tile_side_m).astype(np.int64)
-        return _each_once(cells_of_boxes(first, last)[0])
+        # Many boxes, such as voxels, meet the same tiles.
+        boxes = _each_once(np.concatenate([first, last - first], axis=1))
+        first, sides = boxes[:, :3], boxes[:, 3:]
+        return _each_once(cells_of_boxes(first, first + sides)[0])
 
 
 def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
@@ -80,17 +83,20 @@ def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
     )
 
 
-def _each_once(cells: Longs) -> Longs:
-    """The different ones of cells [N, 3], in order."""
-    if len(cells) == 0:
-        return cells
-    low = cells.min(axis=0)
-    x, y, z = (int(size) for size in cells.max(axis=0) - low + 1)
-    if x * y * z >= 2**62:
-        return np.asarray(np.unique(cells, axis=0))
+def _each_once(rows: Longs) -> Longs:
+    """The different ones of rows [N, D], in order."""
+    if len(rows) == 0:
+        return rows
+    columns = [np.ascontiguousarray(column) for column in rows.T]
+    lows = [int(column.min()) for column in columns]
+    sizes = [int(column.max()) - low + 1 for column, low in zip(columns, lows, strict=True)]
+    if math.prod(sizes) >= 2**62:
+        return np.asarray(np.unique(rows, axis=0))
     # By one number each: numpy holds Python's lock while it sorts rows.
-    names = np.unique(((cells - low) * (y * z, z, 1)).sum(axis=1))
-    each = np.stack([names // (y * z), names // z % y, names % z], axis=1) + low
+    names = np.zeros(len(rows), np.int64)
+    for column, low, size in zip(columns, lows, sizes, strict=True):
+        names = names * size + (column - low)
+    each = np.stack(np.unravel_index(np.unique(names), sizes), axis=1) + lows
     return np.asarray(each, np.int64)
 
 
@@ -105,9 +111,7 @@ class TileBorder:
     @classmethod
     def of_tile(cls, points: Longs, volume: Floats) -> "TileBorder":
         """Those of a tile's lattice points [P, 3] that lie on its faces."""
-        last = len(volume) - 1
-        outer = points[((points == 0) | (points == last)).any(axis=1)]
-        return cls(outer.astype(np.int16), volume[tuple(outer.T)])
+        return cls(*_on_faces(points, volume))
 
     @classmethod
     def joined(cls, borders: Iterable["TileBorder"]) -> "TileBorder":
@@ -134,6 +138,22 @@ class TileBorder:
         places = tuple(self.points.T)
         waits = np.isnan(volume[places])
         volume[tuple(self.points[waits].T)] = self.values[waits]
+
+
+@kernel()
+def _on_faces(points: Longs, volume: Floats) -> tuple[NDArray[np.int16], Floats]:
+    """Those of a tile's lattice points [P, 3] that lie on its faces, and their values."""
+    last = len(volume) - 1
+    outer = np.empty((len(points), 3), np.int16)
+    values = np.empty(len(points), np.float32)
+    count = 0
+    for point in points:
+        x, y, z = point
+        if min(x, y, z) == 0 or max(x, y, z) == last:
+            outer[count, 0], outer[count, 1], outer[count, 2] = x, y, z
+            values[count] = volume[x, y, z]
+            count += 1
+    return outer[:count].copy(), values[:count].copy()
 
 
 def check_level(level: int) -> None:
@@ -231,40 +251,47 @@ def mesh_tile(
 
 def _seen_cells(source: ComposedView, first: Longs, lattice: TileLattice) -> Longs:
     """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
-    reach_m = lattice.cell_m / 2 + lattice.reach_m
-    count = -(-lattice.cells // lattice.group)
-    groups = _cells_of(np.zeros((1, 3), np.int64), count, count) * lattice.group
-    centres = _positions(groups, lattice.group / 2, first, lattice.cell_m)
-    # A group is searched where any of its cells may be such.
-    wide = lattice.cell_m * (lattice.group - 1) / 2 + reach_m
-    groups = groups[source.status(centres, wide) == Status.SURFACE]
-    cells = _cells_of(groups, lattice.group, lattice.cells)
-    seen = source.status(_positions(cells, 0.5, first, lattice.cell_m), reach_m)
-    return np.asarray(cells[seen == Status.SURFACE])
+    middles = (first[:, None] + np.arange(lattice.cells) + 0.5) * np.float64(lattice.cell_m)
+    near = source.surface_in_grid(middles, lattice.cell_m / 2 + lattice.reach_m)
+    return _by_group(np.flatnonzero(near), lattice.cells, lattice.group)
 
 
 @kernel()
-def _cells_of(groups: Longs, group_side: int, side: int) -> Longs:
-    """Cells [C, 3] of groups, named by their least corners, of a tile of ``side`` cells."""
-    cells = np.empty((len(groups) * group_side**3, 3), np.int64)
-    count = 0
-    for group in groups:
-        for x in range(group[0], min(group[0] + group_side, side)):
-            for y in range(group[1], min(group[1] + group_side, side)):
-                for z in range(group[2], min(group[2] + group_side, side)):
-                    cells[count, 0], cells[count, 1], cells[count, 2] = x, y, z
-                    count += 1
-    return cells[:count]
+def _by_group(names: Longs, side: int, group: int) -> Longs:
+    """The cells [C, 3] of a tile with these numbers [C], increasing: group by group."""
+    groups = -(-side // group)
+    starts = np.zeros(groups**3 + 1, np.int64)
+    homes = np.empty(len(names), np.int64)
+    for i in range(len(names)):
+        x, y, z = names[i] // (side * side), names[i] // side % side, names[i] % side
+        homes[i] = (x // group * groups + y // group) * groups + z // group
+        starts[homes[i] + 1] += 1
+    starts = np.cumsum(starts)
+    cells = np.empty((len(names), 3), np.int64)
+    for i in range(len(names)):
+        at = starts[homes[i]]
+        starts[homes[i]] += 1
+        cells[at, 0] = names[i] // (side * side)
+        cells[at, 1] = names[i] // side % side
+        cells[at, 2] = names[i] % side
+    return cells
 
 
 @kernel()
-def _positions(cells: Longs, offset: float, first: Longs, cell_m: float) -> Doubles:
-    """Where cells [C, 3] of the tile are in the map frame, ``offset`` cells from their corners."""
-    positions = np.empty(cells.shape)
-    for i in range(len(cells)):
+def _positions(points: Longs, first: Longs, cell_m: float) -> Doubles:
+    """Where lattice points [P, 3] of the tile are in the map frame."""
+    positions = np.empty(points.shape)
+    for i in range(len(points)):
         for axis in range(3):
-            positions[i, axis] = (first[axis] + cells[i, axis] + offset) * cell_m
+            positions[i, axis] = (first[axis] + points[i, axis]) * cell_m
     return positions
+
+
+@kernel()
+def _enter(values: Floats, points: Longs, volume: Floats) -> None:
+    """Put values [P] at lattice points [P, 3] into the volume."""
+    for i in range(len(points)):
+        volume[points[i, 0], points[i, 1], points[i, 2]] = values[i]
 
 
 @kernel()
@@ -295,5 +322,5 @@ def _lattice_values(
     if around is not None:
         around.put(volume)
         asked = points[np.isnan(volume[tuple(points.T)])]
-    volume[tuple(asked.T)] = source.distances(_positions(asked, 0.0, first, lattice.cell_m))
+    _enter(source.distances(_positions(asked, first, lattice.cell_m)), asked, volume)
     return volume, points

@@ -5,6 +5,7 @@ from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
+from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
@@ -67,7 +68,9 @@ class TileQueries:
         check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
         lattice = self._cache.lattice(request.level)
-        mesh = mesh_tile(epoch, index, lattice, fill_m=request.fill_m)
+        # On the thread that answers alone: of a box full of tiles, others make more of them.
+        view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
+        mesh = mesh_tile(view, index, lattice, fill_m=request.fill_m)
         # A change that no refresh found yet shows in a later list: the tile is fetched again then.
         (changed,) = self._cache.changed(request.level, np.array([index])).tolist()
         return Tile(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from support.exact_maps import SETTINGS, exact_map, flat, table
 from support.small_world import settings, settle, world
 from triquad_format.records.region import seen_voxels
+from triquad_format.records.status import Status
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
 from triquad_server.epochs.epoch import Epoch
@@ -78,6 +79,11 @@ class Patchwork:
         for row in np.flatnonzero((steps % self.lattice.cells == 0).any(axis=1)):
             values[row] = self.borders.get(tuple(steps[row].tolist()), 1.0)
         return values
+
+    def surface_in_grid(self, axes: NDArray[np.float64], reach_m: float) -> NDArray[np.bool_]:
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        surface = self.status(points.reshape(-1, 3), reach_m) == Status.SURFACE
+        return surface.reshape(points.shape[:-1])
 
     def status(self, points: NDArray[np.float64], reach_m: float) -> NDArray[np.uint8]:
         status = np.zeros(len(points), np.uint8)

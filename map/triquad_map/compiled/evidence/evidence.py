@@ -6,6 +6,7 @@ answers as if it had been seen. Only a 3-D record can tell such ghosts from surf
 All coordinates here are voxel coordinates of the region (see :mod:`triquad_format.records.region`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,6 +23,7 @@ from triquad_map.compiled.evidence.margins import (
     near_ends,
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.evidence.surface_grid import surface_in_grid
 from triquad_map.compiled.evidence.unknown_search import find_unknown
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (
@@ -127,6 +129,10 @@ class FrozenEvidence:
     def status(self, voxels: Doubles, reach: float = 0.5) -> Bytes:
         """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
         return _status(voxels, reach, self.seen)
+
+    def surface_in_grid(self, axes: Sequence[Doubles], reach: float) -> Bools:
+        """Where a grid has surface; see :class:`triquad_map.composition.region.SeenSpace`."""
+        return surface_in_grid(axes, reach, self.seen)
 
     def near_ends(self, voxels: Doubles, reach: float) -> Bools:
         """Where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
