@@ -273,7 +273,7 @@ def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> flo
 
 @kernel(fastmath=True)
 def _spread(cell: int) -> int:
-    """Every third bit of a Morton code."""
+    """A number's bits, each at three times its place."""
     code = 0
     for bit in range(_CELL_BITS):
         code |= (cell >> bit & 1) << 3 * bit
@@ -314,16 +314,16 @@ def _spatial_order(points: Doubles) -> Ints:
         order[i] = i
     for digit in range(_DIGITS):
         shift = digit * _DIGIT_BITS
-        places = np.zeros(_DIGIT + 2, np.int32)
+        ends = np.zeros(_DIGIT + 2, np.int32)  # of the points with lesser digits
         for i in range(len(points)):
-            places[(codes[i] >> shift & _DIGIT) + 1] += 1
+            ends[(codes[i] >> shift & _DIGIT) + 1] += 1
         for value in range(_DIGIT):
-            places[value + 1] += places[value]
+            ends[value + 1] += ends[value]
         order, before = before, order
-        for i in before:
-            value = codes[i] >> shift & _DIGIT
-            order[places[value]] = i
-            places[value] += 1
+        for point in before:
+            own = codes[point] >> shift & _DIGIT
+            order[ends[own]] = point
+            ends[own] += 1
     return order
 
 
@@ -344,7 +344,7 @@ def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> 
         np.empty(_WAITING, np.float32),
         np.empty(LANES, np.float32),
     )
-    before = np.int64(_NONE)  # of one type all along, for which code is compiled once
+    before = _NONE
     for i in _spatial_order(points):
         at = (points[i, 0], points[i, 1], points[i, 2])
         if not max(abs(at[0]), abs(at[1]), abs(at[2])) < _FARTHEST:
