@@ -3,7 +3,7 @@
 From the root of the tree down, the nearest box first, and no box that lies farther than the
 nearest surfel so far. Boxes and surfels are looked at eight at a time. The surfel that was found
 for the point before is a first bound, so points are taken in an order in which neighbours follow
-each other. All of it becomes one function: to call others takes longer than the arithmetic.
+each other.
 """
 
 from typing import NamedTuple
@@ -59,6 +59,7 @@ _CELL_BITS = 7  # of each coordinate of the cells by which points are put in ord
 _DIGIT_BITS = 11  # of a cell's code that are counted at a time
 _DIGIT = (1 << _DIGIT_BITS) - 1
 _DIGITS = 2
+_BEYOND = 1 + 1e-9  # so that the greatest coordinate lies in the last cell
 
 Place = tuple[float, float, float]
 Vectors = tuple[Lanes, Lanes, Lanes]
@@ -85,7 +86,7 @@ class Found(NamedTuple):
     kept: int  # leaves
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _from_surfels(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
     """From the middles of a leaf's surfels to a place."""
     surfels = tree.surfels
@@ -95,7 +96,7 @@ def _from_surfels(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
     return x, y, z
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _normals(tree: SurfelTree, leaf: int) -> Vectors:
     surfels = tree.surfels
     return (
@@ -105,7 +106,7 @@ def _normals(tree: SurfelTree, leaf: int) -> Vectors:
     )
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _squares(tree: SurfelTree, leaf: int, at: Place) -> Lanes:
     """Squares of the distances from a place to a leaf's surfels."""
     x, y, z = _from_surfels(tree, leaf, at)
@@ -124,12 +125,12 @@ def _sifted(room: Room, limit: float) -> int:
     for i in range(_KEPT):
         if room.nearest[i] <= limit:
             room.kept[count], room.nearest[count] = room.kept[i], room.nearest[i]
-            room.squares[count] = room.squares[i]
+            store(room.squares, (count, 0), load(room.squares, (i, 0)))
             count += 1
     return count
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _limit(distance: float, at: Place) -> float:
     """Square of the distance up to which surfels may count, where one is so near."""
     farthest = max(abs(at[0]), abs(at[1]), abs(at[2])) + distance
@@ -138,7 +139,7 @@ def _limit(distance: float, at: Place) -> float:
     return limit
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _open(tree: SurfelTree, node: int, at: Place, limit: float, room: Room, count: int) -> int:
     """Add what lies below a node to the ``count`` leaves and nodes that wait; how many they are."""
     boxes, waiting, away = tree.boxes, room.waiting, room.away
@@ -166,7 +167,7 @@ def _open(tree: SurfelTree, node: int, at: Place, limit: float, room: Room, coun
     return count
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _search(tree: SurfelTree, at: Place, distance: float, limit: float, room: Room) -> Found:
     """Search all surfels that are nearer than ``distance``, or count in the direction.
 
@@ -180,7 +181,7 @@ def _search(tree: SurfelTree, at: Place, distance: float, limit: float, room: Ro
         count -= 1
         if room.away[count] > limit:
             continue
-        box = room.waiting[count]
+        box = int(room.waiting[count])
         if box >= leaves:
             count = _open(tree, box - leaves, at, limit, room, count)
             continue
@@ -202,7 +203,7 @@ def _search(tree: SurfelTree, at: Place, distance: float, limit: float, room: Ro
     return Found(leaf, lane, best, kept)
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
     """From the points of a leaf's surfels that are nearest to a place to that place."""
     x, y, z = _from_surfels(tree, leaf, at)
@@ -215,7 +216,7 @@ def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
     return u + share * x, v + share * y, w + share * z
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _put_in_order(room: Room, kept: int, far: float) -> int:
     """Order the kept leaves of which a surfel is so near; how many they are.
 
@@ -233,7 +234,7 @@ def _put_in_order(room: Room, kept: int, far: float) -> int:
     return count
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _write_found(
     tree: SurfelTree, at: Place, found: Found, room: Room, i: int, nearest: NearestSurfels
 ) -> None:
@@ -246,7 +247,7 @@ def _write_found(
         farther = (root(load(room.squares, (k, 0))) - fill(best)) * fill(1 / _SMOOTHING)
         weight = larger(fill(1.0) - farther, fill(0.0))
         weight = weight * weight
-        a, b, c = _closest_offset(tree, room.kept[k], at)
+        a, b, c = _closest_offset(tree, int(room.kept[k]), at)
         weights = weights + weight
         x, y, z = x + weight * a, y + weight * b, z + weight * c
     share = 1 / total(weights)
@@ -261,7 +262,7 @@ def _write_found(
     nearest.rows[i] = tree.order[tree.leaves[found.leaf] + found.lane]
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> float:
     """As :func:`_limit`, from how far is searched and a leaf that may be near."""
     if leaf != _NONE:
@@ -270,9 +271,9 @@ def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> flo
     return _limit(distance, at)
 
 
-@kernel(fastmath=True, inline="always")
+@kernel(fastmath=True)
 def _spread(cell: int) -> int:
-    """Every third bit of a Morton code."""
+    """A number's bits, each at three times its place."""
     code = 0
     for bit in range(_CELL_BITS):
         code |= (cell >> bit & 1) << 3 * bit
@@ -283,32 +284,46 @@ def _spread(cell: int) -> int:
 def _cell_codes(points: Doubles) -> Ints:
     """Morton codes [N] of the points' cells, of which there are so many along the longest side."""
     codes = np.zeros(len(points), np.int32)
-    low = np.array([points[:, axis].min() for axis in range(3)])
-    side = max([points[:, axis].max() - low[axis] for axis in range(3)])
-    scale = (1 << _CELL_BITS) / max(side, 1.0) * (1 - 1e-9)
-    for i in range(len(points)):
-        for axis in range(3):
-            codes[i] |= _spread(int((points[i, axis] - low[axis]) * scale)) << axis
+    side = 1.0
+    for axis in range(3):
+        low, high = _ends(points, axis)
+        side = max(side, high - low)
+    scale = (1 << _CELL_BITS) / (side * _BEYOND)
+    for axis in range(3):
+        low, _ = _ends(points, axis)
+        for i in range(len(points)):
+            codes[i] |= _spread(int((points[i, axis] - low) * scale)) << axis
     return codes
+
+
+@kernel(fastmath=True)
+def _ends(points: Doubles, axis: int) -> tuple[float, float]:
+    """The least and the greatest coordinate."""
+    low = high = points[0, axis]
+    for i in range(len(points)):
+        low, high = min(low, points[i, axis]), max(high, points[i, axis])
+    return low, high
 
 
 @kernel(fastmath=True)
 def _spatial_order(points: Doubles) -> Ints:
     """The numbers of points [N, 3] in an order in which neighbours mostly follow each other."""
     codes = _cell_codes(points)
-    order = np.arange(len(points)).astype(np.int32)
+    order, before = np.empty(len(points), np.int32), np.empty(len(points), np.int32)
+    for i in range(len(points)):
+        order[i] = i
     for digit in range(_DIGITS):
         shift = digit * _DIGIT_BITS
-        places = np.zeros((1 << _DIGIT_BITS) + 1, np.int32)
-        for code in codes:
-            places[(code >> shift & _DIGIT) + 1] += 1
-        for value in range(1 << _DIGIT_BITS):
-            places[value + 1] += places[value]
-        before, order = order, np.empty_like(order)
-        for i in before:
-            value = codes[i] >> shift & _DIGIT
-            order[places[value]] = i
-            places[value] += 1
+        ends = np.zeros(_DIGIT + 2, np.int32)  # of the points with lesser digits
+        for i in range(len(points)):
+            ends[(codes[i] >> shift & _DIGIT) + 1] += 1
+        for value in range(_DIGIT):
+            ends[value + 1] += ends[value]
+        order, before = before, order
+        for point in before:
+            own = codes[point] >> shift & _DIGIT
+            order[ends[own]] = point
+            ends[own] += 1
     return order
 
 

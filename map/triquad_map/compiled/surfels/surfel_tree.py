@@ -125,7 +125,7 @@ def _leaves(surface: Bytes, starts: Ints, blocks: Rows) -> tuple[Ints, Ints, Int
                 at += 1
         done += end
     leaves[count] = done
-    return order, leaves[: count + 1].copy(), firsts
+    return order, leaves[: count + 1], firsts
 
 
 @kernel(inline="always")
@@ -200,11 +200,12 @@ def _fill_leaves(
                 boxes[axis, leaf], boxes[axis + 3, leaf] = low + corner, high + corner
 
 
-@kernel()
+@kernel(fastmath=True)
 def _fill_nodes(children: Ints, boxes: Floats, leaves: int) -> None:
     """Fill in the boxes around the children of each node."""
     for node in range(len(children) - 1):
-        first, last = children[node], children[node + 1]
         for axis in range(3):
-            boxes[axis, leaves + node] = boxes[axis, first:last].min()
-            boxes[axis + 3, leaves + node] = boxes[axis + 3, first:last].max()
+            low, high = _NOWHERE, -_NOWHERE
+            for child in range(children[node], children[node + 1]):
+                low, high = min(low, boxes[axis, child]), max(high, boxes[axis + 3, child])
+            boxes[axis, leaves + node], boxes[axis + 3, leaves + node] = low, high
