@@ -14,7 +14,8 @@ from triquad_format.records.region import AXES, Mlp, Region, TrainingState, Vert
 from triquad_format.records.replay_rays import ReplayRays
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
+from triquad_map.compiled.field.field import FieldArrays
+from triquad_map.compiled.field.frozen_field import FrozenCompiledField
 from triquad_map.compiled.field.quadtree import LiveQuadtree
 
 from triquad_server.engine.initial_mlp import initial_mlp
