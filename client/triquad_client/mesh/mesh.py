@@ -24,7 +24,7 @@ from triquad_client.net.call import NEWEST, Ask, Call, Run, ask, ask_each, offlo
 if TYPE_CHECKING:
     import trimesh
 
-_TILES_AT_A_TIME = 32
+_TILES_AT_A_TIME = 128
 """Are fetched before it is asked whether they are too much."""
 
 WELD_M = 1e-4

@@ -3,7 +3,7 @@
 from triquad_format.records.region import MapRecord, Region
 
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.field.field import recorded_field
+from triquad_map.compiled.field.frozen_field import recorded_field
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.team import Team
 from triquad_map.composition.composed_view import ComposedView

@@ -10,11 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.status import Status
 
-from triquad_map.composition.region import FieldEngine, FieldRegion, FieldValues, Split, Work
+from triquad_map.composition.region import (
+    FieldEngine,
+    FieldRegion,
+    FieldValues,
+    Split,
+    Work,
+    in_grid,
+)
 from triquad_map.surface import FieldSample, SampleField
 from triquad_map.view import FieldAnswer
 
@@ -84,6 +91,35 @@ class FieldView:
 
         self._split(len(points), work)
         return distances
+
+    def distances_in_grid(self, axes: Doubles, points: Longs) -> Floats:
+        """As :meth:`distances`, but for rounding, at points of a grid: in half the time.
+
+        Args:
+            axes: [3, S] its coordinates on each axis, metres, map frame.
+            points: [N, 3] the points, by their numbers on the axes.
+        """
+        region = self._only_region(axes)
+        if region is None:
+            return self.distances(in_grid(axes, points))
+        local = (axes - region.centre[:, None]).astype(np.float32)
+        distances = np.empty(len(points), np.float32)
+
+        def work(first: int, last: int) -> None:
+            distances[first:last] = region.engine.evaluate_in_grid(local, points[first:last])
+
+        self._split(len(points), work)
+        return distances
+
+    def _only_region(self, axes: Doubles) -> FieldRegion | None:
+        """The region that alone covers a grid with coordinates ``axes`` [3, S], if one does."""
+        places = axes / self._settings.region_pitch_m
+        home = np.floor(places[:, :1] + 0.5)
+        core_m = self._settings.region_side_m / 2 - self._settings.overlap_m
+        if np.abs(places - home).max() * self._settings.region_pitch_m > core_m:
+            return None
+        numbers = np.flatnonzero((self._cells == home).all(axis=0))
+        return self._field_regions[numbers[0]] if len(numbers) else None
 
     def status(self, points: Doubles, reach_m: float | None = None) -> Bytes:
         """Status values [N] of points [N, 3]: what the evidence of each point's region says.

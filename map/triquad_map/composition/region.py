@@ -3,12 +3,16 @@
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.surface import Surfels
+
+_Float = TypeVar("_Float", bound=np.floating)
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,14 @@ class FieldEngine(Protocol):
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
         """The field at points [N, 3], metres from the region's centre."""
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """The signed distance at points of a grid, as :meth:`evaluate` has it but for rounding.
+
+        Args:
+            axes: [3, S] coordinates of the grid on each axis, metres from the region's centre.
+            points: [N, 3] the points, by their numbers on the axes.
+        """
 
 
 class SeenSpace(Protocol):
@@ -118,6 +130,12 @@ class MapRegion(FieldRegion, Protocol):
     @property
     def surfels(self) -> RegionSurfels:
         """What stands for its surface. Not to be asked for within a :class:`Split`."""
+
+
+def in_grid(axes: NDArray[_Float], points: Longs) -> NDArray[_Float]:
+    """The points [N, 3] of a grid with coordinates ``axes`` [3, S], by their numbers on them."""
+    places = [axis[numbers] for axis, numbers in zip(axes, points.T, strict=True)]
+    return np.stack(places, axis=1)
 
 
 Work = Callable[[int, int], None]

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 from triquad_format.records import morton
-from triquad_format.records.arrays import Floats
+from triquad_format.records.arrays import Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES, Region, VertexTable
 
-from triquad_map.composition.region import FieldValues
+from triquad_map.composition.region import FieldValues, in_grid
 from triquad_map.reference.coded_rows import ONE_CELL, CodedRows
 
 _CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
@@ -61,6 +61,10 @@ class RegionField:
         if not gradient:
             return FieldValues(value * scale, np.zeros((0, 3), np.float32))
         return FieldValues(value * scale, np.einsum("anc,nc->na", slopes, sensitivity) * scale)
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """Distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
+        return self.evaluate(in_grid(axes, points), gradient=False).sdf
 
     def _interpolate(self, local: Floats, slopes: Floats | None) -> Floats:
         """Interpolated features [N, H * d]; their d/dx goes into ``slopes`` [3, N, ...]."""

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.field import FieldArrays, FrozenCompiledField
+from triquad_map.compiled.field.field import FieldArrays
+from triquad_map.compiled.field.frozen_field import FrozenCompiledField
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
 from triquad_map.composition.region import FieldEngine
 

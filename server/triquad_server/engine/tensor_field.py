@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from triquad_format.records.arrays import Floats
+from triquad_format.records.arrays import Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.field.field import FieldArrays
@@ -24,7 +24,7 @@ from triquad_map.compiled.field.quadtree import (
     morton_code,
 )
 from triquad_map.compiled.voxel_index import home_slot, longest_probe
-from triquad_map.composition.region import FieldValues
+from triquad_map.composition.region import FieldValues, in_grid
 
 from triquad_server.engine.live_field import LiveField
 
@@ -158,6 +158,10 @@ class TensorField:
             np.concatenate([part.sdf for part in parts]),
             np.concatenate([part.gradient for part in parts]),
         )
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """Distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
+        return self.evaluate(in_grid(axes, points), gradient=False).sdf
 
     def sdf(self, points: Tensor) -> Tensor:
         """Signed distance [N] in metres; differentiable in the points."""

@@ -278,16 +278,6 @@ def _by_group(names: Longs, side: int, group: int) -> Longs:
 
 
 @kernel()
-def _positions(points: Longs, first: Longs, cell_m: float) -> Doubles:
-    """Where lattice points [P, 3] of the tile are in the map frame."""
-    positions = np.empty(points.shape)
-    for i in range(len(points)):
-        for axis in range(3):
-            positions[i, axis] = (first[axis] + points[i, axis]) * cell_m
-    return positions
-
-
-@kernel()
 def _enter(values: Floats, points: Longs, volume: Floats) -> None:
     """Put values [P] at lattice points [P, 3] into the volume."""
     for i in range(len(points)):
@@ -322,5 +312,6 @@ def _lattice_values(
     if around is not None:
         around.put(volume)
         asked = points[np.isnan(volume[tuple(points.T)])]
-    _enter(source.distances(_positions(asked, first, lattice.cell_m)), asked, volume)
+    axes = (first[:, None] + np.arange(lattice.cells + 1)) * np.float64(lattice.cell_m)
+    _enter(source.distances_in_grid(axes, asked), asked, volume)
     return volume, points

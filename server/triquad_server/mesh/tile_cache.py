@@ -3,7 +3,7 @@
 import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
-from triquad_map.compiled.team import Team
+from triquad_map.compiled.team import THREADS, Team
 from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs.epoch import Epoch
+from triquad_server.mesh.answered_tiles import AnsweredTiles
 from triquad_server.mesh.mesher import TileBorder, TileIndex, TileLattice, mesh_tile, tile_lattice
 from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
 from triquad_server.settings import MeshSettings
@@ -22,6 +23,9 @@ from triquad_server.settings import MeshSettings
 _AROUND = [
     (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
 ]
+
+_ANSWERED_BYTES = 16_000_000
+"""Of tiles of one epoch that somebody asked for one by one: some 130 m of street."""
 
 TileKey = tuple[int, TileIndex]
 """Level of detail and index of a tile."""
@@ -153,10 +157,14 @@ class _TileLevel:
         return found
 
 
+def _touch(first: TileIndex, second: TileIndex) -> bool:
+    return all(abs(a - b) <= 1 for a, b in zip(first, second, strict=True))
+
+
 class TileCache:
     """Makes tiles when they are asked for, and keeps them until their surface changes.
 
-    One thread makes tiles and asks for what is new; any thread may ask what changed.
+    One thread has tiles made and asks for what is new; any thread may ask what changed.
     """
 
     def __init__(self, settings: MeshSettings, team: Team) -> None:
@@ -171,6 +179,8 @@ class TileCache:
         self.revision = 0  # how often bytes of any tile came to differ
         self.tiles_made = 0  # so far
         self._bytes = TileBytes(settings.cache_bytes)
+        # Those that are asked for one by one.
+        self.answered = AnsweredTiles(min(_ANSWERED_BYTES, settings.cache_bytes))
 
     @property
     def epoch(self) -> int:
@@ -180,7 +190,7 @@ class TileCache:
     @property
     def nbytes(self) -> int:
         """Bytes of the encoded tiles that are kept."""
-        return self._bytes.size
+        return self._bytes.size + self.answered.nbytes
 
     def lattice(self, level: int) -> TileLattice:
         """Where the tiles of a level lie."""
@@ -202,10 +212,8 @@ class TileCache:
             for level in self._levels:
                 level.record(changes, epoch.field_settings.leaf_m / 2, epoch.number)
             self._epoch = epoch
-            # The threads that answer queries are spared: these give way to them.
-            self._view = ComposedView(
-                epoch.number, epoch.field_settings, epoch.frozen_regions, split=self._team.split
-            )
+            # Without the threads that answer queries: those that make tiles give way to them.
+            self._view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
         """Epochs [T] in which the surface of tiles [T, 3] last changed; 0 where none was seen."""
@@ -226,6 +234,25 @@ class TileCache:
             return self._levels[level].delta(
                 low, high, known_to=known_to, known=known, revision=self.revision
             )
+
+    def make_some(self, level: int, indices: Iterable[TileIndex]) -> list[TileIndex]:
+        """Make some tiles at the same time, one on each core, the first of ``indices`` among them.
+
+        No two of them touch, so that none has to fit another that is not made yet.
+        """
+        chosen: list[TileIndex] = []
+        for index in indices:
+            if not any(_touch(index, other) for other in chosen):
+                chosen.append(index)
+            if len(chosen) == THREADS:
+                break
+
+        def work(first: int, last: int) -> None:
+            for index in chosen[first:last]:
+                self.make(level, index)
+
+        self._team.split(len(chosen), work, least=1)
+        return chosen
 
     def make(self, level: int, index: TileIndex) -> CachedTile:
         """Make a tile from the epoch of the last refresh, to fit its neighbours."""

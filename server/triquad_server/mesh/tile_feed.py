@@ -225,12 +225,13 @@ class TileFeed:
     def _make(self, level: int, indices: list[TileIndex]) -> None:
         """Make tiles for a moment; queries come first."""
         ends_s = time.monotonic() + _SLICE_S
-        for index in indices:
+        left = dict.fromkeys(indices)
+        while left and time.monotonic() < ends_s and not self._stopping:
             self._epochs.gate.give_way(_GIVE_WAY_S)
             with self._epochs.gate.turn():
-                self._cache.make(level, index)
-            if time.monotonic() > ends_s or self._stopping:
-                return
+                made = self._cache.make_some(level, left)
+            for index in made:
+                del left[index]
 
     def _remake(self, level: int, indices: list[TileIndex]) -> None:
         """Make tiles anew for a moment; while a planner asks, leave it alone for longer then."""

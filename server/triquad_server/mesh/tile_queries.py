@@ -1,5 +1,7 @@
 """Answers to queries of single mesh tiles, and of which there are."""
 
+from dataclasses import replace
+
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
@@ -68,19 +70,24 @@ class TileQueries:
         check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
         lattice = self._cache.lattice(request.level)
-        # On the thread that answers alone: of a box full of tiles, others make more of them.
-        view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
-        mesh = mesh_tile(view, index, lattice, fill_m=request.fill_m)
+        asked = (request.level, index, request.fill_m)
+        tile = self._cache.answered.get(epoch.number, asked)
+        if tile is None:
+            # On the thread that answers alone: of a box full of tiles, others make more of them.
+            view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
+            mesh = mesh_tile(view, index, lattice, fill_m=request.fill_m)
+            tile = Tile(
+                epoch=epoch.number,
+                changed=0,
+                origin=mesh.origin,
+                vertices=mesh.vertices,
+                faces=mesh.faces,
+                filled=mesh.filled.astype(np.uint8) if request.fill_m > 0 else None,
+            )
+            self._cache.answered.put(epoch.number, asked, tile)
         # A change that no refresh found yet shows in a later list: the tile is fetched again then.
         (changed,) = self._cache.changed(request.level, np.array([index])).tolist()
-        return Tile(
-            epoch=epoch.number,
-            changed=min(changed, epoch.number),
-            origin=mesh.origin,
-            vertices=mesh.vertices,
-            faces=mesh.faces,
-            filled=mesh.filled.astype(np.uint8) if request.fill_m > 0 else None,
-        )
+        return replace(tile, changed=min(changed, epoch.number))
 
 
 def surface_tiles(epoch: Epoch, lattice: TileLattice, fill_m: float = 0.0) -> Ints:

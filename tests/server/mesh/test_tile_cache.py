@@ -71,11 +71,13 @@ class Patchwork:
     epochs: dict[TileIndex, Epoch]
     borders: dict[tuple[int, int, int], float]
 
-    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        steps = np.rint(points / self.lattice.cell_m).astype(np.int64)
+    def distances_in_grid(
+        self, axes: NDArray[np.float64], points: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        steps = np.rint(axes / self.lattice.cell_m).astype(np.int64)[:, 0] + points
         values = np.ones(len(points), np.float32)
         for index, rows in self._owned(steps).items():
-            values[rows] = self.epochs[index].distances(points[rows])
+            values[rows] = self.epochs[index].distances_in_grid(axes, points[rows])
         for row in np.flatnonzero((steps % self.lattice.cells == 0).any(axis=1)):
             values[row] = self.borders.get(tuple(steps[row].tolist()), 1.0)
         return values
@@ -318,6 +320,24 @@ def test_no_tile_is_made_again_before_all_were_made() -> None:
     assert len(set(made)) == 6
     # After all the others those come first that were made longest ago.
     assert cache.delta(0, *EVERYWHERE, 0, {}).to_make[-6:] == made
+
+
+def test_tiles_made_at_the_same_time_meet_as_those_made_one_by_one() -> None:
+    together, alone = TileCache(MESH, TEAM), TileCache(MESH, TEAM)
+    epochs: dict[int, Epoch] = {}
+    for epoch in (ground(flat(0.3)), bump(4.0, 0.05), bump(3.0, 0.05)):
+        epochs[epoch.number] = epoch
+        together.refresh(epoch)
+        while to_make := together.delta(0, *EVERYWHERE, 0, {}).to_make:
+            made = together.make_some(0, to_make)
+            assert made[0] == to_make[0]
+            assert len(made) == len(set(made))
+        if len(epochs) == 1:
+            alone.refresh(epoch)
+            make_all(alone)
+            pair = [triangles(surfaces(cache).items(), 16) for cache in (together, alone)]
+            np.testing.assert_array_equal(*pair)
+        patchwork(together, epochs, 0)  # on their faces, all of them say the same
 
 
 def test_a_box_has_the_tiles_that_meet_it() -> None:

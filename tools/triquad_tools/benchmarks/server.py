@@ -60,8 +60,11 @@ def _early(client: Client, made: BenchStreet) -> list[Figure]:
 
 def _converged(client: Client, made: BenchStreet) -> list[Figure]:
     street = score_street(client.query_sdf, made.probes)
+    started = time.perf_counter()
     mesh = client.mesh(made.drive.scene.box)
+    first_s = time.perf_counter() - started
     times = [seconds(lambda: client.mesh(made.drive.scene.box)) for _ in range(3)]
+    again_s = statistics.median(times)
     scores = made.mesh_scores(mesh)
     return [
         Figure("converged: F-score", 100 * scores.f_score, "%", at_least=98),
@@ -73,7 +76,8 @@ def _converged(client: Client, made: BenchStreet) -> list[Figure]:
         Figure("converged: SDF error within 0.1 m", 100 * street.sdf_error_m, "cm", at_most=1.2),
         Figure("converged: gradient angle, median", street.gradient_angle_deg, "deg", at_most=6),
         Figure("houses unknown inside", 100 * street.houses_unknown_ratio, "%", at_least=99),
-        Figure("mesh of the whole street, fetched", statistics.median(times), "s", at_most=3),
+        Figure("mesh of the whole street, first fetched", first_s, "s", at_most=1.6),
+        Figure("mesh of the whole street, fetched again", again_s, "s", at_most=1.0),
     ]
 
 

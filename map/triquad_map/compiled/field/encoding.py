@@ -18,7 +18,9 @@ from triquad_map.compiled.voxel_index import EMPTY, find_row
 BATCH = 64
 """Points of a batch."""
 
-_AXES = np.array(AXES)
+PLANE_AXES = np.array(AXES)
+"""The two axes of each plane, as kernels take them."""
+
 _TURN = np.float32(2 * np.pi)
 _BELOW_1 = np.nextafter(np.float32(1), np.float32(0))
 
@@ -116,7 +118,7 @@ def locate(batch: PointBatch, geometry: Geometry, vertices: Vertices, features: 
 
 @kernel(fastmath=True)
 def _find_blocks(batch: PointBatch, plane: int, geometry: Geometry, vertices: Vertices) -> None:
-    first, second = _AXES[plane, 0], _AXES[plane, 1]
+    first, second = PLANE_AXES[plane, 0], PLANE_AXES[plane, 1]
     scale = np.float32(1 << (geometry.levels - 1))
     limit = geometry.shape.limit
     for t in range(BATCH):
@@ -179,7 +181,37 @@ def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
                 ),
                 _weights(batch, at, t),
             )
-    for k in range(levels * size):
+    _transpose_features(batch, levels * size)
+
+
+@kernel(fastmath=True)
+def interpolate_plane(
+    batch: PointBatch, plane: int, geometry: Geometry, vertices: Vertices, features: Floats
+) -> None:
+    """As :func:`locate` and :func:`interpolate`, with the features of one plane alone."""
+    size = features.shape[1]
+    _find_blocks(batch, plane, geometry, vertices)
+    _find_cells(batch, plane, geometry)
+    batch.features[:] = 0
+    for t in range(BATCH):
+        block = vertices.rows[batch.blocks[plane, t]]
+        for h in range(geometry.levels):
+            at = plane * geometry.levels + h
+            corner, side = batch.corners[at, t], (1 << h) + 1
+            rows = (
+                block[corner],
+                block[corner + side],
+                block[corner + 1],
+                block[corner + side + 1],
+            )
+            add_rows(batch.features, t, h * size, features, rows, _weights(batch, at, t))
+    _transpose_features(batch, geometry.levels * size)
+
+
+@kernel(fastmath=True)
+def _transpose_features(batch: PointBatch, count: int) -> None:
+    """The first ``count`` inputs of the MLP, from the features of each point."""
+    for k in range(count):
         for t in range(BATCH):
             batch.x[k, t] = batch.features[t, k]
 
@@ -219,8 +251,8 @@ def add_feature_slopes(batch: PointBatch, geometry: Geometry, features: Floats) 
                 across += g * (f10 - f00 + b * twist)
                 along += g * (f01 - f00 + a * twist)
             per_m = np.float32(1 << h) / (np.float32(1 << (levels - 1)) * geometry.leaf_m)
-            batch.gradient[_AXES[plane, 0], t] += across * per_m
-            batch.gradient[_AXES[plane, 1], t] += along * per_m
+            batch.gradient[PLANE_AXES[plane, 0], t] += across * per_m
+            batch.gradient[PLANE_AXES[plane, 1], t] += along * per_m
 
 
 @kernel()

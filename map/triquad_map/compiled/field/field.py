@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import Region
 
 from triquad_map.compiled.field.encoding import (
     BATCH,
@@ -26,7 +25,6 @@ from triquad_map.compiled.field.encoding import (
 )
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree, Vertices
 from triquad_map.compiled.kernel import kernel
-from triquad_map.composition.region import FieldValues
 
 _ZERO = np.float32(0)
 
@@ -61,7 +59,7 @@ class FieldArrays(NamedTuple):
 
 
 @kernel(fastmath=True)
-def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
+def add_product(weights: Floats, x: Floats, out: Floats) -> None:
     """``out += weights.T @ x`` for weights [K, J], x [K, T], out [J, T]."""
     inputs, outputs = weights.shape
     k = 0
@@ -143,7 +141,7 @@ def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
     for j in range(len(biases)):
         for t in range(BATCH):
             out[j, t] = biases[j]
-    _add_product(weights, x, out)
+    add_product(weights, x, out)
     for j in range(len(biases)):
         for t in range(BATCH):
             out[j, t] = max(out[j, t], _ZERO)
@@ -153,6 +151,12 @@ def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
 def _decode(batch: PointBatch, mlp: Mlp) -> None:
     """Both hidden layers and the logits of the batch's inputs."""
     _layer(mlp.w1, mlp.b1, batch.x, batch.h1)
+    decode_rest(batch, mlp)
+
+
+@kernel(fastmath=True)
+def decode_rest(batch: PointBatch, mlp: Mlp) -> None:
+    """The second hidden layer and the logits, from the first."""
     _layer(mlp.w2, mlp.b2, batch.h1, batch.h2)
     for t in range(BATCH):
         batch.logits[t] = mlp.b3[0]
@@ -177,13 +181,13 @@ def backward(batch: PointBatch, mlp: Mlp, w1_transposed: Floats, w2_transposed: 
         for t in range(BATCH):
             batch.g2[j, t] = batch.slopes[t] * mlp.w3[j] if batch.h2[j, t] > 0 else _ZERO
     batch.g1[:] = 0
-    _add_product(w2_transposed, batch.g2, batch.g1)
+    add_product(w2_transposed, batch.g2, batch.g1)
     for j in range(len(mlp.b1)):
         for t in range(BATCH):
             batch.g1[j, t] = batch.g1[j, t] if batch.h1[j, t] > 0 else _ZERO
     gx = batch.gx[: w1_transposed.shape[1]]
     gx[:] = 0
-    _add_product(w1_transposed, batch.g1, gx)
+    add_product(w1_transposed, batch.g1, gx)
 
 
 @kernel(fastmath=True)
@@ -239,41 +243,6 @@ def evaluate(points: Floats, field: CompiledField, logits: Floats, gradients: Fl
         for t in range(count):
             for axis in range(3):
                 gradients[first + t, axis] = batch.gradient[axis, t]
-
-
-class FrozenCompiledField:
-    """A field that answers from arrays, which nothing may change from then on."""
-
-    def __init__(self, settings: FieldSettings, tree: FrozenQuadtree, arrays: FieldArrays) -> None:
-        self.settings = settings
-        self.tree = tree
-        self.arrays = arrays
-        self._field = make_field(settings, tree, arrays)
-
-    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
-        logits = np.empty(len(points), np.float32)
-        gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
-        evaluate(points, self._field, logits, gradients)
-        scale = np.float32(self.settings.logit_scale_m)
-        return FieldValues(logits * scale, gradients * scale)
-
-
-def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledField:
-    """The field of a region as a file holds it."""
-    tree = LiveQuadtree(settings)
-    features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
-    for table in region.tables:
-        h = table.level - settings.levels.start
-        tree.restore(table.plane, h, table.codes.astype(np.int64))
-        features.append(table.vectors())
-    layers = zip(region.mlp.weights, region.mlp.biases, strict=True)
-    arrays = FieldArrays(
-        np.concatenate(features),
-        tuple(np.ascontiguousarray(array, np.float32) for layer in layers for array in layer),
-        np.asarray(region.frequencies, np.float32),
-    )
-    return FrozenCompiledField(settings, tree.freeze(), arrays)
 
 
 def make_field(

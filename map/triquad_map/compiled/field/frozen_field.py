@@ -1,0 +1,52 @@
+"""A field that answers from arrays which do not change, such as those of an epoch or of a file."""
+
+import numpy as np
+from triquad_format.records.arrays import Floats, Longs
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.region import Region
+
+from triquad_map.compiled.field.field import FieldArrays, evaluate, make_field
+from triquad_map.compiled.field.grid import evaluate_in_grid
+from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
+from triquad_map.composition.region import FieldValues
+
+
+class FrozenCompiledField:
+    """A field that answers from arrays, which nothing may change from then on."""
+
+    def __init__(self, settings: FieldSettings, tree: FrozenQuadtree, arrays: FieldArrays) -> None:
+        self.settings = settings
+        self.tree = tree
+        self.arrays = arrays
+        self._field = make_field(settings, tree, arrays)
+
+    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
+        """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
+        logits = np.empty(len(points), np.float32)
+        gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
+        evaluate(points, self._field, logits, gradients)
+        scale = np.float32(self.settings.logit_scale_m)
+        return FieldValues(logits * scale, gradients * scale)
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """Distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
+        logits = np.empty(len(points), np.float32)
+        evaluate_in_grid(axes, points, self._field, logits)
+        return np.asarray(logits * np.float32(self.settings.logit_scale_m))
+
+
+def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledField:
+    """The field of a region as a file holds it."""
+    tree = LiveQuadtree(settings)
+    features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
+    for table in region.tables:
+        h = table.level - settings.levels.start
+        tree.restore(table.plane, h, table.codes.astype(np.int64))
+        features.append(table.vectors())
+    layers = zip(region.mlp.weights, region.mlp.biases, strict=True)
+    arrays = FieldArrays(
+        np.concatenate(features),
+        tuple(np.ascontiguousarray(array, np.float32) for layer in layers for array in layer),
+        np.asarray(region.frequencies, np.float32),
+    )
+    return FrozenCompiledField(settings, tree.freeze(), arrays)
