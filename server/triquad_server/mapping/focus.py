@@ -19,9 +19,9 @@ _LATEST_SAMPLES = 1 << 19
 _MOST_SHARE = 0.25
 """Where more of the blocks with surface are seen anew, all of the region learns."""
 
-_LEAST_FREE = 0.5
+_LEAST_FREE = 0.25
 """Or where, of the rows under what is seen anew, fewer are under nothing else: in a small place,
-nearly all rows are shared."""
+nearly all rows are shared, and so they are under a small thing."""
 
 _LEARNT_STEPS = 300
 """An MLP that took fewer has not learnt enough to stay as it is; a pretrained one has."""

@@ -110,8 +110,8 @@ class LearntPlaces:
 
     def judge(
         self, ends: Floats, sdf: NDArray[np.floating], field: AtEnds, *, settled: bool
-    ) -> None:
-        """Find out where the error falls no more, and whether it rose.
+    ) -> bool:
+        """Find out where the error falls no more; returns whether it rose, and all is learnt again.
 
         Args:
             ends: [N, 3] of the rays that are held out now, metres from the region's centre.
@@ -120,14 +120,15 @@ class LearntPlaces:
             settled: nothing is trained any more. Before, errors rise and fall by chance.
         """
         squares = sdf.astype(np.float64) ** 2
-        if settled and self._rose(ends, squares):
+        rose = settled and self._rose(ends, squares)
+        if rose:
             self.learn_all_again()
-        if self._visits < VISITS:
-            return
-        self._compare(field)
-        self._ends, self._squares = ends.copy(), squares
-        self._visits = 0.0
-        self._seen = self._seen[:0]
+        if self._visits >= VISITS:
+            self._compare(field)
+            self._ends, self._squares = ends.copy(), squares
+            self._visits = 0.0
+            self._seen = self._seen[:0]
+        return rose
 
     def _compare(self, field: AtEnds) -> None:
         """The errors at the rays of the last time, in places that were seen since."""

@@ -405,7 +405,7 @@ class LiveRegion:
 
         sdf = at_ends(ends)
         self.places = places = self._judgement.judge(rows, sdf)
-        self.learnt.judge(ends, sdf, at_ends, settled=self.budget.samples == 0)
+        rose = self.learnt.judge(ends, sdf, at_ends, settled=self.budget.samples == 0)
         self.repairs = self.repairs.after(places)
         if len(places.forgotten_keys):
             x, y, z = places.centres[places.forgotten][0] + self.centre
@@ -418,7 +418,7 @@ class LiveRegion:
                 z,
             )
         attended = self.pool.attend(places.forgotten_keys)
-        if attended:
+        if attended or rose:
             self._focus.release()
         self.budget.repair(attended)
 

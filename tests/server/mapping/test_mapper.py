@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.small_world import World, settings, settle, settled_mapper, surface_error, world
-from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
 from triquad_sensors.pose import moved
@@ -424,6 +424,22 @@ def test_where_little_is_seen_anew_all_else_stays_to_the_bit() -> None:
     settle(mapper)
     later = mapper.publish()
     assert (later.query(seen[away]).sdf != before.query(seen[away]).sdf).any()
+
+
+def test_who_looks_again_at_what_is_known_leaves_all_else_to_the_bit() -> None:
+    one_region = settings().model_copy(update={"field": FieldSettings(depth=11)})
+    mapper = settled_mapper(one_region, world(10))
+    before = mapper.publish()
+    scan = world(10).scans[5]
+    reach_m = 6.0
+    near = scan.points[np.linalg.norm(scan.points, axis=1) < reach_m]
+    mapper.ingest(near, scan.world_from_sensor)
+    settle(mapper)
+    after = mapper.publish()
+    seen = np.concatenate([moved(s.points, s.world_from_sensor) for s in world(10).scans])
+    away = np.linalg.norm(seen - scan.world_from_sensor[:3, 3], axis=1) > reach_m + 3
+    np.testing.assert_array_equal(after.query(seen[away]).sdf, before.query(seen[away]).sdf)
+    assert (after.query(seen[~away]).sdf != before.query(seen[~away]).sdf).any()
 
 
 def test_reset_forgets_a_box_and_everything() -> None:
