@@ -7,11 +7,11 @@ packages, directly or not; folders of earlier digests are removed. Versions of n
 processors numba tells apart itself.
 """
 
+import ast
 import functools
 import hashlib
 import logging
 import os
-import re
 import shutil
 import sys
 import tempfile
@@ -19,30 +19,18 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from llvmlite import binding
 from numba.core import caching, event
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 _OURS = "triquad_"
 """What the names of the packages begin with whose modules count."""
 
-_IMPORT = re.compile(
-    rf"^(?:from|import)\s+({_OURS}[\w.]+)(?:\s+import\s+(\([^)]*\)|[^\n]*))?", re.MULTILINE
-)
-"""An import of a module of these, and the names after it; to parse the files takes 0.2 s."""
-
 _log = logging.getLogger(__name__)
 
 _numba_config: Any = numba.config
-_njit: Any = numba.njit  # whose types leave out no_cfunc_wrapper: nothing here is called from C
 _FunctionCache: Any = caching.FunctionCache
 _choosing_folder = threading.Lock()
 
@@ -62,7 +50,7 @@ def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
             folder = _code_folder(function.__module__, chosen)
             _numba_config.CACHE_DIR = str(folder or chosen)
             try:
-                jit: Any = _njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
+                jit: Any = numba.njit(nogil=True, **options)(function)
                 if folder is not None:
                     jit._cache = _KeptCode(function)  # as its enable_caching() does
             finally:
@@ -73,53 +61,11 @@ def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
     return compiled
 
 
-def share_compiling() -> None:
-    """From now on, each kernel is compiled by one of the processes that say so; others wait."""
-    _KeptCode.is_shared = fcntl is not None
-
-
 class _KeptCode(_FunctionCache):  # type: ignore[misc]
     """The compiled code of a kernel on disk, without which the kernel works as well."""
 
-    is_shared = False  # with other processes that compile at the same time
-    _turn: IO[bytes] | None = None  # by which others know that this process compiles it
-
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code, if there is some; what cannot be read is compiled and kept anew."""
-        code = self._load(sig, target_context)
-        if code is None and self.is_shared and self._turn is None:
-            # No two wait for each other: a kernel waits for those alone that it calls.
-            self._turn = self._begin_turn()
-            code = self._load(sig, target_context)
-            if code is not None:
-                self._end_turn()
-        return code
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep compiled code for other processes, where the disk has room for it."""
-        try:
-            super().save_overload(sig, data)
-        except OSError as error:
-            _log.warning("%s: its compiled code cannot be kept: %s", self._name, error)
-        finally:
-            self._end_turn()
-
-    def _begin_turn(self) -> IO[bytes] | None:
-        try:
-            folder = Path(self.cache_path)
-            folder.mkdir(parents=True, exist_ok=True)
-            turn = (folder / f"{self._py_func.__qualname__}.lock").open("wb")
-        except OSError:
-            return None
-        fcntl.flock(turn, fcntl.LOCK_EX)
-        return turn
-
-    def _end_turn(self) -> None:
-        if self._turn is not None:
-            self._turn.close()
-            self._turn = None
-
-    def _load(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
         except Exception as error:  # whatever comes of a file that a power cut left half written
@@ -127,6 +73,13 @@ class _KeptCode(_FunctionCache):  # type: ignore[misc]
             with suppress(OSError):
                 self.flush()
             return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep compiled code for other processes, where the disk has room for it."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _log.warning("%s: its compiled code cannot be kept: %s", self._name, error)
 
 
 class _CompilingIsTold(event.Listener):
@@ -146,19 +99,6 @@ class _CompilingIsTold(event.Listener):
 
 
 event.register("numba:compile", _CompilingIsTold())
-
-
-def compiled_mark(module: str) -> Path | None:
-    """A file to write once all kernels that ``module`` leads to are compiled; None: nowhere.
-
-    It is another one for other sources, another release of numba, and another processor.
-    """
-    folder = _code_folder(module, _numba_config.CACHE_DIR)
-    if folder is None:
-        return None
-    processor = f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
-    digest = hashlib.sha256(f"{numba.__version__} {processor}".encode())
-    return folder / f"compiled-{digest.hexdigest()[:24]}"
 
 
 @functools.cache
@@ -217,12 +157,15 @@ def _source_digest(module: str) -> str:
 
 @functools.cache
 def _imports(module: str) -> set[str]:
-    """The modules of these packages that a module imports itself, at its top level."""
+    """The modules of these packages that a module imports itself."""
     names: set[str] = set()
-    for parent, children in _IMPORT.findall(_file_of(module).read_text(encoding="utf-8")):
-        names.add(parent)
-        names.update(f"{parent}.{child}" for child in re.findall(r"\w+", children))
-    return names & sys.modules.keys()
+    for node in ast.parse(_file_of(module).read_bytes()).body:
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return {name for name in names if name.startswith(_OURS) and name in sys.modules}
 
 
 def _file_of(module: str) -> Path:
