@@ -49,7 +49,7 @@ def test_while_libraries_are_imported(name: str, module: str) -> None:
     assert done.stdout == ""
 
 
-@pytest.mark.parametrize("module", ["triquad_server.settings", "numpy", "torch"])
+@pytest.mark.parametrize("module", ["triquad_server.settings", "numpy", "numba"])
 def test_while_the_libraries_of_the_server_are_imported(module: str) -> None:
     code = PRESSED_AT_IMPORT.format(module=module)
     code += "from triquad_server.cli import main\nsys.exit(main())"
