@@ -4,33 +4,29 @@ import functools
 import logging
 import sys
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 
-import numpy as np
 from triquad_format.errors import SettingsError
-from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import MapRecord
-from triquad_map.questions.distance import DistanceOptions, distances
 
 from triquad_server.device import choose_device
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.configuration import Configuration, configuration
 from triquad_server.net.session import open_session
 from triquad_server.network_defaults import network_defaults
 from triquad_server.phases import Phases
-from triquad_server.process.memory import give_back_early
+from triquad_server.preparation import Preparation
+from triquad_server.process.memory import give_back_early, leave_out_blas
 from triquad_server.process.open_files import allow_open_files
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
 from triquad_server.self_question import SelfQuestion
 from triquad_server.service import ServedMap, Service
-from triquad_server.settings import MemorySettings, Settings
+from triquad_server.settings import Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.supervision import Supervision
@@ -40,13 +36,6 @@ _log = logging.getLogger("triquad_server")
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits: a query is to be answered in a
 few milliseconds, which is Python's default for a single turn."""
-
-_QUICK_S = 3.0
-"""Compiled code that is found on disk is ready by then."""
-
-_WARM_UP_SCANS = 6  # of rays that pass the sphere, until it is taken back
-_WARM_UP_DIRECTIONS = 400
-_WARM_UP_RADIUS_M = 3.0
 
 
 class _StoppedEarlyError(Exception):
@@ -61,6 +50,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     give_back_early()
+    leave_out_blas()
     allow_open_files()
     _stop_where_a_thread_ends(stops)
     if options.store is None:
@@ -125,7 +115,11 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     if restored is not None:
         settings = _settings_of(restored.record, settings)
     teams = stack.enter_context(closing(Teams()))
-    _prepare(settings, device, teams, next_stage=_unless_stopped(stops, phases))
+    preparation = Preparation(
+        settings, device, teams, starting=phases.starting, check=_stop_check(stops)
+    )
+    stack.callback(preparation.close)
+    preparation.for_answers()
     phases.starting("opening the map")
     mapper = Mapper(
         options.map_name,
@@ -144,7 +138,7 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
         teams=teams,
     )
     failed = functools.partial(stops.put, Stop.INTERNAL_ERROR)
-    service = Service(session, served, settings, failed=failed)
+    service = Service(session, served, settings, failed=failed, maps=False)
     stack.enter_context(closing(service))
     if monitoring is not None:
         stack.enter_context(monitoring.showing(service.metrics))
@@ -152,6 +146,8 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     _log_ready(options, network, service.epoch, device)
     question = SelfQuestion(session, options.map_name, service.own_name)
     phases.serving(service.health, question)
+    stack.callback(preparation.close)  # before the service closes
+    preparation.for_mapping(service.begin_to_map, failed)
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> MonitoringServer | None:
@@ -195,80 +191,14 @@ def _settings_of(record: MapRecord, settings: Settings) -> Settings:
     return kept
 
 
-def _unless_stopped(stops: Stops, phases: Phases) -> Callable[[str], None]:
-    """What tells the next stage of the start, or ends the start if the server is asked to stop."""
+def _stop_check(stops: Stops) -> Callable[[], None]:
+    """What ends the start if the server is asked to stop."""
 
-    def next_stage(stage: str) -> None:
+    def check() -> None:
         if not stops.empty():
             raise _StoppedEarlyError
-        phases.starting(stage)
 
-    return next_stage
-
-
-def _prepare(
-    settings: Settings, device: str, teams: Teams, *, next_stage: Callable[[str], None]
-) -> None:
-    """Have all kernels compiled; whoever waits for it is told how it goes.
-
-    Raises:
-        _StoppedEarlyError: of ``next_stage``: the server is asked to stop.
-    """
-    _log.info("preparing compiled code")
-    started = time.monotonic()
-
-    def report(stage: str) -> None:
-        next_stage(f"preparing compiled code: {stage}")
-        seconds = time.monotonic() - started
-        if seconds > _QUICK_S:
-            _log.info("%.0f s so far; next: %s", seconds, stage)
-
-    warm_up(settings, device, teams, report=report)
-
-
-def warm_up(
-    settings: Settings,
-    device: str,
-    teams: Teams | None = None,
-    report: Callable[[str], None] = lambda _: None,
-) -> None:
-    """Map and ask a made-up sphere, let it vanish, and forget it.
-
-    Compiling takes a minute at the very first start; then the compiled code is found on disk.
-    ``report`` is told what comes next.
-    """
-    count = min(_WARM_UP_DIRECTIONS, settings.scan.max_points)
-    directions = np.random.default_rng(0).normal(size=(count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    radius = min(max(_WARM_UP_RADIUS_M, settings.scan.range_min_m), settings.scan.range_max_m)
-    teams = teams or Teams()
-    settings = settings.model_copy(update={"memory": MemorySettings()})  # with room for it
-    mapper = Mapper("warm-up", settings, device, teams=teams)
-    report("taking in scans")
-    rays = mapper.ingest((directions * radius).astype(np.float32), np.eye(4))
-    mapper.regions[0].growth_by(rays)
-    report("training")
-    mapper.train()
-    mapper.publish()
-    report("what is gone")
-    for _ in range(_WARM_UP_SCANS):
-        mapper.ingest((2 * directions * radius).astype(np.float32), np.eye(4))
-    epoch = mapper.publish()
-    again = Mapper("warm-up", settings, device, mapper.changes_since(None).record, teams)
-    again.publish()
-    region = again.regions[0]
-    blocks = region.evidence.surface_blocks()
-    region.field.hold(region.field.tree.rows_under(blocks, BLOCK_VOXELS))
-    region.field.live_view().evaluate(rays.ends.astype(np.float32), gradient=True)
-    region.pool.focus(blocks)  # as if it were seen anew
-    again.train()
-    report("queries")
-    epoch.query(directions, gradient=True)
-    distances(epoch, directions, DistanceOptions(unknown_distance=True))
-    report("meshes")
-    cache = TileCache(settings.mesh, teams.meshing)
-    cache.refresh(epoch)
-    cache.make(0, (0, 0, 0))
+    return check
 
 
 def _log_who_gets_in(network: Configuration) -> None:

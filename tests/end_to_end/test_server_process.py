@@ -72,6 +72,19 @@ def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(tmp_pa
         assert_same_map(before, ask(server.endpoint))
 
 
+def test_at_the_very_first_start_it_serves_and_then_maps(tmp_path, arguments):
+    """Where nothing is compiled yet, others compile for it."""
+    nothing = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    with servers.server_process(arguments, environment=nothing) as server:
+        assert "all is compiled" not in server.log
+        assert ask(server.endpoint).epoch >= 1
+        learn(server.endpoint)
+        assert server.log.count("compiling") == 1
+        assert server.log.index("ready: ") < server.log.index("all is compiled")
+    with servers.server_process(arguments, environment=nothing) as server:
+        assert "compiling" not in server.log
+
+
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="the system tells no mappings")
 def test_on_a_cpu_torch_stays_out_of_memory(arguments):
     with servers.server_process(arguments) as server:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -79,6 +80,13 @@ def test_compiled_code_is_found_by_the_next_process(package):
 def test_who_waits_while_it_is_compiled_is_told_once(package):
     assert run_process(package).stderr.count("compiling") == 1
     assert run_process(package).stderr == ""
+
+
+def test_of_several_processes_one_compiles_each_kernel(package):
+    with ThreadPoolExecutor() as pool:
+        runs = [pool.submit(run_process, package) for _ in range(3)]
+        results = [run.result().stdout.split() for run in runs]
+    assert sorted(results) == [["33", "0"], ["33", "1"], ["33", "1"]]
 
 
 def test_a_change_of_what_a_kernel_calls_counts(package):

@@ -21,7 +21,6 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, Scan
 from triquad_format.wire.zenoh_config import QUIET, put
-from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.configuration import NetworkOptions, configuration
 from triquad_server.net.session import open_session
@@ -30,6 +29,7 @@ from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
+from triquad_server.warm_up import warm_up
 from triquad_tools.demo.server import free_endpoint
 
 MAP = "default"
@@ -243,8 +243,10 @@ def server_process(
 ) -> Iterator[ServerProcess]:
     """A server process; killed at the end if it still runs.
 
-    ``environment`` has variables beside those of this process.
+    ``environment`` has variables beside those of this process; without any all is compiled before.
     """
+    if environment is None:
+        compiled()
     endpoint = endpoint or free_endpoint()
     command = [sys.executable, "-m", "triquad_server.cli", "--listen", endpoint]
     command += ["--device", "cpu", *map(str, arguments)]

@@ -11,9 +11,9 @@ from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server.engine.initial_mlp import PRETRAINED, random_mlp
 from triquad_server.engine.live_field import LiveField
-from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.street import bench_street, learn_all
 from triquad_tools.console.progress import progress

@@ -7,30 +7,48 @@ packages, directly or not; folders of earlier digests are removed. Versions of n
 processors numba tells apart itself.
 """
 
-import ast
 import functools
 import hashlib
 import logging
 import os
+import re
 import shutil
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import numba
 import numpy as np
+from llvmlite import binding
 from numba.core import caching, event
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 _OURS = "triquad_"
 """What the names of the packages begin with whose modules count."""
 
+_IMPORT = re.compile(
+    rf"^(?:from|import)\s+({_OURS}[\w.]+)(?:\s+import\s+(\([^)]*\)|[^\n]*))?", re.MULTILINE
+)
+"""An import of a module of these, and the names after it; to parse the files takes 0.2 s."""
+
+_LONGEST_TURN_S = 60.0
+"""After so long a process that compiles a kernel counts as one that hangs."""
+
+_LOOK_S = 0.02  # between two looks whether it is done
+
 _log = logging.getLogger(__name__)
 
 _numba_config: Any = numba.config
+_njit: Any = numba.njit  # whose types leave out no_cfunc_wrapper: nothing here is called from C
 _FunctionCache: Any = caching.FunctionCache
 _choosing_folder = threading.Lock()
 
@@ -39,6 +57,9 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
     """Compile a function when it is first called; it runs without Python's lock.
+
+    It is compiled once for each kinds of arguments, for which each literal number is one of its
+    own, and so is each width: where many hang on it, a caller says ``np.int64(0)``.
 
     Args:
         options: of ``numba.njit``.
@@ -50,7 +71,7 @@ def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
             folder = _code_folder(function.__module__, chosen)
             _numba_config.CACHE_DIR = str(folder or chosen)
             try:
-                jit: Any = numba.njit(nogil=True, **options)(function)
+                jit: Any = _njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
                 if folder is not None:
                     jit._cache = _KeptCode(function)  # as its enable_caching() does
             finally:
@@ -61,11 +82,64 @@ def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
     return compiled
 
 
+def inner_kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
+    """As :func:`kernel`, for a function that kernels alone call.
+
+    It takes no objects of Python, and a seventh less time to compile.
+    """
+    return kernel(no_cpython_wrapper=True, **options)
+
+
 class _KeptCode(_FunctionCache):  # type: ignore[misc]
-    """The compiled code of a kernel on disk, without which the kernel works as well."""
+    """The compiled code of a kernel on disk, without which the kernel works as well.
+
+    Of several processes that come to a kernel at the same time one compiles it; others wait.
+    """
+
+    _turn: IO[bytes] | None = None  # by which others know that this process compiles it
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code, if there is some; what cannot be read is compiled and kept anew."""
+        code = self._load(sig, target_context)
+        if code is None and self._turn is None:
+            # No two wait for each other: a kernel waits for those alone that it calls.
+            self._turn = self._begin_turn()
+            code = self._load(sig, target_context)
+            if code is not None:
+                self._end_turn()
+        return code
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep compiled code for other processes, where the disk has room for it."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _log.warning("%s: its compiled code cannot be kept: %s", self._name, error)
+        finally:
+            self._end_turn()
+
+    def _begin_turn(self) -> IO[bytes] | None:
+        """Wait until no other process compiles the kernel; None: it is compiled all the same."""
+        try:
+            folder = Path(self.cache_path)
+            folder.mkdir(parents=True, exist_ok=True)
+            turn = (folder / f"{self._py_func.__qualname__}.lock").open("wb")
+        except OSError:
+            return None
+        ends_s = time.monotonic() + _LONGEST_TURN_S
+        while not _is_locked(turn):
+            if time.monotonic() > ends_s:
+                turn.close()
+                return None
+            time.sleep(_LOOK_S)
+        return turn
+
+    def _end_turn(self) -> None:
+        if self._turn is not None:
+            self._turn.close()
+            self._turn = None
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
         except Exception as error:  # whatever comes of a file that a power cut left half written
@@ -74,12 +148,18 @@ class _KeptCode(_FunctionCache):  # type: ignore[misc]
                 self.flush()
             return None
 
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep compiled code for other processes, where the disk has room for it."""
-        try:
-            super().save_overload(sig, data)
-        except OSError as error:
-            _log.warning("%s: its compiled code cannot be kept: %s", self._name, error)
+
+def _is_locked(file: IO[bytes]) -> bool:
+    """Lock a file until it is closed, unless another process has; True where none can."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
 
 
 class _CompilingIsTold(event.Listener):
@@ -99,6 +179,19 @@ class _CompilingIsTold(event.Listener):
 
 
 event.register("numba:compile", _CompilingIsTold())
+
+
+def compiled_marks(module: str) -> Path | None:
+    """A folder for marks of which kernels that ``module`` leads to are compiled; None: nowhere.
+
+    It is another one for other sources, another release of numba, and another processor.
+    """
+    folder = _code_folder(module, _numba_config.CACHE_DIR)
+    if folder is None:
+        return None
+    processor = f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
+    digest = hashlib.sha256(f"{numba.__version__} {processor}".encode())
+    return folder / f"compiled-{digest.hexdigest()[:24]}"
 
 
 @functools.cache
@@ -157,15 +250,12 @@ def _source_digest(module: str) -> str:
 
 @functools.cache
 def _imports(module: str) -> set[str]:
-    """The modules of these packages that a module imports itself."""
+    """The modules of these packages that a module imports itself, at its top level."""
     names: set[str] = set()
-    for node in ast.parse(_file_of(module).read_bytes()).body:
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module)
-            names.update(f"{node.module}.{alias.name}" for alias in node.names)
-    return {name for name in names if name.startswith(_OURS) and name in sys.modules}
+    for parent, children in _IMPORT.findall(_file_of(module).read_text(encoding="utf-8")):
+        names.add(parent)
+        names.update(f"{parent}.{child}" for child in re.findall(r"\w+", children))
+    return names & sys.modules.keys()
 
 
 def _file_of(module: str) -> Path:

@@ -6,7 +6,7 @@ The moments [10] of points are their number and the sums of x, y, z, xx, xy, xz,
 import numpy as np
 from triquad_format.records.arrays import Doubles
 
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 
 MOMENTS = 10
 
@@ -31,7 +31,7 @@ def add_points(m: Doubles, at: tuple[float, float, float], count: float) -> None
     m[9] += count * c * c
 
 
-@kernel()
+@inner_kernel()
 def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
     """The unit normal, of either sign, of the plane of points with the moments ``m``.
 

@@ -29,7 +29,7 @@ from triquad_map.compiled.field.field import (
     make_field,
     transposed,
 )
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import THREADS, Team, share
 
 from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
@@ -190,7 +190,7 @@ class GradientSums:
         self.features, self.touched, self.step = (), (), 1
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, known: int) -> int:
     """Add the rows of the first ``count`` points to the ``known`` ones; returns how many now."""
     for t in range(count):
@@ -203,14 +203,14 @@ def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, 
     return known
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _squashed(logit: float, tail: float) -> float:
     """A logit as a number in [0, 1]; its ``tail`` is ``exp(-abs(logit))``, which is never large."""
     squashed: float = (np.float32(1) if logit >= 0 else tail) / (np.float32(1) + tail)
     return squashed
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _cross_entropy(batch: PointBatch, wanted: Floats, share: float) -> float:
     """Set the slopes of the batch's logits; returns the sum of the losses."""
     loss = 0.0
@@ -254,7 +254,7 @@ def _add_loss_gradient(
     levels = field.geometry.levels
     batch = batch_for(field)
     w1_transposed, w2_transposed = transposed(field.mlp, levels * field.features.shape[1])
-    known = 0
+    known = np.int64(0)
     loss = 0.0
     for first in range(0, len(points), BATCH):
         count = load(batch, points, first)

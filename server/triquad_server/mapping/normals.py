@@ -7,7 +7,7 @@ fine grid serves where it has a plane, the coarse one where it has not.
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Ints, Longs
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import (
@@ -55,7 +55,7 @@ def _add(
     return len(points), count
 
 
-@kernel()
+@inner_kernel()
 def _gather(row: int, cell_m: float, index: Index, moments: Floats) -> tuple[float, ...]:
     """Sum the moments of the 27 cells around that of a row, relative to its centre."""
     x, y, z = unpack(index.row_keys[row])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.quadtree import morton_code
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.live_field import Batch
@@ -69,7 +69,7 @@ class Placement(NamedTuple):
     half_side_m: float  # of the region's cube: samples lie inside
 
 
-@kernel()
+@inner_kernel()
 def _set_direction(direction: Doubles, origin: AnyFloats, end: AnyFloats) -> float:
     """Set the unit vector [3] from ``origin`` to ``end``; returns how far it is."""
     squared = 0.0
@@ -83,7 +83,7 @@ def _set_direction(direction: Doubles, origin: AnyFloats, end: AnyFloats) -> flo
     return reach_m
 
 
-@kernel()
+@inner_kernel()
 def _clipped(
     end: AnyFloats, direction: Doubles, half_side_m: float, first: float, last: float
 ) -> tuple[float, float]:
@@ -101,7 +101,7 @@ def _clipped(
     return first, last
 
 
-@kernel()
+@inner_kernel()
 def _free_part(
     end: AnyFloats, direction: Doubles, reach_m: float, placement: Placement
 ) -> tuple[float, float, float]:

@@ -12,7 +12,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.feature_rows import prefetch_row
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import (
     Index,
@@ -49,7 +49,7 @@ RAY_BYTES = math.ceil(_ROOM * 4 * (COLUMNS + 2))
 """Of a ray, with where its origin and its bin are, and with the room beside it."""
 
 
-@kernel()
+@inner_kernel()
 def _bin(row: Floats, bin_m: float) -> int:
     mixed: int = np.int64(0)
     for axis, prime in enumerate((73856093, 19349663, 83492791)):

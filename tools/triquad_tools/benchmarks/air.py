@@ -6,9 +6,9 @@ from functools import partial
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
-from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure, seconds, typical
 from triquad_tools.benchmarks.street import LENGTH_M, SCANS

@@ -13,13 +13,13 @@ from triquad_server.engine.live_field import Batch, Rates
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.launch import warm_up
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.mesher import mesh_tile, tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure, compare, seconds, typical
 from triquad_tools.benchmarks.street import BenchStreet

@@ -10,10 +10,10 @@ from dataclasses import asdict
 from functools import partial
 
 import numpy as np
-from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.memory import resident_bytes
 from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure, seconds
 from triquad_tools.console.lines import print_line

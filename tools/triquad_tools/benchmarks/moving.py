@@ -12,10 +12,10 @@ from triquad_client import Mesh
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.launch import warm_up
 from triquad_server.mesh.marching_cubes import centroids
 from triquad_server.mesh.mesher import mesh_tile, tile_lattice
 from triquad_server.settings import MeshSettings, Settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.align import check_recorded
 from triquad_tools.benchmarks.ended_voxels import (

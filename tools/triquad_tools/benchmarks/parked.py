@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_sensors.sweep import PosedScan
-from triquad_server.launch import warm_up
 from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import StreamedMap, learn_all, sdf_error_cm

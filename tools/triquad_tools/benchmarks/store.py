@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.records.region import MapRecord
-from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_server.store.store import Store
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.served import MAP, served, stream_beside_planner

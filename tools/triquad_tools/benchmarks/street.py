@@ -8,9 +8,9 @@ from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 from triquad_sensors.sweep import PosedScan
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import seconds
 from triquad_tools.console.progress import progress

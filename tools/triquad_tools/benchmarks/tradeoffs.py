@@ -13,10 +13,10 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.preview import previews_of
 from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import CurvePoint, Figure
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper

@@ -11,11 +11,11 @@ from triquad_server.device import choose_device
 from triquad_server.errors import StoreError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
-from triquad_server.launch import warm_up
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 from triquad_server.settings.loading import PRESETS, load_settings
+from triquad_server.warm_up import warm_up
 
 from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, ToolError, run

@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -32,12 +32,17 @@ class DemoServer:
     """A running server; leaving the ``with`` statement stops it in any case."""
 
     def __init__(
-        self, folder: Path, map_name: str, arguments: Sequence[str] = (), endpoint: str = ""
+        self,
+        folder: Path,
+        map_name: str,
+        arguments: Sequence[str] = (),
+        endpoint: str = "",
+        variables: Mapping[str, str] | None = None,
     ) -> None:
         """Start the process, with store and log in a folder, and wait until it is ready.
 
         ``arguments`` are further ones of its command line; without an ``endpoint`` a free one of
-        the loopback is taken.
+        the loopback is taken, and without ``variables`` the environment of this process.
 
         Raises:
             ToolError: it ended before, or took too long.
@@ -51,7 +56,7 @@ class DemoServer:
         command += ["--map", map_name, "--store", str(folder / "store")]
         command += ["--no-multicast-scouting", *arguments]
         self._process = subprocess.Popen(
-            command, stderr=subprocess.PIPE, text=True, errors="replace"
+            command, stderr=subprocess.PIPE, text=True, errors="replace", env=variables
         )
         self._reader = threading.Thread(target=self._read_log, name="server log")
         self._reader.start()

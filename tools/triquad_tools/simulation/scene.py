@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Longs
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 
 from triquad_tools.simulation.solids import BOUND, Solid, X, Y, Z, distance_to, solid_table
 
@@ -142,7 +142,7 @@ def _all_distances(solids: Doubles, points: Doubles) -> Doubles:
     return distances
 
 
-@kernel()
+@inner_kernel()
 def _cell(origin: Doubles, shape: Longs, point: Doubles) -> int:
     """The flat index of a point's cell; one past the last for a point beside the grid."""
     flat = np.int64(0)
@@ -208,7 +208,7 @@ def _cast(
     return ranges
 
 
-@kernel()
+@inner_kernel()
 def _hit(row: Doubles, origin: Doubles, direction: Doubles, start: float, limit: float) -> float:
     """Range from ``start`` on at which a ray hits one solid; ``limit`` if that is nearer."""
     dx, dy, dz = direction[0], direction[1], direction[2]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel
 
 Vector = tuple[float, float, float]
 
@@ -78,7 +78,7 @@ def solid_table(solids: tuple[Solid, ...]) -> Doubles:
 Distance = tuple[float, float, float, float]  # and its gradient
 
 
-@kernel()
+@inner_kernel()
 def _box_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
     qx, qy, qz = abs(x) - row[_A], abs(y) - row[_B], abs(z) - row[_C]
     sx, sy, sz = math.copysign(1.0, x), math.copysign(1.0, y), math.copysign(1.0, z)
@@ -93,7 +93,7 @@ def _box_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
     return length - row[_D], sx * mx / length, sy * my / length, sz * mz / length
 
 
-@kernel()
+@inner_kernel()
 def _extrude(profile: float, along: float) -> tuple[float, float, float]:
     """Distance to a profile extruded along an axis, and its derivatives by both arguments."""
     if profile <= 0.0 and along <= 0.0:
@@ -103,7 +103,7 @@ def _extrude(profile: float, along: float) -> tuple[float, float, float]:
     return length, mp / length, ma / length
 
 
-@kernel()
+@inner_kernel()
 def _cylinder_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
     rho = math.sqrt(x * x + y * y)
     distance, wr, wz = _extrude(rho - row[_A], abs(z) - row[_B])
@@ -111,7 +111,7 @@ def _cylinder_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
     return distance, wr * ux, wr * uy, math.copysign(wz, z)
 
 
-@kernel()
+@inner_kernel()
 def _gable_profile(row: Doubles, y: float, z: float) -> tuple[float, float, float]:
     """Distance to the right half of a gable's outline (``y >= 0``, ``z`` from the bottom)."""
     width, ridge, eave = row[_B], 2.0 * row[_C], row[_D]
@@ -136,14 +136,14 @@ def _gable_profile(row: Doubles, y: float, z: float) -> tuple[float, float, floa
     return (best, by / best, bz / best) if best > 0.0 else (0.0, ny, nz)
 
 
-@kernel()
+@inner_kernel()
 def _gable_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
     profile, gy, gz = _gable_profile(row, abs(y), z + row[_C])
     distance, wp, wx = _extrude(profile, abs(x) - row[_A])
     return distance, math.copysign(wx, x), math.copysign(wp * gy, y), wp * gz
 
 
-@kernel()
+@inner_kernel()
 def distance_to(row: Doubles, x: float, y: float, z: float) -> Distance:
     """Signed distance of a world point to the solid of a row, and its gradient, world frame."""
     kind = row[_KIND]

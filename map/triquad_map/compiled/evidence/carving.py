@@ -11,7 +11,7 @@ from triquad_format.records.arrays import Doubles, Ints
 from triquad_map.compiled.evidence.crossings import Passing, note_passes
 from triquad_map.compiled.evidence.observed import Observed, Vector
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
     LOW,
     SHIFT,
@@ -66,7 +66,7 @@ def part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[floa
     return first, min(length, leaves_x, leaves_y, leaves_z)
 
 
-@kernel()
+@inner_kernel()
 def _walk(
     ray: Passing, reach: float, seen: SeenVoxels, count: int, observed: Observed, crossed: Ints
 ) -> tuple[int, int]:

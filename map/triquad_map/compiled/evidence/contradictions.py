@@ -23,7 +23,7 @@ from triquad_map.compiled.evidence.observed import (
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.evidence.surroundings import Around, depth_around, seen_around
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
 
 _PRIOR_HITS, _PRIOR_PASSES = 0.3, 0.7
@@ -75,7 +75,7 @@ class Disbelief(NamedTuple):
         return cls(scans, own, around=3 * own, shared=own + math.log(2), witnessed=own / 2)
 
 
-@kernel()
+@inner_kernel()
 def _improbability(passes: int, earlier: int, hits: int) -> float:
     """Logarithm of how probable so many passes in a row are, by what was seen earlier."""
     a, b = hits + _PRIOR_HITS, earlier + _PRIOR_PASSES
@@ -85,7 +85,7 @@ def _improbability(passes: int, earlier: int, hits: int) -> float:
     return total
 
 
-@kernel()
+@inner_kernel()
 def _own_improbability(voxel: ObservedVoxel) -> float:
     """Logarithm of how probable the crossings of a voxel are by its own record.
 
@@ -96,7 +96,7 @@ def _own_improbability(voxel: ObservedVoxel) -> float:
     return float(own + np.log(tries))
 
 
-@kernel()
+@inner_kernel()
 def _goes_along(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
     """Whether a surface goes since those around it are gone.
 
@@ -116,7 +116,7 @@ def _goes_along(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
     return bool(voxel.passes * np.log(share) + np.log(voxel.hits) <= rule.shared)
 
 
-@kernel()
+@inner_kernel()
 def _is_doubted_around(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
     """Whether no surface around a voxel is believed, and what passed all of it is improbable."""
     if around.gone + around.doubted < around.known:
@@ -131,7 +131,7 @@ def _is_doubted_around(voxel: ObservedVoxel, around: Around, rule: Disbelief) ->
     return _improbability(around.passes, around.earlier_passes, around.hits) < rule.around
 
 
-@kernel()
+@inner_kernel()
 def _goes_with_group(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
     """Whether a surface without a record of its own goes with what was seen two voxels around.
 
@@ -149,7 +149,7 @@ def _goes_with_group(row: int, seen: SeenVoxels, observed: Observed, rule: Disbe
     return depth_around(row, _GROUP_REACH, seen, observed) < _GROUP_FLAT
 
 
-@kernel()
+@inner_kernel()
 def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
     """Whether the surface of a voxel is gone, by its own record or with those around it."""
     voxel = observed.voxels[row]
@@ -164,7 +164,7 @@ def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) ->
     return _goes_with_group(row, seen, observed, rule)
 
 
-@kernel()
+@inner_kernel()
 def _take_back(
     row: int, seen: SeenVoxels, observed: Observed, taken: list[Voxel], waiting: list[int]
 ) -> None:

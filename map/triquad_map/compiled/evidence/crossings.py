@@ -19,7 +19,7 @@ from triquad_map.compiled.evidence.observed import (
     voxel_of,
 )
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 
 _SPREAD_SHARE = 0.8
 _LEAST_RADIUS, _GREATEST_RADIUS = 0.15, 0.5
@@ -68,7 +68,7 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> bool:
     return bool(off_x * off_x + off_y * off_y + off_z * off_z <= radius * radius)
 
 
-@kernel()
+@inner_kernel()
 def note_passes(
     ray: Passing, crossed: Ints, seen: SeenVoxels, observed: Observed, passed: Ints
 ) -> None:

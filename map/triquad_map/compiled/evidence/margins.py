@@ -17,7 +17,7 @@ from triquad_format.records.region import BLOCK_BYTES
 
 from triquad_map.compiled.evidence.observed import Voxel
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, is_set, unpack
 from triquad_map.surface import MARGIN_STEP
 
@@ -49,7 +49,7 @@ class SurfaceEnds(NamedTuple):
     beyond: Bytes  # [S, 6] quarters of it on each side, at the end of which none did
 
 
-@kernel()
+@inner_kernel()
 def _add_block(row: int, shift: Voxel, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
     """Add the voxels of a block that is ``shift`` blocks from the one in ``around``."""
     number = ends.firsts[row]
@@ -68,7 +68,7 @@ def _add_block(row: int, shift: Voxel, seen: SeenVoxels, ends: SurfaceEnds, arou
         number += _BITS_SET[bits]
 
 
-@kernel()
+@inner_kernel()
 def _fill_around(row: int, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
     """What is known of a block's voxels and those beside it: scans and 1; 0: no surface."""
     around[:] = 0
@@ -82,7 +82,7 @@ def _fill_around(row: int, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -
                     _add_block(near, (i, j, k), seen, ends, around)
 
 
-@kernel()
+@inner_kernel()
 def _look_around(voxel: Voxel, around: Scans) -> tuple[int, int]:
     """Scans that hit a voxel or one beside it, whichever was hit most, and where surface goes on.
 
@@ -99,7 +99,7 @@ def _look_around(voxel: Voxel, around: Scans) -> tuple[int, int]:
     return most, goes_on
 
 
-@kernel()
+@inner_kernel()
 def _fill_margins(voxel: Voxel, beyond: Bytes, around: Scans, margins: Bytes) -> None:
     """Fill in the ``margins`` [6] of a voxel, whose place in ``around`` is given."""
     scans, goes_on = _look_around(voxel, around)
@@ -131,7 +131,7 @@ def margins_that_count(seen: SeenVoxels, ends: SurfaceEnds) -> Bytes:
     return margins
 
 
-@kernel()
+@inner_kernel()
 def _number_of(row: int, voxel: Voxel, firsts: Longs, seen: SeenVoxels) -> int:
     """The number of a surface voxel, in the block ``row``, among all."""
     last = byte_of(voxel[0], voxel[1])
@@ -142,7 +142,7 @@ def _number_of(row: int, voxel: Voxel, firsts: Longs, seen: SeenVoxels) -> int:
     return int(number + _BITS_SET[below])
 
 
-@kernel()
+@inner_kernel()
 def _holds(point: Doubles, voxel: Voxel, margins: Bytes) -> bool:
     """Whether a point near a voxel lies in none of its ``margins`` [6]."""
     for side in range(_SIDES):

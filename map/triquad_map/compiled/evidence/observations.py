@@ -20,7 +20,7 @@ from triquad_map.compiled.evidence.outcomes import outcome_codes, outcome_counts
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.evidence.sightings import Sighting, record_ends
 from triquad_map.compiled.evidence.support import Support, fill_support
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import SHIFT, with_room
 from triquad_map.composition.region import Split
 from triquad_map.surface import LEAST_STRENGTH, SurfelKind, Surfels
@@ -72,7 +72,7 @@ def _set_discs(
             _set_disc_beside(row, seen, observed)
 
 
-@kernel()
+@inner_kernel()
 def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
     """Take the disc of a voxel beside it for one that has none: the nearest to its middle.
 
@@ -85,7 +85,7 @@ def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
         normal, mean = disc.normal, disc.mean
         if near == row or not is_flat(disc):
             continue
-        beside = voxel_of(near, seen, observed)
+        beside = voxel_of(np.int64(near), seen, observed)
         height = 0.0
         for axis in range(3):
             height += (corner[axis] + 0.5 - beside[axis] - mean[axis]) * normal[axis]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Ints, Longs
 
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of, byte_of, find_block, unpack
 
 OBSERVED_VOXEL = np.dtype(
@@ -81,7 +81,7 @@ def row_of(seen: SeenVoxels, observed: Observed, x: int, y: int, z: int) -> int:
     return int(observed.rows[observed.places[block], byte_of(x, y) << SHIFT | (z & LOW)])
 
 
-@kernel()
+@inner_kernel()
 def voxel_of(row: int, seen: SeenVoxels, observed: Observed) -> Voxel:
     """The voxel of a row."""
     owner = observed.voxels[row].owner
@@ -101,13 +101,13 @@ def has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
     return bool(seen.surface[block, owner >> SHIFT & (1 << (2 * SHIFT)) - 1] & bit_of(owner & LOW))
 
 
-@kernel()
+@inner_kernel()
 def rows_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> Ints:
     """The rows of the voxel of a row and those up to ``reach`` around it in which rays ended."""
     middle = voxel_of(row, seen, observed)
     x, y, z = middle
     rows = np.empty((2 * reach + 1) ** 3, np.int32)
-    count = 0
+    count = np.int64(0)
     for i in range((x - reach) >> SHIFT, ((x + reach) >> SHIFT) + 1):
         for j in range((y - reach) >> SHIFT, ((y + reach) >> SHIFT) + 1):
             for k in range((z - reach) >> SHIFT, ((z + reach) >> SHIFT) + 1):
@@ -119,7 +119,7 @@ def rows_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> I
     return rows[:count]
 
 
-@kernel()
+@inner_kernel()
 def _add_rows(
     of_block: Ints, corner: Voxel, middle: Voxel, reach: int, rows: Ints, count: int
 ) -> int:

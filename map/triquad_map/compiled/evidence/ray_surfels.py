@@ -5,7 +5,7 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.evidence.observed import Observed, row_of
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
 from triquad_map.surface import SurfelKind, Surfels, nothing_shown
 
@@ -22,7 +22,7 @@ def ray_surfels(voxels: Longs, since: int, seen: SeenVoxels, observed: Observed)
     return surfels
 
 
-@kernel()
+@inner_kernel()
 def _normal_around(
     voxel: Longs, row: int, seen: SeenVoxels, observed: Observed, normal: Doubles
 ) -> bool:
@@ -47,19 +47,32 @@ def _normal_around(
     return bool(plane_normal(moments, normal))
 
 
-@kernel()
+@inner_kernel()
 def _set_normal(
     voxel: Longs, row: int, seen: SeenVoxels, observed: Observed, normal: Doubles
 ) -> bool:
     """Set the normal of the surface in a voxel, to the sensor; False: it is the way there."""
     towards = observed.voxels[row].towards
-    normal[:] = observed.voxels[row].normal
-    if not normal.any() and not _normal_around(voxel, row, seen, observed, normal):
-        normal[:] = towards / max(np.sqrt((towards * towards).sum()), 1e-6)
+    is_known = False
+    for axis in range(3):
+        normal[axis] = observed.voxels[row].normal[axis]
+        is_known = is_known or normal[axis] != 0
+    if not is_known and not _normal_around(voxel, row, seen, observed, normal):
+        length = max(np.sqrt(_product(towards, towards)), 1e-6)
+        for axis in range(3):
+            normal[axis] = towards[axis] / length
         return False
-    if (normal * towards).sum() < 0:
-        normal *= -1
+    if _product(normal, towards) < 0:
+        for axis in range(3):
+            normal[axis] = -normal[axis]
     return True
+
+
+@inner_kernel()
+def _product(one: Floats | Doubles, other: Floats) -> float:
+    """The scalar product of two vectors [3]."""
+    product: float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+    return product
 
 
 @kernel()

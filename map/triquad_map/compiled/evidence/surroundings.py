@@ -6,7 +6,7 @@ import numpy as np
 
 from triquad_map.compiled.evidence.observed import Observed, has_surface, rows_around, voxel_of
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel
 
 
 class Around(NamedTuple):
@@ -25,7 +25,7 @@ class Around(NamedTuple):
     hits: int
 
 
-@kernel()
+@inner_kernel()
 def seen_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> Around:
     """What is known of the voxel of a row and those up to ``reach`` around it."""
     known = gone = doubted = later = scans = 0
@@ -64,7 +64,7 @@ def seen_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> A
     )
 
 
-@kernel()
+@inner_kernel()
 def depth_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> float:
     """How deep what was seen up to ``reach`` around lies along the ray that hit the voxel last.
 

@@ -6,7 +6,7 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import CELL_LIMIT, LOW, SHIFT, find_row, pack
 
 _SIDE = float(BLOCK_VOXELS)
@@ -40,7 +40,7 @@ def _take(at: Place, low: Place, side: float, square: float, state: Doubles) -> 
     state[_Z] = _nearest(at[2], low[2], side)
 
 
-@kernel()
+@inner_kernel()
 def _search_block(row: int, corner: Place, at: Place, seen: SeenVoxels, state: Doubles) -> None:
     """Search the unknown voxels of a block."""
     for byte in range(BLOCK_BYTES):
@@ -60,7 +60,7 @@ def _search_block(row: int, corner: Place, at: Place, seen: SeenVoxels, state: D
                     _take(at, (x, y, z), 1.0, square, state)
 
 
-@kernel()
+@inner_kernel()
 def _search(at: Place, seen: SeenVoxels, cells: tuple[int, int], state: Doubles) -> None:
     """Search the blocks around a point, shell by shell."""
     home_x = int(np.floor(at[0])) >> SHIFT

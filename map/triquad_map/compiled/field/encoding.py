@@ -12,7 +12,7 @@ from triquad_format.records.region import AXES
 
 from triquad_map.compiled.field.feature_rows import add_rows, add_to_row, prefetch_row
 from triquad_map.compiled.field.quadtree import Shape, Vertices, block_key
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import EMPTY, find_row
 
 BATCH = 64
@@ -116,7 +116,7 @@ def locate(batch: PointBatch, geometry: Geometry, vertices: Vertices, features: 
                     prefetch_row(features, row)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _find_blocks(batch: PointBatch, plane: int, geometry: Geometry, vertices: Vertices) -> None:
     first, second = PLANE_AXES[plane, 0], PLANE_AXES[plane, 1]
     scale = np.float32(1 << (geometry.levels - 1))
@@ -137,7 +137,7 @@ def _find_blocks(batch: PointBatch, plane: int, geometry: Geometry, vertices: Ve
         prefetch_row(vertices.rows, number)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _find_cells(batch: PointBatch, plane: int, geometry: Geometry) -> None:
     for h in range(geometry.levels):
         at = plane * geometry.levels + h
@@ -160,7 +160,7 @@ def _weights(batch: PointBatch, at: int, t: int) -> tuple[float, float, float, f
     return np.float32(1) - a - b + both, a - both, b - both, both
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
     """The first inputs of the MLP: features summed over the planes, level by level."""
     size = features.shape[1]
@@ -184,7 +184,7 @@ def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
     _transpose_features(batch, levels * size)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def interpolate_plane(
     batch: PointBatch, plane: int, geometry: Geometry, vertices: Vertices, features: Floats
 ) -> None:
@@ -208,7 +208,7 @@ def interpolate_plane(
     _transpose_features(batch, geometry.levels * size)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _transpose_features(batch: PointBatch, count: int) -> None:
     """The first ``count`` inputs of the MLP, from the features of each point."""
     for k in range(count):
@@ -216,7 +216,7 @@ def _transpose_features(batch: PointBatch, count: int) -> None:
             batch.x[k, t] = batch.features[t, k]
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def add_feature_gradient(batch: PointBatch, count: int, levels: int, sums: Floats) -> None:
     """Add the gradient of the first ``count`` points' features to ``sums`` [rows, d]."""
     size = sums.shape[1]
@@ -231,7 +231,7 @@ def add_feature_gradient(batch: PointBatch, count: int, levels: int, sums: Float
             add_to_row(sums, batch.rows[t, 4 * at + 3], weights[3], batch.features, t, start)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def add_feature_slopes(batch: PointBatch, geometry: Geometry, features: Floats) -> None:
     """Add what the features contribute to the gradient with respect to the points."""
     levels = geometry.levels
@@ -255,7 +255,7 @@ def add_feature_slopes(batch: PointBatch, geometry: Geometry, features: Floats) 
             batch.gradient[PLANE_AXES[plane, 1], t] += along * per_m
 
 
-@kernel()
+@inner_kernel()
 def _transpose_gradient(batch: PointBatch, count: int) -> None:
     """The gradient of the first ``count`` inputs, point by point, into ``batch.features``."""
     for k in range(count):
@@ -292,7 +292,7 @@ def wave(batch: PointBatch, first: int, turns_per_m: Floats) -> None:
                 batch.x[sine, t] = _cosine(turns - np.float32(0.25))
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def add_wave_slopes(batch: PointBatch, first: int, turns_per_m: Floats) -> None:
     """Add what the Fourier features contribute to the gradient with respect to the points."""
     m = len(turns_per_m)

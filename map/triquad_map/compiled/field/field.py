@@ -24,7 +24,7 @@ from triquad_map.compiled.field.encoding import (
     wave,
 )
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree, Vertices
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 
 _ZERO = np.float32(0)
 
@@ -58,7 +58,7 @@ class FieldArrays(NamedTuple):
     frequencies: Floats  # [m] of Fourier features, on coordinates normalised to [-1, 1]
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def add_product(weights: Floats, x: Floats, out: Floats) -> None:
     """``out += weights.T @ x`` for weights [K, J], x [K, T], out [J, T]."""
     inputs, outputs = weights.shape
@@ -87,7 +87,7 @@ def add_product(weights: Floats, x: Floats, out: Floats) -> None:
         k += 1
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
     """``sums += x @ g.T`` for x [K, T], g [J, T], sums [K, J]."""
     inputs, outputs = sums.shape
@@ -118,7 +118,7 @@ def _add_outer_product(x: Floats, g: Floats, sums: Floats) -> None:
             sums[k, j] += _dot(x[k], g[j])
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _dot(a: Floats, b: Floats) -> float:
     total: float = _ZERO
     for t in range(BATCH):
@@ -126,7 +126,7 @@ def _dot(a: Floats, b: Floats) -> float:
     return total
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _add_row_sums(g: Floats, sums: Floats) -> None:
     """``sums += g.sum(1)`` for g [J, T]."""
     for j in range(len(g)):
@@ -136,7 +136,7 @@ def _add_row_sums(g: Floats, sums: Floats) -> None:
         sums[j] += total
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
     for j in range(len(biases)):
         for t in range(BATCH):
@@ -147,14 +147,14 @@ def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
             out[j, t] = max(out[j, t], _ZERO)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _decode(batch: PointBatch, mlp: Mlp) -> None:
     """Both hidden layers and the logits of the batch's inputs."""
     _layer(mlp.w1, mlp.b1, batch.x, batch.h1)
     decode_rest(batch, mlp)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def decode_rest(batch: PointBatch, mlp: Mlp) -> None:
     """The second hidden layer and the logits, from the first."""
     _layer(mlp.w2, mlp.b2, batch.h1, batch.h2)
@@ -165,7 +165,7 @@ def decode_rest(batch: PointBatch, mlp: Mlp) -> None:
             batch.logits[t] += mlp.w3[j] * batch.h2[j, t]
 
 
-@kernel()
+@inner_kernel()
 def transposed(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
     """The first two layers' weights as :func:`backward` needs them.
 
@@ -190,7 +190,7 @@ def backward(batch: PointBatch, mlp: Mlp, w1_transposed: Floats, w2_transposed: 
     add_product(w1_transposed, batch.g1, gx)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def add_weight_gradient(batch: PointBatch, sums: Mlp) -> None:
     """Add the gradient of the weights, after :func:`backward`; points of no slope add nothing."""
     _add_outer_product(batch.x, batch.g1, sums.w1)
@@ -203,7 +203,7 @@ def add_weight_gradient(batch: PointBatch, sums: Mlp) -> None:
         sums.b3[0] += batch.slopes[t]
 
 
-@kernel()
+@inner_kernel()
 def batch_for(field: CompiledField) -> PointBatch:
     """Room for a batch of points of a field."""
     inputs, hidden = field.mlp.w1.shape

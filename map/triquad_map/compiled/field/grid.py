@@ -15,15 +15,17 @@ from triquad_map.compiled.field.encoding import (
     wave,
 )
 from triquad_map.compiled.field.field import CompiledField, add_product, batch_for, decode_rest
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 
 _ZERO = np.float32(0)
 
-_WAVE_OF_PLANE = (0, 2, 1)
+_WAVE_OF_PLANE = np.array([0, 2, 1])
 """For each plane the axis whose Fourier features count with it; each counts once."""
 
+_PLANES = np.arange(3)  # as literal numbers they would be compiled for one by one
 
-@kernel(fastmath=True)
+
+@inner_kernel(fastmath=True)
 def _wave_terms(axes: Floats, field: CompiledField, batch: PointBatch) -> Floats:
     """What the Fourier features of each coordinate of a grid add to the first layer: [3, S, J]."""
     learnt = field.geometry.levels * field.features.shape[1]
@@ -40,7 +42,8 @@ def _wave_terms(axes: Floats, field: CompiledField, batch: PointBatch) -> Floats
                 part = slice(start, start + m)
                 add_product(field.mlp.w1[part], batch.x[part], batch.h1)
             for t in range(min(BATCH, axes.shape[1] - first)):
-                terms[axis, first + t] = batch.h1[:, t]
+                for j in range(len(batch.h1)):
+                    terms[axis, first + t, j] = batch.h1[j, t]
     return terms
 
 
@@ -60,15 +63,22 @@ def _pairs(points: Longs, u: int, v: int, side: int, numbers: Ints) -> Longs:
     return pairs[:count]
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _plane_terms(
-    axes: Floats, pairs: Longs, plane: int, field: CompiledField, batch: PointBatch, waves: Floats
+    axes: Floats,
+    points: Longs,
+    plane: int,
+    field: CompiledField,
+    batch: PointBatch,
+    waves: Floats,
+    numbers: Ints,
 ) -> Floats:
     """What one plane adds to the first layer at pairs [P, 2] of its coordinates: [P, J].
 
-    Each brings along the waves of one axis.
+    Each brings along the waves of one axis. Fills in which of them each point has.
     """
     learnt = field.geometry.levels * field.features.shape[1]
+    pairs = _pairs(points, PLANE_AXES[plane, 0], PLANE_AXES[plane, 1], axes.shape[1], numbers)
     terms = np.empty((len(pairs), len(field.mlp.b1)), np.float32)
     brought = _WAVE_OF_PLANE[plane]
     for first in range(0, len(pairs), BATCH):
@@ -97,12 +107,9 @@ def evaluate_in_grid(axes: Floats, points: Longs, field: CompiledField, logits: 
     batch = batch_for(field)
     waves = _wave_terms(axes, field, batch)
     numbers = np.empty((3, len(points)), np.int32)
-    xy = _pairs(points, 0, 1, axes.shape[1], numbers[0])
-    xz = _pairs(points, 0, 2, axes.shape[1], numbers[1])
-    yz = _pairs(points, 1, 2, axes.shape[1], numbers[2])
-    on_xy = _plane_terms(axes, xy, 0, field, batch, waves)
-    on_xz = _plane_terms(axes, xz, 1, field, batch, waves)
-    on_yz = _plane_terms(axes, yz, 2, field, batch, waves)
+    on_xy = _plane_terms(axes, points, _PLANES[0], field, batch, waves, numbers[0])
+    on_xz = _plane_terms(axes, points, _PLANES[1], field, batch, waves, numbers[1])
+    on_yz = _plane_terms(axes, points, _PLANES[2], field, batch, waves, numbers[2])
     sums = np.empty((BATCH, len(field.mlp.b1)), np.float32)
     for first in range(0, len(points), BATCH):
         count = min(BATCH, len(points) - first)

@@ -18,7 +18,7 @@ from triquad_format.records.arrays import Bools, Bytes, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
     Index,
     VoxelIndex,
@@ -83,7 +83,7 @@ def block_key(plane: int, u: int, v: int) -> int:
     return key
 
 
-@kernel()
+@inner_kernel()
 def _enter(
     shape: Shape, vertices: Vertices, plane: int, h: int, u: int, v: int, row: int, count: int
 ) -> int:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Ints
 
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import (
     LANES,
     Lanes,
@@ -86,7 +86,7 @@ class Found(NamedTuple):
     kept: int  # leaves
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _from_surfels(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
     """From the middles of a leaf's surfels to a place."""
     surfels = tree.surfels
@@ -96,7 +96,7 @@ def _from_surfels(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
     return x, y, z
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _normals(tree: SurfelTree, leaf: int) -> Vectors:
     surfels = tree.surfels
     return (
@@ -106,7 +106,7 @@ def _normals(tree: SurfelTree, leaf: int) -> Vectors:
     )
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _squares(tree: SurfelTree, leaf: int, at: Place) -> Lanes:
     """Squares of the distances from a place to a leaf's surfels."""
     x, y, z = _from_surfels(tree, leaf, at)
@@ -118,7 +118,7 @@ def _squares(tree: SurfelTree, leaf: int, at: Place) -> Lanes:
     return height + beyond * beyond
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _sifted(room: Room, limit: float) -> int:
     """Of all kept leaves keep those of which a surfel is so near; how many they are."""
     count = 0
@@ -130,7 +130,7 @@ def _sifted(room: Room, limit: float) -> int:
     return count
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _limit(distance: float, at: Place) -> float:
     """Square of the distance up to which surfels may count, where one is so near."""
     farthest = max(abs(at[0]), abs(at[1]), abs(at[2])) + distance
@@ -139,7 +139,7 @@ def _limit(distance: float, at: Place) -> float:
     return limit
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _open(tree: SurfelTree, node: int, at: Place, limit: float, room: Room, count: int) -> int:
     """Add what lies below a node to the ``count`` leaves and nodes that wait; how many they are."""
     boxes, waiting, away = tree.boxes, room.waiting, room.away
@@ -167,7 +167,7 @@ def _open(tree: SurfelTree, node: int, at: Place, limit: float, room: Room, coun
     return count
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _search(tree: SurfelTree, at: Place, distance: float, limit: float, room: Room) -> Found:
     """Search all surfels that are nearer than ``distance``, or count in the direction.
 
@@ -203,7 +203,7 @@ def _search(tree: SurfelTree, at: Place, distance: float, limit: float, room: Ro
     return Found(leaf, lane, best, kept)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
     """From the points of a leaf's surfels that are nearest to a place to that place."""
     x, y, z = _from_surfels(tree, leaf, at)
@@ -216,7 +216,7 @@ def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
     return u + share * x, v + share * y, w + share * z
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _put_in_order(room: Room, kept: int, far: float) -> int:
     """Order the kept leaves of which a surfel is so near; how many they are.
 
@@ -234,7 +234,7 @@ def _put_in_order(room: Room, kept: int, far: float) -> int:
     return count
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _write_found(
     tree: SurfelTree, at: Place, found: Found, room: Room, i: int, nearest: NearestSurfels
 ) -> None:
@@ -262,7 +262,7 @@ def _write_found(
     nearest.rows[i] = tree.order[tree.leaves[found.leaf] + found.lane]
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> float:
     """As :func:`_limit`, from how far is searched and a leaf that may be near."""
     if leaf != _NONE:
@@ -271,7 +271,7 @@ def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> flo
     return _limit(distance, at)
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _spread(cell: int) -> int:
     """A number's bits, each at three times its place."""
     code = 0
@@ -280,7 +280,7 @@ def _spread(cell: int) -> int:
     return code
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _cell_codes(points: Doubles) -> Ints:
     """Morton codes [N] of the points' cells, of which there are so many along the longest side."""
     codes = np.zeros(len(points), np.int32)
@@ -296,7 +296,7 @@ def _cell_codes(points: Doubles) -> Ints:
     return codes
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _ends(points: Doubles, axis: int) -> tuple[float, float]:
     """The least and the greatest coordinate."""
     low = high = points[0, axis]
@@ -305,7 +305,7 @@ def _ends(points: Doubles, axis: int) -> tuple[float, float]:
     return low, high
 
 
-@kernel(fastmath=True)
+@inner_kernel(fastmath=True)
 def _spatial_order(points: Doubles) -> Ints:
     """The numbers of points [N, 3] in an order in which neighbours mostly follow each other."""
     codes = _cell_codes(points)
@@ -344,7 +344,7 @@ def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> 
         np.empty(_WAITING, np.float32),
         np.empty(LANES, np.float32),
     )
-    before = _NONE
+    before = np.int64(_NONE)
     for i in _spatial_order(points):
         at = (points[i, 0], points[i, 1], points[i, 2])
         if not max(abs(at[0]), abs(at[1]), abs(at[2])) < _FARTHEST:
