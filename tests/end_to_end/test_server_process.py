@@ -137,7 +137,7 @@ def test_sigterm_amid_a_stream_of_scans(tmp_path, arguments):
     ):
         for _ in range(40):
             client.publish_scan(servers.sphere(20_000), POSE)
-        client.flush(servers.WAIT_S, pending=39)
+        client.flush(servers.WAIT_S, pending=20)  # fewer than may wait: some are taken
         server.process.send_signal(signal.SIGTERM)
         assert server.wait() == 0
     assert "Traceback" not in server.log
