@@ -20,10 +20,10 @@ from triquad_server.settings import Settings
 from triquad_server.warm_up import WarmUp, is_compiled
 
 _ORDERS = (
-    ("field", "questions", "meshes", "steps"),
-    ("surfels", "questions", "taking_back", "scans", "training", "what_is_gone"),
+    ("field", "questions", "steps", "normals", "taking_back", "meshes"),
+    ("surfels", "questions", "scans", "training", "what_is_gone"),
 )
-"""What each process goes through: kernels that answer first, the halves of them apart."""
+"""What each process goes through: kernels that answer first, then those that map; halves apart."""
 
 _CODE = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "

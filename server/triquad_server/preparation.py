@@ -9,7 +9,15 @@ from triquad_server import compilers
 from triquad_server.compilers import Compilers
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
-from triquad_server.warm_up import ANSWERING, MAPPING, WarmUp, can_keep, is_compiled
+from triquad_server.warm_up import (
+    ANSWERING,
+    MAPPING,
+    MESHING,
+    STAGES,
+    WarmUp,
+    can_keep,
+    is_compiled,
+)
 
 _QUICK_S = 3.0
 """Compiled code that is found on disk is ready by then."""
@@ -55,7 +63,7 @@ class Preparation:
         can_wait = self._device == "cpu" and can_keep() and compilers.can_start()
         if can_wait:
             self._compile_beside()
-        for stage in ANSWERING if can_wait else ANSWERING + MAPPING:
+        for stage in ANSWERING if can_wait else STAGES:
             self._report(stage.replace("_", " "))
             self._go_through(stage, self._check)
         self._is_done = not can_wait
@@ -80,11 +88,11 @@ class Preparation:
 
     def _compile_beside(self) -> None:
         """Have others compile, where something is missing."""
-        if all(map(is_compiled, ANSWERING + MAPPING)):
+        if all(map(is_compiled, STAGES)):
             return
         _log.warning(
             "compiling, up to a minute in all: this is done once for each release. "
-            "Questions are answered as soon as they can be; scans are taken in after that"
+            "Questions are answered as soon as they can be; scans wait until they can be taken in"
         )
         self._compilers = Compilers(self._settings)
 
@@ -98,15 +106,20 @@ class Preparation:
         try:
             for stage in MAPPING:
                 self._go_through(stage, self._look_for_close)
-            if self._compilers is not None:
-                seconds = time.monotonic() - self._started_s
-                _log.info("all is compiled, after %.0f s: scans are taken in from now on", seconds)
+            self._tell("scans are taken in from now on")
             done()
+            for stage in MESHING:
+                self._go_through(stage, self._look_for_close)
+            self._tell("all is compiled")
         except _ClosedError:
             pass
         except Exception:
             _log.exception("compiled code could not be prepared")
             failed()
+
+    def _tell(self, what: str) -> None:
+        if self._compilers is not None:
+            _log.info("%.0f s since the start: %s", time.monotonic() - self._started_s, what)
 
     def _report(self, stage: str) -> None:
         self._check()

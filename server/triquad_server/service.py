@@ -190,6 +190,7 @@ class Service:
             memory=self._settings.memory,
         )
         if not maps:
+            self._scans.hold()
             mapper.rest()
         mapper.start()
         self._parts.callback(mapper.close)

@@ -27,6 +27,7 @@ from triquad_server.engine.live_field import Batch, LiveField, Rates, initial_fi
 from triquad_server.engine.memory import memory_on
 from triquad_server.engine.trainer import trainer_of
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MemorySettings, Settings
@@ -44,7 +45,7 @@ def warm_up(
 ) -> None:
     """Have all kernels compiled; ``report`` is told what comes next."""
     made_up = WarmUp(settings, device, teams or Teams())
-    for stage in ANSWERING + MAPPING:
+    for stage in STAGES:
         report(stage.replace("_", " "))
         made_up.go_through(stage)
 
@@ -71,8 +72,13 @@ def _mark_compiled(stage: str) -> None:
 ANSWERING = ("field", "surfels", "questions")
 """The stages whose kernels answer."""
 
-MAPPING = ("meshes", "scans", "training", "what_is_gone")
-"""Those of all else."""
+MAPPING = ("scans", "training", "what_is_gone")
+"""Those that map."""
+
+MESHING = ("meshes",)
+"""And those of meshes."""
+
+STAGES = ANSWERING + MAPPING + MESHING
 
 
 class WarmUp:
@@ -122,6 +128,11 @@ class WarmUp:
         rates = Rates(training.learning_rate, training.beta1, training.beta2, young_rate=0.0)
         trainer.train(Batch(points, points[:, 0].copy()), rates)
 
+    def normals(self) -> None:
+        """Ends of rays tell normals."""
+        normals = SurfaceNormals(self._settings.field.leaf_m, self._teams.mapping)
+        normals.add(self._directions * self._radius_m, np.zeros(3))
+
     def questions(self) -> None:
         """A restored map answers."""
         epoch = self._restored.publish()
@@ -160,6 +171,10 @@ class WarmUp:
         region.field.live_view().evaluate(self._points(100), gradient=True)
         region.pool.focus(blocks)  # as if it were seen anew
         again.train()
+        region.pool.limit(len(region.pool))
+        new = np.zeros(len(region.pool), np.bool_)
+        new[: len(new) // 4] = True
+        region.pool.add(region.pool.table.of(new))  # in place of others
 
     def taking_back(self) -> None:
         """Surface that rays contradict goes, on which nothing was trained."""

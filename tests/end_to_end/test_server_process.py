@@ -76,11 +76,16 @@ def test_at_the_very_first_start_it_serves_and_then_maps(tmp_path, arguments):
     """Where nothing is compiled yet, others compile for it."""
     nothing = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     with servers.server_process(arguments, environment=nothing) as server:
-        assert "all is compiled" not in server.log
+        assert "scans are taken in" not in server.log
         assert ask(server.endpoint).epoch >= 1
-        learn(server.endpoint)
+        with triquad_client.connect(server.endpoint) as client:
+            for _ in range(100):
+                client.publish_scan(servers.sphere(1000), POSE)
+            report = client.flush(servers.WAIT_S)
+        assert (report.lost, report.refused) == (0, 0)
         assert server.log.count("compiling") == 1
-        assert server.log.index("ready: ") < server.log.index("all is compiled")
+        assert server.log.index("ready: ") < server.log.index("scans are taken in")
+        server.wait_for("all is compiled")
     with servers.server_process(arguments, environment=nothing) as server:
         assert "compiling" not in server.log
 

@@ -35,6 +35,7 @@ class ScanQueue:
         self._lock = threading.Lock()
         self._scans: FairQueue[Scan] = FairQueue(limit * MAX_SOURCES_WAITING, limit_bytes)
         self._in_hand = False
+        self._holds = False  # more scans of a source than the limit
 
     def __len__(self) -> int:
         return len(self._scans) + self._in_hand
@@ -53,10 +54,17 @@ class ScanQueue:
                 return
             owner = Owner(scan.source)
             self._scans.put(owner, scan, _bytes_of(scan))
-            if self._scans.count(owner) > self.limit:
+            if self._scans.count(owner) > self.limit and not self._holds:
                 self.ledger.push_out(self._scans.drop_oldest(owner))
             for pushed_out in self._scans.excess(newest=False):
                 self.ledger.push_out(pushed_out)
+
+    def hold(self) -> None:
+        """Let as many scans of a source wait as there are bytes for, until few wait again.
+
+        That is for a server which takes none in yet.
+        """
+        self._holds = True
 
     def refuse(self, scan: Scan, reason: str, text: str) -> None:
         """Account for a scan that arrived but is not let in."""
@@ -73,6 +81,7 @@ class ScanQueue:
         is asked for.
         """
         with self._lock:
+            self._holds = self._holds and len(self._scans) > self.limit
             scan = self._scans.take(
                 lambda scan: scan.source not in passed_over or self._falls_behind(scan.source)
             )
