@@ -186,7 +186,7 @@ class GradientSums:
             self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
 
     def clear(self) -> None:
-        """Forget a step that failed midway."""
+        """Forget a step that failed midway, and free the room."""
         self.features, self.touched, self.step = (), (), 1
 
 

@@ -15,6 +15,9 @@ from triquad_server.epochs.query_gate import QueryGate
 from triquad_server.net.asking_client import asking_client
 from triquad_server.settings import MemorySettings, ServiceSettings
 
+_RECENT_PERIODS = 10
+"""For so many of the periods in which epochs follow each other the newest but one stay."""
+
 _PINNED_SHARE = 0.5  # of the memory of older epochs, for those that are pinned
 
 
@@ -64,6 +67,7 @@ class EpochHistory:
         self._clock = clock
         self._older_bytes = older_bytes
         self._published_s = clock()  # when the newest was
+        self._recent_s = _RECENT_PERIODS * settings.publish_period_s
         self._epochs = {first.number: first}  # oldest first
         self._pins: list[_Pin] = []  # in the order in which they were first asked for
         self._viewed: Counter[int] = Counter()  # requests that are at work on an epoch, by number
@@ -75,6 +79,12 @@ class EpochHistory:
             self._published_s = self._clock()
             self._epochs[epoch.number] = epoch
             self._tidy()
+
+    def let_go(self) -> bool:
+        """Let go of those whose time is over; whether none was published for a while."""
+        with self._lock:
+            self._tidy()
+            return not self._is_recent
 
     def kept(self) -> KeptEpochs:
         """What is kept now."""
@@ -117,6 +127,11 @@ class EpochHistory:
                     if epoch is not self.newest:
                         self._pin(asking_client.get(), epoch.number)
 
+    @property
+    def _is_recent(self) -> bool:
+        """Whether the newest was published a short time ago."""
+        return self._clock() - self._published_s <= self._recent_s
+
     def _get(self, number: int) -> Epoch:
         epoch = self._epochs.get(number) if number else self.newest
         if epoch is None:
@@ -138,7 +153,8 @@ class EpochHistory:
 
     def _tidy(self) -> None:
         """Let go of older epochs whose time is over, or that exceed a limit."""
-        recent = list(self._epochs)[-self._settings.epochs_kept :]
+        kept = self._settings.epochs_kept if self._is_recent else 1
+        recent = list(self._epochs)[-kept:]
         room = _Room(self.newest, self._older_bytes)
         stay = {self.newest.number, *self._viewed}
         for number in self._pinned():

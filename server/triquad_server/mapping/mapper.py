@@ -286,6 +286,10 @@ class Mapper:
         self._structure_changed = False
         return self._epoch
 
+    def release(self) -> None:
+        """Free what training alone needs, until there is something to learn again."""
+        self._setup.sums.clear()
+
     def reset(self, minimum: Doubles, maximum: Doubles) -> None:
         """Forget what lies between two corners [3], metres, map frame.
 

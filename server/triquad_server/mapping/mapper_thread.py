@@ -260,6 +260,8 @@ class MapperThread:
         self._else_s = time.monotonic() - ingested_s
         if self._mapper.settled and not took_scans:
             self.time.begin(Activity.IDLE)
+            if self.epochs.let_go():
+                self._mapper.release()
             self._wake.wait(self._rest_s())
 
     def _is_publish_due(self) -> bool:

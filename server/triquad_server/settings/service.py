@@ -44,7 +44,8 @@ class ServiceSettings(BaseModel):
     """Time between epochs while the map changes."""
 
     epochs_kept: Annotated[int, Field(ge=1, le=1000)] = 4
-    """Newest epochs that requests can ask for by number."""
+    """Newest epochs that requests can ask for by number; a while after the last one was published,
+    the newest alone."""
 
     epochs_pinned: Annotated[int, Field(ge=0, le=1000)] = 8
     """Older epochs that stay because they were asked for by number, of all clients together."""

@@ -177,6 +177,19 @@ def test_the_newest_never_goes():
     assert is_gone(epochs, 1)
 
 
+def test_once_no_epoch_follows_only_the_newest_and_those_asked_for_stay():
+    clock = Clock()
+    epochs = history(kept=4, pinned=1, clock=clock)
+    for number in range(2, 6):
+        epochs.add(epoch(number))
+    epochs.let_go()
+    assert [kept.number for kept in epochs.kept().epochs] == [2, 3, 4, 5]
+    epochs.get(3)
+    clock.now += 10 * ServiceSettings().publish_period_s + 1
+    epochs.let_go()
+    assert [kept.number for kept in epochs.kept().epochs] == [3, 5]
+
+
 DEEDS = st.one_of(
     st.just("publish"),
     st.tuples(st.just("ask"), st.integers(0, 12)),  # so many epochs back
@@ -189,18 +202,22 @@ def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, de
     pin_s = 10.0
     clock = Clock()
     epochs = history(kept, pinned, pin_s, clock)
-    newest = 1
+    newest, published = 1, clock.now
+    alone = 1  # the newest when it last was for long
     asked: dict[int, float] = {}  # in the order of asking
     for deed in deeds:
         if deed == "publish":
             newest += 1
+            published = clock.now
             epochs.add(epoch(newest))
         elif deed[0] == "wait":
             clock.now += deed[1]
+            if clock.now - published > 10 * ServiceSettings().publish_period_s:
+                alone = newest
         else:
             number = max(1, newest - deed[1])
             if is_gone(epochs, number):
-                assert number <= newest - kept
+                assert number <= newest - kept or number < alone
                 expired = clock.now - asked.get(number, -1e9) > pin_s
                 alive = [other for other, at in asked.items() if clock.now - at <= pin_s]
                 assert expired or len(alive) > pinned

@@ -32,6 +32,8 @@ _NEVER = -1
 _UNLEARNT_REFITTED = 4_000
 """Of surfels that rays alone show, with each epoch: there are few."""
 
+_FITTED_AT_ONCE = 32_768  # each takes half a kilobyte meanwhile
+
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 Rows = NDArray[np.intp]
@@ -232,8 +234,10 @@ def _fitted_again(
     epoch: int,
 ) -> SurfelMap:
     """Fit the surfels in some rows; changes ``fitted``."""
-    new = fit_surfels(fitted.places.voxels[rows], field, evidence.ended_in, by_rays)
-    for name, array in vars(new).items():
-        getattr(fitted.surfels, name)[rows] = array
+    for first in range(0, len(rows), _FITTED_AT_ONCE):
+        part = rows[first : first + _FITTED_AT_ONCE]
+        new = fit_surfels(fitted.places.voxels[part], field, evidence.ended_in, by_rays)
+        for name, array in vars(new).items():
+            getattr(fitted.surfels, name)[part] = array
     fitted.epochs[rows] = epoch
     return SurfelMap(evidence, fitted)
