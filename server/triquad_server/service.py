@@ -44,7 +44,7 @@ from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.net.request_handlers import Handler, answering
-from triquad_server.process.threads import Teams
+from triquad_server.process.threads import NICENESS, Teams
 from triquad_server.queries.change_queries import ChangeQueries
 from triquad_server.queries.questions import Questions
 from triquad_server.queries.served_operations import ServedOperations
@@ -56,7 +56,7 @@ from triquad_server.store.resets import Resets
 from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
 
-_TILE_WORKERS = 2  # one computes while another packs
+_TILE_WORKERS = 2  # each makes tiles of its own; a client asks for several at the same time
 
 
 @dataclass(frozen=True)
@@ -275,6 +275,7 @@ class Service:
                 keys.TILE: answering(TileRequest, tiles.tile),
             },
             _TILE_WORKERS,
+            NICENESS,
         )
         self._serve("tile_updates", {keys.TILE_UPDATES: feed.add})
         self._operations.queues["mesh_followers"] = lambda: feed.queue
@@ -311,6 +312,8 @@ class Service:
         )
         return downloads
 
-    def _serve(self, queue: str, handlers: Mapping[str, Handler], workers: int = 1) -> None:
+    def _serve(
+        self, queue: str, handlers: Mapping[str, Handler], workers: int = 1, niceness: int = 0
+    ) -> None:
         """Answer a group of operations from now on, as :meth:`ServedOperations.serve`."""
-        self._parts.callback(self._operations.serve(queue, handlers, workers).close)
+        self._parts.callback(self._operations.serve(queue, handlers, workers, niceness).close)

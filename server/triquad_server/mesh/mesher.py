@@ -60,12 +60,22 @@ class TileLattice:
 
         ``low`` and ``high`` [N, 3] are the boxes' corners, metres, map frame.
         """
-        first = np.floor((low - margin_m) / self.tile_side_m).astype(np.int64)
-        last = np.floor((high + margin_m) / self.tile_side_m).astype(np.int64)
-        # Many boxes, such as voxels, meet the same tiles.
-        boxes = _each_once(np.concatenate([first, last - first], axis=1))
-        first, sides = boxes[:, :3], boxes[:, 3:]
-        return _each_once(cells_of_boxes(first, first + sides)[0])
+        boxes = _each_once(_tile_boxes(low, high, margin_m, self.tile_side_m))
+        return _each_once(cells_of_boxes(boxes[:, :3], boxes[:, 3:])[0])
+
+
+@kernel()
+def _tile_boxes(low: Doubles, high: Doubles, margin_m: float, side_m: float) -> Longs:
+    """The first and last tiles [B, 6] of boxes [N, 3]; once, where boxes in a row have the same."""
+    boxes = np.empty((len(low), 6), np.int64)
+    count = 0
+    for i in range(len(low)):
+        for axis in range(3):
+            boxes[count, axis] = np.floor((low[i, axis] - margin_m) / side_m)
+            boxes[count, 3 + axis] = np.floor((high[i, axis] + margin_m) / side_m)
+        if count == 0 or (boxes[count] != boxes[count - 1]).any():
+            count += 1
+    return boxes[:count]
 
 
 def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:

@@ -11,6 +11,7 @@ import zenoh
 from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
 from triquad_format.wire.metrics_messages import QueueMetrics
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.net.askers import Askers
 from triquad_server.net.asking_client import asking_client
@@ -82,8 +83,9 @@ class RequestHandlers:
         *,
         workers: int,
         limits: RequestLimits,
+        niceness: int = 0,
     ) -> None:
-        """Begin to serve ``operations``, by key, with so many ``workers``.
+        """Begin to serve ``operations``, by key, with so many ``workers`` of this niceness.
 
         ``askers``, ``long_work`` and ``replies`` are those of all groups.
         """
@@ -102,7 +104,9 @@ class RequestHandlers:
         self._stopping = False
         # As many as ever work or send at a time; they are started when they are needed.
         most_begun = max(MOST_SHORT, workers) + MOST_LONG
-        self._workers = ThreadPoolExecutor(most_begun + MOST_SENDING, "worker")
+        self._workers = ThreadPoolExecutor(
+            most_begun + MOST_SENDING, "worker", initializer=lower_priority, initargs=(niceness,)
+        )
         self._refusals = ThreadPoolExecutor(_REFUSALS, "refusals")
         self._refused = ByteBudget(_REFUSED_BYTES, small=_LARGE_BYTES)
         self._queryables: list[zenoh.Queryable[Any]] = []

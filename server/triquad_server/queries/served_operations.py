@@ -66,11 +66,12 @@ class ServedOperations:
         return self._askers.own_name
 
     def serve(
-        self, queue: str, handlers: Mapping[str, Handler], workers: int = 1
+        self, queue: str, handlers: Mapping[str, Handler], workers: int = 1, niceness: int = 0
     ) -> RequestHandlers:
         """Answer a group of operations from now on; no other group waits for it.
 
-        ``queue`` is the name of what waits for them.
+        ``queue`` is the name of what waits for them; ``niceness`` is that of the threads that
+        answer, see :func:`triquad_map.compiled.team.lower_priority`.
         """
         operations = {}
         for name, handler in handlers.items():
@@ -83,6 +84,7 @@ class ServedOperations:
             self._long_work,
             self._replies,
             workers=workers,
+            niceness=niceness,
             limits=self._limits_of(queue),
         )
         self._groups.append(group)
