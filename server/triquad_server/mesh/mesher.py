@@ -73,8 +73,10 @@ def _tile_boxes(low: Doubles, high: Doubles, margin_m: float, side_m: float) -> 
         for axis in range(3):
             boxes[count, axis] = np.floor((low[i, axis] - margin_m) / side_m)
             boxes[count, 3 + axis] = np.floor((high[i, axis] + margin_m) / side_m)
-        if count == 0 or (boxes[count] != boxes[count - 1]).any():
-            count += 1
+        is_new = count == 0
+        for k in range(6):
+            is_new = is_new or boxes[count, k] != boxes[count - 1, k]
+        count += int(is_new)
     return boxes[:count]
 
 
