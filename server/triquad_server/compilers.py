@@ -6,10 +6,10 @@ by the others, and by the server.
 
 import json
 import logging
-import queue
+import os
 import subprocess
 import sys
-import threading
+import time
 from collections.abc import Callable, Collection
 
 from triquad_map.compiled.team import lower_priority
@@ -29,7 +29,7 @@ _CODE = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from triquad_server.compilers import compile_stages; compile_stages(sys.argv[2:])"
 )
-_LOOK_S = 0.05  # after which whoever waits is asked whether to go on
+_LOOK_S = 0.05  # between two looks whether a stage is compiled
 
 _log = logging.getLogger(__name__)
 
@@ -43,53 +43,34 @@ class Compilers:
     """The processes; who starts them closes them."""
 
     def __init__(self, settings: Settings) -> None:
-        self._done: set[str] = set()
-        self._closed = False
-        self._told: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         orders = [[stage for stage in order if not is_compiled(stage)] for order in _ORDERS]
         self._processes = [_started(order, settings) for order in orders if order]
-        self._running = len(self._processes)
-        for process in self._processes:
-            threading.Thread(target=self._listen, args=(process,), daemon=True).start()
 
     def wait_for(self, stage: str, look: Callable[[], None]) -> None:
         """Wait until a stage is compiled, or will not be.
 
         ``look`` is called meanwhile, and may raise what ends the waiting.
         """
-        while self._running and stage not in self._done and not is_compiled(stage):
+        while not is_compiled(stage):
+            if all(process.poll() is not None for process in self._processes):
+                _log.warning("the processes that compile have failed: this one does it")
+                return
             look()
-            try:
-                done = self._told.get(timeout=_LOOK_S)
-            except queue.Empty:
-                continue
-            if done is None:
-                self._running -= 1
-            else:
-                self._done.add(done)
+            time.sleep(_LOOK_S)
 
     def close(self) -> None:
         """End the processes, whatever they are at."""
-        self._closed = True
         for process in self._processes:
             process.kill()
             process.wait()
-
-    def _listen(self, process: "subprocess.Popen[str]") -> None:
-        assert process.stdout is not None
-        with process.stdout:
-            for line in process.stdout:
-                self._told.put(line.strip())
-        if process.wait() != 0 and not self._closed:
-            _log.warning("a process that compiled has failed: this one compiles what is missing")
-        self._told.put(None)
 
 
 def _started(order: Collection[str], settings: Settings) -> "subprocess.Popen[str]":
     process = subprocess.Popen(
         [sys.executable, "-I", "-c", _CODE, json.dumps(sys.path), *order],
         stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,  # what cannot be compiled, the server itself fails at and tells
         text=True,
         start_new_session=True,  # Ctrl-C is not for it
     )
@@ -100,12 +81,12 @@ def _started(order: Collection[str], settings: Settings) -> "subprocess.Popen[st
 
 
 def compile_stages(stages: Collection[str]) -> None:
-    """In a process of its own: go through ``stages``, and print each once it is compiled."""
+    """In a process of its own: go through ``stages``, for as long as the server is there."""
+    server = os.getppid()
     lower_priority(NICENESS)
     put_off_collection()  # a sixth of the time
-    logging.disable(logging.WARNING)  # the server has said what goes on
-    settings = Settings.model_validate_json(sys.stdin.read())
-    made_up = WarmUp(settings, "cpu", Teams())
+    made_up = WarmUp(Settings.model_validate_json(sys.stdin.read()), "cpu", Teams())
     for stage in stages:
+        if os.getppid() != server:
+            return
         made_up.go_through(stage)
-        print(stage, flush=True)  # noqa: T201 - to the server

@@ -58,8 +58,8 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
     """Compile a function when it is first called; it runs without Python's lock.
 
-    It is compiled once for each kinds of arguments, for which each literal number is one of its
-    own, and so is each width: where many hang on it, a caller says ``np.int64(0)``.
+    It is compiled once for each combination of the arguments' types. Each literal number is a type
+    of its own, as is each width of numbers: a kernel that calls a large one says ``np.int64(0)``.
 
     Args:
         options: of ``numba.njit``.
