@@ -169,7 +169,7 @@ def serve(
 ) -> Server:
     """Start a map server within this program, and return once it serves.
 
-    The very first start compiles for about a minute, as a warning in the log says.
+    The very first start compiles for half a minute, as a warning in the log says.
 
     Args:
         store: folder for checkpoints; without one the map is not kept. The server goes on from

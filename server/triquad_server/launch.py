@@ -102,16 +102,8 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     settings = options.settings
     network = configuration(options.network, network_defaults(options.map_name, settings))
     monitoring = _open_monitoring(settings, stack)
-    store = None
-    restored = None
-    if options.store is not None:
-        store = Store(options.store, options.map_name, settings.store)
-        stack.enter_context(closing(store))
-        if options.restore is not None:
-            phases.starting(f"taking the map back to epoch {options.restore}")
-            store.restore(options.restore)
-        phases.starting("restoring the newest checkpoint")
-        restored = _restored(store, options)
+    store = _open_store(options, phases, stack)
+    restored = None if store is None else _restored(store, options, phases)
     if restored is not None:
         settings = _settings_of(restored.record, settings)
     teams = stack.enter_context(closing(Teams()))
@@ -157,8 +149,21 @@ def _open_monitoring(settings: Settings, stack: ExitStack) -> MonitoringServer |
     return stack.enter_context(closing(MonitoringServer(settings.metrics)))
 
 
-def _restored(store: Store, options: LaunchOptions) -> ValidCheckpoint | None:
+def _open_store(options: LaunchOptions, phases: Phases, stack: ExitStack) -> Store | None:
+    """Where checkpoints are kept, if they are; taken back to an older one where that is asked."""
+    if options.store is None:
+        return None
+    store = Store(options.store, options.map_name, options.settings.store)
+    stack.enter_context(closing(store))
+    if options.restore is not None:
+        phases.starting(f"taking the map back to epoch {options.restore}")
+        store.restore(options.restore)
+    return store
+
+
+def _restored(store: Store, options: LaunchOptions, phases: Phases) -> ValidCheckpoint | None:
     """The checkpoint from which the map goes on, if there is one."""
+    phases.starting("restoring the newest checkpoint")
     restored = store.newest()
     if restored is None:
         return None

@@ -5,6 +5,8 @@ import threading
 import time
 from collections.abc import Callable
 
+from triquad_map.compiled.kernel import COMPILING
+
 from triquad_server import compilers
 from triquad_server.compilers import Compilers
 from triquad_server.process.threads import Teams
@@ -66,6 +68,7 @@ class Preparation:
         for stage in ANSWERING if can_wait else STAGES:
             self._report(stage.replace("_", " "))
             self._go_through(stage, self._check)
+        self._check()
         self._is_done = not can_wait
 
     def for_mapping(self, done: Callable[[], None], failed: Callable[[], None]) -> None:
@@ -91,8 +94,9 @@ class Preparation:
         if all(map(is_compiled, STAGES)):
             return
         _log.warning(
-            "compiling, up to a minute in all: this is done once for each release. "
-            "Questions are answered as soon as they can be; scans wait until they can be taken in"
+            "%s. Questions are answered as soon as they can be; "
+            "scans wait until they can be taken in",
+            COMPILING,
         )
         self._compilers = Compilers(self._settings)
 
@@ -122,7 +126,6 @@ class Preparation:
             _log.info("%.0f s since the start: %s", time.monotonic() - self._started_s, what)
 
     def _report(self, stage: str) -> None:
-        self._check()
         self._starting(f"preparing compiled code: {stage}")
         seconds = time.monotonic() - self._started_s
         if seconds > _QUICK_S:

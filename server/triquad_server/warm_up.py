@@ -1,6 +1,6 @@
 """Has kernels compiled before they are needed, by maps and questions that are made up.
 
-Compiling takes a minute in all at the very first start; then the compiled code is found on disk.
+At the very first start that takes a minute of one core; then the compiled code is found on disk.
 """
 
 from collections.abc import Callable
@@ -31,6 +31,17 @@ from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MemorySettings, Settings
+
+ANSWERING = ("field", "surfels", "questions")
+"""The stages whose kernels answer."""
+
+MAPPING = ("scans", "training", "what_is_gone")
+"""Those that map."""
+
+MESHING = ("meshes",)
+"""And those of meshes."""
+
+STAGES = ANSWERING + MAPPING + MESHING
 
 _SCANS = 6  # of rays that pass the sphere, until it is taken back
 _DIRECTIONS = 400
@@ -67,18 +78,6 @@ def _mark_compiled(stage: str) -> None:
         with suppress(OSError):
             marks.mkdir(parents=True, exist_ok=True)
             (marks / stage).touch()
-
-
-ANSWERING = ("field", "surfels", "questions")
-"""The stages whose kernels answer."""
-
-MAPPING = ("scans", "training", "what_is_gone")
-"""Those that map."""
-
-MESHING = ("meshes",)
-"""And those of meshes."""
-
-STAGES = ANSWERING + MAPPING + MESHING
 
 
 class WarmUp:

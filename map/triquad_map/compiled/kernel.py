@@ -40,6 +40,9 @@ _IMPORT = re.compile(
 )
 """An import of a module of these, and the names after it; to parse the files takes 0.2 s."""
 
+COMPILING = "compiling, up to a minute in all: this is done once for each release"
+"""What is told where compiled code is not found."""
+
 _LONGEST_TURN_S = 60.0
 """After so long a process that compiles a kernel counts as one that hangs."""
 
@@ -172,7 +175,7 @@ class _CompilingIsTold(event.Listener):
         module = event.data["dispatcher"].py_func.__module__
         if not self._told and module.startswith(_OURS):
             self._told = True
-            _log.warning("compiling, up to a minute in all: this is done once for each release")
+            _log.warning(COMPILING)
 
     def on_end(self, event: Any) -> None:
         pass
@@ -181,6 +184,7 @@ class _CompilingIsTold(event.Listener):
 event.register("numba:compile", _CompilingIsTold())
 
 
+@functools.cache
 def compiled_marks(module: str) -> Path | None:
     """A folder for marks of which kernels that ``module`` leads to are compiled; None: nowhere.
 

@@ -11,9 +11,9 @@ from triquad_client import connect
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.benchmarks.figures import Figure
+from triquad_tools.benchmarks.served import MAP
 from triquad_tools.demo.server import DemoServer
 
-_MAP = "bench"
 _STARTS = 5
 _TIMEOUT_S = 300.0
 
@@ -27,9 +27,9 @@ def measure_start() -> list[Figure]:
     return [
         Figure("ready at the very first start", first.ready_s, "s", at_most=15),
         Figure("a scan is taken in then, after", first.mapping_s, "s"),
-        Figure("resident memory by then", first.resident_mb, "MB"),
+        Figure("resident memory after it", first.resident_mb, "MB"),
         Figure("ready at a later start", ready_s, "s", at_most=1.5),
-        Figure("resident memory by then", later[-1].resident_mb, "MB"),
+        Figure("resident memory after that", later[-1].resident_mb, "MB"),
     ]
 
 
@@ -41,9 +41,9 @@ class _Start:
         variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
         started = time.monotonic()
         with tempfile.TemporaryDirectory(dir=folder) as name:
-            server = DemoServer(Path(name), _MAP, ["--device", "cpu"], variables=variables)
+            server = DemoServer(Path(name), MAP, ["--device", "cpu"], variables=variables)
             self.ready_s = time.monotonic() - started
-            with server, connect(server.endpoint, _MAP, timeout_s=_TIMEOUT_S) as client:
+            with server, connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client:
                 client.publish_scan(_sphere(), np.eye(4))
                 client.flush(_TIMEOUT_S)
                 self.mapping_s = time.monotonic() - started
