@@ -79,10 +79,13 @@ def joined(
 
 def origin_of(points: Doubles) -> Doubles:
     """An origin [3] among points [N, 3], from which they travel in single precision."""
+    if not len(points):
+        return np.zeros(3)
     # The median, so that a few far points do not cost the others their precision; of a sample,
     # as it takes longer than all the rest.
     some = points[:: max(1, len(points) // _ORIGIN_SAMPLE)]
-    return np.asarray(np.median(some, axis=0)) if len(points) else np.zeros(3)
+    middle = len(some) // 2
+    return np.asarray(np.partition(some, middle, axis=0)[middle])
 
 
 def offsets_from(points: Doubles, origin: Doubles) -> Floats:

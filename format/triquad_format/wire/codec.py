@@ -33,12 +33,27 @@ MAX_OBJECTS = 20_000
 _MAX_DEPTH = 16
 
 _DTYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"})
+_ARRAY_KEYS = {"dtype", "shape", "data"}
 _MAX_DIMENSIONS = 4
 
-# How many bytes follow the first of a header: a number itself, a length, or a count.
-_NUMBER_BYTES = dict(zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True))
+# How many bytes follow the first of a header: a length, or a count.
 _LENGTH_BYTES = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}  # binaries and strings
 _COUNT_BYTES = {0xDC: 2, 0xDD: 4, 0xDE: 2, 0xDF: 4}  # arrays and maps
+
+
+def _sizes() -> bytes:
+    """The size of an object, by its first byte; 0: that does not tell it, or it holds others."""
+    sizes = bytearray(256)
+    for code in (*range(0x80), *range(0xE0, 0x100), 0xC0, 0xC2, 0xC3):  # small numbers, nil, truth
+        sizes[code] = 1
+    for code in range(0xA0, 0xC0):  # short strings
+        sizes[code] = 1 + (code & 0x1F)
+    for code, size in zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True):
+        sizes[code] = 1 + size  # numbers
+    return bytes(sizes)
+
+
+_SIZES = _sizes()
 
 MessageT = TypeVar("MessageT", bound="Message")
 
@@ -51,6 +66,12 @@ class Message:
     def annotations(cls) -> dict[str, Any]:
         """The fields' names and annotations."""
         return typing.get_type_hints(cls, include_extras=True)
+
+    @classmethod
+    @functools.cache
+    def forms(cls) -> dict[str, "Form"]:
+        """How each field travels, by its name."""
+        return {name: _form(annotation) for name, annotation in cls.annotations().items()}
 
 
 @dataclass(frozen=True)
@@ -109,10 +130,13 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
 
 def pack_array(array: NDArray[np.generic]) -> dict[str, object]:
     """The msgpack form of an array, little endian and C order."""
-    little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
-    if little.dtype.str not in _DTYPES:
-        raise WireError(f"arrays of {array.dtype} do not travel; use one of {sorted(_DTYPES)}")
-    return {"dtype": little.dtype.str, "shape": list(array.shape), "data": little.tobytes()}
+    dtype = array.dtype.str
+    if dtype not in _DTYPES:
+        array = array.astype(array.dtype.newbyteorder("<"))
+        dtype = array.dtype.str
+        if dtype not in _DTYPES:
+            raise WireError(f"arrays of {array.dtype} do not travel; use one of {sorted(_DTYPES)}")
+    return {"dtype": dtype, "shape": list(array.shape), "data": array.tobytes()}
 
 
 def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
@@ -122,7 +146,7 @@ def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
         WireError: the form is not complete or its sizes contradict each other. Nothing is
             allocated for a shape that the bytes do not fill.
     """
-    if not isinstance(packed, Mapping) or set(packed) != {"dtype", "shape", "data"}:
+    if not isinstance(packed, dict) or packed.keys() != _ARRAY_KEYS:
         raise WireError(f"{name}: expected an array with dtype, shape and data")
     dtype, shape, data = packed["dtype"], packed["shape"], packed["data"]
     if not isinstance(dtype, str) or dtype not in _DTYPES:
@@ -144,22 +168,26 @@ def check_structure(payload: bytes, max_objects: int = MAX_OBJECTS) -> None:
     Raises:
         WireError: the text says which.
     """
-    at = objects = 0
-    open_items = [1]
-    while open_items:
-        if open_items[-1] == 0:
-            open_items.pop()
+    at, objects = 0, 1  # as many as the headers so far announce
+    missing, around = 1, [0]  # objects still to come, in the innermost one and in those around it
+    while missing or len(around) > 1:
+        if not missing:
+            missing = around.pop()
             continue
-        open_items[-1] -= 1
-        objects += 1
         if at >= len(payload):
             raise WireError("not a triquad message: it is incomplete")
+        missing -= 1
+        size = _SIZES[payload[at]]
+        if size:
+            at += size
+            continue
         at, children = _header(payload, at)
-        if objects + children > max_objects:
+        objects += children
+        if objects > max_objects:
             raise WireError(f"not a triquad message: more than {max_objects} objects")
-        if children:
-            open_items.append(children)
-        if len(open_items) > _MAX_DEPTH:
+        around.append(missing)
+        missing = children
+        if len(around) > _MAX_DEPTH:
             raise WireError(f"not a triquad message: nested more than {_MAX_DEPTH} deep")
     if at != len(payload):
         raise WireError("not a triquad message: it is incomplete, or something follows it")
@@ -197,17 +225,13 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
 def _header(payload: bytes, at: int) -> tuple[int, int]:
     """Where the next header is, and how many objects the one at ``at`` announces."""
     code = payload[at]
+    if _SIZES[code]:
+        return at + _SIZES[code], 0
     at += 1
-    if code <= 0x7F or code >= 0xE0 or code in (0xC0, 0xC2, 0xC3):  # small numbers, nil, booleans
-        return at, 0
     if code <= 0x8F:
         return at, 2 * (code & 0x0F)
     if code <= 0x9F:
         return at, code & 0x0F
-    if code <= 0xBF:
-        return at + (code & 0x1F), 0
-    if code in _NUMBER_BYTES:
-        return at + _NUMBER_BYTES[code], 0
     if code in _LENGTH_BYTES:
         size = _LENGTH_BYTES[code]
         return at + size + int.from_bytes(payload[at : at + size], "big"), 0
@@ -218,66 +242,101 @@ def _header(payload: bytes, at: int) -> tuple[int, int]:
     raise WireError(f"not a triquad message: type {code:#x} does not occur in one")
 
 
+@dataclass(frozen=True)
+class Form:
+    """How the values of a field travel. Both take the field's name, for errors, and a value."""
+
+    pack: Callable[[str, Any], object]
+    unpack: Callable[[str, object], Any]
+
+
+def _form(annotation: Any) -> Form:
+    spec = _array_spec(annotation)
+    if spec is not None:
+        return _array_form(spec)
+    annotation = _plain(annotation)
+    if isinstance(annotation, type) and issubclass(annotation, Message):
+        return _message_form(annotation)
+    origin = get_origin(annotation)
+    if origin in (types.UnionType, typing.Union):
+        (inner,) = (arg for arg in get_args(annotation) if arg is not type(None))
+        return _optional_form(_form(inner))
+    if origin is dict:
+        key_type, item = get_args(annotation)
+        return _map_form(_plain(key_type), _form(item))
+    scalar = functools.partial(_scalar, annotation)
+    return Form(scalar, scalar)
+
+
+def _array_form(spec: ArraySpec) -> Form:
+    def pack(name: str, array: Any) -> object:
+        if not isinstance(array, np.ndarray):
+            raise WireError(f"{name}: expected an array, got {type(array).__name__}")
+        spec.check(name, array)
+        return pack_array(array)
+
+    def unpack(name: str, packed: object) -> NDArray[np.generic]:
+        array = unpack_array(name, packed)
+        spec.check(name, array)
+        return array
+
+    return Form(pack, unpack)
+
+
+def _message_form(kind: type[Message]) -> Form:
+    def pack(name: str, message: Any) -> object:
+        if not isinstance(message, kind):
+            raise WireError(f"{name}: expected {kind.__name__}, got {message!r}")
+        return _pack_fields(name, message)
+
+    def unpack(name: str, body: object) -> Message:
+        if not isinstance(body, dict):
+            raise WireError(f"{name}: expected a map with {', '.join(kind.annotations())}")
+        return _unpack_fields(name, kind, body)
+
+    return Form(pack, unpack)
+
+
+def _optional_form(form: Form) -> Form:
+    def pack(name: str, value: Any) -> object:
+        return None if value is None else form.pack(name, value)
+
+    def unpack(name: str, value: object) -> Any:
+        return None if value is None else form.unpack(name, value)
+
+    return Form(pack, unpack)
+
+
+def _map_form(key_type: Any, form: Form) -> Form:
+    def each(name: str, entries: Any, by: Callable[[str, Any], Any]) -> dict[Any, Any]:
+        if not isinstance(entries, dict):
+            raise WireError(f"{name}: expected dict, got {type(entries).__name__}")
+        return {
+            _scalar(key_type, f"{name} key", key): by(f"{name}[{key!r}]", entry)
+            for key, entry in entries.items()
+        }
+
+    return Form(
+        lambda name, entries: each(name, entries, form.pack),
+        lambda name, entries: each(name, entries, form.unpack),
+    )
+
+
 def _pack_fields(name: str, message: Message) -> dict[str, object]:
     return {
-        field: _pack(f"{name}.{field}", annotation, getattr(message, field))
-        for field, annotation in message.annotations().items()
+        field: form.pack(f"{name}.{field}", getattr(message, field))
+        for field, form in message.forms().items()
     }
 
 
 def _unpack_fields(name: str, kind: type[MessageT], body: Mapping[str, object]) -> MessageT:
     fields = {}
-    for field, annotation in kind.annotations().items():
+    for field, form in kind.forms().items():
         if field in body:
-            fields[field] = _unpack(f"{name}.{field}", annotation, body[field])
+            fields[field] = form.unpack(f"{name}.{field}", body[field])
         elif not hasattr(kind, field):  # without a default, for those who speak as before it came
             raise WireError(f"{name}.{field}: missing")
     return kind(**fields)
-
-
-def _pack(name: str, annotation: Any, value: object) -> object:
-    spec = _array_spec(annotation)
-    if spec is not None:
-        if not isinstance(value, np.ndarray):
-            raise WireError(f"{name}: expected an array, got {type(value).__name__}")
-        spec.check(name, value)
-        return pack_array(value)
-    if isinstance(annotation, type) and issubclass(annotation, Message):
-        if not isinstance(value, annotation):
-            raise WireError(f"{name}: expected {annotation.__name__}, got {value!r}")
-        return _pack_fields(name, value)
-    return _converted(name, annotation, value, by=_pack)
-
-
-def _unpack(name: str, annotation: Any, value: object) -> object:
-    spec = _array_spec(annotation)
-    if spec is not None:
-        array = unpack_array(name, value)
-        spec.check(name, array)
-        return array
-    if isinstance(annotation, type) and issubclass(annotation, Message):
-        if not isinstance(value, dict):
-            raise WireError(f"{name}: expected a map with {', '.join(annotation.annotations())}")
-        return _unpack_fields(name, annotation, value)
-    return _converted(name, annotation, value, by=_unpack)
-
-
-def _converted(
-    name: str, annotation: Any, value: object, by: Callable[[str, Any, object], object]
-) -> object:
-    """What ``by`` makes of a value that may be ``None``, or of a map's entries; else a scalar."""
-    annotation = _plain(annotation)
-    origin = get_origin(annotation)
-    if origin in (types.UnionType, typing.Union):
-        (inner,) = (arg for arg in get_args(annotation) if arg is not type(None))
-        return None if value is None else by(name, inner, value)
-    if origin is dict and isinstance(value, dict):
-        key_type, item = get_args(annotation)
-        return {
-            _scalar(f"{name} key", _plain(key_type), key): by(f"{name}[{key!r}]", item, entry)
-            for key, entry in value.items()
-        }
-    return _scalar(name, annotation, value)
 
 
 def _array_spec(annotation: Any) -> ArraySpec | None:
@@ -292,13 +351,13 @@ def _plain(annotation: Any) -> Any:
     return annotation.__origin__ if hasattr(annotation, "__metadata__") else annotation
 
 
-def _scalar(name: str, annotation: Any, value: object) -> Any:
+def _scalar(annotation: Any, name: str, value: object) -> Any:
     """``value`` where it is exactly an ``annotation`` (an int also serves as a float)."""
     if annotation is float and type(value) is int:
         return float(value)
     if type(value) is not annotation:
         wanted = getattr(annotation, "__name__", str(annotation))
         raise WireError(f"{name}: expected {wanted}, got {type(value).__name__}")
-    if annotation is int and not -(2**63) <= typing.cast(int, value) < 2**63:
+    if annotation is int and not -(2**63) <= typing.cast("int", value) < 2**63:
         raise WireError(f"{name}: {value} does not fit 64 bits")
     return value

@@ -1,5 +1,6 @@
 """Who asks, and for how long: the attachment of a request."""
 
+import functools
 from dataclasses import dataclass
 
 from triquad_format.errors import WireError
@@ -8,6 +9,8 @@ from triquad_format.wire.codec import Message
 
 MAX_ORIGIN_BYTES = 1024
 """A longer attachment is not read."""
+
+_REMEMBERED = 256
 
 
 @dataclass(frozen=True)
@@ -20,8 +23,11 @@ class RequestOrigin(Message):
 
 def read_origin(attachment: bytes) -> RequestOrigin | None:
     """The origin that an attachment names; ``None`` where it names none."""
-    if len(attachment) > MAX_ORIGIN_BYTES:
-        return None
+    return None if len(attachment) > MAX_ORIGIN_BYTES else _decoded(attachment)
+
+
+@functools.lru_cache(_REMEMBERED)  # a client attaches the same to all that it asks
+def _decoded(attachment: bytes) -> RequestOrigin | None:
     try:
         return codec.decode(RequestOrigin, attachment)
     except WireError:

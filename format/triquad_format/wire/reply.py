@@ -4,6 +4,7 @@ A field's annotation names its bounds beside its type, so that a message says al
 place. A server may be wrong or hostile: what does not answer the question is refused whole.
 """
 
+import functools
 import math
 import re
 from collections.abc import Iterator
@@ -221,11 +222,9 @@ def _of_field(
                 yield name, problem
 
 
-def _checks(annotation: Any) -> Iterator[Check]:
+@functools.cache
+def _checks(annotation: Any) -> tuple[Check, ...]:
     """The checks in an annotation, that of a field which may be ``None`` included."""
-    for extra in getattr(annotation, "__metadata__", ()):
-        if hasattr(extra, "problem"):
-            yield extra
-    if not hasattr(annotation, "__metadata__"):
-        for choice in get_args(annotation):
-            yield from _checks(choice)
+    if hasattr(annotation, "__metadata__"):
+        return tuple(extra for extra in annotation.__metadata__ if hasattr(extra, "problem"))
+    return tuple(check for choice in get_args(annotation) for check in _checks(choice))

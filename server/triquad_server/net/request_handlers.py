@@ -1,10 +1,10 @@
 """Groups of operations, each with a queue and workers; every request is answered exactly once."""
 
 import logging
-import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import zenoh
@@ -18,6 +18,7 @@ from triquad_server.net.asking_client import asking_client
 from triquad_server.net.byte_budget import ByteBudget
 from triquad_server.net.long_work import LongWork
 from triquad_server.net.operation_counts import OperationCounts
+from triquad_server.net.receivers import Receivers
 from triquad_server.net.request import Request, RequestT, Turns
 from triquad_server.net.request_queue import (
     MOST_LONG,
@@ -110,17 +111,15 @@ class RequestHandlers:
         self._refusals = ThreadPoolExecutor(_REFUSALS, "refusals")
         self._refused = ByteBudget(_REFUSED_BYTES, small=_LARGE_BYTES)
         self._queryables: list[zenoh.Queryable[Any]] = []
-        self._receivers: list[threading.Thread] = []
+        self._receivers: list[Receivers[zenoh.Query]] = []
         for key in operations:
             channel = zenoh.handlers.FifoChannel(limits.waiting)
             queryable = session.declare_queryable(key, channel, complete=True)
-            receive = threading.Thread(
-                target=self._receive, args=(queryable, key), name=f"receiver-{key}"
-            )
+            receive = partial(self._receive, key)
             self._queryables.append(queryable)
-            self._receivers.append(receive)
-        for thread in self._receivers:
-            thread.start()
+            self._receivers.append(
+                Receivers(queryable, receive, name=f"receiver-{key}", niceness=niceness)
+            )
 
     @property
     def queue(self) -> QueueMetrics:
@@ -137,24 +136,27 @@ class RequestHandlers:
         """As :meth:`stop`, and take no more requests."""
         for queryable in self._queryables:
             queryable.undeclare()
-        for thread in self._receivers:
-            thread.join()
-        self.stop()
+        self.stop()  # those who receive may be at work
+        for receivers in self._receivers:
+            receivers.join()
+        self.stop()  # and may have taken something after that
         self._workers.shutdown()
         self._refusals.shutdown()
 
-    def _receive(self, queryable: zenoh.Queryable[Any], key: str) -> None:
-        """Empty the channel at once: a full one would stall the network's threads."""
-        for query in queryable:
-            if str(query.key_expr) != key:
-                query.drop()  # unanswered: who means it names it
-                continue
-            try:
-                self._take(query, key)
-            except Exception:  # such as too little memory: the next one may be answered
-                _log.exception("a request on %s could not be received", key)
+    def _receive(self, key: str, query: zenoh.Query) -> None:
+        """Have a request wait, and work at the one whose turn it is."""
+        if str(query.key_expr) != key:
+            query.drop()  # unanswered: who means it names it
+            return
+        try:
+            job = self._take(query, key)
+            if job is not None:
+                self._work(job)
+        except Exception:  # such as too little memory: the next one may be answered
+            _log.exception("a request on %s could not be received", key)
 
-    def _take(self, query: zenoh.Query, key: str) -> None:
+    def _take(self, query: zenoh.Query, key: str) -> Job[Request] | None:
+        """Have a request wait; returns one to begin with, if there is a worker for it."""
         asker = self._askers.asker(query, self._limits.longest_s)
         counts = self._operations[key].counts
         request = Request(query, key, counts, asker, self._askers, self._replies)
@@ -162,12 +164,15 @@ class RequestHandlers:
             limit = self._limits.max_bytes
             text = f"{request.size} bytes exceed the limit of {limit}: split it"
             self._refuse_aside(request, "too_large", text)
-        elif self._stopping:
+            return None
+        if self._stopping:
             self._refuse_aside(request, "busy", _STOPPING)
-        else:
-            for excess in self._queue.put(asker.owner, request, request.size):
-                text = f"{self._limits.waiting} requests wait already; try later"
-                self._refuse_aside(excess, "busy", text)
+            return None
+        placed = self._queue.put(asker.owner, request, request.size)
+        for excess in placed.excess:
+            text = f"{self._limits.waiting} requests wait already; try later"
+            self._refuse_aside(excess, "busy", text)
+        return placed.begun
 
     def _refuse_aside(self, request: Request, code: str, text: str) -> None:
         """Refuse a request, in another thread mostly: its client may not take the reply."""

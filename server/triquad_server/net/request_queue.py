@@ -46,6 +46,14 @@ class Job(Generic[RequestT]):
     is_worked_at: bool = False
 
 
+@dataclass(frozen=True)
+class Placed(Generic[RequestT]):
+    """What putting a request into the queue led to."""
+
+    begun: Job[RequestT] | None  # the caller is to work at it; maybe that of somebody else
+    excess: list[RequestT]  # too many now; maybe the new one is among them
+
+
 class RequestQueue(Generic[RequestT]):
     """A bounded queue of requests, of which some are worked at, at the same time.
 
@@ -86,12 +94,13 @@ class RequestQueue(Generic[RequestT]):
         with self._lock:
             return QueueMetrics(len(self._waiting), self._waiting.limit)
 
-    def put(self, owner: Owner, request: RequestT, nbytes: int) -> list[RequestT]:
-        """Have a request wait; returns those that are too many now, this one maybe among them."""
+    def put(self, owner: Owner, request: RequestT, nbytes: int) -> Placed[RequestT]:
+        """Have a request wait, or the caller begin with one."""
         with self._lock:
             self._waiting.put(owner, Job(request, owner, nbytes), nbytes)
+            begun = self._take_next()
             self._fill()
-            return [job.request for job in self._waiting.excess(newest=True)]
+            return Placed(begun, [job.request for job in self._waiting.excess(newest=True)])
 
     def pause(self, job: Job[RequestT]) -> None:
         """Return when it is the turn of a request again that is worked at: at once, mostly."""
@@ -103,7 +112,8 @@ class RequestQueue(Generic[RequestT]):
                 self._overtaking = 0
             job.may_go_on.clear()
             self._paused.append(job)
-            self._start(other)
+            if self._is_begun(other):
+                self._begin(other)
         job.may_go_on.wait()
 
     def rest(self, job: Job[RequestT], rest_s: float) -> None:
@@ -157,9 +167,19 @@ class RequestQueue(Generic[RequestT]):
 
     def _fill(self) -> None:
         """Have requests worked at while there is a worker for one."""
+        while (job := self._take_next()) is not None:
+            self._begin(job)
+
+    def _take_next(self) -> Job[RequestT] | None:
+        """A request that somebody is to begin with, if there is a worker for one.
+
+        Those that paused, and whose turn comes before, go on.
+        """
         while self._free > 0 and (job := self._next()) is not None:
             self._free -= 1
-            self._start(job)
+            if self._is_begun(job):
+                return job
+        return None
 
     def _next(self) -> Job[RequestT] | None:
         """Whose turn it is."""
@@ -185,15 +205,16 @@ class RequestQueue(Generic[RequestT]):
             and self._sending.total() < MOST_SENDING
         )
 
-    def _start(self, job: Job[RequestT]) -> None:
-        if job.is_worked_at:  # it had paused
+    def _is_begun(self, job: Job[RequestT]) -> bool:
+        """Have a request worked at; whether it begins, and needs a thread, or it had paused."""
+        if job.is_worked_at:
             job.may_go_on.set()
-            return
+            return False
         job.is_worked_at = True
         if job.is_long:
             self._long.add(job)
         _count(self._begun, job.owner.group, 1)
-        self._begin(job)
+        return True
 
 
 def _count(counter: Counter[CountedT], counted: CountedT, change: int) -> None:

@@ -24,7 +24,13 @@ class Work:
         )
 
     def put(self, owner, *requests):
-        return [excess for each in requests for excess in self.queue.put(owner, each, 1)]
+        excess = []
+        for each in requests:
+            placed = self.queue.put(owner, each, 1)
+            excess += placed.excess
+            if placed.begun is not None:
+                self.begun[placed.begun.request] = placed.begun
+        return excess
 
     def pause(self, request):
         """Pause in a thread; returns an event that tells when it goes on."""

@@ -39,7 +39,10 @@ class Server:
         chance = random.Random(f"{self._seed} {asker}")
         for number in range(REQUESTS):
             owner = Owner(chance.choice(["", asker]), str(chance.randrange(3)))
-            self._end(self.queue.put(owner, f"{asker} {number}", chance.randrange(100)))
+            placed = self.queue.put(owner, f"{asker} {number}", chance.randrange(100))
+            self._end(placed.excess)
+            if placed.begun is not None:
+                self._threads.submit(self._work, placed.begun)
             time.sleep(0.002 * chance.random())
 
     def close(self):
