@@ -65,6 +65,9 @@ LEAST_STRENGTH = 0.25
 UNLEARNT_SHARE = 0.5
 """Of the confidence, where rays ended but the field shows no surface."""
 
+HALF_LIFE_S = 86_400.0
+"""While the rest of the map was seen again, confidence in what was not halves in this time."""
+
 
 class SurfelKind(IntEnum):
     """What stands for the surface that was seen in a voxel."""

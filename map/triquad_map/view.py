@@ -1,11 +1,14 @@
 """What every map answers, live or from a file; all questions are put together from this."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 
 from triquad_map.asked import asked
+
+NO_LENGTH_M = 1e-6
+"""What is no longer has no direction."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,7 @@ class FieldAnswer:
         return asked("gradient", self._gradient, "gradient")
 
 
-@dataclass(frozen=True)
-class NearestSurface:
+class NearestSurface(NamedTuple):
     """The nearest seen surface of N points, map frame, metres.
 
     Where none was found within the limit, the distance is the limit and the rest is 0.
@@ -32,7 +34,7 @@ class NearestSurface:
     found: Bools  # [N]
     distance: Doubles  # [N] to the point
     point: Doubles  # [N, 3] the nearest point of it
-    mean: Doubles  # [N, 3] about the same, over all that is nearly as near
+    gradient: Doubles  # [N, 3] of the distance: unit vectors from all that is nearly as near
     confidence: Floats  # [N] in [0, 1]
     learnt: Bools  # [N] whether the field shows it; else rays alone do
     normal: Floats  # [N, 3] of what is not learnt, unit vectors to free space; else 0

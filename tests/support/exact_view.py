@@ -46,10 +46,10 @@ class ExactView:
         world = closest @ self.map_from_scene[:3, :3].T + self.map_from_scene[:3, 3]
         world[~found] = 0.0
         distance = np.where(found, np.abs(sdf), max_distance_m)
+        away = (points - world) / np.maximum(np.abs(sdf), 1e-9)[:, None]
+        away[~found] = 0.0
         confidence, normal = found.astype(np.float32), np.zeros(points.shape, np.float32)
-        return NearestSurface(
-            found, distance, world, world, confidence, np.ones_like(found), normal
-        )
+        return NearestSurface(found, distance, world, away, confidence, np.ones_like(found), normal)
 
     def nearest_unknown(self, points: NDArray[np.float64], max_distance_m: float) -> NearestUnknown:
         local = self._local(points)

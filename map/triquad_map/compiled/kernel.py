@@ -48,6 +48,10 @@ _LONGEST_TURN_S = 60.0
 
 _LOOK_S = 0.02  # between two looks whether it is done
 
+_ALWAYS = {"nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
+"""Options of all kernels: they run without Python's lock, nothing calls them from C, and to divide
+by zero gives no exception, for which each division would look (a sixth of the time of a search)."""
+
 _log = logging.getLogger(__name__)
 
 _numba_config: Any = numba.config
@@ -74,7 +78,7 @@ def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
             folder = _code_folder(function.__module__, chosen)
             _numba_config.CACHE_DIR = str(folder or chosen)
             try:
-                jit: Any = _njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
+                jit: Any = _njit(**_ALWAYS, **options)(function)
                 if folder is not None:
                     jit._cache = _KeptCode(function)  # as its enable_caching() does
             finally:

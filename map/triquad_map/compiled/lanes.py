@@ -137,6 +137,16 @@ def root(_: Any, lanes: Any) -> Any:
 
 
 @_kernel_code
+def whole(_: Any, lanes: Any) -> Any:
+    """The nearest whole numbers."""
+
+    def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
+        return _call(builder, f"llvm.nearbyint.v{LANES}f32", _VECTOR, args)
+
+    return _KIND(lanes), generate
+
+
+@_kernel_code
 def least(_: Any, lanes: Any) -> Any:
     """The least number of all."""
 

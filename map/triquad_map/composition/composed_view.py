@@ -9,8 +9,7 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.composition.field_view import FieldView, in_one
-from triquad_map.composition.region import MapRegion, NearestSurfels, RegionSurfels, Split
-from triquad_map.surface import SurfelKind
+from triquad_map.composition.region import MapRegion, NearestSurfels, RegionFrame, Split
 from triquad_map.view import NearestSurface, NearestUnknown
 
 Rows = NDArray[np.intp]
@@ -18,10 +17,6 @@ Rows = NDArray[np.intp]
 _FARTHEST_CELL = 1 << 20
 _LEAST_SEARCHES = 128
 """Points for which it is worth while to start another thread that searches."""
-
-_RAY_DISC = int(SurfelKind.RAY_DISC)
-_HALF_LIFE_S = 86_400.0
-"""While the rest of the map was seen again, confidence in what was not halves in this time."""
 
 
 class ComposedView(FieldView):
@@ -53,7 +48,7 @@ class ComposedView(FieldView):
             found=np.zeros(count, np.bool_),
             distance=np.full(count, max_distance_m),
             point=np.zeros((count, 3)),
-            mean=np.zeros((count, 3)),
+            gradient=np.zeros((count, 3)),
             confidence=np.zeros(count, np.float32),
             learnt=np.ones(count, np.bool_),
             normal=np.zeros((count, 3), np.float32),
@@ -66,12 +61,9 @@ class ComposedView(FieldView):
         ]
 
         def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            mine = NearestSurface(**{name: array[part] for name, array in vars(nearest).items()})
+            mine = NearestSurface._make(array[first:last] for array in nearest)
             for region, surfels in near:
-                alone = len(near) == 1  # then the search itself finds out soonest what is far away
-                rows = slice(None) if alone else self._rows_near(points[part], mine, region)
-                self._improve_surface(mine, points[part], rows, region.centre, surfels)
+                surfels.improve(mine, points[first:last], self._frame(region))
 
         self._split(count, work, _LEAST_SEARCHES)
         return nearest
@@ -102,46 +94,10 @@ class ComposedView(FieldView):
             if (region.centre - half <= high).all() and (region.centre + half >= low).all():
                 yield region
 
-    def _rows_near(self, points: Doubles, nearest: NearestSurface, region: MapRegion) -> Rows:
-        """Which of the points [N, 3] lie nearer to a region than to what is found so far."""
-        offsets = np.abs(points - region.centre)
-        beyond = np.maximum(offsets - self._settings.region_side_m / 2, 0.0)
-        return np.flatnonzero(np.einsum("ij,ij->i", beyond, beyond) < nearest.distance**2)
-
-    def _improve_surface(
-        self,
-        nearest: NearestSurface,
-        points: Doubles,
-        rows: Rows | slice,
-        centre: Doubles,
-        surfels: RegionSurfels,
-    ) -> None:
-        """Take what is nearer in a region to some ``rows`` of the points."""
-        leaf_m = self._settings.leaf_m
-        found = no_surfels(nearest.distance[rows] / leaf_m)
-        surfels.find_nearest(self._settings.leaf_coordinates(points[rows] - centre), found)
-        hits = found.rows >= 0
-        if not hits.all():  # mostly they are, and nothing has to be picked out
-            rows = np.flatnonzero(hits) if isinstance(rows, slice) else rows[hits]
-            found = NearestSurfels(
-                distances=found.distances[hits],
-                closest=found.closest[hits],
-                means=found.means[hits],
-                rows=found.rows[hits],
-            )
-        corner = centre - self._settings.region_side_m / 2
-        nearest.found[rows] = True
-        nearest.distance[rows] = found.distances * leaf_m
-        nearest.point[rows] = found.closest * leaf_m + corner
-        nearest.mean[rows] = found.means * leaf_m + corner
-        age_s = np.maximum(self._newest_s - surfels.seen_s[found.rows], 0)
-        faded = np.exp2(age_s / -_HALF_LIFE_S)
-        nearest.confidence[rows] = surfels.confidence[found.rows] * faded
-        kinds = surfels.surfels.kinds[found.rows]
-        nearest.learnt[rows] = kinds < _RAY_DISC
-        facing = (kinds == _RAY_DISC)[:, None]
-        normals = surfels.surfels.normals
-        nearest.normal[rows] = np.where(facing, normals[found.rows], 0.0) if facing.any() else 0.0
+    def _frame(self, region: MapRegion) -> RegionFrame:
+        """Where the region's leaf coordinates lie, for its surfels."""
+        x, y, z = self._settings.region_corner(region.index).tolist()
+        return RegionFrame((x, y, z), self._settings.leaf_m, self._newest_s)
 
     def _improve_unknown(self, found: NearestUnknown, points: Doubles) -> None:
         """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""

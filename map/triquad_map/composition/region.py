@@ -11,6 +11,7 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, L
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.surface import Surfels
+from triquad_map.view import NearestSurface
 
 _Float = TypeVar("_Float", bound=np.floating)
 
@@ -83,6 +84,14 @@ class NearestSurfels(NamedTuple):
     rows: Ints  # [N] number of the surfel, -1 where there is none
 
 
+class RegionFrame(NamedTuple):
+    """Where a region's leaf coordinates lie in the map, and as of when it is looked at."""
+
+    corner: tuple[float, float, float]  # where they are 0, metres, map frame
+    leaf_m: float
+    newest_s: int  # when anything in the map was seen last, seconds since 1970
+
+
 class RegionSurfels(Protocol):
     """The surfels of a region: S of them."""
 
@@ -102,6 +111,9 @@ class RegionSurfels(Protocol):
 
     def find_nearest(self, points: Doubles, found: NearestSurfels) -> None:
         """Improve ``found`` where a surfel lies nearer to leaf coordinates ``points`` [N, 3]."""
+
+    def improve(self, nearest: NearestSurface, points: Doubles, frame: RegionFrame) -> None:
+        """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
 
 
 class FieldRegion(Protocol):

@@ -14,7 +14,7 @@ from triquad_format.records.status import Status
 from triquad_map.asked import asked
 from triquad_map.questions.joined import joined
 from triquad_map.surface import DISC_RADIUS
-from triquad_map.view import MapView, NearestSurface
+from triquad_map.view import NO_LENGTH_M, MapView, NearestSurface
 
 # Arrays take numbers sooner than they take members of an enumeration.
 _SURFACE, _UNKNOWN = int(Status.SURFACE), int(Status.UNKNOWN)
@@ -28,9 +28,7 @@ _SURFEL_VOXELS = 1.5
 _WIDENED_VOXELS = float(np.sqrt(0.5)) - DISC_RADIUS
 """From the rim of a disc to where it meets those of the voxels beside it, at their corners."""
 
-_NO_LENGTH_M = 1e-6
-
-_PART_POINTS = 1 << 15
+_PART_POINTS = 1 << 17
 """Points that are answered together: meanwhile each takes ten times the bytes of its answer."""
 
 Rows = NDArray[np.intp]
@@ -118,9 +116,7 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
 def _distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
     nearest = view.nearest_surface(points, options.max_distance_m)
     status = view.status(points)
-    gradient = _unit(points - nearest.mean)
-    gradient[~nearest.found] = 0.0
-    distance = nearest.distance.copy()
+    gradient, distance = nearest.gradient, nearest.distance  # from here on, of the answer
     near = (distance < _SURFEL_VOXELS * view.voxel_m) & (status == _SURFACE) & nearest.found
     learnt, unlearnt = np.flatnonzero(near & nearest.learnt), np.flatnonzero(near & ~nearest.learnt)
     _join_field(view, points, learnt, distance=distance, gradient=gradient)
@@ -238,8 +234,8 @@ def _surfel_share(view: MapView, distance: Doubles) -> Doubles:
 def _unit(vectors: Doubles, otherwise: Doubles | float = 0.0) -> Doubles:
     """The directions [N, 3] of ``vectors`` [N, 3]; ``otherwise`` where they have no length."""
     lengths = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-    directions: Doubles = vectors / np.maximum(lengths, _NO_LENGTH_M)[:, None]
-    short = lengths <= _NO_LENGTH_M
+    directions: Doubles = vectors / np.maximum(lengths, NO_LENGTH_M)[:, None]
+    short = lengths <= NO_LENGTH_M
     if short.any():
         directions[short] = np.broadcast_to(otherwise, vectors.shape)[short]
     return directions

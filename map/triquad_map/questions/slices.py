@@ -41,7 +41,8 @@ class SlicedView:
     def nearest_surface(self, points: Doubles, max_distance_m: float) -> NearestSurface:
         """As of the view."""
         slices = self._slices(points)
-        return joined([self._view.nearest_surface(part, max_distance_m) for part in slices])
+        parts = [self._view.nearest_surface(part, max_distance_m) for part in slices]
+        return NearestSurface._make(map(np.concatenate, zip(*parts, strict=True)))
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
         """As of the view."""

@@ -8,10 +8,12 @@ from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import Evidence, seen_voxels, surface_counts
 
-from triquad_map.composition.region import NearestSurfels
+from triquad_map.composition.composed_view import no_surfels
+from triquad_map.composition.region import NearestSurfels, RegionFrame
 from triquad_map.reference.seen_blocks import SeenBlocks
 from triquad_map.surface import (
     DISC_RADIUS,
+    HALF_LIFE_S,
     OUTSIDE,
     SMOOTHING,
     SampleField,
@@ -20,6 +22,7 @@ from triquad_map.surface import (
     fit_surfels,
     support_confidence,
 )
+from triquad_map.view import NO_LENGTH_M, NearestSurface
 
 _PAIRS = 1 << 19
 """Points with blocks or surfels that are compared together: what bounds the memory."""
@@ -67,6 +70,28 @@ class SurfelCloud:
             self._improve(found, points, part, chosen=nearest & (gaps < limits))
             reach = found.distances[part, None] + SMOOTHING
             self._improve(found, points, part, chosen=gaps <= reach)
+
+    def improve(self, nearest: NearestSurface, points: Doubles, frame: RegionFrame) -> None:
+        """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
+        places = (points - frame.corner) / frame.leaf_m
+        found = no_surfels(nearest.distance / frame.leaf_m)
+        self.find_nearest(places, found)
+        rows = np.flatnonzero(found.rows >= 0)
+        surfels = found.rows[rows]
+        away = places[rows] - found.means[rows]
+        lengths = np.linalg.norm(away, axis=1, keepdims=True)
+        age_s = np.maximum(frame.newest_s - self.seen_s[surfels], 0)
+        kinds = self.surfels.kinds[surfels]
+        facing = (kinds == SurfelKind.RAY_DISC)[:, None]
+        nearest.found[rows] = True
+        nearest.distance[rows] = found.distances[rows] * frame.leaf_m
+        nearest.point[rows] = found.closest[rows] * frame.leaf_m + frame.corner
+        nearest.gradient[rows] = np.where(
+            lengths * frame.leaf_m > NO_LENGTH_M, away / np.maximum(lengths, NO_LENGTH_M), 0.0
+        )
+        nearest.confidence[rows] = self.confidence[surfels] * np.exp2(age_s / -HALF_LIFE_S)
+        nearest.learnt[rows] = kinds < SurfelKind.RAY_DISC
+        nearest.normal[rows] = np.where(facing, self.surfels.normals[surfels], 0.0)
 
     def _block_gaps(self, points: Doubles) -> Doubles:
         """How far [N, B] the surfels of each block are at least from each point."""

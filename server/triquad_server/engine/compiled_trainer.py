@@ -103,7 +103,7 @@ def _corrections(mean_decay: float, variance_decay: float) -> tuple[Doubles, Flo
     )
 
 
-@kernel(fastmath=True, error_model="numpy", inline="always")
+@kernel(fastmath=True, inline="always")
 def _step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: CompiledRates) -> None:
     """One step of a row along its gradient, which is cleared."""
     parameter.steps[row] += 1
@@ -120,7 +120,7 @@ def _step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: Comp
     )
 
 
-@kernel(fastmath=True, error_model="numpy")
+@kernel(fastmath=True)
 def _step_touched(
     part: int,
     count: int,

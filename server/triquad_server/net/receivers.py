@@ -9,7 +9,8 @@ from triquad_map.compiled.team import lower_priority
 
 _log = logging.getLogger(__name__)
 
-_MOST_WAITING = 2
+_MOST_WAITING = 8
+"""Threads that stay for what comes next: to start one takes as long as a short request."""
 
 ArrivalT = TypeVar("ArrivalT")
 

@@ -45,20 +45,20 @@ def test_what_comes_is_received_however_many_are_worked_at():
 
 
 def test_few_threads_stay_once_the_work_is_done():
-    channel, together, done = Channel(), threading.Barrier(8), queue.SimpleQueue()
+    channel, together, done = Channel(), threading.Barrier(24), queue.SimpleQueue()
 
     def handle(arrival):
         together.wait(WAIT_S)
         done.put(threading.current_thread())
 
     receivers = Receivers(channel, handle, name="receiver")
-    channel.send(*range(8))
-    threads = {done.get(timeout=WAIT_S) for _ in range(8)}
-    assert len(threads) == 8
+    channel.send(*range(24))
+    threads = {done.get(timeout=WAIT_S) for _ in range(24)}
+    assert len(threads) == 24
     until_s = time.monotonic() + WAIT_S
-    while sum(thread.is_alive() for thread in threads) > 2 and time.monotonic() < until_s:
+    while sum(thread.is_alive() for thread in threads) > 8 and time.monotonic() < until_s:
         time.sleep(0.01)
-    assert sum(thread.is_alive() for thread in threads) <= 2
+    assert sum(thread.is_alive() for thread in threads) <= 8
     channel.close()
     receivers.join()
     assert not any(thread.is_alive() for thread in threads)

@@ -194,7 +194,7 @@ def add_to_row(
             table[row, k] += weight * values[point, start + k]
 
 
-@kernel(fastmath=True, error_model="numpy", inline="always")
+@kernel(fastmath=True, inline="always")
 def move_row(
     gradients: Floats,
     values: Floats,

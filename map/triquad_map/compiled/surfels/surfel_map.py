@@ -13,10 +13,11 @@ from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.surfels.nearest_surface import ShownSurfels, improve_nearest
 from triquad_map.compiled.surfels.surfel_search import find_nearest
 from triquad_map.compiled.surfels.surfel_tree import TreeShape, surfel_tree, tree_shape
 from triquad_map.compiled.voxel_index import LOW, SHIFT, keys_of
-from triquad_map.composition.region import NearestSurfels
+from triquad_map.composition.region import NearestSurfels, RegionFrame
 from triquad_map.surface import (
     SampleField,
     ShownByRays,
@@ -26,6 +27,7 @@ from triquad_map.surface import (
     nothing_shown,
     support_confidence,
 )
+from triquad_map.view import NearestSurface
 
 _NEVER = -1
 
@@ -121,6 +123,8 @@ class SurfelMap:
         self._tree = surfel_tree(places.shape, places.voxels, fitted.surfels)
         self.confidence = support_confidence(evidence.levels, fitted.surfels.kinds)
         self.seen_s = np.repeat(evidence.seen_s, np.diff(places.starts))
+        kinds, normals = fitted.surfels.kinds, fitted.surfels.normals
+        self._shown = ShownSurfels(kinds, normals, self.confidence, self.seen_s)
 
     def __len__(self) -> int:
         return len(self._fitted.epochs)
@@ -138,6 +142,10 @@ class SurfelMap:
     def find_nearest(self, points: Doubles, found: NearestSurfels) -> None:
         """Improve ``found`` where a surfel lies nearer to leaf coordinates ``points`` [N, 3]."""
         find_nearest(points, self._tree, found)
+
+    def improve(self, nearest: NearestSurface, points: Doubles, frame: RegionFrame) -> None:
+        """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
+        improve_nearest(points, self._tree, self._shown, frame, nearest)
 
     def updated(
         self,

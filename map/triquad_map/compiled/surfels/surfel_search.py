@@ -24,6 +24,7 @@ from triquad_map.compiled.lanes import (
     root,
     store,
     total,
+    whole,
 )
 from triquad_map.compiled.surfels.surfel_tree import (
     CORNER,
@@ -49,6 +50,13 @@ _SMOOTHING = np.float32(SMOOTHING)
 _KEPT = 128
 """How many leaves are remembered for the direction."""
 
+_SQUARES = 3
+"""In what is remembered of each leaf, the row after x, y and z."""
+
+_WHOLE = np.float32(1 << 24) / _KEPT
+"""Weights and distances are counted in whole numbers up to this, of which so many have a sum that
+is exact: it does not hang on the order in which leaves are met, and so on no other point."""
+
 _WAITING = 1024
 """Room for boxes that may have to be opened: seven levels of nodes with 64 below each, and more."""
 
@@ -70,8 +78,7 @@ class Room(NamedTuple):
 
     kept: Ints  # [_KEPT] leaves that may hold surfels that count in the direction
     nearest: Floats  # [_KEPT] square of the distance to the nearest surfel of each
-    squares: Floats  # [_KEPT, LANES] and to all
-    order: Ints  # [_KEPT] in which they count
+    offsets: Floats  # [_KEPT, 4, LANES] from all of each, x, y, z, and the squares of their lengths
     waiting: Ints  # [_WAITING] leaves and nodes that may hold nearer surfels, the nearest last
     away: Floats  # [_WAITING] squares of the distances to their boxes
     aside: Floats  # [LANES] room for those of a few boxes
@@ -107,15 +114,16 @@ def _normals(tree: SurfelTree, leaf: int) -> Vectors:
 
 
 @inner_kernel(fastmath=True)
-def _squares(tree: SurfelTree, leaf: int, at: Place) -> Lanes:
-    """Squares of the distances from a place to a leaf's surfels."""
+def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
+    """From the points of a leaf's surfels that are nearest to a place to that place."""
     x, y, z = _from_surfels(tree, leaf, at)
     u, v, w = _normals(tree, leaf)
     height = x * u + y * v + z * w
-    height = height * height
-    beside = root(larger(x * x + y * y + z * z - height, fill(0.0)))
-    beyond = larger(beside - load(tree.surfels, (leaf, RADIUS, 0)), fill(0.0))
-    return height + beyond * beyond
+    u, v, w = height * u, height * v, height * w
+    x, y, z = x - u, y - v, z - w
+    beside = larger(root(x * x + y * y + z * z), fill(_NO_LENGTH))
+    share = larger(fill(1.0) - load(tree.surfels, (leaf, RADIUS, 0)) / beside, fill(0.0))
+    return u + share * x, v + share * y, w + share * z
 
 
 @inner_kernel(fastmath=True)
@@ -125,7 +133,8 @@ def _sifted(room: Room, limit: float) -> int:
     for i in range(_KEPT):
         if room.nearest[i] <= limit:
             room.kept[count], room.nearest[count] = room.kept[i], room.nearest[i]
-            store(room.squares, (count, 0), load(room.squares, (i, 0)))
+            for row in range(_SQUARES + 1):
+                store(room.offsets, (count, row, 0), load(room.offsets, (i, row, 0)))
             count += 1
     return count
 
@@ -185,7 +194,8 @@ def _search(tree: SurfelTree, at: Place, distance: float, limit: float, room: Ro
         if box >= leaves:
             count = _open(tree, box - leaves, at, limit, room, count)
             continue
-        squares = _squares(tree, box, at)
+        x, y, z = _closest_offset(tree, box, at)
+        squares = x * x + y * y + z * z
         nearest = least(squares)
         if nearest > limit:
             continue
@@ -198,40 +208,10 @@ def _search(tree: SurfelTree, at: Place, distance: float, limit: float, room: Ro
             kept = min(kept, _KEPT - 1)
         if kept < _KEPT:
             room.kept[kept], room.nearest[kept] = box, nearest
-            store(room.squares, (kept, 0), squares)
+            for row, numbers in enumerate((x, y, z, squares)):
+                store(room.offsets, (kept, row, 0), numbers)
             kept += 1
     return Found(leaf, lane, best, kept)
-
-
-@inner_kernel(fastmath=True)
-def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
-    """From the points of a leaf's surfels that are nearest to a place to that place."""
-    x, y, z = _from_surfels(tree, leaf, at)
-    u, v, w = _normals(tree, leaf)
-    height = x * u + y * v + z * w
-    u, v, w = height * u, height * v, height * w
-    x, y, z = x - u, y - v, z - w
-    beside = larger(root(x * x + y * y + z * z), fill(_NO_LENGTH))
-    share = larger(fill(1.0) - load(tree.surfels, (leaf, RADIUS, 0)) / beside, fill(0.0))
-    return u + share * x, v + share * y, w + share * z
-
-
-@inner_kernel(fastmath=True)
-def _put_in_order(room: Room, kept: int, far: float) -> int:
-    """Order the kept leaves of which a surfel is so near; how many they are.
-
-    In which order they were met hangs on other points, and so would the last digit of a sum.
-    """
-    count = 0
-    for k in range(kept):
-        if room.nearest[k] <= far:
-            place = count
-            while place > 0 and room.kept[room.order[place - 1]] > room.kept[k]:
-                room.order[place] = room.order[place - 1]
-                place -= 1
-            room.order[place] = k
-            count += 1
-    return count
 
 
 @inner_kernel(fastmath=True)
@@ -240,24 +220,27 @@ def _write_found(
 ) -> None:
     """Write what was found for point ``i``."""
     best = np.sqrt(found.square)
-    far = (best + _SMOOTHING) ** 2
+    farthest = best + _SMOOTHING
+    unit = _WHOLE / farthest
     weights, x, y, z = fill(0.0), fill(0.0), fill(0.0), fill(0.0)
-    for turn in range(_put_in_order(room, found.kept, far)):
-        k = room.order[turn]
-        farther = (root(load(room.squares, (k, 0))) - fill(best)) * fill(1 / _SMOOTHING)
+    for k in range(found.kept):
+        if room.nearest[k] > farthest * farthest:
+            continue
+        farther = (root(load(room.offsets, (k, _SQUARES, 0))) - fill(best)) * fill(1 / _SMOOTHING)
         weight = larger(fill(1.0) - farther, fill(0.0))
         weight = weight * weight
-        a, b, c = _closest_offset(tree, int(room.kept[k]), at)
-        weights = weights + weight
-        x, y, z = x + weight * a, y + weight * b, z + weight * c
-    share = 1 / total(weights)
+        weights = weights + whole(fill(_WHOLE) * weight)
+        weight = fill(unit) * weight
+        x = x + whole(weight * load(room.offsets, (k, 0, 0)))
+        y = y + whole(weight * load(room.offsets, (k, 1, 0)))
+        z = z + whole(weight * load(room.offsets, (k, 2, 0)))
+        if room.kept[k] == found.leaf:
+            for axis in range(3):
+                nearest.closest[i, axis] = at[axis] - room.offsets[k, axis, found.lane]
+    share = farthest / total(weights)
     nearest.means[i, 0] = at[0] - total(x) * share
     nearest.means[i, 1] = at[1] - total(y) * share
     nearest.means[i, 2] = at[2] - total(z) * share
-    x, y, z = _closest_offset(tree, found.leaf, at)
-    for axis, offsets in enumerate((x, y, z)):
-        store(room.aside, (0,), offsets)
-        nearest.closest[i, axis] = at[axis] - room.aside[found.lane]
     nearest.distances[i] = best
     nearest.rows[i] = tree.order[tree.leaves[found.leaf] + found.lane]
 
@@ -338,8 +321,7 @@ def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> 
     room = Room(
         np.empty(_KEPT, np.int32),
         np.empty(_KEPT, np.float32),
-        np.empty((_KEPT, LANES), np.float32),
-        np.empty(_KEPT, np.int32),
+        np.empty((_KEPT, _SQUARES + 1, LANES), np.float32),
         np.empty(_WAITING, np.int32),
         np.empty(_WAITING, np.float32),
         np.empty(LANES, np.float32),
