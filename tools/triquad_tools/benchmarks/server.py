@@ -2,6 +2,7 @@
 
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,8 @@ _SOON_S = 2.0  # after the last scan
 _SETTLE_LIMIT_S = 300.0
 _MESH_SAMPLES = 6_000_000
 _REPEATS = 15
+_ASKED = 1_000
+_QUESTIONS, _FIRST = 320, 20  # the first are not counted
 
 
 def measure_server(made: BenchStreet) -> list[Figure]:
@@ -37,6 +40,7 @@ def measure_server(made: BenchStreet) -> list[Figure]:
         wait_until_settled(client, _SETTLE_LIMIT_S)
         settled_s = time.monotonic() - started
         figures.append(Figure("from then until settled", settled_s, "s", at_most=300))
+        figures += _idle(client, made)
         figures += _converged(client, made)
         figures += _network(client, made, server.folder)
         resident = client.status().memory_bytes / 1e6
@@ -56,6 +60,26 @@ def _early(client: Client, made: BenchStreet) -> list[Figure]:
         Figure("then: F-score", 100 * scores.f_score, "%", at_least=99),
         Figure("then: completion ratio", 100 * scores.completion_ratio, "%", at_least=95),
     ]
+
+
+def _idle(client: Client, made: BenchStreet) -> list[Figure]:
+    """How soon an idle server answers one question after the other."""
+    around = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
+    points = around + np.random.default_rng(0).uniform((-8, -8, -1.5), (8, 8, 2.0), (_ASKED, 3))
+    near = np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
+
+    def typical_ms(ask: Callable[[], object]) -> float:
+        return 1e3 * statistics.median([seconds(ask) for _ in range(_QUESTIONS)][_FIRST:])
+
+    one_ms = typical_ms(lambda: client.query_sdf(near[:1], gradient=True))
+    gradient_ms = typical_ms(lambda: client.query_sdf(near, gradient=True))
+    distance_ms = typical_ms(lambda: client.query_distance(points))
+    return [
+        Figure("one point with gradient while idle, median", one_ms, "ms", at_most=0.7),
+        Figure("1,000 points with gradient while idle, median", gradient_ms, "ms", at_most=1.4),
+        Figure("1,000 distances to 5 m with gradient while idle, median", distance_ms, "ms",
+               at_most=2.2),
+    ]  # fmt: skip
 
 
 def _converged(client: Client, made: BenchStreet) -> list[Figure]:
