@@ -170,7 +170,7 @@ class WarmUp:
         region.field.live_view().evaluate(self._points(100), gradient=True)
         region.pool.focus(blocks)  # as if it were seen anew
         again.train()
-        region.pool.limit(len(region.pool))
+        region.pool.limit(len(region.pool) - 1)
         new = np.zeros(len(region.pool), np.bool_)
         new[: len(new) // 4] = True
         region.pool.add(region.pool.table.of(new))  # in place of others

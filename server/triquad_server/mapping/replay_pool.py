@@ -45,8 +45,8 @@ _AHEAD = 16  # places that are brought into the cache before their turn
 _NO_LIMIT = 1 << 62
 _ROOM = 1.1  # at most, of the capacity: it grows with the map
 
-RAY_BYTES = math.ceil(_ROOM * 4 * (COLUMNS + 2))
-"""Of a ray, with where its origin and its bin are, and with the room beside it."""
+RAY_BYTES = math.ceil(_ROOM * 4 * (COLUMNS + 1))
+"""Of a ray, with where its origin is, and with the room beside it."""
 
 
 @inner_kernel()
@@ -58,8 +58,24 @@ def _bin(row: Floats, bin_m: float) -> int:
 
 
 @kernel()
+def _count(rows: Floats, bin_m: float) -> Ints:
+    """How many rays [N] end in each bin."""
+    occupancy = np.zeros(_BINS, np.int32)
+    for i in range(len(rows)):
+        occupancy[_bin(rows[i], bin_m)] += 1
+    return occupancy
+
+
+@kernel()
 def _best_to_push_out(
-    size: int, count: int, first: int, stride: int, offset: int, bins: Ints, occupancy: Ints
+    size: int,
+    count: int,
+    first: int,
+    stride: int,
+    offset: int,
+    rows: Floats,
+    bin_m: float,
+    occupancy: Ints,
 ) -> Longs:
     """Different places whose rays are the best to push out, ``count <= size // 2`` of them.
 
@@ -70,7 +86,11 @@ def _best_to_push_out(
     for i in range(count):
         left = (first + i * stride) % half
         right = half + (left + offset) % half
-        chosen[i] = left if occupancy[bins[left]] > occupancy[bins[right]] else right
+        on_left, on_right = (
+            occupancy[_bin(rows[left], bin_m)],
+            occupancy[_bin(rows[right], bin_m)],
+        )
+        chosen[i] = left if on_left > on_right else right
     return chosen
 
 
@@ -82,7 +102,6 @@ def _put(
     used: int,
     rows: Floats,
     origin_of: Ints,
-    bins: Ints,
     occupancy: Ints,
 ) -> None:
     """Put new rays into places; those below ``used`` hold one that is pushed out."""
@@ -90,11 +109,10 @@ def _put(
         prefetch_row(rows, places[min(i + _AHEAD, len(places) - 1)])
         place = places[i]
         if place < used:
-            occupancy[bins[place]] -= 1
+            occupancy[_bin(rows[place], bin_m)] -= 1
         rows[place] = new.rows[i]
         origin_of[place] = new.origin_of[i]
-        bins[place] = _bin(new.rows[i], bin_m)
-        occupancy[bins[place]] += 1
+        occupancy[_bin(new.rows[i], bin_m)] += 1
 
 
 @kernel(inline="always")
@@ -144,18 +162,18 @@ def _remove_ending_in(
     size: int,
     rows: Floats,
     origin_of: Ints,
-    bins: Ints,
     occupancy: Ints,
 ) -> int:
     """Remove the rays that end in voxels, and put the last ones there; returns the size."""
     i = 0
     while i < size:
-        if bins_of_gone[bins[i]]:
+        own_bin = _bin(rows[i], _BIN_LEAVES * leaf_m)
+        if bins_of_gone[own_bin]:
             x, y, z = _voxel(rows[i], leaf_m, middle)
             if find_row(gone, pack(x, y, z)) >= 0:
-                occupancy[bins[i]] -= 1
+                occupancy[own_bin] -= 1
                 size -= 1
-                rows[i], origin_of[i], bins[i] = rows[size], origin_of[size], bins[size]
+                rows[i], origin_of[i] = rows[size], origin_of[size]
                 continue
         i += 1
     return size
@@ -187,8 +205,7 @@ class ReplayPool:
         self._origins = np.zeros((0, 3), np.float32)
         self._origin_count = 0
         self._on_device = _rays_on_device(memory, placement, seed)
-        self._bins = np.zeros(0, np.int32)
-        self._occupancy = np.zeros(_BINS, np.int32)
+        self._occupancy = np.zeros(_BINS, np.int32)  # rays that end in each bin
         self._fresh = np.zeros(0, np.int64)
         self._attended = np.zeros(0, np.int64)
         self._blocks: Index | None = None  # in which the rays end that are drawn on at random
@@ -228,7 +245,6 @@ class ReplayPool:
             used,
             self._rows,
             self._origin_of,
-            self._bins,
             self._occupancy,
         )
         if self._on_device is not None:
@@ -315,7 +331,6 @@ class ReplayPool:
             self._size,
             self._rows,
             self._origin_of,
-            self._bins,
             self._occupancy,
         )
         self._fresh = self._fresh[self._fresh < self._size]
@@ -356,10 +371,10 @@ class ReplayPool:
 
     def _keep(self, places: Longs) -> None:
         # All or none, where memory is short; so below.
-        rows, origin_of, bins = self._rows[places], self._origin_of[places], self._bins[places]
-        self._rows, self._origin_of, self._bins = rows, origin_of, bins
+        rows, origin_of = self._rows[places], self._origin_of[places]
+        self._rows, self._origin_of = rows, origin_of
         self._size = len(places)
-        self._occupancy = np.bincount(self._bins, minlength=_BINS).astype(np.int32)
+        self._occupancy = _count(rows, self._bin_m)
         self._fresh = self._fresh[:0]
         self._attended = self._attended[:0]
         self._focused = None
@@ -368,14 +383,24 @@ class ReplayPool:
     def _extend(self, size: int) -> None:
         if size > len(self._rows):
             room = max(size, min(2 * len(self._rows), int(_ROOM * self._capacity)))
-            used = slice(self._size)
-            self._rows, self._origin_of, self._bins = (
-                with_room(self._rows[used], room),
-                with_room(self._origin_of[used], room),
-                with_room(self._bins[used], room),
-            )
+            # The rows last: where memory is short, all of this is tried again.
+            for name in ("_origin_of", "_rows"):
+                self._make_room(name, room)
             self._copy_to_device()
         self._size = size
+
+    def _make_room(self, name: str, rows: int) -> None:
+        """Let an array have so many rows, in place.
+
+        To copy it every few scans of new surface would take as long as all else here.
+        """
+        array = vars(self).pop(name)  # numpy sees to it that nobody else holds on to it
+        try:
+            array.resize((rows, *array.shape[1:]))
+        except ValueError:  # somebody does
+            array = with_room(array, rows)
+        finally:
+            setattr(self, name, array)
 
     def _add_origins(self, new: Floats) -> int:
         """Add origins [K, 3], in place of those of no ray any more; returns the first one's row."""
@@ -405,7 +430,7 @@ class ReplayPool:
         first, offset = self._rng.integers(half, size=2)
         stride = _coprime(half)
         return _best_to_push_out(
-            self._size, count, first, stride, offset, self._bins, self._occupancy
+            self._size, count, first, stride, offset, self._rows, self._bin_m, self._occupancy
         )
 
 

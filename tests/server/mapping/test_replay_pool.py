@@ -48,6 +48,18 @@ def test_it_is_bounded() -> None:
     assert len(pool) == 1000
 
 
+def test_what_somebody_holds_stays_as_it_was_while_the_pool_grows() -> None:
+    pool = new_pool(100_000)
+    pool.add(labelled(place(0, 500)))
+    held = pool.table
+    wanted = held.rows.copy()
+    for i in range(20):
+        pool.add(labelled(place(i, 2000)))
+    np.testing.assert_array_equal(held.rows, wanted)
+    np.testing.assert_array_equal(pool.table.rows[:500], wanted)
+    assert len(pool) == 40_500
+
+
 def test_samples_come_back_as_they_were() -> None:
     pool = new_pool(10_000)
     points = place(0, 8000)
