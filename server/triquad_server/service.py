@@ -226,6 +226,7 @@ class Service:
         questions = Questions(
             self._mapper.epochs.view,
             QuestionLimits(limits.max_query_points, limits.max_search_points),
+            give_way=self._mapper.epochs.gate.wait_for_mapping,
         )
         self._serve("field", {keys.SDF: questions.of(SdfRequest)}, limits.query_workers)
         self._serve(

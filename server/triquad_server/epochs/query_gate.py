@@ -1,4 +1,4 @@
-"""When work in the background goes on: queries come first, and it takes turns."""
+"""When work in the background goes on: queries come first, unless scans would be lost for them."""
 
 import math
 import threading
@@ -6,6 +6,12 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+_PERIOD_S = 0.05
+"""Where queries are held back, they wait in the first part of each such period, and those that have
+come are answered in the rest."""
+
+_HELD_S = 0.02
 
 
 class QueryGate:
@@ -15,6 +21,7 @@ class QueryGate:
         self._idle = threading.Condition()
         self._in_flight = 0
         self._answered_s = -math.inf  # when a query last was, monotonic
+        self._holds_back = False
         self._turns = threading.Condition()
         self._waiting: deque[object] = deque()  # whose turn it is, then who comes next
 
@@ -41,6 +48,26 @@ class QueryGate:
         """Return once no query is in flight, or after ``limit_s``: training never starves."""
         with self._idle:
             self._idle.wait_for(lambda: self._in_flight == 0, limit_s)
+
+    def hold_back(self, held: bool) -> None:
+        """Leave most of the time to mapping from now on, or no more: it does not keep up."""
+        with self._idle:
+            self._holds_back = held
+            self._idle.notify_all()
+
+    def wait_for_mapping(self) -> None:
+        """Within a query: return once it may go on, which is at once but where it is held back."""
+        with self._idle:
+            if not self._held_s():
+                return
+            self._in_flight -= 1  # meanwhile nobody gives way to it
+            self._idle.notify_all()
+            while (held_s := self._held_s()) > 0:
+                self._idle.wait(held_s)
+            self._in_flight += 1
+
+    def _held_s(self) -> float:
+        return max(0.0, _HELD_S - time.monotonic() % _PERIOD_S) if self._holds_back else 0.0
 
     @contextmanager
     def turn(self) -> Iterator[None]:

@@ -15,6 +15,9 @@ MAX_SOURCES_WAITING = 64
 _BEHIND = 0.25
 """A source falls behind of whose scans more than this share of its limit wait."""
 
+_PRESSED = 0.5
+"""And is pressed where more than this share does."""
+
 _SCAN_BYTES = 2_000  # that a scan takes beside its points
 
 
@@ -87,6 +90,10 @@ class ScanQueue:
             )
             self._in_hand = scan is not None
             return scan
+
+    def is_pressed(self, source: str) -> bool:
+        """Whether so many scans of a source wait that some will soon be lost."""
+        return self._scans.count(Owner(source)) > _PRESSED * self.limit
 
     def _falls_behind(self, source: str) -> bool:
         return self._scans.count(Owner(source)) > _BEHIND * self.limit

@@ -219,6 +219,7 @@ class MapperThread:
             _log.exception("the mapper was stopped by an internal error")
             self._failed()
         finally:
+            self.epochs.gate.hold_back(False)
             self._refuse_commands(ended)
 
     def _turn_safely(self) -> None:
@@ -306,6 +307,7 @@ class MapperThread:
             self._ingest(scan)
             if time.monotonic() > ends_s:
                 break
+        self.epochs.gate.hold_back(any(map(self._scans.is_pressed, sources)))
         return bool(sources)
 
     def _ingest(self, scan: Scan) -> None:

@@ -45,3 +45,32 @@ def test_asked_a_short_time_ago() -> None:
         assert gate.asked_within(0.0)
     assert gate.asked_within(_LONG_S)
     assert not gate.asked_within(0.0)
+
+
+def test_while_mapping_is_pressed_it_gives_way_to_no_query_for_long() -> None:
+    gate = QueryGate()
+    answered = threading.Event()
+
+    def ask() -> None:
+        with gate.query():
+            while not answered.is_set():
+                gate.wait_for_mapping()
+
+    gate.hold_back(True)
+    with ThreadPoolExecutor(1) as threads:
+        asked = threads.submit(ask)
+        for _ in range(3):
+            gate.give_way(_LONG_S)  # returns while the query is held back
+        answered.set()
+        asked.result(_LONG_S)
+
+
+def test_what_is_held_back_is_answered_in_the_end() -> None:
+    gate = QueryGate()
+    gate.hold_back(True)
+    for _ in range(5):
+        with gate.query():
+            gate.wait_for_mapping()
+    gate.hold_back(False)
+    with gate.query():
+        gate.wait_for_mapping()

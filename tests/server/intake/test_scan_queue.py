@@ -222,6 +222,17 @@ def test_a_source_is_passed_over_until_it_falls_behind():
     assert queue.take().sequence == 2
 
 
+def test_a_source_is_pressed_while_more_than_half_of_what_may_wait_does():
+    queue = ScanQueue(limit=8)
+    for sequence in range(5):
+        assert not queue.is_pressed("a")
+        queue.put(servers.scan(sequence, source="a"))
+    assert queue.is_pressed("a")
+    assert not queue.is_pressed("b")
+    queue.take()
+    assert not queue.is_pressed("a")
+
+
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():
     nbytes = servers.scan().points.nbytes
     queue = ScanQueue(100, 10 * nbytes)

@@ -26,7 +26,7 @@ from triquad_tools.benchmarks.ground import ground_latency, ground_points, measu
 from triquad_tools.benchmarks.served import MAP, Served, latency_figures, served, stream
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.demo.probe import ProbeReport
-from triquad_tools.recordings.publishing import wait_until_settled
+from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
 
 Points = Doubles
 
@@ -118,10 +118,14 @@ def _sixteen(server: Served, made: BenchStreet, points: Sequence[Points]) -> lis
             time.sleep(2 * _WARM_S)
             title = f"streaming beside {_CLIENTS} planners ({question})"
             trained = _trained_per_s(server, made, title)
+            lost = server.client.flush(FLUSH_TIMEOUT_S).lost
             met = [probe.finish() for probe in asking]
         name = f"{_CLIENTS} clients, {question}"
         figures += _met_together(name, met)
-        figures.append(Figure(f"{name}: training keeps", trained / alone, "", at_least=0.5))
+        figures += [
+            Figure(f"{name}: training keeps", trained / alone, "", at_least=0.5),
+            Figure(f"{name}: scans lost of {len(made.scans)}", lost, "", at_most=0),
+        ]
     return figures
 
 
