@@ -11,7 +11,7 @@ _PERIOD_S = 0.05
 """Where queries are held back, they wait in the first part of each such period, and those that have
 come are answered in the rest."""
 
-_HELD_S = 0.02
+_MOST_HELD = 0.9
 
 
 class QueryGate:
@@ -21,7 +21,7 @@ class QueryGate:
         self._idle = threading.Condition()
         self._in_flight = 0
         self._answered_s = -math.inf  # when a query last was, monotonic
-        self._holds_back = False
+        self._held = 0.0  # for which share of the time queries are held back
         self._turns = threading.Condition()
         self._waiting: deque[object] = deque()  # whose turn it is, then who comes next
 
@@ -49,10 +49,10 @@ class QueryGate:
         with self._idle:
             self._idle.wait_for(lambda: self._in_flight == 0, limit_s)
 
-    def hold_back(self, held: bool) -> None:
-        """Leave most of the time to mapping from now on, or no more: it does not keep up."""
+    def hold_back(self, share: float) -> None:
+        """From now on, leave this share of the time, or nearly all, to mapping: it falls behind."""
         with self._idle:
-            self._holds_back = held
+            self._held = min(share, _MOST_HELD)
             self._idle.notify_all()
 
     def wait_for_mapping(self) -> None:
@@ -67,7 +67,7 @@ class QueryGate:
             self._in_flight += 1
 
     def _held_s(self) -> float:
-        return max(0.0, _HELD_S - time.monotonic() % _PERIOD_S) if self._holds_back else 0.0
+        return max(0.0, self._held * _PERIOD_S - time.monotonic() % _PERIOD_S)
 
     @contextmanager
     def turn(self) -> Iterator[None]:

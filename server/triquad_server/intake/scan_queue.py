@@ -15,9 +15,6 @@ MAX_SOURCES_WAITING = 64
 _BEHIND = 0.25
 """A source falls behind of whose scans more than this share of its limit wait."""
 
-_PRESSED = 0.5
-"""And is pressed where more than this share does."""
-
 _SCAN_BYTES = 2_000  # that a scan takes beside its points
 
 
@@ -91,9 +88,10 @@ class ScanQueue:
             self._in_hand = scan is not None
             return scan
 
-    def is_pressed(self, source: str) -> bool:
-        """Whether so many scans of a source wait that some will soon be lost."""
-        return self._scans.count(Owner(source)) > _PRESSED * self.limit
+    def pressure(self, source: str) -> float:
+        """How near a source is to losing scans: 0 until it falls behind, 1 when it does."""
+        share = self._scans.count(Owner(source)) / self.limit
+        return min(1.0, max(0.0, share - _BEHIND) / (1.0 - _BEHIND))
 
     def _falls_behind(self, source: str) -> bool:
         return self._scans.count(Owner(source)) > _BEHIND * self.limit

@@ -219,7 +219,7 @@ class MapperThread:
             _log.exception("the mapper was stopped by an internal error")
             self._failed()
         finally:
-            self.epochs.gate.hold_back(False)
+            self.epochs.gate.hold_back(0.0)
             self._refuse_commands(ended)
 
     def _turn_safely(self) -> None:
@@ -307,7 +307,7 @@ class MapperThread:
             self._ingest(scan)
             if time.monotonic() > ends_s:
                 break
-        self.epochs.gate.hold_back(any(map(self._scans.is_pressed, sources)))
+        self.epochs.gate.hold_back(max(map(self._scans.pressure, sources), default=0.0))
         return bool(sources)
 
     def _ingest(self, scan: Scan) -> None:

@@ -222,15 +222,16 @@ def test_a_source_is_passed_over_until_it_falls_behind():
     assert queue.take().sequence == 2
 
 
-def test_a_source_is_pressed_while_more_than_half_of_what_may_wait_does():
+def test_pressure_rises_from_where_a_source_falls_behind_to_where_it_loses_scans():
     queue = ScanQueue(limit=8)
-    for sequence in range(5):
-        assert not queue.is_pressed("a")
+    pressures = []
+    for sequence in range(9):
+        pressures.append(queue.pressure("a"))
         queue.put(servers.scan(sequence, source="a"))
-    assert queue.is_pressed("a")
-    assert not queue.is_pressed("b")
-    queue.take()
-    assert not queue.is_pressed("a")
+    assert pressures[:3] == [0.0, 0.0, 0.0]
+    assert pressures[3:] == sorted(set(pressures[3:]))
+    assert pressures[-1] == queue.pressure("a") == 1.0
+    assert queue.pressure("b") == 0.0
 
 
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():
