@@ -72,6 +72,11 @@ class FairQueue(Generic[ItemT]):
         lanes = self._groups.get(owner.group)
         return len(lanes[owner.name].items) if lanes and owner.name in lanes else 0
 
+    def most(self) -> int:
+        """Items that wait of the owner who has most."""
+        lanes = (lane for lanes in self._groups.values() for lane in lanes.values())
+        return max((len(lane.items) for lane in lanes), default=0)
+
     def put(self, owner: Owner, item: ItemT, nbytes: int) -> None:
         """Add an item at the end of its owner's; the caller then drops what is too much."""
         lane = self._lane(owner)

@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 _PERIOD_S = 0.05
@@ -21,7 +21,7 @@ class QueryGate:
         self._idle = threading.Condition()
         self._in_flight = 0
         self._answered_s = -math.inf  # when a query last was, monotonic
-        self._held = 0.0  # for which share of the time queries are held back
+        self._pressure: Callable[[], float] = lambda: 0.0
         self._turns = threading.Condition()
         self._waiting: deque[object] = deque()  # whose turn it is, then who comes next
 
@@ -49,11 +49,9 @@ class QueryGate:
         with self._idle:
             self._idle.wait_for(lambda: self._in_flight == 0, limit_s)
 
-    def hold_back(self, share: float) -> None:
-        """From now on, leave this share of the time, or nearly all, to mapping: it falls behind."""
-        with self._idle:
-            self._held = min(share, _MOST_HELD)
-            self._idle.notify_all()
+    def hold_back_by(self, pressure: Callable[[], float]) -> None:
+        """Hold queries back for the share of the time that ``pressure`` tells, or nearly all."""
+        self._pressure = pressure
 
     def wait_for_mapping(self) -> None:
         """Within a query: return once it may go on, which is at once but where it is held back."""
@@ -67,7 +65,8 @@ class QueryGate:
             self._in_flight += 1
 
     def _held_s(self) -> float:
-        return max(0.0, self._held * _PERIOD_S - time.monotonic() % _PERIOD_S)
+        held_s = min(self._pressure(), _MOST_HELD) * _PERIOD_S
+        return max(0.0, held_s - time.monotonic() % _PERIOD_S)
 
     @contextmanager
     def turn(self) -> Iterator[None]:

@@ -88,10 +88,11 @@ class ScanQueue:
             self._in_hand = scan is not None
             return scan
 
-    def pressure(self, source: str) -> float:
-        """How near a source is to losing scans: 0 until it falls behind, 1 when it does."""
-        share = self._scans.count(Owner(source)) / self.limit
-        return min(1.0, max(0.0, share - _BEHIND) / (1.0 - _BEHIND))
+    def pressure(self) -> float:
+        """How near a source is to losing scans: 0 while half as many wait as may, 1: it does."""
+        with self._lock:
+            share = self._scans.most() / self.limit
+        return min(1.0, max(0.0, 2.0 * share - 1.0))
 
     def _falls_behind(self, source: str) -> bool:
         return self._scans.count(Owner(source)) > _BEHIND * self.limit

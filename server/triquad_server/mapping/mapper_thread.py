@@ -125,6 +125,7 @@ class MapperThread:
         self._fit = map_fit(mapper.regions)
         older_bytes = (memory or MemorySettings()).epochs_bytes
         self.epochs = EpochHistory(first, settings, older_bytes=older_bytes)
+        self.epochs.gate.hold_back_by(scans.pressure)
         self.surface = SurfaceHistory(first, settings.changes_kept)
         self.trails = SourceTrails(first.field_settings.leaf_m)
         self.progress = Progress()
@@ -219,7 +220,6 @@ class MapperThread:
             _log.exception("the mapper was stopped by an internal error")
             self._failed()
         finally:
-            self.epochs.gate.hold_back(0.0)
             self._refuse_commands(ended)
 
     def _turn_safely(self) -> None:
@@ -307,7 +307,6 @@ class MapperThread:
             self._ingest(scan)
             if time.monotonic() > ends_s:
                 break
-        self.epochs.gate.hold_back(max(map(self._scans.pressure, sources), default=0.0))
         return bool(sources)
 
     def _ingest(self, scan: Scan) -> None:

@@ -56,7 +56,7 @@ def test_while_mapping_is_pressed_it_gives_way_to_no_query_for_long() -> None:
             while not answered.is_set():
                 gate.wait_for_mapping()
 
-    gate.hold_back(1.0)
+    gate.hold_back_by(lambda: 1.0)
     with ThreadPoolExecutor(1) as threads:
         asked = threads.submit(ask)
         for _ in range(3):
@@ -67,10 +67,10 @@ def test_while_mapping_is_pressed_it_gives_way_to_no_query_for_long() -> None:
 
 def test_what_is_held_back_is_answered_in_the_end() -> None:
     gate = QueryGate()
-    gate.hold_back(1.0)
+    gate.hold_back_by(lambda: 1.0)
     for _ in range(5):
         with gate.query():
             gate.wait_for_mapping()
-    gate.hold_back(0.0)
+    gate.hold_back_by(lambda: 0.0)
     with gate.query():
         gate.wait_for_mapping()

@@ -222,16 +222,16 @@ def test_a_source_is_passed_over_until_it_falls_behind():
     assert queue.take().sequence == 2
 
 
-def test_pressure_rises_from_where_a_source_falls_behind_to_where_it_loses_scans():
+def test_pressure_rises_from_half_of_what_may_wait_to_where_scans_are_lost():
     queue = ScanQueue(limit=8)
     pressures = []
     for sequence in range(9):
-        pressures.append(queue.pressure("a"))
+        pressures.append(queue.pressure())
         queue.put(servers.scan(sequence, source="a"))
-    assert pressures[:3] == [0.0, 0.0, 0.0]
-    assert pressures[3:] == sorted(set(pressures[3:]))
-    assert pressures[-1] == queue.pressure("a") == 1.0
-    assert queue.pressure("b") == 0.0
+    assert pressures[:5] == [0.0] * 5
+    assert pressures[5:] == sorted(set(pressures[5:]))
+    queue.put(servers.scan(0, source="b"))
+    assert pressures[-1] == queue.pressure() == 1.0
 
 
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():
