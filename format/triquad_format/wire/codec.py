@@ -31,6 +31,8 @@ _MAX_WIRE_STRING_BYTES = 65_536
 _MAX_ITEMS = 65_536
 MAX_OBJECTS = 20_000
 _MAX_DEPTH = 16
+# To begin with: a refusal for want of memory must not want 256 KiB.
+_BUFFER_BYTES = 4096
 
 _DTYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"})
 _ARRAY_KEYS = {"dtype", "shape", "data"}
@@ -102,7 +104,7 @@ def encode(message: Message) -> bytes:
     """
     kind = type(message).__name__
     body = {"triquad": PROTOCOL_VERSION, "kind": kind, **_pack_fields(kind, message)}
-    return typing.cast(bytes, msgpack.packb(body))
+    return typing.cast(bytes, msgpack.packb(body, buf_size=_BUFFER_BYTES))
 
 
 def decode(expected: type[MessageT], payload: bytes) -> MessageT:

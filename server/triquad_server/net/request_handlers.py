@@ -152,7 +152,9 @@ class RequestHandlers:
             job = self._take(query, key)
             if job is not None:
                 self._work(job)
-        except Exception:  # such as too little memory: the next one may be answered
+        except MemoryError:
+            _log.warning("a request on %s goes unanswered: too little memory", key)
+        except Exception:  # the next one may be answered
             _log.exception("a request on %s could not be received", key)
 
     def _take(self, query: zenoh.Query, key: str) -> Job[Request] | None:
