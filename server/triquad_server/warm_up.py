@@ -16,8 +16,8 @@ from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.kernel import compiled_marks
 from triquad_map.compiled.surfels.surfel_map import first_surfels
-from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples
+from triquad_map.composition.region import no_surfels
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.surface import FieldSample
 

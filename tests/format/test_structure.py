@@ -29,6 +29,13 @@ def test_ordinary_values_pass(value):
         check_structure(packed[:-1])
 
 
+@pytest.mark.parametrize("innermost", [b"\x01", b"\xc4\x01x", b"\x90", b"\x80"])
+def test_what_holds_nothing_is_no_level_of_its_own(innermost):
+    check_structure(b"\x91" * 15 + innermost)
+    with pytest.raises(WireError, match="deep"):
+        check_structure(b"\x91" * 16 + innermost)
+
+
 @given(st.binary(max_size=200))
 def test_what_passes_can_be_unpacked_and_what_does_not_is_named(payload):
     try:

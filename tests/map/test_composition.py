@@ -10,7 +10,7 @@ from support.map_records import random_record, with_levels
 from triquad_format.records import morton
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord
-from triquad_map.composition.composed_view import no_surfels
+from triquad_map.composition.region import no_surfels
 from triquad_map.reference.evaluator import MapEvaluator
 
 TWO = ((0, 0, 0), (1, 0, 0))

@@ -15,7 +15,7 @@ from triquad_map.compiled.recorded_view import RecordedView
 from triquad_map.compiled.surfels.surfel_map import surfel_places
 from triquad_map.compiled.surfels.surfel_search import find_nearest
 from triquad_map.compiled.surfels.surfel_tree import surfel_tree
-from triquad_map.composition.composed_view import no_surfels
+from triquad_map.composition.region import no_surfels
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
 from triquad_map.questions.ground import ground as ground_below

@@ -187,8 +187,9 @@ def check_structure(payload: bytes, max_objects: int = MAX_OBJECTS) -> None:
         objects += children
         if objects > max_objects:
             raise WireError(f"not a triquad message: more than {max_objects} objects")
-        around.append(missing)
-        missing = children
+        if children:
+            around.append(missing)
+            missing = children
         if len(around) > _MAX_DEPTH:
             raise WireError(f"not a triquad message: nested more than {_MAX_DEPTH} deep")
     if at != len(payload):

@@ -9,7 +9,7 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.composition.field_view import FieldView, in_one
-from triquad_map.composition.region import MapRegion, NearestSurfels, RegionFrame, Split
+from triquad_map.composition.region import MapRegion, RegionFrame, Split
 from triquad_map.view import NearestSurface, NearestUnknown
 
 Rows = NDArray[np.intp]
@@ -55,15 +55,15 @@ class ComposedView(FieldView):
         )
         # Here, not in the threads of the split: to make surfels may take all of these.
         near = [
-            (region, region.surfels)
+            (region.surfels, self._frame(region))
             for region in self._regions_near(points, max_distance_m)
             if len(region.surfels)
         ]
 
         def work(first: int, last: int) -> None:
             mine = NearestSurface._make(array[first:last] for array in nearest)
-            for region, surfels in near:
-                surfels.improve(mine, points[first:last], self._frame(region))
+            for surfels, frame in near:
+                surfels.improve(mine, points[first:last], frame)
 
         self._split(count, work, _LEAST_SEARCHES)
         return nearest
@@ -166,11 +166,3 @@ class ComposedView(FieldView):
         found.distance[nearer] = distances[nearer] * leaf_m
         corner = region.centre - self._settings.region_side_m / 2
         found.point[nearer] = corner + nearest[nearer] * leaf_m
-
-
-def no_surfels(limits: Doubles) -> NearestSurfels:
-    """What is known of points before surfels less than ``limits`` [N] voxels away are found."""
-    count = len(limits)
-    return NearestSurfels(
-        limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.int32)
-    )

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
-from triquad_map.surface import Surfels
 from triquad_map.view import NearestSurface
 
 _Float = TypeVar("_Float", bound=np.floating)
@@ -84,6 +83,14 @@ class NearestSurfels(NamedTuple):
     rows: Ints  # [N] number of the surfel, -1 where there is none
 
 
+def no_surfels(limits: Doubles) -> NearestSurfels:
+    """What is known of points before surfels less than ``limits`` [N] voxels away are found."""
+    count = len(limits)
+    return NearestSurfels(
+        limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.int32)
+    )
+
+
 class RegionFrame(NamedTuple):
     """Where a region's leaf coordinates lie in the map, and as of when it is looked at."""
 
@@ -93,24 +100,9 @@ class RegionFrame(NamedTuple):
 
 
 class RegionSurfels(Protocol):
-    """The surfels of a region: S of them."""
-
-    @property
-    def surfels(self) -> Surfels:
-        """All of them, by their numbers."""
-
-    @property
-    def confidence(self) -> Floats:
-        """[S] in [0, 1], as if just seen."""
-
-    @property
-    def seen_s(self) -> Longs:
-        """[S] when each was seen last, seconds since 1970."""
+    """The surfels of a region."""
 
     def __len__(self) -> int: ...
-
-    def find_nearest(self, points: Doubles, found: NearestSurfels) -> None:
-        """Improve ``found`` where a surfel lies nearer to leaf coordinates ``points`` [N, 3]."""
 
     def improve(self, nearest: NearestSurface, points: Doubles, frame: RegionFrame) -> None:
         """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""

@@ -8,8 +8,7 @@ from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import Evidence, seen_voxels, surface_counts
 
-from triquad_map.composition.composed_view import no_surfels
-from triquad_map.composition.region import NearestSurfels, RegionFrame
+from triquad_map.composition.region import NearestSurfels, RegionFrame, no_surfels
 from triquad_map.reference.seen_blocks import SeenBlocks
 from triquad_map.surface import (
     DISC_RADIUS,
@@ -36,9 +35,9 @@ class SurfelCloud:
 
         Each has a ``confidence`` [S], and was ``seen_s`` [S] last, seconds since 1970.
         """
-        self.surfels = surfels
-        self.confidence = confidence
-        self.seen_s = seen_s
+        self._surfels = surfels
+        self._confidence = confidence
+        self._seen_s = seen_s
         kept = np.flatnonzero(surfels.kinds != SurfelKind.NONE)
         self._rows = kept
         self._positions = voxels[kept] + 0.5 + surfels.offsets[kept]
@@ -51,7 +50,7 @@ class SurfelCloud:
         self._corners = cells[first] * BLOCK_VOXELS
 
     def __len__(self) -> int:
-        return len(self.confidence)
+        return len(self._confidence)
 
     def find_nearest(self, points: Doubles, found: NearestSurfels) -> None:
         """Improve ``found`` where a surfel lies nearer to ``points`` [N, 3], voxels."""
@@ -80,8 +79,8 @@ class SurfelCloud:
         surfels = found.rows[rows]
         away = places[rows] - found.means[rows]
         lengths = np.linalg.norm(away, axis=1, keepdims=True)
-        age_s = np.maximum(frame.newest_s - self.seen_s[surfels], 0)
-        kinds = self.surfels.kinds[surfels]
+        age_s = np.maximum(frame.newest_s - self._seen_s[surfels], 0)
+        kinds = self._surfels.kinds[surfels]
         facing = (kinds == SurfelKind.RAY_DISC)[:, None]
         nearest.found[rows] = True
         nearest.distance[rows] = found.distances[rows] * frame.leaf_m
@@ -89,9 +88,9 @@ class SurfelCloud:
         nearest.gradient[rows] = np.where(
             lengths * frame.leaf_m > NO_LENGTH_M, away / np.maximum(lengths, NO_LENGTH_M), 0.0
         )
-        nearest.confidence[rows] = self.confidence[surfels] * np.exp2(age_s / -HALF_LIFE_S)
+        nearest.confidence[rows] = self._confidence[surfels] * np.exp2(age_s / -HALF_LIFE_S)
         nearest.learnt[rows] = kinds < SurfelKind.RAY_DISC
-        nearest.normal[rows] = np.where(facing, self.surfels.normals[surfels], 0.0)
+        nearest.normal[rows] = np.where(facing, self._surfels.normals[surfels], 0.0)
 
     def _block_gaps(self, points: Doubles) -> Doubles:
         """How far [N, B] the surfels of each block are at least from each point."""

@@ -19,8 +19,8 @@ from triquad_map.compiled.evidence.live_evidence import LiveEvidence, Marks
 from triquad_map.compiled.evidence.sightings import Sighting
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.voxel_index import empty_keys, thin
-from triquad_map.composition.composed_view import no_surfels
 from triquad_map.composition.field_view import field_samples
+from triquad_map.composition.region import no_surfels
 from triquad_map.places import in_cube
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 

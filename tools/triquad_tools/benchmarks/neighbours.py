@@ -8,7 +8,7 @@ from triquad_format.records.arrays import Doubles
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.noisy_neighbours import frozen_neighbours, neighbour
-from triquad_tools.benchmarks.served import MAP, Served, served, stream
+from triquad_tools.benchmarks.served import MAP, Served, around, served, stream
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.demo.probe import ProbeReport
 
@@ -22,8 +22,7 @@ _SETTLE_S = 600.0
 def measure_neighbours(made: BenchStreet) -> list[Figure]:
     """Figures of a planner at 20 Hz and a lidar at 10 Hz, alone and beside noisy neighbours."""
     place = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
-    box = (-8, -8, -1.5), (8, 8, 2.0)
-    points = place + np.random.default_rng(0).uniform(*box, (_ASKED, 3))
+    points = around(place, _ASKED, np.random.default_rng(0))
     with served() as server:
         stream(server.client, made.scans[:_WARM_SCANS], "streaming alone at first")
         alone = _measure(server, made, points, kinds=())

@@ -23,7 +23,7 @@ from triquad_server.settings import Settings
 from triquad_tools.benchmarks.answers import REACH_M, measure_answers
 from triquad_tools.benchmarks.figures import Figure, seconds
 from triquad_tools.benchmarks.ground import ground_latency, ground_points, measure_ground
-from triquad_tools.benchmarks.served import MAP, Served, latency_figures, served, stream
+from triquad_tools.benchmarks.served import MAP, Served, around, latency_figures, served, stream
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.demo.probe import ProbeReport
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
@@ -87,7 +87,7 @@ def _planner_points(made: BenchStreet, count: int) -> list[Points]:
     """What each planner asks: ``count`` points around one place of the drive."""
     rng = np.random.default_rng(0)
     poses = made.drive.poses[np.arange(_CLIENTS) * len(made.drive.poses) // _CLIENTS]
-    return [pose[:3, 3] + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (count, 3)) for pose in poses]
+    return [around(pose[:3, 3], count, rng) for pose in poses]
 
 
 def _trained_per_s(server: Served, made: BenchStreet, title: str) -> float:

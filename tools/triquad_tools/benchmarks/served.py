@@ -45,6 +45,16 @@ class Served:
         return Probe(self.endpoint, MAP, points, question=question)
 
 
+def around(place: Doubles, count: int, rng: np.random.Generator) -> Doubles:
+    """So many points [N, 3] around a place [3] of a drive, as a planner asks for."""
+    return place + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (count, 3))
+
+
+def near_surface(made: BenchStreet) -> Doubles:
+    """1,000 points [N, 3] near the street's surface."""
+    return np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
+
+
 @contextmanager
 def served(record: MapRecord | None = None, arguments: Sequence[str] = ()) -> Iterator[Served]:
     """A server with an empty map, or with that of a record, in a folder that goes in the end.
@@ -85,8 +95,7 @@ def stream_beside_planner(
     server: Served, made: BenchStreet, published: Callable[[int], None] = lambda _: None
 ) -> ProbeReport:
     """Stream the street while a planner asks for 1,000 gradients, and say what it met."""
-    points = np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
-    with server.planner(points, "gradient") as probe:
+    with server.planner(near_surface(made), "gradient") as probe:
         stream(server.client, made.scans, published=published)
         return probe.finish()
 

@@ -14,7 +14,13 @@ from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.core import seen_points
 from triquad_tools.benchmarks.figures import Figure, seconds
-from triquad_tools.benchmarks.served import latency_figures, served, stream_beside_planner
+from triquad_tools.benchmarks.served import (
+    around,
+    latency_figures,
+    near_surface,
+    served,
+    stream_beside_planner,
+)
 from triquad_tools.benchmarks.street import BenchStreet
 from triquad_tools.evaluation.map_scores import score_street
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
@@ -64,9 +70,8 @@ def _early(client: Client, made: BenchStreet) -> list[Figure]:
 
 def _idle(client: Client, made: BenchStreet) -> list[Figure]:
     """How soon an idle server answers one question after the other."""
-    around = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
-    points = around + np.random.default_rng(0).uniform((-8, -8, -1.5), (8, 8, 2.0), (_ASKED, 3))
-    near = np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
+    place = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
+    points, near = around(place, _ASKED, np.random.default_rng(0)), near_surface(made)
 
     def typical_ms(ask: Callable[[], object]) -> float:
         return 1e3 * statistics.median([seconds(ask) for _ in range(_QUESTIONS)][_FIRST:])

@@ -121,10 +121,13 @@ class SurfelMap:
         self._fitted = fitted
         places = fitted.places
         self._tree = surfel_tree(places.shape, places.voxels, fitted.surfels)
-        self.confidence = support_confidence(evidence.levels, fitted.surfels.kinds)
-        self.seen_s = np.repeat(evidence.seen_s, np.diff(places.starts))
-        kinds, normals = fitted.surfels.kinds, fitted.surfels.normals
-        self._shown = ShownSurfels(kinds, normals, self.confidence, self.seen_s)
+        kinds = fitted.surfels.kinds
+        self._shown = ShownSurfels(
+            kinds,
+            normals=fitted.surfels.normals,
+            confidence=support_confidence(evidence.levels, kinds),
+            seen_s=np.repeat(evidence.seen_s, np.diff(places.starts)),
+        )
 
     def __len__(self) -> int:
         return len(self._fitted.epochs)
