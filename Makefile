@@ -20,8 +20,9 @@ INSTALLED = $(VENV)/.installed
 demo: $(INSTALLED)
 	$(BIN)/triquad-demo --out demo-out
 
+# Where several processes test, torch's threads would wait for each other: seven times as long.
 test: check
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --durations=10
 
 docs: $(INSTALLED)
 	$(BIN)/python docs/settings_tables.py

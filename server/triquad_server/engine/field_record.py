@@ -4,11 +4,10 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
-from triquad_format.records.replay_rays import ReplayRays
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 
-from triquad_server.engine.live_field import Batch, LiveField
+from triquad_server.engine.live_field import LiveField
 from triquad_server.engine.memory import FrozenField, Memory
 
 _VARIANCE_BITS = 3  # that follow the first, in a checkpoint
@@ -38,18 +37,14 @@ def region_record(
     )
 
 
-def training_state(
-    field: LiveField, *, rays: ReplayRays, samples: Batch, budget_samples: int
-) -> TrainingState:
-    """What training needs beyond the field itself, sharing nothing with it.
+def training_state(field: LiveField, budget_samples: int) -> TrainingState:
+    """What training needs beyond the field, but for rays and samples, sharing nothing with it.
 
     Of the vertices' moments the means are left out, which forget in some ten steps, and the
     variances are rounded: that changes steps by at most 3 %, and takes a seventh of the bytes.
 
     Args:
         field: whose optimiser state is copied.
-        rays: that are to be trained on again.
-        samples: likewise, of what no ray tells.
         budget_samples: how many samples are still to be trained on.
     """
     array, size = field.memory.array, field.settings.feature_size
@@ -67,10 +62,9 @@ def training_state(
         mlp_means=tuple(array(part.means[0]).copy() for part in mlp),
         mlp_variances=tuple(array(part.variances[0]).copy() for part in mlp),
         mlp_steps=field.mlp_steps,
-        sample_points=samples.points,
-        sample_labels=samples.labels.astype(np.float16),
+        sample_points=np.zeros((0, 3), np.float32),
+        sample_labels=np.zeros(0, np.float16),
         budget_samples=budget_samples,
-        rays=rays,
     )
 
 

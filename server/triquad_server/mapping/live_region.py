@@ -43,9 +43,10 @@ from triquad_server.mapping.ray_table import (
     rays_through,
     samples_alone,
 )
+from triquad_server.mapping.region_copy import RegionCopy
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
-from triquad_server.mapping.replay_record import recorded_rays, restored_rays
+from triquad_server.mapping.replay_record import restored_rays
 from triquad_server.mapping.slopes import Slopes
 from triquad_server.mapping.training_budget import TrainingBudget
 
@@ -365,23 +366,22 @@ class LiveRegion:
             buffers=own,
         )
 
-    def record(self) -> Region:
-        """The region with its training state as plain arrays, sharing nothing with this one."""
-        table = both_tables(self.pool.table, self.held_out.table)
-        rays, others = recorded_rays(table, self._settings)
-        others = others[others < len(self.pool)]  # samples are for training
-        state = training_state(
-            self.field,
-            rays=rays,
-            samples=self.pool.draw_on(others),
-            budget_samples=self.budget.samples,
-        )
+    def copy(self) -> RegionCopy:
+        """The region as it is now, sharing nothing with this one."""
         state = replace(
-            state,
+            training_state(self.field, self.budget.samples),
             places_repaired=self.repairs.done,
             places_given_up=self.repairs.given_up,
         )
-        return region_record(self.index, self.field, self.evidence, training=state)
+        return RegionCopy(
+            region=region_record(self.index, self.field, self.evidence, training=None),
+            training=state,
+            table=both_tables(self.pool.table, self.held_out.table),
+            trained=len(self.pool),
+            placement=self._setup.placement,
+            settings=self._settings,
+            team=self._setup.team,
+        )
 
     @property
     def _is_to_be_judged(self) -> bool:

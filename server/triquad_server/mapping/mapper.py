@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_format.records.field_settings import RegionIndex
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 
@@ -21,6 +21,7 @@ from triquad_server.mapping.fair_share import FairShare
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.normals import SurfaceNormals
+from triquad_server.mapping.region_copy import RegionCopy
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.regions_around import regions_around
 from triquad_server.process.threads import Teams
@@ -38,6 +39,24 @@ class MapChanges:
     record: MapRecord  # of the regions that changed, with training state
     regions: tuple[RegionIndex, ...]  # all that there are
     epoch: Epoch  # the same state, for questions
+
+
+@dataclass(frozen=True)
+class MapCopy:
+    """What changed, as it was at a moment."""
+
+    name: str
+    settings: FieldSettings
+    copies: tuple[RegionCopy, ...]
+    regions: tuple[RegionIndex, ...]  # all that there are
+    epoch: Epoch  # the same state
+
+    def changes(self) -> MapChanges:
+        """The records of it, which take a second for 100 m of a street."""
+        regions = tuple(copy.record() for copy in self.copies)
+        epoch = self.epoch
+        record = MapRecord(self.name, epoch.number, self.settings, regions, progress=epoch.progress)
+        return MapChanges(record, self.regions, epoch)
 
 
 class Mapper:
@@ -309,25 +328,24 @@ class Mapper:
         self._share_out()
         self._structure_changed = True
 
-    @shortages()
     def changes_since(self, epoch: int | None) -> MapChanges:
         """The newest epoch, with training state, of the regions that changed after ``epoch``.
 
         ``None``: of all regions.
         """
+        return self.copy_since(epoch).changes()
+
+    @shortages()
+    def copy_since(self, epoch: int | None) -> MapCopy:
+        """As :meth:`changes_since`, of which other threads make the records."""
         newest = self.publish()
         changed = {
             frozen.index
             for frozen in newest.frozen_regions
             if epoch is None or frozen.changed > epoch
         }
-        regions = tuple(
-            region.record() for index, region in self._regions.items() if index in changed
-        )
-        record = MapRecord(
-            self._name, newest.number, self._field_settings, regions, progress=newest.progress
-        )
-        return MapChanges(record, tuple(self._regions), newest)
+        copies = tuple(region.copy() for index, region in self._regions.items() if index in changed)
+        return MapCopy(self._name, self._field_settings, copies, tuple(self._regions), newest)
 
     def _freeze(self, region: LiveRegion, before: dict[RegionIndex, FrozenRegion]) -> FrozenRegion:
         """The region as it is now; the last frozen one where it did not change since."""

@@ -20,13 +20,14 @@ from triquad_server.errors import (
     StoreBaseError,
     StoreError,
 )
-from triquad_server.mapping.mapper import MapChanges
+from triquad_server.mapping.mapper import MapChanges, MapCopy
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
 
+_NO_MEMORY = "the map cannot be copied for a checkpoint: out of memory"
 _NO_STORE = "the server was started without a store: the map is not kept"
 
 ResultT = TypeVar("ResultT")
@@ -184,9 +185,9 @@ class CheckpointThread:
         """
         assert self._store is not None
         base = self._store.base_epoch
-        return self.write_changes(self._changes_since(base))
+        return self.write_changes(self._copy_since(base))
 
-    def write_changes(self, changes: MapChanges) -> CheckpointInfo:
+    def write_changes(self, copied: MapCopy) -> CheckpointInfo:
         """Write what changed since the last checkpoint; only for what runs on this thread.
 
         Raises:
@@ -195,11 +196,11 @@ class CheckpointThread:
         assert self._store is not None
         last = self.last
         # The base is the last checkpoint, as long as its files are as they were written.
-        if last is not None and last.epoch == changes.record.epoch == self._store.base_epoch:
+        if last is not None and last.epoch == copied.epoch.number == self._store.base_epoch:
             return last
         started = time.monotonic()
         try:
-            info = self._write_changes(self._store, changes)
+            info = self._write_changes(self._store, copied)
         except Exception as error:
             self._counts = replace(self._counts, failed=self._counts.failed + 1)
             if isinstance(error, StoreError):
@@ -217,24 +218,24 @@ class CheckpointThread:
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
 
-    def _write_changes(self, store: Store, changes: MapChanges) -> CheckpointInfo:
+    def _write_changes(self, store: Store, copied: MapCopy) -> CheckpointInfo:
         """Write the changes; all of the map where the checkpoints before were damaged since."""
         try:
-            return store.write(changes)
+            return store.write(_changes(copied))
         except StoreBaseError as error:
             _log.warning("%s; all of the map is written instead", error)
-            return store.write(self._changes_since(None))
+            return store.write(_changes(self._copy_since(None)))
 
-    def _changes_since(self, base: int | None) -> MapChanges:
+    def _copy_since(self, base: int | None) -> MapCopy:
         """What a checkpoint needs that follows the epoch ``base``.
 
         Raises:
             StoreError: memory does not suffice for a copy of it.
         """
         try:
-            return self._mapper.call(lambda mapper: mapper.changes_since(base))
+            return self._mapper.call(lambda mapper: mapper.copy_since(base))
         except MemoryError as error:
-            raise StoreError("the map cannot be copied for a checkpoint: out of memory") from error
+            raise StoreError(_NO_MEMORY) from error
 
     def _fold(self) -> None:
         """Put old checkpoints together, where there are many."""
@@ -265,3 +266,15 @@ class CheckpointThread:
     def _interrupted(self) -> bool:
         """Whether something is more urgent than folding, which can be begun again."""
         return self._stopping.is_set() or not self._asked.empty()
+
+
+def _changes(copied: MapCopy) -> MapChanges:
+    """The records of what was copied.
+
+    Raises:
+        StoreError: memory does not suffice for them.
+    """
+    try:
+        return copied.changes()
+    except MemoryError as error:
+        raise StoreError(_NO_MEMORY) from error

@@ -175,8 +175,8 @@ class Observations:
         used = used_blocks(surface)
         ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
         rows = self.arrays.rows[self.arrays.places[used]][ended]
-        voxels = self.arrays.voxels[rows]
-        return outcome_codes(np.stack([voxels[name] for name in _RECORD], axis=1))
+        voxels = self.arrays.voxels
+        return outcome_codes(np.stack([voxels[name][rows] for name in _RECORD], axis=1))
 
     def seen_s(self, blocks: int) -> Longs:
         """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
