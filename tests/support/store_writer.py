@@ -8,7 +8,8 @@ from pathlib import Path
 from support.map_records import random_record
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord, Region
-from triquad_server.mapping.mapper import MapChanges, Mapper
+from triquad_server.mapping.map_snapshot import MapChanges
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings, StoreSettings
 from triquad_server.store.store import Store
 

@@ -36,6 +36,7 @@ from triquad_server.mapping.focus import Focus
 from triquad_server.mapping.held_out import are_held_out, both_tables
 from triquad_server.mapping.judgement import JudgedPlaces, Judgement, Repairs
 from triquad_server.mapping.learnt_places import VISITS, LearntPlaces
+from triquad_server.mapping.map_snapshot import RegionSnapshot
 from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.ray_table import (
     END,
@@ -43,7 +44,6 @@ from triquad_server.mapping.ray_table import (
     rays_through,
     samples_alone,
 )
-from triquad_server.mapping.region_copy import RegionCopy
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import ReplayPool
 from triquad_server.mapping.replay_record import restored_rays
@@ -366,14 +366,14 @@ class LiveRegion:
             buffers=own,
         )
 
-    def copy(self) -> RegionCopy:
+    def snapshot(self) -> RegionSnapshot:
         """The region as it is now, sharing nothing with this one."""
         state = replace(
             training_state(self.field, self.budget.samples),
             places_repaired=self.repairs.done,
             places_given_up=self.repairs.given_up,
         )
-        return RegionCopy(
+        return RegionSnapshot(
             region=region_record(self.index, self.field, self.evidence, training=None),
             training=state,
             table=both_tables(self.pool.table, self.held_out.table),

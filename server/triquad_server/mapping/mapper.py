@@ -2,11 +2,10 @@
 
 import logging
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 
@@ -19,9 +18,9 @@ from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.fair_share import FairShare
 from triquad_server.mapping.live_region import LiveRegion
+from triquad_server.mapping.map_snapshot import MapChanges, MapSnapshot
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.normals import SurfaceNormals
-from triquad_server.mapping.region_copy import RegionCopy
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.regions_around import regions_around
 from triquad_server.process.threads import Teams
@@ -30,33 +29,6 @@ from triquad_server.settings import ANY_SOURCE, Settings
 _log = logging.getLogger(__name__)
 
 _LOSS_MEMORY = 0.95
-
-
-@dataclass(frozen=True)
-class MapChanges:
-    """What a checkpoint needs that follows another."""
-
-    record: MapRecord  # of the regions that changed, with training state
-    regions: tuple[RegionIndex, ...]  # all that there are
-    epoch: Epoch  # the same state, for questions
-
-
-@dataclass(frozen=True)
-class MapCopy:
-    """What changed, as it was at a moment."""
-
-    name: str
-    settings: FieldSettings
-    copies: tuple[RegionCopy, ...]
-    regions: tuple[RegionIndex, ...]  # all that there are
-    epoch: Epoch  # the same state
-
-    def changes(self) -> MapChanges:
-        """The records of it, which take a second for 100 m of a street."""
-        regions = tuple(copy.record() for copy in self.copies)
-        epoch = self.epoch
-        record = MapRecord(self.name, epoch.number, self.settings, regions, progress=epoch.progress)
-        return MapChanges(record, self.regions, epoch)
 
 
 class Mapper:
@@ -333,10 +305,10 @@ class Mapper:
 
         ``None``: of all regions.
         """
-        return self.copy_since(epoch).changes()
+        return self.snapshot_since(epoch).changes()
 
     @shortages()
-    def copy_since(self, epoch: int | None) -> MapCopy:
+    def snapshot_since(self, epoch: int | None) -> MapSnapshot:
         """As :meth:`changes_since`, of which other threads make the records."""
         newest = self.publish()
         changed = {
@@ -344,8 +316,12 @@ class Mapper:
             for frozen in newest.frozen_regions
             if epoch is None or frozen.changed > epoch
         }
-        copies = tuple(region.copy() for index, region in self._regions.items() if index in changed)
-        return MapCopy(self._name, self._field_settings, copies, tuple(self._regions), newest)
+        snapshots = tuple(
+            region.snapshot() for index, region in self._regions.items() if index in changed
+        )
+        return MapSnapshot(
+            self._name, self._field_settings, snapshots, tuple(self._regions), newest
+        )
 
     def _freeze(self, region: LiveRegion, before: dict[RegionIndex, FrozenRegion]) -> FrozenRegion:
         """The region as it is now; the last frozen one where it did not change since."""

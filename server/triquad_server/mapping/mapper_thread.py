@@ -20,7 +20,8 @@ from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.map_fit import map_fit
-from triquad_server.mapping.mapper import MapCopy, Mapper
+from triquad_server.mapping.map_snapshot import MapSnapshot
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
 from triquad_server.mesh.mesher import check_box
 from triquad_server.process.threads import NICENESS
@@ -73,7 +74,7 @@ class Progress:
 class Forgotten:
     """What a reset did."""
 
-    before: MapCopy  # of the map that was
+    before: MapSnapshot  # of the map that was
     epoch: int  # the first that shows it
 
 
@@ -198,7 +199,7 @@ class MapperThread:
         check_box(request.minimum, request.maximum)
 
         def reset(mapper: Mapper) -> Forgotten:
-            return Forgotten(mapper.copy_since(base), self._forget(mapper, request))
+            return Forgotten(mapper.snapshot_since(base), self._forget(mapper, request))
 
         return self.call(reset)
 

@@ -20,7 +20,7 @@ from triquad_server.errors import (
     StoreBaseError,
     StoreError,
 )
-from triquad_server.mapping.mapper import MapChanges, MapCopy
+from triquad_server.mapping.map_snapshot import MapChanges, MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
@@ -185,9 +185,9 @@ class CheckpointThread:
         """
         assert self._store is not None
         base = self._store.base_epoch
-        return self.write_changes(self._copy_since(base))
+        return self.write_changes(self._snapshot_since(base))
 
-    def write_changes(self, copied: MapCopy) -> CheckpointInfo:
+    def write_changes(self, snapshot: MapSnapshot) -> CheckpointInfo:
         """Write what changed since the last checkpoint; only for what runs on this thread.
 
         Raises:
@@ -196,11 +196,11 @@ class CheckpointThread:
         assert self._store is not None
         last = self.last
         # The base is the last checkpoint, as long as its files are as they were written.
-        if last is not None and last.epoch == copied.epoch.number == self._store.base_epoch:
+        if last is not None and last.epoch == snapshot.epoch.number == self._store.base_epoch:
             return last
         started = time.monotonic()
         try:
-            info = self._write_changes(self._store, copied)
+            info = self._write_changes(self._store, snapshot)
         except Exception as error:
             self._counts = replace(self._counts, failed=self._counts.failed + 1)
             if isinstance(error, StoreError):
@@ -218,22 +218,22 @@ class CheckpointThread:
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
 
-    def _write_changes(self, store: Store, copied: MapCopy) -> CheckpointInfo:
+    def _write_changes(self, store: Store, snapshot: MapSnapshot) -> CheckpointInfo:
         """Write the changes; all of the map where the checkpoints before were damaged since."""
         try:
-            return store.write(_changes(copied))
+            return store.write(_changes(snapshot))
         except StoreBaseError as error:
             _log.warning("%s; all of the map is written instead", error)
-            return store.write(_changes(self._copy_since(None)))
+            return store.write(_changes(self._snapshot_since(None)))
 
-    def _copy_since(self, base: int | None) -> MapCopy:
+    def _snapshot_since(self, base: int | None) -> MapSnapshot:
         """What a checkpoint needs that follows the epoch ``base``.
 
         Raises:
             StoreError: memory does not suffice for a copy of it.
         """
         try:
-            return self._mapper.call(lambda mapper: mapper.copy_since(base))
+            return self._mapper.call(lambda mapper: mapper.snapshot_since(base))
         except MemoryError as error:
             raise StoreError(_NO_MEMORY) from error
 
@@ -268,13 +268,13 @@ class CheckpointThread:
         return self._stopping.is_set() or not self._asked.empty()
 
 
-def _changes(copied: MapCopy) -> MapChanges:
-    """The records of what was copied.
+def _changes(snapshot: MapSnapshot) -> MapChanges:
+    """The records of a snapshot.
 
     Raises:
         StoreError: memory does not suffice for them.
     """
     try:
-        return copied.changes()
+        return snapshot.changes()
     except MemoryError as error:
         raise StoreError(_NO_MEMORY) from error

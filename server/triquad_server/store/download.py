@@ -51,7 +51,7 @@ class MapDownloads:
                     self._files.move_to_end(file.info.sha256)
                     return file.info
         if request.training:
-            changes = self._mapper.call(lambda mapper: mapper.copy_since(None)).changes()
+            changes = self._mapper.call(lambda mapper: mapper.snapshot_since(None)).changes()
             record, newest = changes.record, changes.epoch
         else:
             record = newest.record()

@@ -6,7 +6,7 @@ from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import ResetReply, ResetRequest
 
 from triquad_server.errors import StoreError
-from triquad_server.mapping.mapper import MapCopy
+from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.mesher import check_box
 from triquad_server.store.checkpoint_thread import CheckpointThread
@@ -75,7 +75,7 @@ class Resets:
         )
         return ResetReply(forgotten.epoch, kept, undo)
 
-    def _keep_the_rest(self, store: Store, before: MapCopy, kept: int | None) -> int | None:
+    def _keep_the_rest(self, store: Store, before: MapSnapshot, kept: int | None) -> int | None:
         """Keep what was learnt while the checkpoint was written, too; returns the epoch kept."""
         if not before.regions or before.epoch.number == kept:
             return kept

@@ -30,7 +30,7 @@ from triquad_format.records.record_check import check_record
 from triquad_format.wire.messages import CheckpointInfo
 
 from triquad_server.errors import StoreBaseError, StoreError
-from triquad_server.mapping.mapper import MapChanges
+from triquad_server.mapping.map_snapshot import MapChanges
 from triquad_server.mesh.preview import preview_part, preview_schema
 from triquad_server.settings import StoreSettings
 from triquad_server.store.kept_checkpoints import KeptCheckpoints

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.map_records import assert_same
 from support.small_world import World, settings, settle, settled_mapper, surface_error, world
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.replay_rays import no_rays
@@ -287,6 +288,22 @@ def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
     after = surface_error(restarted.publish(), world())
     assert during < before + 0.005, "the optimiser goes on where it was"
     assert after < before + 0.002, "what the scan did not see is not forgotten"
+
+
+def test_the_records_of_a_moment_are_the_same_however_the_map_goes_on() -> None:
+    # The pool of the one region is full: new rays take the places of those that were.
+    chosen = Settings.model_validate({"training": {"pool_bytes": 4000 * RAY_BYTES}})
+    mapper = Mapper("test", chosen, "cpu")
+    first, *others = world().scans
+    mapper.ingest(first.points, first.world_from_sensor)
+    mapper.train()
+    snapshot = mapper.snapshot_since(None)
+    at_once = snapshot.changes().record
+    for scan in others:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+        mapper.train()
+    assert mapper.changes_since(None).record.progress != at_once.progress
+    assert_same(snapshot.changes().record, at_once)
 
 
 def test_a_record_with_nothing_to_train_on_has_no_training_budget() -> None:

@@ -155,7 +155,7 @@ def test_a_checkpoint_for_which_there_is_no_memory_is_refused_and_the_next_one_w
         checkpoints.start()
         with closing(checkpoints):
             with monkeypatch.context() as patched:
-                patched.setattr(Mapper, "copy_since", lambda *_: bytes(2**60))
+                patched.setattr(Mapper, "snapshot_since", lambda *_: bytes(2**60))
                 with pytest.raises(RefusedError, match="store: .* out of memory"):
                     checkpoints.answer(CheckpointRequest())
             assert checkpoints.answer(CheckpointRequest()).epoch == thread.epochs.newest.number

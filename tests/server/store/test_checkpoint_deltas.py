@@ -13,7 +13,8 @@ from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.recovery.recovered_map import recover
 from triquad_server.errors import StoreBaseError, StoreError
-from triquad_server.mapping.mapper import MapChanges, Mapper
+from triquad_server.mapping.map_snapshot import MapChanges
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings, StoreSettings
 from triquad_server.store.store import Store
 

@@ -8,7 +8,8 @@ from triquad_format.errors import MapFileError, TooLargeMapFileError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.region import MapRecord
 from triquad_server.errors import StoreError
-from triquad_server.mapping.mapper import MapChanges, Mapper
+from triquad_server.mapping.map_snapshot import MapChanges
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import StoreSettings
 from triquad_server.store import restore
 from triquad_server.store import store as store_module
