@@ -15,7 +15,7 @@ from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.net.operation_counts import OperationCounts
-from triquad_server.process.memory import give_back_free, resident_bytes
+from triquad_server.process.memory import give_back_compiler, give_back_free, resident_bytes
 from triquad_server.store.checkpoint_thread import CheckpointThread
 
 _log = logging.getLogger(__name__)
@@ -170,6 +170,7 @@ class Heartbeat:
         while not self._stopping.wait(STATUS_PERIOD_S):
             beat += 1
             if beat % _BEATS_PER_TRIM == 0 or resident_bytes() > trimmed_to + _TRIMMED_AT_BYTES:
+                give_back_compiler()
                 give_back_free()
                 trimmed_to = resident_bytes()
             try:
