@@ -43,7 +43,9 @@ class AnsweredTiles:
                 self._epoch, self._data, self.nbytes = epoch, {}, 0
             if epoch < self._epoch or self.nbytes >= self._limit:
                 return
-        data = zstandard.ZstdCompressor(level=_LEVEL).compress(codec.encode(tile))
+        compressed = zstandard.ZstdCompressor(level=_LEVEL).compress(codec.encode(tile))
+        # What zstandard returns has the room of the worst case behind it, two thirds of its memory.
+        data = bytes(memoryview(compressed))
         with self._lock:
             grown = self.nbytes + len(data)
             if epoch == self._epoch and grown <= self._limit and asked not in self._data:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.compiled.team import Team
@@ -32,13 +32,12 @@ class Changes:
 
 @dataclass(frozen=True)
 class _Voxels:
-    """The voxels of a region with seen surface."""
+    """The voxels of a region with seen surface: a map has hundreds of thousands of them."""
 
-    keys: Longs  # [V] increasing
+    keys: Longs  # [V] increasing; they tell where each is
     margins: NDArray[np.int8]  # [V, 6] quarters of a voxel beyond all ends
-    centres: Doubles  # [V, 3] metres, map frame
     groups: Doubles  # [G, 3] centres of the groups
-    group: NDArray[np.intp]  # [V] of each voxel
+    group: Ints  # [V] of each voxel
 
 
 @dataclass(frozen=True)
@@ -81,14 +80,17 @@ class SurfaceChanges:
             old = before.pop(region.index, None)
             if old is None:
                 new = self._measure(region, None)
-                found.append(Changes(new.voxels.centres, nothing))
+                found.append(Changes(self._centres(region, new.voxels.keys), nothing))
             elif old.region is region:
                 new = old
             else:
                 new, changes = self._compare(old, self._measure(region, old))
                 found.append(changes)
             self._recorded[region.index] = new
-        found += [Changes(gone.voxels.centres, nothing) for gone in before.values()]
+        found += [
+            Changes(self._centres(gone.region, gone.voxels.keys), nothing)
+            for gone in before.values()
+        ]
         return Changes(
             np.concatenate([changes.places for changes in found]),
             np.concatenate([changes.drifted for changes in found]),
@@ -98,7 +100,7 @@ class SurfaceChanges:
         """What is to be recorded, and what changed."""
         voxels = new.voxels
         before, margins = old.offsets, old.margins
-        gone = np.zeros((0, 3))
+        gone = np.zeros(0, np.int64)
         if voxels is not old.voxels:
             before = np.full(len(voxels.keys), np.nan, np.float32)
             margins = voxels.margins.copy()
@@ -106,7 +108,7 @@ class SurfaceChanges:
                 voxels.keys, old.voxels.keys, assume_unique=True, return_indices=True
             )
             before[rows], margins[rows] = old.offsets[old_rows], old.margins[old_rows]
-            gone = np.delete(old.voxels.centres, old_rows, axis=0)
+            gone = np.delete(old.voxels.keys, old_rows)
         moved = np.abs(new.offsets - before)
         is_new = np.isnan(before)
         is_new |= (np.abs(voxels.margins - margins) >= _FARTHER).any(axis=1)
@@ -123,32 +125,38 @@ class SurfaceChanges:
         offsets = np.where(is_told, new.offsets, before)
         margins = np.where(is_told[:, None], voxels.margins, margins)
         places = is_new | (left & many_left[voxels.group])
+        keys = np.concatenate([gone, voxels.keys[places]])
         return _Recorded(new.region, voxels, offsets, margins), Changes(
-            np.concatenate([gone, voxels.centres[places]]), voxels.groups[drifted]
+            self._centres(new.region, keys), voxels.groups[drifted]
         )
 
     def _measure(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
         unchanged = old if old and old.region.evidence is region.evidence else None
         voxels = unchanged.voxels if unchanged else self._voxels(region)
-        return _Recorded(region, voxels, self._offsets(region, voxels.centres), voxels.margins)
+        return _Recorded(region, voxels, self._offsets(region, voxels.keys), voxels.margins)
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
         evidence = region.evidence
         voxels = surfel_voxels(evidence.cells, evidence.surface, len(region.surfels))
         keys = _key(voxels)
         order = np.argsort(keys)
-        corner = region.centre - self._settings.region_side_m / 2
-        centres = corner + (voxels[order] + 0.5) * self._settings.leaf_m
-        cells = np.floor(centres / self._group_m).astype(np.int64)
+        keys = keys[order]
+        cells = np.floor(self._centres(region, keys) / self._group_m).astype(np.int64)
         low = cells.min(axis=0, initial=0)
         _, first, group = np.unique(_key(cells - low), return_index=True, return_inverse=True)
         groups = ((cells[first] + 0.5) * self._group_m).astype(np.float64)
         margins = evidence.margins[order].astype(np.int8)
-        return _Voxels(keys[order], margins, centres, groups, group=group.ravel())
+        return _Voxels(keys, margins, groups, group.ravel().astype(np.int32))
 
-    def _offsets(self, region: FrozenRegion, centres: Doubles) -> Floats:
-        """How far [V] the surface is from the centres; at most a voxel: beyond are others."""
-        offsets = np.empty(len(centres), np.float32)
+    def _centres(self, region: FrozenRegion, keys: Longs) -> Doubles:
+        """The centres [N, 3] of voxels of a region, metres, map frame."""
+        corner = region.centre - self._settings.region_side_m / 2
+        return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
+
+    def _offsets(self, region: FrozenRegion, keys: Longs) -> Floats:
+        """How far [V] the surface is from voxels' centres; at most a voxel: beyond are others."""
+        centres = self._centres(region, keys)
+        offsets = np.empty(len(keys), np.float32)
         leaf_m = self._settings.leaf_m
 
         def work(first: int, last: int) -> None:
@@ -158,10 +166,16 @@ class SurfaceChanges:
             slope = np.maximum(np.linalg.norm(values.gradient, axis=1), 0.1)
             offsets[part] = np.clip(values.sdf / slope, -leaf_m, leaf_m)
 
-        self._team.split(len(centres), work)
+        self._team.split(len(keys), work)
         return offsets
 
 
 def _key(cells: Longs) -> Longs:
     """One number for each of cells [N, 3], none of them negative."""
     return (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
+
+
+def _cells(keys: Longs) -> Longs:
+    """The inverse of :func:`_key`."""
+    x, y, z = keys >> 2 * _KEY_BITS, keys >> _KEY_BITS, keys
+    return np.stack([x, y, z], axis=1) & ((1 << _KEY_BITS) - 1)

@@ -1,5 +1,8 @@
 """Tiles are answered with again, and only of the newest epoch that was asked for."""
 
+import tracemalloc
+from dataclasses import replace
+
 import numpy as np
 from triquad_format.wire.messages import Tile
 from triquad_server.mesh.answered_tiles import AnsweredTiles
@@ -53,3 +56,20 @@ def test_what_does_not_fit_is_not_kept_and_pushes_nothing_out() -> None:
     assert 0 < tiles.nbytes <= 8_000
     assert tiles.get(7, asked(0)) is not None
     assert tiles.get(7, asked(9)) is None
+
+
+def test_what_is_kept_takes_no_more_memory_than_is_told() -> None:
+    def zeros(epoch: int) -> Tile:  # which shrink to next to nothing
+        return replace(tile(epoch, vertices=5_000), vertices=np.zeros((5_000, 3), np.float32))
+
+    tiles, many = AnsweredTiles(10_000_000), 50
+    tiles.put(7, asked(-1), zeros(7))
+    tracemalloc.start()
+    try:
+        for x in range(many):
+            tiles.put(7, asked(x), zeros(7))
+        taken, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    told = tiles.nbytes * many / (many + 1)
+    assert told < taken < 1.1 * told
