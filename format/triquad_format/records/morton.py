@@ -18,13 +18,14 @@ SPREAD_2D = (
 )
 """Shifts and masks that move bit ``i`` of a number to bit ``2 * i``."""
 
-_SPREAD_3D = (
+SPREAD_3D = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
     (8, 0x100F00F00F00F00F),
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
+"""The same to bit ``3 * i``."""
 
 
 def encode(cells: NDArray[np.integer]) -> Longs:
@@ -37,19 +38,21 @@ def encode(cells: NDArray[np.integer]) -> Longs:
         ``[...]`` int64 codes, ordered along the Z curve.
     """
     dimensions = cells.shape[-1]
-    spread = SPREAD_2D if dimensions == 2 else _SPREAD_3D
+    spread = SPREAD_2D if dimensions == 2 else SPREAD_3D
     code = np.zeros(cells.shape[:-1], np.int64)
     for axis in range(dimensions):
         bits = cells[..., axis].astype(np.int64)
         for shift, mask in spread:
-            bits = (bits | (bits << shift)) & mask
-        code |= bits << axis
+            bits |= bits << shift  # in place: maps have millions of cells
+            bits &= mask
+        bits <<= axis
+        code |= bits
     return code
 
 
 def decode(codes: NDArray[np.integer], dimensions: int) -> Longs:
     """Integer cells ``[..., D]`` of Morton codes ``[...]``; the inverse of :func:`encode`."""
-    spread = SPREAD_2D if dimensions == 2 else _SPREAD_3D
+    spread = SPREAD_2D if dimensions == 2 else SPREAD_3D
     shifts = [shift for shift, _ in spread]
     top = 0x00000000FFFFFFFF if dimensions == 2 else 0x00000000001FFFFF
     masks = [top, *(mask for _, mask in spread[:-1])]

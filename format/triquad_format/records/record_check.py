@@ -163,7 +163,8 @@ def _check_rays(settings: FieldSettings, rays: ReplayRays) -> None:
         raise FormatError("ray ends: one lies far outside its region")
     if rays.origin_of.min() < 0 or rays.origin_of.max() >= len(rays.origins):
         raise FormatError("ray origins of ends: one is not among the origins")
-    if (np.diff(rays.leaf_codes) < 0).any():
+    codes = rays.leaf_codes
+    if (codes[1:] < codes[:-1]).any():
         raise FormatError("ray ends: they are not in the order of their leaves")
 
 

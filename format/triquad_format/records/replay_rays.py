@@ -1,6 +1,6 @@
 """Rays that training draws from again, as a record holds them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ SLOPE_SCALE = 255
 
 HELD_OUT = 32
 """One ray in so many is held out: it is never trained on, and tells how good the field is."""
+
+_AT_ONCE = 1 << 16
 
 AXIS_BITS = 21
 AXIS_MASK = (1 << AXIS_BITS) - 1
@@ -65,7 +67,11 @@ class ReplayRays:
     @property
     def leaf_codes(self) -> Longs:
         """Morton codes [R] of the leaves in which they end, from the corner of the same cube."""
-        return morton.encode(self.ends // STEPS)
+        codes = np.empty(len(self), np.int64)
+        for first in range(0, len(self), _AT_ONCE):  # maps have millions of rays
+            part = slice(first, first + _AT_ONCE)
+            codes[part] = morton.encode(self.ends[part] // STEPS)
+        return codes
 
     def ends_m(self, settings: FieldSettings) -> Doubles:
         """Where they end [R, 3], metres from the region's centre: the middles of the steps."""
@@ -74,15 +80,16 @@ class ReplayRays:
 
     def chosen(self, rows: NDArray[np.intp]) -> "ReplayRays":
         """Some of the rays, with the origins that they have."""
-        origin_of = self.origin_of[rows]
-        used = np.bincount(origin_of, minlength=len(self.origins)) > 0
-        numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        return ReplayRays(
-            self.ends[rows],
-            numbers[origin_of],
-            self.slopes[rows],
-            origins=self.origins[used],
+        some = replace(
+            self, ends=self.ends[rows], origin_of=self.origin_of[rows], slopes=self.slopes[rows]
         )
+        return some.with_own_origins()
+
+    def with_own_origins(self) -> "ReplayRays":
+        """The rays without origins of which none comes."""
+        used = np.bincount(self.origin_of, minlength=len(self.origins)) > 0
+        numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        return replace(self, origin_of=numbers[self.origin_of], origins=self.origins[used])
 
 
 def no_rays() -> ReplayRays:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from triquad_format.records import replay_rays
 from triquad_format.records.arrays import Bools, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 
 from triquad_server.mapping.ray_table import END, RayTable
 
@@ -23,17 +23,32 @@ def ray_keys(rows: Floats, settings: FieldSettings) -> Longs:
     return replay_rays.ray_keys(ends_in_steps(rows, settings))
 
 
+@kernel(inline="always")
+def end_in_steps(row: Floats, leaf_m: float, corner: float) -> tuple[int, int, int]:
+    """As :func:`ends_in_steps`, of one ray; the cube's ``corner`` is so many leaves away."""
+    return (
+        np.int64(np.floor((np.float64(row[END]) / leaf_m + corner) * replay_rays.STEPS)),
+        np.int64(np.floor((np.float64(row[END + 1]) / leaf_m + corner) * replay_rays.STEPS)),
+        np.int64(np.floor((np.float64(row[END + 2]) / leaf_m + corner) * replay_rays.STEPS)),
+    )
+
+
+@inner_kernel()
+def is_held_out(x: int, y: int, z: int) -> bool:
+    """As :func:`triquad_format.records.replay_rays.are_held_out`, of one ray."""
+    key = np.uint64(0)
+    for step in (x, y, z):
+        key = key << np.uint64(replay_rays.AXIS_BITS) | np.uint64(step & replay_rays.AXIS_MASK)
+    held: bool = (key * replay_rays.MIXED) >> np.uint64(replay_rays.MIXED_SHIFT) == 0
+    return held
+
+
 @kernel()
 def _held_out(rows: Floats, leaf_m: float, corner: float) -> Bools:
-    """As :func:`triquad_format.records.replay_rays.are_held_out`, in a tenth of the time."""
     held = np.empty(len(rows), np.bool_)
     for i in range(len(rows)):
-        key = np.uint64(0)
-        for axis in range(3):
-            leaves = np.float64(rows[i, END + axis]) / leaf_m + corner
-            step = np.int64(np.floor(leaves * replay_rays.STEPS)) & replay_rays.AXIS_MASK
-            key = key << np.uint64(replay_rays.AXIS_BITS) | np.uint64(step)
-        held[i] = (key * replay_rays.MIXED) >> np.uint64(replay_rays.MIXED_SHIFT) == 0
+        x, y, z = end_in_steps(rows[i], leaf_m, corner)
+        held[i] = is_held_out(x, y, z)
     return held
 
 

@@ -9,10 +9,11 @@ import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays, are_held_out
+from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Team
 
-from triquad_server.mapping.held_out import ends_in_steps
+from triquad_server.mapping.held_out import end_in_steps, is_held_out
 from triquad_server.mapping.normals import SurfaceNormals
 from triquad_server.mapping.ray_table import LEAST_SLOPE, VALUE, RayTable
 
@@ -23,10 +24,75 @@ _ORIGIN_BITS = 15  # beside 48 of a leaf's code
 _ROUNDED_STEPS = 3
 """To the middle of so many steps: 5 mm at the default leaf, which adds 1.4 mm of noise."""
 
-_FIRST = np.arange(STEPS, dtype=np.int32) // _ROUNDED_STEPS * _ROUNDED_STEPS
-_ROUNDED = (_FIRST + np.minimum(_FIRST + _ROUNDED_STEPS, STEPS) - 1) // 2  # of each step of a leaf
-
 _ROUNDED_SLOPES = 8  # of SLOPE_SCALE
+
+_FAR = -1  # the code of what is no ray that ends in the cube
+
+
+@inner_kernel()
+def _leaf_code(x: int, y: int, z: int) -> int:
+    """As :func:`triquad_format.records.morton.encode`, of one leaf."""
+    code: int = np.int64(0)
+    for axis, number in enumerate((x, y, z)):
+        bits = np.int64(number)
+        for shift, mask in morton.SPREAD_3D:
+            bits = (bits | (bits << shift)) & mask
+        code |= bits << axis
+    return code
+
+
+@kernel()
+def _codes(table: RayTable, leaf_m: float, side: int, coarser: int) -> Longs:
+    """By what the rays [N] of a table are put in order: by origin within a leaf, nearly.
+
+    Neighbours that are alike take less room.
+    """
+    codes = np.empty(len(table.rows), np.int64)
+    most = 2 * side * STEPS
+    for i in range(len(codes)):
+        x, y, z = end_in_steps(table.rows[i], leaf_m, float(side))
+        origin = np.int64(table.origin_of[i])
+        codes[i] = _FAR
+        if origin >= 0 and min(x, y, z) >= 0 and max(x, y, z) < most:
+            code = _leaf_code(x // STEPS, y // STEPS, z // STEPS)
+            codes[i] = code << _ORIGIN_BITS | origin >> coarser
+    return codes
+
+
+@kernel()
+def _record(
+    rows: Floats, places: Longs, leaf_m: float, corner: float, ends: Ints, slopes: Bytes
+) -> None:
+    """Fill in the ``ends`` [R, 3] and ``slopes`` [R] of the rays at ``places`` [R]."""
+    for i in range(len(places)):
+        row = rows[places[i]]
+        x, y, z = end_in_steps(row, leaf_m, corner)
+        near_x, near_y, near_z = _rounded(x), _rounded(y), _rounded(z)
+        # Rays that are held out stay what they are, and no others become it.
+        if not is_held_out(x, y, z) and not is_held_out(near_x, near_y, near_z):
+            x, y, z = near_x, near_y, near_z
+        ends[i, 0], ends[i, 1], ends[i, 2] = x, y, z
+        slopes[i] = _told_slope(row[VALUE])
+
+
+@inner_kernel()
+def _rounded(step: int) -> int:
+    """The middle of a few steps of the same leaf."""
+    leaf = step // STEPS * STEPS
+    first = (step - leaf) // _ROUNDED_STEPS * _ROUNDED_STEPS
+    after = min(first + _ROUNDED_STEPS, STEPS)
+    return leaf + (first + after - 1) // 2
+
+
+@inner_kernel()
+def _told_slope(value: float) -> int:
+    """The slope of a ray with this ``value`` in its table, if the field told it.
+
+    SLOPE_SCALE where a normal did, and where nothing did.
+    """
+    if value >= 0 or value <= -1:
+        return SLOPE_SCALE
+    return int(-SLOPE_SCALE * value) // _ROUNDED_SLOPES * _ROUNDED_SLOPES + _ROUNDED_SLOPES // 2
 
 
 def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays, Longs]:
@@ -34,43 +100,19 @@ def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays,
     what ends far away.
     """
     side = 1 << settings.depth
-    steps = ends_in_steps(table.rows, settings)
-    fits = (table.origin_of >= 0) & ((steps >= 0) & (steps < 2 * side * STEPS)).all(axis=1)
-    places = np.flatnonzero(fits)
-    if len(places) > _MOST_RAYS:
-        places = np.sort(np.random.default_rng(len(places)).choice(places, _MOST_RAYS, False))
-    # By origin within a leaf, nearly: neighbours that are alike take less room.
     coarser = max(0, len(table.origins).bit_length() - _ORIGIN_BITS)
-    codes = morton.encode(steps[places] // STEPS) << _ORIGIN_BITS
-    places = places[np.argsort(codes | table.origin_of[places] >> coarser)]
-    rays = ReplayRays(
-        _rounded_ends(steps[places].astype(np.int32)),
-        table.origin_of[places],
-        _told_slopes(table.rows[places, VALUE]),
-        origins=table.origins,
-    )
-    return rays.chosen(np.arange(len(rays))), np.flatnonzero(~fits)
-
-
-def _rounded_ends(steps: Ints) -> Ints:
-    """Ends [N, 3] within the same leaves; rays that are held out stay what they are, and no others
-    become it.
-    """
-    rounded = steps - steps % STEPS + _ROUNDED[steps % STEPS]
-    is_exact = are_held_out(steps) | are_held_out(rounded)
-    rounded[is_exact] = steps[is_exact]
-    return rounded
-
-
-def _told_slopes(values: Floats) -> Bytes:
-    """Slopes [N] of rays with these ``values`` [N] in their table, if the field told them.
-
-    SLOPE_SCALE where a normal did, and where nothing did.
-    """
-    slopes = (SLOPE_SCALE * np.abs(values)).astype(np.uint8)
-    rounded = slopes - slopes % _ROUNDED_SLOPES + _ROUNDED_SLOPES // 2
-    is_told = (values < 0) & (values > -1)
-    return np.where(is_told, rounded, SLOPE_SCALE).astype(np.uint8)
+    codes = _codes(table, settings.leaf_m, side, coarser)
+    places = np.argsort(codes)
+    far = int((codes == _FAR).sum())
+    del codes  # a big map's rays are what memory is shortest for
+    others, places = np.sort(places[:far]), places[far:]
+    if len(places) > _MOST_RAYS:
+        rng = np.random.default_rng(len(places))
+        places = places[np.sort(rng.choice(len(places), _MOST_RAYS, replace=False))]
+    ends, slopes = np.empty((len(places), 3), np.int32), np.empty(len(places), np.uint8)
+    _record(table.rows, places, settings.leaf_m, float(side), ends, slopes)
+    rays = ReplayRays(ends, table.origin_of[places], slopes, origins=table.origins)
+    return rays.with_own_origins(), others
 
 
 def restored_rays(rays: ReplayRays, settings: FieldSettings, team: Team) -> RayTable:

@@ -200,7 +200,9 @@ class CheckpointThread:
             return last
         started = time.monotonic()
         try:
-            info = self._write_changes(self._store, snapshot)
+            changes = _changes(snapshot)
+            del snapshot  # the records have all of it, and memory is shortest now
+            info = self._write_changes(self._store, changes)
         except Exception as error:
             self._counts = replace(self._counts, failed=self._counts.failed + 1)
             if isinstance(error, StoreError):
@@ -218,10 +220,10 @@ class CheckpointThread:
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
 
-    def _write_changes(self, store: Store, snapshot: MapSnapshot) -> CheckpointInfo:
+    def _write_changes(self, store: Store, changes: MapChanges) -> CheckpointInfo:
         """Write the changes; all of the map where the checkpoints before were damaged since."""
         try:
-            return store.write(_changes(snapshot))
+            return store.write(changes)
         except StoreBaseError as error:
             _log.warning("%s; all of the map is written instead", error)
             return store.write(_changes(self._snapshot_since(None)))

@@ -183,7 +183,8 @@ def unshuffle_codes(planes: Bytes) -> Longs:
 def shuffle_counts(counts: Longs) -> Bytes:
     """Shuffled numbers ``[B, V]`` that are not negative, in as few bytes as hold them all."""
     width = (int(counts.max(initial=1)).bit_length() + 7) // 8
-    return shuffle(counts)[:width]
+    narrow = next(size for size in (1, 2, 4, 8) if size >= width)
+    return shuffle(counts.astype(f"<u{narrow}"))[:width]
 
 
 def unshuffle_counts(planes: Bytes) -> Longs:
