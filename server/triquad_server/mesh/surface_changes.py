@@ -46,7 +46,9 @@ class _Recorded:
 
     region: FrozenRegion
     voxels: _Voxels
-    offsets: Floats  # [V] metres from each voxel's centre to the surface
+    offsets: Floats | None
+    """[V] metres from each voxel's centre to the surface; None: what the region's field tells."""
+
     margins: NDArray[np.int8]  # [V, 6] of the voxels
 
 
@@ -79,12 +81,12 @@ class SurfaceChanges:
         for region in regions:
             old = before.pop(region.index, None)
             if old is None:
-                new = self._measure(region, None)
+                new = self._seen(region, None)
                 found.append(Changes(self._centres(region, new.voxels.keys), nothing))
             elif old.region is region:
                 new = old
             else:
-                new, changes = self._compare(old, self._measure(region, old))
+                new, changes = self._compare(old, self._seen(region, old))
                 found.append(changes)
             self._recorded[region.index] = new
         found += [
@@ -99,7 +101,8 @@ class SurfaceChanges:
     def _compare(self, old: _Recorded, new: _Recorded) -> tuple[_Recorded, Changes]:
         """What is to be recorded, and what changed."""
         voxels = new.voxels
-        before, margins = old.offsets, old.margins
+        now, told = self._offsets(new), self._offsets(old)
+        before, margins = told, old.margins
         gone = np.zeros(0, np.int64)
         if voxels is not old.voxels:
             before = np.full(len(voxels.keys), np.nan, np.float32)
@@ -107,9 +110,9 @@ class SurfaceChanges:
             _, rows, old_rows = np.intersect1d(
                 voxels.keys, old.voxels.keys, assume_unique=True, return_indices=True
             )
-            before[rows], margins[rows] = old.offsets[old_rows], old.margins[old_rows]
+            before[rows], margins[rows] = told[old_rows], old.margins[old_rows]
             gone = np.delete(old.voxels.keys, old_rows)
-        moved = np.abs(new.offsets - before)
+        moved = np.abs(now - before)
         is_new = np.isnan(before)
         is_new |= (np.abs(voxels.margins - margins) >= _FARTHER).any(axis=1)
 
@@ -122,7 +125,7 @@ class SurfaceChanges:
         drifted = 2 * count(moved > self._tolerance_m) > size
         reported = drifted | many_left | (count(is_new) > 0)
         is_told = reported[voxels.group]
-        offsets = np.where(is_told, new.offsets, before)
+        offsets = np.where(is_told, now, before)
         margins = np.where(is_told[:, None], voxels.margins, margins)
         places = is_new | (left & many_left[voxels.group])
         keys = np.concatenate([gone, voxels.keys[places]])
@@ -130,10 +133,13 @@ class SurfaceChanges:
             self._centres(new.region, keys), voxels.groups[drifted]
         )
 
-    def _measure(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
-        unchanged = old if old and old.region.evidence is region.evidence else None
-        voxels = unchanged.voxels if unchanged else self._voxels(region)
-        return _Recorded(region, voxels, self._offsets(region, voxels.keys), voxels.margins)
+    def _seen(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
+        """A region without offsets: whoever asks for the first list of tiles needs none."""
+        if old is not None and old.region.evidence is region.evidence:
+            voxels = old.voxels
+        else:
+            voxels = self._voxels(region)
+        return _Recorded(region, voxels, None, voxels.margins)
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
         evidence = region.evidence
@@ -153,10 +159,13 @@ class SurfaceChanges:
         corner = region.centre - self._settings.region_side_m / 2
         return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
 
-    def _offsets(self, region: FrozenRegion, keys: Longs) -> Floats:
+    def _offsets(self, recorded: _Recorded) -> Floats:
         """How far [V] the surface is from voxels' centres; at most a voxel: beyond are others."""
-        centres = self._centres(region, keys)
-        offsets = np.empty(len(keys), np.float32)
+        if recorded.offsets is not None:
+            return recorded.offsets
+        region = recorded.region
+        centres = self._centres(region, recorded.voxels.keys)
+        offsets = np.empty(len(centres), np.float32)
         leaf_m = self._settings.leaf_m
 
         def work(first: int, last: int) -> None:
@@ -166,7 +175,7 @@ class SurfaceChanges:
             slope = np.maximum(np.linalg.norm(values.gradient, axis=1), 0.1)
             offsets[part] = np.clip(values.sdf / slope, -leaf_m, leaf_m)
 
-        self._team.split(len(keys), work)
+        self._team.split(len(centres), work)
         return offsets
 
 
