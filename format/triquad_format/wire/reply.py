@@ -198,31 +198,53 @@ def _problems(
     message: Message, question: Message, outer: tuple[Message, ...]
 ) -> Iterator[tuple[str, str]]:
     exchange = Exchange(question, (message, *outer))
-    for field, annotation in message.annotations().items():
-        name = f"{type(message).__name__}.{field}"
-        yield from _of_field(name, annotation, getattr(message, field), exchange)
+    kind: Any = type(message)  # mypy takes no class of messages for hashable
+    for field, bounds in _bounds_of(kind).items():
+        for within, problem in bounds.problems(getattr(message, field), exchange):
+            yield f"{kind.__name__}.{field}{within}", problem
 
 
-def _of_field(
-    name: str, annotation: Any, value: Any, exchange: Exchange
-) -> Iterator[tuple[str, str]]:
-    if value is None:
-        return
-    if isinstance(value, Message):
-        yield from _problems(value, exchange.question, exchange.around)
-    elif get_origin(annotation) is dict:
-        key_type, item = get_args(annotation)
-        for key, entry in value.items():
-            yield from _of_field(f"{name} key", key_type, key, exchange)
-            yield from _of_field(f"{name}[{key!r}]", item, entry, exchange)
-    else:
-        for check in _checks(annotation):
-            problem = check.problem(value, exchange)
-            if problem is not None:
-                yield name, problem
+@dataclass(frozen=True)
+class _Bounds:
+    """What the values of a field keep to; of a map, its keys and its items."""
+
+    checks: tuple[Check, ...] = ()
+    key: "_Bounds | None" = None
+    item: "_Bounds | None" = None
+
+    def problems(self, value: Any, exchange: Exchange) -> Iterator[tuple[str, str]]:
+        """Where in a value something is wrong, and what."""
+        if value is None:
+            return
+        if isinstance(value, Message):
+            for name, wrong in _problems(value, exchange.question, exchange.around):
+                yield f": {name}", wrong
+        elif self.key is not None and self.item is not None:
+            for key, entry in value.items():
+                for within, problem in self.key.problems(key, exchange):
+                    yield f" key{within}", problem
+                for within, problem in self.item.problems(entry, exchange):
+                    yield f"[{key!r}]{within}", problem
+        else:
+            for check in self.checks:
+                found = check.problem(value, exchange)
+                if found is not None:
+                    yield "", found
 
 
 @functools.cache
+def _bounds_of(kind: type[Any]) -> dict[str, _Bounds]:
+    """Those of a message's fields: to look them up by annotation takes longer than to check."""
+    return {field: _bounds(annotation) for field, annotation in kind.annotations().items()}
+
+
+def _bounds(annotation: Any) -> _Bounds:
+    if get_origin(annotation) is dict:
+        key, item = get_args(annotation)
+        return _Bounds(key=_bounds(key), item=_bounds(item))
+    return _Bounds(_checks(annotation))
+
+
 def _checks(annotation: Any) -> tuple[Check, ...]:
     """The checks in an annotation, that of a field which may be ``None`` included."""
     if hasattr(annotation, "__metadata__"):

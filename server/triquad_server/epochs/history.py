@@ -118,12 +118,15 @@ class EpochHistory:
             with self._lock:
                 epoch = self._get(number)
                 self._viewed[epoch.number] += 1
-                self._tidy()
+                if number:  # which pins it; else nothing is different
+                    self._tidy()
             try:
                 yield epoch
             finally:
                 with self._lock:
-                    self._viewed -= Counter([epoch.number])
+                    self._viewed[epoch.number] -= 1
+                    if not self._viewed[epoch.number]:
+                        del self._viewed[epoch.number]
                     if epoch is not self.newest:
                         self._pin(asking_client.get(), epoch.number)
 
