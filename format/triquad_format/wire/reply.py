@@ -200,8 +200,7 @@ def _problems(
     exchange = Exchange(question, (message, *outer))
     kind: Any = type(message)  # mypy takes no class of messages for hashable
     for field, bounds in _bounds_of(kind).items():
-        for within, problem in bounds.problems(getattr(message, field), exchange):
-            yield f"{kind.__name__}.{field}{within}", problem
+        yield from bounds.problems(f"{kind.__name__}.{field}", getattr(message, field), exchange)
 
 
 @dataclass(frozen=True)
@@ -212,24 +211,21 @@ class _Bounds:
     key: "_Bounds | None" = None
     item: "_Bounds | None" = None
 
-    def problems(self, value: Any, exchange: Exchange) -> Iterator[tuple[str, str]]:
-        """Where in a value something is wrong, and what."""
+    def problems(self, name: str, value: Any, exchange: Exchange) -> Iterator[tuple[str, str]]:
+        """Where in the value of the field ``name`` something is wrong, and what."""
         if value is None:
             return
         if isinstance(value, Message):
-            for name, wrong in _problems(value, exchange.question, exchange.around):
-                yield f": {name}", wrong
+            yield from _problems(value, exchange.question, exchange.around)
         elif self.key is not None and self.item is not None:
             for key, entry in value.items():
-                for within, problem in self.key.problems(key, exchange):
-                    yield f" key{within}", problem
-                for within, problem in self.item.problems(entry, exchange):
-                    yield f"[{key!r}]{within}", problem
+                yield from self.key.problems(f"{name} key", key, exchange)
+                yield from self.item.problems(f"{name}[{key!r}]", entry, exchange)
         else:
             for check in self.checks:
-                found = check.problem(value, exchange)
-                if found is not None:
-                    yield "", found
+                problem = check.problem(value, exchange)
+                if problem is not None:
+                    yield name, problem
 
 
 @functools.cache

@@ -124,9 +124,7 @@ class EpochHistory:
                 yield epoch
             finally:
                 with self._lock:
-                    self._viewed[epoch.number] -= 1
-                    if not self._viewed[epoch.number]:
-                        del self._viewed[epoch.number]
+                    self._viewed -= Counter([epoch.number])
                     if epoch is not self.newest:
                         self._pin(asking_client.get(), epoch.number)
 
