@@ -118,8 +118,7 @@ class EpochHistory:
             with self._lock:
                 epoch = self._get(number)
                 self._viewed[epoch.number] += 1
-                if number:  # which pins it; else nothing is different
-                    self._tidy()
+                self._tidy()
             try:
                 yield epoch
             finally:
