@@ -125,6 +125,6 @@ def lower_priority(niceness: int) -> None:
     """
     if niceness and sys.platform == "linux":
         with contextlib.suppress(OSError):
-            thread = threading.get_native_id()
-            nice = os.getpriority(os.PRIO_PROCESS, thread) + niceness
-            os.setpriority(os.PRIO_PROCESS, thread, nice)
+            # Not what the thread has: it may have been started by one that was lowered itself.
+            nice = os.getpriority(os.PRIO_PROCESS, os.getpid()) + niceness
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
