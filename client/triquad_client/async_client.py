@@ -24,7 +24,8 @@ from triquad_client.client import Client
 from triquad_client.documentation import documented_as
 from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
-from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
+from triquad_client.mesh.mesh import Mesh
+from triquad_client.mesh.mesh_calls import fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.net.async_driver import AsyncDriver
 from triquad_client.net.connection import Connection
 from triquad_client.offline.synced_map import AsyncSyncedMap

@@ -21,7 +21,8 @@ from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.calls.sources import SourceReport
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
-from triquad_client.mesh.mesh import Mesh, fetch_mesh, fetch_tile, fetch_tiles
+from triquad_client.mesh.mesh import Mesh
+from triquad_client.mesh.mesh_calls import fetch_mesh, fetch_tile, fetch_tiles
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.net.connection import Connection, RemoteDriver
 from triquad_client.offline.synced_map import SyncedMap

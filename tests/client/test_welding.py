@@ -1,5 +1,6 @@
 import numpy as np
-from triquad_client.mesh.mesh import compacted, welded
+from triquad_client.mesh.mesh import compacted
+from triquad_client.mesh.tile_join import on_sides, welded
 
 
 def test_vertices_on_a_common_face_become_one():
@@ -7,7 +8,8 @@ def test_vertices_on_a_common_face_become_one():
     left = np.array([[0.5, 0.5, 0.5], [1, 0.2, 0.3], [1, 0.8, 0.3]])
     right = np.array([[1, 0.2, 0.3], [1, 0.8, 0.3], [1.5, 0.5, 0.5]])
     faces = np.array([[0, 1, 2], [3, 5, 4]], np.int32)
-    mesh = welded(np.concatenate([left, right]), faces, 1.0)
+    vertices = np.concatenate([left, right])
+    mesh = welded(vertices, faces, on_sides(vertices, 1.0))
     assert len(mesh.vertices) == 4
     assert len(mesh.faces) == 2
     assert len(set(mesh.faces.ravel())) == 4
@@ -24,22 +26,21 @@ def test_rounding_boundaries_do_not_leave_cracks():
     index = np.arange(count - 1)
     first = np.stack([index, index + 1, np.full(count - 1, 2 * count)], axis=1)
     second = np.stack([index + 1, index, np.full(count - 1, count + 1)], axis=1) + count
-    mesh = welded(
-        np.concatenate([edge, copy, apexes]),
-        np.concatenate([first, second]).astype(np.int32),
-        6.4,
-    )
+    vertices = np.concatenate([edge, copy, apexes])
+    faces = np.concatenate([first, second]).astype(np.int32)
+    mesh = welded(vertices, faces, on_sides(vertices, 6.4))
     assert len(mesh.vertices) == count + 2
 
 
 def test_faces_that_become_degenerate_are_left_out():
     vertices = np.array([[1, 0, 0], [1, 1e-6, 0], [0.5, 0.5, 0.5]])
-    mesh = welded(vertices, np.array([[0, 1, 2]], np.int32), 1.0)
+    mesh = welded(vertices, np.array([[0, 1, 2]], np.int32), on_sides(vertices, 1.0))
     assert mesh.faces.shape == (0, 3)
 
 
 def test_an_empty_mesh_stays_empty():
-    mesh = welded(np.zeros((0, 3)), np.zeros((0, 3), np.int32), 6.4)
+    vertices = np.zeros((0, 3))
+    mesh = welded(vertices, np.zeros((0, 3), np.int32), on_sides(vertices, 6.4))
     assert mesh.vertices.shape == (0, 3)
     assert mesh.faces.shape == (0, 3)
     assert mesh.faces.dtype == np.int32

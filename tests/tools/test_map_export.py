@@ -12,7 +12,7 @@ from support.map_records import random_record
 from support.mapfile_edit import file_bytes
 from support.small_world import settings, settled_epoch
 from triquad_client import Mesh
-from triquad_client.mesh.mesh import joined
+from triquad_client.mesh.tile_join import joined
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record

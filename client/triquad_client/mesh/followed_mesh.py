@@ -17,7 +17,9 @@ from triquad_format.wire.tile_codec import decode_tile, decoded_bytes
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError
-from triquad_client.mesh.mesh import Mesh, joined, too_large_error
+from triquad_client.mesh.mesh import Mesh
+from triquad_client.mesh.mesh_calls import too_large_error
+from triquad_client.mesh.tile_join import joined
 
 _REPLY_BYTES = 1_000_000
 
@@ -182,7 +184,7 @@ class FollowedMesh:
 
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""
-        tiles = [Mesh(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values()]
+        tiles = (Mesh(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values())
         box = self.minimum, self.maximum
         return joined(tiles, self.tile_side_m, box=box, epoch=self.epoch)
 

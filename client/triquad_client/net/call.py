@@ -50,10 +50,12 @@ class Ask(Generic[ReplyT]):
 
 @dataclass(frozen=True)
 class Batch:
-    """A step: one request per item. It is sent the replies, in the order of the items."""
+    """A step: one request per item. It is sent what ``take`` makes of the replies, in the order of
+    the items: of each while the next are on their way."""
 
     items: Iterable[Any]
     request: Callable[[Any], Ask[Any]]
+    take: Callable[[Any], Any]
     at_once: int  # requests that wait for their replies at the same time
 
 
@@ -102,8 +104,18 @@ def ask_each(
     items: Iterable[ItemT], request: Callable[[ItemT], Ask[ReplyT]], at_once: int = _PARTS_IN_FLIGHT
 ) -> Call[list[ReplyT]]:
     """The replies to one request per item; each is made when its turn comes, maybe in a thread."""
-    replies: list[ReplyT] = yield Batch(items, request, at_once)
-    return replies
+    return (yield from take_each(items, request, lambda reply: reply, at_once))
+
+
+def take_each(
+    items: Iterable[ItemT],
+    request: Callable[[ItemT], Ask[ReplyT]],
+    take: Callable[[ReplyT], ResultT],
+    at_once: int = _PARTS_IN_FLIGHT,
+) -> Call[list[ResultT]]:
+    """As :func:`ask_each`: what ``take``, which must be quick, makes of each reply."""
+    taken: list[ResultT] = yield Batch(items, request, take, at_once)
+    return taken
 
 
 def offload(job: Callable[[Run], ResultT]) -> Call[ResultT]:
@@ -153,7 +165,7 @@ class Driver(ABC):
 
     @abstractmethod
     async def _replies(self, batch: Batch) -> list[Any]:
-        """The replies to the requests, in the order of the items."""
+        """What is made of the replies to the requests, in the order of the items."""
 
     @abstractmethod
     async def _pause(self, seconds: float) -> None:
@@ -190,14 +202,14 @@ async def exchange(
     send: Callable[[Ask[Any]], Awaitable[PendingT]],
     receive: Callable[[Ask[Any], PendingT], Awaitable[Any]],
 ) -> list[Any]:
-    """The replies to a batch, of which ``batch.at_once`` requests are under way at a time."""
+    """What is made of the replies to a batch, of which ``batch.at_once`` are awaited at a time."""
     waiting: deque[tuple[Ask[Any], PendingT]] = deque()
-    replies = []
+    taken = []
     for item in batch.items:
         request = batch.request(item)
         waiting.append((request, await send(request)))
         if len(waiting) >= batch.at_once:
-            replies.append(await receive(*waiting.popleft()))
+            taken.append(batch.take(await receive(*waiting.popleft())))
     while waiting:
-        replies.append(await receive(*waiting.popleft()))
-    return replies
+        taken.append(batch.take(await receive(*waiting.popleft())))
+    return taken

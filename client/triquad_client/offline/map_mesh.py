@@ -21,7 +21,8 @@ from triquad_map.view import MeshedView
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.mesh.mesh import Mesh, joined
+from triquad_client.mesh.mesh import Mesh
+from triquad_client.mesh.tile_join import TileJoin
 
 CELL_RANGE_M = (0.005, 10.0)
 MAX_FACES = 50_000_000
@@ -164,11 +165,12 @@ def map_mesh(
 ) -> Mesh:
     """The surface of a map where rays have seen one, whole; arguments as of :func:`mesh_blocks`."""
     blocks = mesh_blocks(view, seen, cell_m, bounds, fill_m)
-    parts: list[Mesh] = []
+    join = TileJoin(blocks.side_m, checks.box(bounds), marked=fill_m > 0)
     faces = 0
     for number, index in enumerate(blocks.indices, start=1):
-        parts.append(blocks.mesh(index))
-        faces += len(parts[-1].faces)
+        part = blocks.mesh(index)
+        join.add(part)
+        faces += len(part.faces)
         if faces > MAX_FACES:
             raise InvalidInputError(
                 f"the mesh has more than {MAX_FACES:,} faces with cells of {blocks.cell_m:g} m: "
@@ -176,7 +178,7 @@ def map_mesh(
             )
         if report is not None:
             report(number, len(blocks.indices))
-    return joined(parts, blocks.side_m, box=checks.box(bounds), epoch=view.epoch, marked=fill_m > 0)
+    return join.mesh(view.epoch)
 
 
 def _marched(volume: Floats, cells: Bools) -> Mesh:

@@ -1,0 +1,142 @@
+"""The meshes of tiles as one mesh: those of its faces that lie in a box, without seams."""
+
+import dataclasses
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
+
+from triquad_client.mesh.mesh import Mesh, compacted
+
+WELD_M = 1e-4
+"""Vertices closer than about this are one."""
+
+_SHIFTS = np.array([(0.5, 0.5, 0.5), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0)])
+"""Vertices that lie on a lattice edge may fall on two sides of a rounding boundary along it, and
+along it only: a second round, shifted along that axis, brings them together."""
+
+
+class TileJoin:
+    """Joins tiles as they come: what concerns a single one is done before the next is there."""
+
+    def __init__(
+        self, tile_side_m: float, box: tuple[Doubles, Doubles], *, marked: bool = False
+    ) -> None:
+        """Faces stay whose centroids lie in the ``box``, given by its corners [3], metres.
+
+        Where tiles are ``marked``, all tell which of their faces fill holes.
+        """
+        self._tile_side_m = tile_side_m
+        self._box = box
+        self._marked = marked
+        self._count = 0  # of vertices so far
+        self._vertices = [np.zeros((0, 3))]
+        self._faces = [np.zeros((0, 3), np.int32)]
+        self._shared = [np.zeros(0, np.int64)]
+        self._filled = [np.zeros(0, np.bool_)]
+
+    def add(self, tile: Mesh) -> None:
+        """Add the mesh of a tile."""
+        cut = _within(tile, self._box)
+        self._vertices.append(cut.vertices)
+        self._faces.append(cut.faces + np.int32(self._count))
+        self._shared.append(on_sides(cut.vertices, self._tile_side_m) + self._count)
+        if cut.filled is not None:
+            self._filled.append(cut.filled)
+        self._count += len(cut.vertices)
+
+    def mesh(self, epoch: int) -> Mesh:
+        """All tiles so far as one mesh, which shows the ``epoch``."""
+        whole = welded(
+            np.concatenate(self._vertices),
+            np.concatenate(self._faces),
+            np.concatenate(self._shared),
+            filled=np.concatenate(self._filled) if self._marked else None,
+        )
+        return dataclasses.replace(whole, epoch=epoch)
+
+
+def joined(
+    tiles: Iterable[Mesh], tile_side_m: float, *, box: tuple[Doubles, Doubles], epoch: int
+) -> Mesh:
+    """The tiles' faces whose centroids lie in a box, given by its corners [3], as one mesh."""
+    join = TileJoin(tile_side_m, box)
+    for tile in tiles:
+        join.add(tile)
+    return join.mesh(epoch)
+
+
+def _within(tile: Mesh, box: tuple[Doubles, Doubles]) -> Mesh:
+    """The faces of a tile whose centroids lie in a box; all of its vertices stay."""
+    low, high = box
+    if ((tile.vertices >= low) & (tile.vertices <= high)).all():
+        return tile
+    centroids = tile.vertices[tile.faces].mean(axis=1)
+    inside = ((centroids >= low) & (centroids <= high)).all(axis=1)
+    filled = None if tile.filled is None else tile.filled[inside]
+    return dataclasses.replace(tile, faces=tile.faces[inside], filled=filled)
+
+
+def on_sides(vertices: Doubles, tile_side_m: float) -> Longs:
+    """Which of vertices [V, 3], metres, lie on the sides of tiles: others may have them, too."""
+    steps = vertices / tile_side_m
+    steps -= np.rint(steps)
+    near = np.abs(steps, out=steps) < WELD_M / tile_side_m
+    return np.flatnonzero(near[:, 0] | near[:, 1] | near[:, 2])
+
+
+def welded(vertices: Doubles, faces: Ints, shared: Longs, filled: Bools | None = None) -> Mesh:
+    """The mesh with one vertex where tiles had several, without faces that this made degenerate.
+
+    Of ``vertices`` [V, 3], metres, only the ``shared`` ones can be the same; ``filled`` [F] is as
+    of :class:`Mesh`.
+    """
+    target = np.arange(len(vertices), dtype=np.int32)
+    target[shared] = shared[_representatives(vertices[shared])]
+    joined = target.take(faces)
+    a, b, c = joined.T
+    kept = (a != b) & (b != c) & (c != a)
+    return compacted(vertices, joined[kept], filled=None if filled is None else filled[kept])
+
+
+def _representatives(points: Doubles) -> NDArray[np.intp]:
+    """For each point [N, 3], the index of the point that stands for it."""
+    chosen = np.arange(len(points))
+    for shift in _SHIFTS:
+        left, at = _numbered(chosen, len(points))
+        names = _names(np.floor(points[left] / WELD_M + shift).astype(np.int64))
+        chosen = left[_firsts(names)][at]
+    return chosen
+
+
+def _numbered(chosen: NDArray[np.intp], count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The different ones of [N] numbers below ``count``, and which of these each is."""
+    used = np.zeros(count, np.bool_)
+    used[chosen] = True
+    return np.flatnonzero(used), (np.cumsum(used) - 1)[chosen]
+
+
+def _firsts(names: Longs) -> NDArray[np.intp]:
+    """For each name [N], where it is found first."""
+    if len(names) == 0:
+        return np.zeros(0, np.intp)
+    order = np.argsort(names)
+    found = names[order]
+    is_new = np.concatenate([[True], found[1:] != found[:-1]])
+    firsts = np.empty(len(names), np.intp)
+    firsts[order] = np.minimum.reduceat(order, np.flatnonzero(is_new))[np.cumsum(is_new) - 1]
+    return firsts
+
+
+def _names(cells: Longs) -> Longs:
+    """A number for each of cells [N, 3], the same one for the same cell alone."""
+    if len(cells) == 0:
+        return np.zeros(0, np.int64)
+    x, y, z = (axis - axis.min() for axis in cells.T)
+    columns = x * (y.max() + 1) + y
+    if (int(x.max()) + 1) * (int(y.max()) + 1) * (int(z.max()) + 1) >= 2**63:
+        # 64 bits do not do for all cells of a large map: for those of the columns in use.
+        _, columns = np.unique(columns, return_inverse=True)
+    names: Longs = columns * (z.max() + 1) + z
+    return names
