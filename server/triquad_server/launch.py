@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from typing import TYPE_CHECKING
 
 from triquad_format.errors import SettingsError
 from triquad_format.records.region import MapRecord
@@ -13,7 +14,6 @@ from triquad_format.records.region import MapRecord
 from triquad_server.device import choose_device
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.monitoring.http_server import MonitoringServer
 from triquad_server.net.configuration import Configuration, configuration
 from triquad_server.net.session import open_session
 from triquad_server.network_defaults import network_defaults
@@ -30,6 +30,9 @@ from triquad_server.settings import Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.supervision import Supervision
+
+if TYPE_CHECKING:
+    from triquad_server.monitoring.http_server import MonitoringServer
 
 _log = logging.getLogger("triquad_server")
 
@@ -142,10 +145,13 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     preparation.for_mapping(service.begin_to_map, failed)
 
 
-def _open_monitoring(settings: Settings, stack: ExitStack) -> MonitoringServer | None:
+def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer | None":
     """The port for metrics, where one is wanted: it listens before all else takes its time."""
     if settings.metrics.port == 0:
         return None
+    # Only where it is wanted, since Python's HTTP server takes a while to import.
+    from triquad_server.monitoring.http_server import MonitoringServer
+
     return stack.enter_context(closing(MonitoringServer(settings.metrics)))
 
 
