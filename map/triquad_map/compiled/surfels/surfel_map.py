@@ -4,10 +4,11 @@ Surfels stand in the order of the evidence: block by block, and within a block v
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
@@ -79,29 +80,41 @@ def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
     return voxels
 
 
-@kernel()
-def moved_rows(before: Bytes, before_starts: Ints, now: Bytes, count: int) -> Ints:
-    """For each surfel [count] of ``now``, its number in ``before``; -1 where it is new.
+class SurfelRows(NamedTuple):
+    """The arrays of surfels in blocks of voxels, as kernels take them."""
 
-    Blocks are those of ``before`` and more.
+    surface: Bytes  # [blocks, BLOCK_BYTES]
+    starts: Ints  # [blocks + 1]
+    offsets: Floats  # [S, 3]
+    normals: Floats  # [S, 3]
+    kinds: Bytes  # [S]
+    epochs: Longs  # [S]
+
+
+@kernel()
+def carry(before: SurfelRows, now: SurfelRows) -> Bools:
+    """Copy surfels to the same voxels of ``now``; whether each [S] of ``before`` has one there.
+
+    Blocks of ``now`` are those of ``before`` and more.
     """
-    rows = np.full(count, -1, np.int32)
-    at = 0
-    for row in range(len(now)):
-        known = row < len(before)
-        old = before_starts[row] if known else 0
+    carried = np.zeros(len(before.epochs), np.bool_)
+    for block in range(len(before.surface)):
+        new, old = now.starts[block], before.starts[block]
         for byte in range(BLOCK_BYTES):
-            bits = int(now[row, byte])
-            old_bits = int(before[row, byte]) if known else 0
-            if bits | old_bits == 0:
+            bits, old_bits = int(now.surface[block, byte]), int(before.surface[block, byte])
+            if bits | old_bits == 0:  # as in most blocks, which are of open air
                 continue
             for z in range(BLOCK_VOXELS):
-                if bits >> z & 1:
-                    if old_bits >> z & 1:
-                        rows[at] = old
-                    at += 1
+                if bits >> z & old_bits >> z & 1:
+                    for axis in range(3):
+                        now.offsets[new, axis] = before.offsets[old, axis]
+                        now.normals[new, axis] = before.normals[old, axis]
+                    now.kinds[new] = before.kinds[old]
+                    now.epochs[new] = before.epochs[old]
+                    carried[old] = True
+                new += bits >> z & 1
                 old += old_bits >> z & 1
-    return rows
+    return carried
 
 
 @dataclass(frozen=True)
@@ -111,6 +124,19 @@ class _Fitted:
     places: SurfelPlaces
     surfels: Surfels
     epochs: Longs  # [S] ``_NEVER`` where there is nothing yet
+
+    @property
+    def rows(self) -> SurfelRows:
+        """Their arrays."""
+        places, surfels = self.places, self.surfels
+        return SurfelRows(
+            places.surface,
+            places.starts,
+            offsets=surfels.offsets,
+            normals=surfels.normals,
+            kinds=surfels.kinds,
+            epochs=self.epochs,
+        )
 
 
 class SurfelMap:
@@ -191,18 +217,9 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
         copies = {name: array.copy() for name, array in vars(before.surfels).items()}
         return _Fitted(old, Surfels(**copies), before.epochs.copy())
     after = _nothing_in(surfel_places(evidence.cells, evidence.surface))
-    used = np.flatnonzero(np.diff(after.places.starts))
-    known = used[used < len(old.surface)]
-    rows = moved_rows(
-        old.surface[known], old.starts[known], evidence.surface[used], len(after.epochs)
-    )
-    kept = np.flatnonzero(rows >= 0)
-    rows = rows[kept]
-    for name, array in vars(after.surfels).items():
-        array[kept] = getattr(before.surfels, name)[rows]
-    after.epochs[kept] = before.epochs[rows]
-    if len(rows) < len(before.epochs):
-        after.epochs[_beside(after, np.delete(old.voxels, rows, axis=0))] = _NEVER
+    carried = carry(before.rows, after.rows)
+    if not carried.all():
+        after.epochs[_beside(after, old.voxels[~carried])] = _NEVER
     return after
 
 
