@@ -1,10 +1,12 @@
 """Work that is shared among threads is all done, once, whatever happens."""
 
+import os
+import sys
 import threading
 
 import numpy as np
 import pytest
-from triquad_map.compiled.team import THREADS, Team
+from triquad_map.compiled.team import THREADS, Team, lower_priority
 
 
 @pytest.fixture
@@ -87,3 +89,24 @@ def test_the_caller_waits_for_no_thread_that_has_other_work(team):
         team.split(len(done), lambda first, last: done.__setitem__(slice(first, last), 1))
         go_on.set()
     assert done.all()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of single threads are Linux's")
+def test_threads_have_the_priority_of_a_caller_who_starts_them_at_the_same():
+    lowered = Team("lowered", 3)
+    met = threading.Barrier(THREADS)
+    niceness = []
+
+    def work(_):
+        met.wait()  # so that each part has a thread of its own
+        niceness.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+
+    def call():
+        lower_priority(3)
+        lowered.each(work)
+
+    caller = threading.Thread(target=call)
+    caller.start()
+    caller.join()
+    lowered.close()
+    assert niceness == [os.getpriority(os.PRIO_PROCESS, os.getpid()) + 3] * THREADS

@@ -161,11 +161,12 @@ class Observations:
         count = int(starts[-1])
         beyond = np.empty((count, len(MARGIN_BITS)), np.uint8)
         support = Support(np.empty(count, np.uint8), np.empty(count, np.uint8), beyond)
+        weights = self.arrays.voxels["weight"][:, None]
 
         def work(first: int, last: int) -> None:
             observed = self.arrays._replace(places=places[first:last])
             part = Support(*(array[starts[first] : starts[last]] for array in support))
-            fill_support(surface[first:last], observed, part)
+            fill_support(surface[first:last], observed, weights, part)
 
         split(len(surface), work, least=_LEAST_BLOCKS)
         return support

@@ -2,11 +2,13 @@
 
 from typing import NamedTuple
 
-from triquad_format.records.arrays import Bytes
+import numpy as np
+from triquad_format.records.arrays import Bytes, Floats
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 
 from triquad_map.compiled.evidence.observed import EIGHTHS, Observed, ObservedVoxel
+from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import SHIFT
 from triquad_map.surface import LEAST_STRENGTH, LEVELS, SECTORS_COUNTED
@@ -43,22 +45,31 @@ def _quarters(eighths: int) -> int:
 
 
 @kernel()
-def fill_support(surface: Bytes, observed: Observed, support: Support) -> None:
-    """Fill in the ``support`` of the voxels of ``surface``, in their order."""
+def fill_support(surface: Bytes, observed: Observed, weights: Floats, support: Support) -> None:
+    """Fill in the ``support`` of the voxels of ``surface``, in their order.
+
+    ``weights`` [rows, 1] are those of the records in ``observed``, which lie all over the memory.
+    """
     at = 0
+    rows = np.empty(BLOCK_BYTES * BLOCK_VOXELS, np.int32)
     for block in range(len(surface)):
         place = observed.places[block]
+        count = 0
         for byte in range(BLOCK_BYTES):
             bits = int(surface[block, byte])
             if bits == 0:
                 continue
             for z in range(BLOCK_VOXELS):
                 if bits >> z & 1:
-                    voxel = observed.voxels[observed.rows[place, byte << SHIFT | z]]
-                    support.levels[at] = _level(voxel)
-                    support.scans[at] = voxel.scans
-                    for axis in range(3):
-                        above = EIGHTHS - 1 - voxel.highest[axis]
-                        support.beyond[at, axis] = _quarters(voxel.lowest[axis])
-                        support.beyond[at, axis + 3] = _quarters(above)
-                    at += 1
+                    rows[count] = observed.rows[place, byte << SHIFT | z]
+                    prefetch_row(weights, rows[count])
+                    count += 1
+        for row in rows[:count]:
+            voxel = observed.voxels[row]
+            support.levels[at] = _level(voxel)
+            support.scans[at] = voxel.scans
+            for axis in range(3):
+                above = EIGHTHS - 1 - voxel.highest[axis]
+                support.beyond[at, axis] = _quarters(voxel.lowest[axis])
+                support.beyond[at, axis + 3] = _quarters(above)
+            at += 1
