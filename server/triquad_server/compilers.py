@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Collection
 
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.process.memory import put_off_collection
 from triquad_server.process.threads import NICENESS, Teams

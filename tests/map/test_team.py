@@ -6,7 +6,8 @@ import threading
 
 import numpy as np
 import pytest
-from triquad_map.compiled.team import THREADS, Team, lower_priority
+from triquad_map.compiled.priority import lower_priority
+from triquad_map.compiled.team import THREADS, Team
 
 
 @pytest.fixture
@@ -95,11 +96,12 @@ def test_the_caller_waits_for_no_thread_that_has_other_work(team):
 def test_threads_have_the_priority_of_a_caller_who_starts_them_at_the_same():
     lowered = Team("lowered", 3)
     met = threading.Barrier(THREADS)
-    niceness = []
+    niceness, policies = [], []
 
     def work(_):
         met.wait()  # so that each part has a thread of its own
         niceness.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+        policies.append(os.sched_getscheduler(0))
 
     def call():
         lower_priority(3)
@@ -110,3 +112,4 @@ def test_threads_have_the_priority_of_a_caller_who_starts_them_at_the_same():
     caller.join()
     lowered.close()
     assert niceness == [os.getpriority(os.PRIO_PROCESS, os.getpid()) + 3] * THREADS
+    assert policies == [os.SCHED_BATCH] * THREADS

@@ -2,11 +2,12 @@
 
 import contextlib
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
+
+from triquad_map.compiled.priority import lower_priority
 
 THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
 """Threads that share the work: one per core that this process may use."""
@@ -43,7 +44,7 @@ class Team:
     """
 
     def __init__(self, name: str, niceness: int = 0) -> None:
-        """Threads start with the first work; for ``niceness`` see :func:`lower_priority`."""
+        """Threads start with the first work; ``niceness`` is as of :func:`lower_priority`."""
         self._pool = ThreadPoolExecutor(
             THREADS, thread_name_prefix=name, initializer=lower_priority, initargs=(niceness,)
         )
@@ -116,15 +117,3 @@ def _finish(parts: Sequence[_Part]) -> None:
 def share(count: int, part: int, parts: int = THREADS) -> tuple[int, int]:
     """Where a part of ``range(count)`` begins and ends."""
     return -(-count * part // parts), -(-count * (part + 1) // parts)
-
-
-def lower_priority(niceness: int) -> None:
-    """Have the calling thread leave the cores to threads of less ``niceness``, 0 being the least.
-
-    Where the system does not know priorities of single threads, nothing happens.
-    """
-    if niceness and sys.platform == "linux":
-        with contextlib.suppress(OSError):
-            # Not what the thread has: it may have been started by one that was lowered itself.
-            nice = os.getpriority(os.PRIO_PROCESS, os.getpid()) + niceness
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)

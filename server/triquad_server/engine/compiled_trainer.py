@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints
 from triquad_map.compiled.field.encoding import BATCH, PointBatch, add_feature_gradient, load
-from triquad_map.compiled.field.feature_rows import move_row, prefetch_row
+from triquad_map.compiled.field.feature_rows import move_row
 from triquad_map.compiled.field.field import (
     CompiledField,
     Mlp,
@@ -30,6 +30,7 @@ from triquad_map.compiled.field.field import (
     transposed,
 )
 from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.row_access import prefetch_row
 from triquad_map.compiled.team import THREADS, Team, share
 
 from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates

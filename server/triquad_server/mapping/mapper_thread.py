@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from triquad_format.wire.messages import FieldFit, ResetReply, ResetRequest, Scan
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.counter import Counter
 from triquad_server.epochs.history import EpochHistory

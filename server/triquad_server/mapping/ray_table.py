@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
-from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.field.quadtree import morton_code
 from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.row_access import prefetch_row
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.live_field import Batch

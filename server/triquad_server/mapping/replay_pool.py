@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.row_access import prefetch_row
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import (
     Index,

@@ -18,7 +18,7 @@ from triquad_format.records.arrays import Ints
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.fair_queue import Owner
 from triquad_server.mesh.mesher import TileIndex, TileLattice, check_box, check_level

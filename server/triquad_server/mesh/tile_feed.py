@@ -8,7 +8,7 @@ import time
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.fair_queue import first_to_go

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import Generic, TypeVar
 
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.priority import lower_priority
 
 _log = logging.getLogger(__name__)
 

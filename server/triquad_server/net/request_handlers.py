@@ -11,7 +11,7 @@ import zenoh
 from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Message
 from triquad_format.wire.metrics_messages import QueueMetrics
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.net.askers import Askers
 from triquad_server.net.asking_client import asking_client

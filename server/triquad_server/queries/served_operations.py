@@ -71,7 +71,7 @@ class ServedOperations:
         """Answer a group of operations from now on; no other group waits for it.
 
         ``queue`` is the name of what waits for them; ``niceness`` is that of the threads that
-        answer, see :func:`triquad_map.compiled.team.lower_priority`.
+        answer, see :func:`triquad_map.compiled.priority.lower_priority`.
         """
         operations = {}
         for name, handler in handlers.items():

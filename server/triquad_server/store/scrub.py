@@ -11,7 +11,7 @@ from triquad_format.errors import FormatError, NoIndexError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
 from triquad_format.mapfile.index import FileBytes, MapIndex, named
 from triquad_format.mapfile.reader import read_map_file
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.process.threads import NICENESS
 

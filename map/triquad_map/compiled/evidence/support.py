@@ -8,8 +8,8 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 
 from triquad_map.compiled.evidence.observed import EIGHTHS, Observed, ObservedVoxel
-from triquad_map.compiled.field.feature_rows import prefetch_row
 from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.row_access import prefetch_row
 from triquad_map.compiled.voxel_index import SHIFT
 from triquad_map.surface import LEAST_STRENGTH, LEVELS, SECTORS_COUNTED
 

@@ -10,9 +10,10 @@ import numpy as np
 from triquad_format.records.arrays import Floats, Ints, Longs
 from triquad_format.records.region import AXES
 
-from triquad_map.compiled.field.feature_rows import add_rows, add_to_row, prefetch_row
+from triquad_map.compiled.field.feature_rows import add_rows, add_to_row
 from triquad_map.compiled.field.quadtree import Shape, Vertices, block_key
 from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.row_access import prefetch_row
 from triquad_map.compiled.voxel_index import EMPTY, find_row
 
 BATCH = 64

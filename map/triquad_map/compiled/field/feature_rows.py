@@ -5,41 +5,19 @@ where a loop over a row reads one array and writes another that might be the sam
 spelt out here; rows of another length are loops.
 """
 
-from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
 from triquad_format.records.arrays import Floats
 
 from triquad_map.compiled.kernel import kernel
-
-# The stub has it as if callers passed the typing context, which they do not.
-_kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., None]]", intrinsic)
+from triquad_map.compiled.row_access import address_of, kernel_code
 
 _LANES = 8
 _VECTOR = ir.VectorType(ir.FloatType(), _LANES)
 _INT32 = ir.IntType(32)
-
-
-def _element(
-    context: Any,
-    builder: Any,
-    array: tuple[Any, Any],
-    row: tuple[Any, Any],
-    column: tuple[Any, Any] | None = None,
-) -> Any:
-    """Address of ``array[row, column]``; every argument is a (type, value) pair."""
-    kind, value = array
-    data = context.make_array(kind)(context, builder, value)
-    indices = [context.cast(builder, row[1], row[0], types.intp)]
-    if column is None:
-        indices.append(context.get_constant(types.intp, 0))
-    else:
-        indices.append(context.cast(builder, column[1], column[0], types.intp))
-    return cgutils.get_item_pointer(context, builder, kind, data, indices, wraparound=False)
 
 
 def _vector(builder: Any, address: Any) -> Any:
@@ -49,7 +27,7 @@ def _vector(builder: Any, address: Any) -> Any:
 def _spread(builder: Any, number: Any) -> Any:
     """A vector of the same number in all lanes."""
     undefined = ir.Constant(_VECTOR, ir.Undefined)
-    first = builder.insert_element(undefined, number, ir.Constant(_INT32, 0))
+    first = builder.insertaddress_of(undefined, number, ir.Constant(_INT32, 0))
     lanes = ir.Constant(ir.VectorType(_INT32, _LANES), [0] * _LANES)
     return builder.shuffle_vector(first, undefined, lanes)
 
@@ -59,24 +37,7 @@ def _multiply_add(builder: Any, total: Any, factor: Any, vector: Any) -> Any:
     return builder.fadd(total, product, flags=["fast"])
 
 
-@_kernel_code
-def prefetch_row(_: Any, table: Any, row: Any) -> Any:
-    """Ask for ``table[row]`` to be brought into the cache."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pairs = list(zip(signature.args, args, strict=True))
-        bytes_ = ir.IntType(8).as_pointer()
-        address = builder.bitcast(_element(context, builder, *pairs), bytes_)
-        kind = ir.FunctionType(ir.VoidType(), [bytes_, _INT32, _INT32, _INT32])
-        call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        # To read, for all cache levels, data.
-        builder.call(call, [address, *(ir.Constant(_INT32, flag) for flag in (0, 3, 1))])
-        return context.get_dummy_value()
-
-    return types.void(table, row), generate
-
-
-@_kernel_code
+@kernel_code
 def _add_rows_of_8(
     _: Any, out: Any, point: Any, start: Any, table: Any, rows: Any, weights: Any
 ) -> Any:
@@ -84,11 +45,11 @@ def _add_rows_of_8(
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pairs = list(zip(signature.args, args, strict=True))
-        target = _vector(builder, _element(context, builder, *pairs[:3]))
+        target = _vector(builder, address_of(context, builder, *pairs[:3]))
         total = builder.load(target, align=4)
         for corner in range(4):
             row = builder.extract_value(args[4], corner)
-            address = _element(context, builder, pairs[3], (signature.args[4].dtype, row))
+            address = address_of(context, builder, pairs[3], (signature.args[4].dtype, row))
             vector = builder.load(_vector(builder, address), align=4)
             weight = builder.extract_value(args[5], corner)
             total = _multiply_add(builder, total, weight, vector)
@@ -98,7 +59,7 @@ def _add_rows_of_8(
     return types.void(out, point, start, table, rows, weights), generate
 
 
-@_kernel_code
+@kernel_code
 def _add_to_row_of_8(
     _: Any, table: Any, row: Any, weight: Any, values: Any, point: Any, start: Any
 ) -> Any:
@@ -106,8 +67,8 @@ def _add_to_row_of_8(
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pairs = list(zip(signature.args, args, strict=True))
-        source = _vector(builder, _element(context, builder, *pairs[3:]))
-        target = _vector(builder, _element(context, builder, *pairs[:2]))
+        source = _vector(builder, address_of(context, builder, *pairs[3:]))
+        target = _vector(builder, address_of(context, builder, *pairs[:2]))
         vector = builder.load(source, align=4)
         total = builder.load(target, align=4)
         builder.store(_multiply_add(builder, total, args[2], vector), target, align=4)
@@ -116,7 +77,7 @@ def _add_to_row_of_8(
     return types.void(table, row, weight, values, point, start), generate
 
 
-@_kernel_code
+@kernel_code
 def _move_row_of_8(
     _: Any,
     gradients: Any,
@@ -137,7 +98,7 @@ def _move_row_of_8(
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pairs = list(zip(signature.args, args, strict=True))
         addresses = [
-            _vector(builder, _element(context, builder, pair, pairs[4])) for pair in pairs[:4]
+            _vector(builder, address_of(context, builder, pair, pairs[4])) for pair in pairs[:4]
         ]
         gradient, value, mean, variance = (builder.load(at, align=4) for at in addresses)
         fast = {"flags": ["fast"]}

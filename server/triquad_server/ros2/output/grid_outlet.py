@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
-from triquad_map.compiled.team import Team, lower_priority
+from triquad_map.compiled.priority import lower_priority
+from triquad_map.compiled.team import Team
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.questions.grid import Grid, GridShape, grid
 from triquad_sensors.ros.type_store import OCCUPANCY_GRID, encode_cdr, type_store

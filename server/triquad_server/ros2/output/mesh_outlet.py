@@ -10,7 +10,7 @@ import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_format.wire.tile_codec import decode_tile
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.fair_queue import Owner
 from triquad_server.mesh.mesher import TileIndex
