@@ -27,7 +27,7 @@ def _vector(builder: Any, address: Any) -> Any:
 def _spread(builder: Any, number: Any) -> Any:
     """A vector of the same number in all lanes."""
     undefined = ir.Constant(_VECTOR, ir.Undefined)
-    first = builder.insertaddress_of(undefined, number, ir.Constant(_INT32, 0))
+    first = builder.insert_element(undefined, number, ir.Constant(_INT32, 0))
     lanes = ir.Constant(ir.VectorType(_INT32, _LANES), [0] * _LANES)
     return builder.shuffle_vector(first, undefined, lanes)
 
