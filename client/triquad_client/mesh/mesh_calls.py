@@ -13,9 +13,6 @@ from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.tile_join import TileJoin
 from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried, take_each
 
-_TILES_AT_ONCE = 16
-"""Tiles that are asked for and have not come yet: some take much longer to make than others."""
-
 
 def fetch_tiles(bounds: Bounds | None, level: int, fill_m: float = 0.0) -> Call[TileList]:
     """The tiles that meet the bounds."""
@@ -65,7 +62,6 @@ def fetch_mesh(
             listed.tiles.tolist(),
             lambda at: _ask_tile(at, listed.epoch, level, fill_m=fill_m),
             take,
-            at_once=_TILES_AT_ONCE,
         )
         return (yield from offload(lambda _: join.mesh(listed.epoch)))
 

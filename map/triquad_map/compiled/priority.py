@@ -45,7 +45,7 @@ def lower_priority(niceness: int) -> None:
 
 
 def _take_long_turns(nice: int) -> None:
-    """Have the calling thread, of this niceness, compute in few long turns."""
+    """Have the calling thread, of this niceness, compute in few long turns, if the system can."""
     call = _SYS_SCHED_SETATTR.get(platform.machine())
     if call is None:
         return
