@@ -116,6 +116,8 @@ class Campaign:
                 env={**os.environ, "PYTHONPATH": str(_TESTS)},
             )
             self._children.add(child)
+            if self._stopped.is_set():  # before the turn was known to be one to end
+                _kill(child)
             try:
                 child.wait(seconds + _HANG_S)
                 how = f"the turn ended with {child.returncode} and told nothing: {log}"
