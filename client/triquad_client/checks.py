@@ -13,9 +13,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.errors import InvalidInputError
-from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.arrays import Doubles, Floats, Ints
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
-from triquad_format.wire.limits import LEVELS, MAX_DISTANCE_M, MAX_FILL_M, MIN_LENGTH_M
+from triquad_format.wire.limits import (
+    LEVELS,
+    MAX_DISTANCE_M,
+    MAX_FILL_M,
+    MIN_LENGTH_M,
+    TILE_INDEX_LIMIT,
+)
 from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
 from triquad_sensors.errors import NO_NUMBER, InvalidScanError
@@ -157,6 +163,18 @@ def level_of_detail(level: int) -> int:
     if type(level) is not int or not 0 <= level < LEVELS:
         raise InvalidInputError(f"level = {_shown(level)}: use 0 to {LEVELS - 1}")
     return level
+
+
+def tile_indices(index: Sequence[int]) -> Ints:
+    """The index of one tile, as a row [1, 3] of several."""
+    for axis, number in zip("xyz", index, strict=True):
+        is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
+        if not is_whole or abs(number) > TILE_INDEX_LIMIT:
+            raise InvalidInputError(
+                f"{axis} = {_shown(number)}: use a whole number from -{TILE_INDEX_LIMIT} to "
+                f"{TILE_INDEX_LIMIT}, such as client.tiles() lists"
+            )
+    return np.array([index], np.int32)
 
 
 def length_to_fill(fill_m: float) -> float:

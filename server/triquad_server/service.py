@@ -16,7 +16,6 @@ from triquad_format.wire.messages import (
     SdfRequest,
     StatusRequest,
     TileListRequest,
-    TileRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import (
@@ -273,7 +272,7 @@ class Service:
             "tiles",
             {
                 keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
-                keys.TILE: answering(TileRequest, tiles.tile),
+                keys.MESH: tiles.answer_mesh,
             },
             _TILE_WORKERS,
             NICENESS,

@@ -16,12 +16,12 @@ from triquad_format.wire.messages import (
     FlushRequest,
     MapChunkRequest,
     MapInfoRequest,
+    MeshRequest,
     ResetRequest,
     Scan,
     SdfRequest,
     StatusRequest,
     TileListRequest,
-    TileRequest,
     TileUpdatesRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
@@ -54,6 +54,7 @@ def good_requests() -> dict[str, list[Message]]:
     """A few requests that are answered, for each operation that is known here."""
     some = servers.sphere(20)
     way = some / np.linalg.norm(some, axis=1, keepdims=True)
+    tiles = np.array([[-1, 0, 0], [0, 0, 0]], np.int32)
     known = (np.zeros((1, 3), np.int32), np.zeros(1, np.int64))
     return {
         keys.SDF: [SdfRequest(_ORIGIN, some, True, 0)],
@@ -67,7 +68,7 @@ def good_requests() -> dict[str, list[Message]]:
         keys.CHANGES: [ChangesRequest(1, "", *_BOX)],
         keys.SOURCES: [SourcesRequest("", 0, 10)],
         keys.TILE_LIST: [TileListRequest(*_BOX, 0)],
-        keys.TILE: [TileRequest(x, 0, 0, 0, level) for x in (-1, 0) for level in (0, 1, 2)],
+        keys.MESH: [MeshRequest(tiles, 0, level) for level in (0, 1, 2)],
         keys.TILE_UPDATES: [TileUpdatesRequest(*_BOX, 0, "", 0, *known, 100_000, 0.2, "c", 0)],
         keys.STATUS: [StatusRequest()],
         keys.METRICS: [MetricsRequest()],

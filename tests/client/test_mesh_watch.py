@@ -20,11 +20,11 @@ from triquad_client import Client, InvalidInputError, MeshWatch
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,
+    MeshReply,
+    MeshRequest,
     ServerStatus,
-    Tile,
     TileList,
     TileListRequest,
-    TileRequest,
     TileUpdates,
 )
 from triquad_format.wire.tile_codec import decode_tile
@@ -225,7 +225,10 @@ def test_levels_that_there_are_not_are_refused(endpoint: str, level: int) -> Non
     everywhere = np.full(3, np.inf)
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
-        assert peer.refusal(keys.TILE, TileRequest(0, 0, 0, 0, level)) == "bad_request"
+        assert (
+            peer.refusal(keys.MESH, MeshRequest(np.zeros((1, 3), np.int32), 0, level))
+            == "bad_request"
+        )
         asks = TileListRequest(-everywhere, everywhere, 0, level)
         assert peer.refusal(keys.TILE_LIST, asks) == "bad_request"
 
@@ -242,10 +245,9 @@ def test_single_tiles_have_levels_too(client: Client, endpoint: str) -> None:
         listed = codec.decode(TileList, answer)
         assert listed.tile_side_m == pytest.approx(6.4)
         assert (listed.changed > 0).all()
-        x, y, z = listed.tiles[0].tolist()
-        answer = peer.ask(keys.TILE, codec.encode(TileRequest(x, y, z, listed.epoch, 2)))
+        answer = peer.ask(keys.MESH, codec.encode(MeshRequest(listed.tiles[:1], listed.epoch, 2)))
         assert isinstance(answer, bytes)
-        tile = codec.decode(Tile, answer)
+        tile = codec.decode(MeshReply, answer)
         assert len(tile.faces) > 0
         assert 3.0 < tile.vertices.max() <= 6.4
 

@@ -13,11 +13,11 @@ from support import servers
 from support.operations import OPERATIONS
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
+    MeshRequest,
     ResetRequest,
     SdfRequest,
     StatusRequest,
     TileListRequest,
-    TileRequest,
 )
 from triquad_format.wire.query_messages import GroundRequest, RaysRequest, SegmentsRequest
 
@@ -38,6 +38,11 @@ def rays(count, range_m):
 
 def ground(count, drop_m, z=0.0):
     return GroundRequest(ORIGIN, np.full((count, 3), z, np.float32), drop_m, 0)
+
+
+def tiles(*xs):
+    """Tiles [T, 3] along the x axis."""
+    return np.array([(x, 0, 0) for x in xs], np.int32).reshape(-1, 3)
 
 
 @pytest.fixture(scope="module")
@@ -218,10 +223,13 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
         (keys.GROUND, ground(1, np.nan), "bad_request"),
         (keys.GROUND, ground(1, 1.0, z=np.inf), "bad_request"),
         (keys.GROUND, ground(100_000, 100.0), "too_large"),
-        (keys.TILE, TileRequest(2**62, 0, 0, 0), "bad_request"),
-        (keys.TILE, TileRequest(0, 0, 0, 0, fill_m=float("nan")), "bad_request"),
-        (keys.TILE, TileRequest(0, 0, 0, 0, fill_m=1e9), "bad_request"),
-        (keys.TILE, TileRequest(0, -(2**63), 0, 0), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(2**31 - 1), 0), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(0, -(2**31)), 0), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(0), 0, fill_m=float("nan")), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(0), 0, fill_m=1e9), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(0), 0, level=3), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(), 0), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(*range(65)), 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN * np.nan, ORIGIN, 0), "bad_request"),
         (keys.RESET, ResetRequest(ORIGIN, ORIGIN * np.nan), "bad_request"),

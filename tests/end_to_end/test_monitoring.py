@@ -108,7 +108,7 @@ def test_buckets_count_up_to_their_bounds(port):
         (float(dict(labels)["le"]), count)
         for (name, labels), count in samples(port).items()
         if name == "triquad_request_duration_seconds_bucket"
-        and ("operation", "query/tile") in labels
+        and ("operation", "query/mesh") in labels
     ]
     assert len(buckets) > 20
     assert buckets == sorted(buckets)

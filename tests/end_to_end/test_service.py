@@ -13,9 +13,10 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,
     FlushRequest,
+    MeshReply,
+    MeshRequest,
     SdfRequest,
     ServerStatus,
-    TileRequest,
 )
 from triquad_map.questions.answers import Answers
 from triquad_server.settings import ServiceSettings
@@ -151,7 +152,7 @@ def test_an_epoch_that_is_gone_is_told_apart(endpoint):
         peer = servers.RawPeer(session)
         request = SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), False, 999)
         assert peer.refusal(keys.SDF, request) == "epoch_gone"
-        assert peer.refusal(keys.TILE, TileRequest(0, 0, 0, 999)) == "epoch_gone"
+        assert peer.refusal(keys.MESH, MeshRequest(np.zeros((1, 3), np.int32), 999)) == "epoch_gone"
 
 
 def test_tiles_make_one_mesh(client):
@@ -170,6 +171,34 @@ def test_tiles_make_one_mesh(client):
     assert len(border) > 100
     assert len(np.unique(np.round(border, 5), axis=0)) == len(border)
     assert mesh.epoch == listed.epoch
+    with pytest.raises(InvalidInputError, match="y = 0.5: use a whole number"):
+        client.mesh_tile(0, 0.5, 0)
+    with pytest.raises(InvalidInputError, match="z = -1000001: use a whole number"):
+        client.mesh_tile(0, 0, -1_000_001)
+
+
+def test_tiles_that_are_asked_for_together_are_those_asked_for_alone(endpoint, client):
+    servers.learn(client)
+    client.settle(servers.WAIT_S)
+    listed = client.tiles()
+    nowhere = np.array([[900_000, 0, 0]], np.int32)
+    tiles = np.concatenate([listed.tiles[:3], nowhere, listed.tiles[3:5]])
+    with servers.raw_session(connect=endpoint) as session:
+        answer = servers.RawPeer(session).ask(keys.MESH, codec.encode(MeshRequest(tiles, 0)))
+    assert isinstance(answer, bytes), answer
+    reply = codec.decode(MeshReply, answer)
+    assert reply.counts[3] == 0
+    ends = np.cumsum(reply.counts)
+    corner_of = np.searchsorted(ends, reply.faces, side="right")  # the tile of each corner
+    assert (corner_of == corner_of[:, :1]).all()
+    for row, index in enumerate(tiles.tolist()):
+        alone = client.mesh_tile(*index)
+        first = ends[row] - reply.counts[row]
+        np.testing.assert_array_equal(
+            reply.faces[corner_of[:, 0] == row] - first, alone.faces, str(index)
+        )
+        vertices = reply.origins[row] + reply.vertices[first : ends[row]]
+        np.testing.assert_array_equal(vertices, alone.vertices)
 
 
 def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):

@@ -18,7 +18,7 @@ from triquad_format.wire.messages import (
     ServerStatus,
     StatusRequest,
     TileList,
-    TileRequest,
+    TileListRequest,
 )
 
 POSE = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], np.float64)
@@ -117,13 +117,13 @@ def test_fields_of_a_later_revision_are_ignored():
 
 
 def test_fields_with_a_default_may_be_missing():
-    body = msgpack.unpackb(codec.encode(TileRequest(1, 2, 3, 4, 1)))
-    assert codec.decode(TileRequest, msgpack.packb(body)).level == 1
+    body = msgpack.unpackb(codec.encode(TileListRequest(np.zeros(3), np.ones(3), 4, 1)))
+    assert codec.decode(TileListRequest, msgpack.packb(body)).level == 1
     del body["level"]
-    assert codec.decode(TileRequest, msgpack.packb(body)) == TileRequest(1, 2, 3, 4, 0)
-    del body["x"]
-    with pytest.raises(WireError, match="TileRequest.x: missing"):
-        codec.decode(TileRequest, msgpack.packb(body))
+    assert codec.decode(TileListRequest, msgpack.packb(body)).level == 0
+    del body["epoch"]
+    with pytest.raises(WireError, match="TileListRequest.epoch: missing"):
+        codec.decode(TileListRequest, msgpack.packb(body))
 
 
 def changed(message, **changes):

@@ -15,16 +15,16 @@ from triquad_format.wire.messages import (
     MapChunkRequest,
     MapInfo,
     MapInfoRequest,
+    MeshReply,
+    MeshRequest,
     ResetReply,
     ResetRequest,
     SdfReply,
     SdfRequest,
     ServerStatus,
     StatusRequest,
-    Tile,
     TileList,
     TileListRequest,
-    TileRequest,
     TileUpdates,
     TileUpdatesRequest,
 )
@@ -184,9 +184,12 @@ def _tiles(request: TileListRequest) -> TileList:
     return TileList(_epoch(request), 6.4, index, changed=np.array([EPOCH]))
 
 
-def _tile(request: TileRequest) -> Tile:
+def _mesh(request: MeshRequest) -> MeshReply:
     filled = np.zeros(len(FACE), np.uint8) if request.fill_m > 0 else None
-    return Tile(_epoch(request), EPOCH, np.zeros(3), vertices=CORNERS, faces=FACE, filled=filled)
+    counts = np.zeros(len(request.tiles), np.int64)
+    counts[0] = len(CORNERS)
+    origins = np.zeros((len(counts), 3))
+    return MeshReply(_epoch(request), origins, counts, vertices=CORNERS, faces=FACE, filled=filled)
 
 
 def _updates(request: TileUpdatesRequest) -> TileUpdates:
@@ -278,7 +281,7 @@ _REPLIES: dict[type[Message], Callable[[Any], Message]] = {
     ChangesRequest: _changes,
     SourcesRequest: _sources,
     TileListRequest: _tiles,
-    TileRequest: _tile,
+    MeshRequest: _mesh,
     TileUpdatesRequest: _updates,
     StatusRequest: _status,
     MetricsRequest: _metrics,

@@ -18,6 +18,12 @@ LEVELS = 3
 MAX_SAMPLE_POINTS = 10_000
 """Points of the newest scan of a source that are told of, at most."""
 
+TILE_INDEX_LIMIT = 1_000_000
+"""Tile indices lie in ``[-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT]``."""
+
+MAX_TILES_ASKED = 64
+"""Mesh tiles of one request."""
+
 MAX_KNOWN_TILES = 100_000
 """Mesh tiles that a client may name as known when it asks what changed."""
 

@@ -17,6 +17,7 @@ from triquad_format.wire.reply import (
     MAX_COUNT,
     AskedBy,
     IndicesOf,
+    PartsOf,
     RowsOf,
     SameAsAsked,
     Text,
@@ -116,24 +117,24 @@ class TileList(MapReply):
 
 
 @dataclass(frozen=True)
-class TileRequest(Message):
-    """The mesh of one tile."""
+class MeshRequest(Message):
+    """The mesh of some tiles."""
 
-    x: int
-    y: int
-    z: int
+    tiles: TileIndices  # [T, 3], 1 to MAX_TILES_ASKED
     epoch: int
     level: int = 0  # of detail
     fill_m: float = 0.0  # how far from seen surface it is continued into unknown space; 0: not
 
 
 @dataclass(frozen=True)
-class Tile(MapReply):
-    """Answer to :class:`TileRequest`."""
+class MeshReply(MapReply):
+    """Answer to :class:`MeshRequest`: the tiles one behind the other, as they were asked for."""
 
-    changed: Epoch  # as in TileList
-    origin: FinitePoint  # metres, map frame: the tile's minimum corner
-    vertices: FinitePositions  # [V, 3] metres, relative to origin
+    # [T, 3] metres, map frame: the tiles' minimum corners
+    origins: Annotated[FinitePoints, AskedBy("tiles")]
+    # [T] vertices of each
+    counts: Annotated[Integers, Within(0, MAX_COUNT), AskedBy("tiles"), PartsOf("vertices")]
+    vertices: FinitePositions  # [V, 3] metres, relative to the origin of their tile
     # [F, 3], counter-clockwise seen from free space
     faces: Annotated[Faces, IndicesOf("vertices")]
     # [F] 1 where the surface was continued and no ray met it, else 0; None: was not asked for

@@ -161,6 +161,18 @@ class RowsOf:
 
 
 @dataclass(frozen=True)
+class PartsOf:
+    """How many rows of another array of the reply each of some parts has: all of its rows."""
+
+    field: str
+
+    def problem(self, value: Any, exchange: Exchange) -> str | None:
+        """Where the sum differs."""
+        parts, count = int(value.sum()), exchange.rows(self.field)
+        return None if parts == count else f"parts of {parts} rows do not go with {count}"
+
+
+@dataclass(frozen=True)
 class IndicesOf:
     """Indices of the rows of another array of the reply."""
 

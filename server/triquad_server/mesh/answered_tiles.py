@@ -4,7 +4,7 @@ import threading
 
 import zstandard
 from triquad_format.wire import codec
-from triquad_format.wire.messages import Tile
+from triquad_format.wire.messages import MeshReply
 
 from triquad_server.mesh.mesher import TileIndex
 
@@ -30,13 +30,13 @@ class AnsweredTiles:
         self._data: dict[AskedTile, bytes] = {}
         self.nbytes = 0
 
-    def get(self, epoch: int, asked: AskedTile) -> Tile | None:
+    def get(self, epoch: int, asked: AskedTile) -> MeshReply | None:
         """The tile of an epoch as it was put; None where it was not, or is gone."""
         with self._lock:
             data = self._data.get(asked) if epoch == self._epoch else None
-        return None if data is None else codec.decode(Tile, zstandard.decompress(data))
+        return None if data is None else codec.decode(MeshReply, zstandard.decompress(data))
 
-    def put(self, epoch: int, asked: AskedTile, tile: Tile) -> None:
+    def put(self, epoch: int, asked: AskedTile, tile: MeshReply) -> None:
         """Keep a tile while there is room, and none of earlier epochs any more."""
         with self._lock:
             if epoch > self._epoch:

@@ -25,7 +25,7 @@ _AROUND = [
 ]
 
 _ANSWERED_BYTES = 16_000_000
-"""Of tiles of one epoch that somebody asked for one by one: some 130 m of street."""
+"""Of tiles of one epoch that somebody asked for by name: some 130 m of street."""
 
 TileKey = tuple[int, TileIndex]
 """Level of detail and index of a tile."""
@@ -179,7 +179,7 @@ class TileCache:
         self.revision = 0  # how often bytes of any tile came to differ
         self.tiles_made = 0  # so far
         self._bytes = TileBytes(settings.cache_bytes)
-        # Those that are asked for one by one.
+        # Those that are asked for by name.
         self.answered = AnsweredTiles(min(_ANSWERED_BYTES, settings.cache_bytes))
 
     @property

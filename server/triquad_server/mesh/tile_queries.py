@@ -1,25 +1,25 @@
-"""Answers to queries of single mesh tiles, and of which there are."""
+"""Answers to queries of mesh tiles, and of which there are."""
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.wire.messages import Tile, TileList, TileListRequest, TileRequest
+from triquad_format.wire.limits import MAX_TILES_ASKED, TILE_INDEX_LIMIT
+from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
 from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
+from triquad_server.mesh.answered_tiles import AskedTile
 from triquad_server.mesh.holes import check_fill
 from triquad_server.mesh.mesher import TileLattice, check_box, check_level, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.net.request import Request
 
 MAX_TILES = 1_000_000
 """Tiles of one list."""
-
-TILE_INDEX_LIMIT = 1_000_000
-"""Tile indices lie in ``[-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT]``."""
 
 
 class TileQueries:
@@ -54,40 +54,79 @@ class TileQueries:
             changed=np.minimum(changed, epoch.number),
         )
 
-    def tile(self, request: TileRequest) -> Tile:
-        """The mesh of one tile.
+    def answer_mesh(self, request: Request) -> None:
+        """Answer a :class:`MeshRequest`; between tiles, others have their turn."""
+        request.answer(self.mesh(request.read(MeshRequest), request.turn))
+
+    def mesh(self, request: MeshRequest, turn: Callable[[], object]) -> MeshReply:
+        """The meshes of some tiles; ``turn`` returns when it is that of the next.
 
         Raises:
             RefusedError: a field is out of range, or the epoch is gone.
         """
-        index = (request.x, request.y, request.z)
-        if max(map(abs, index)) > TILE_INDEX_LIMIT:
-            raise RefusedError(
-                "bad_request",
-                f"tile {index} is out of range: use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
-            )
+        _check_tiles(request.tiles)
         check_level(request.level)
         check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
-        lattice = self._cache.lattice(request.level)
-        asked = (request.level, index, request.fill_m)
-        tile = self._cache.answered.get(epoch.number, asked)
-        if tile is None:
-            # On the thread that answers alone: of a box full of tiles, others make more of them.
-            view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
-            mesh = mesh_tile(view, index, lattice, fill_m=request.fill_m)
-            tile = Tile(
-                epoch=epoch.number,
-                changed=0,
-                origin=mesh.origin,
-                vertices=mesh.vertices,
-                faces=mesh.faces,
-                filled=mesh.filled.astype(np.uint8) if request.fill_m > 0 else None,
-            )
-            self._cache.answered.put(epoch.number, asked, tile)
-        # A change that no refresh found yet shows in a later list: the tile is fetched again then.
-        (changed,) = self._cache.changed(request.level, np.array([index])).tolist()
-        return replace(tile, changed=min(changed, epoch.number))
+        tiles = []
+        for x, y, z in request.tiles.tolist():
+            turn()
+            tiles.append(self._tile(epoch, (request.level, (x, y, z), request.fill_m)))
+        return _joined(tiles)
+
+    def _tile(self, epoch: Epoch, asked: AskedTile) -> MeshReply:
+        """The mesh of one tile, from what was answered before or made anew."""
+        kept = self._cache.answered.get(epoch.number, asked)
+        if kept is not None:
+            return kept
+        level, index, fill_m = asked
+        # On the thread that answers alone: of a box full of tiles, others make more of them.
+        view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
+        mesh = mesh_tile(view, index, self._cache.lattice(level), fill_m=fill_m)
+        vertices = mesh.vertices
+        made = MeshReply(
+            epoch=epoch.number,
+            origins=mesh.origin[None],
+            counts=np.array([len(vertices)]),
+            vertices=vertices,
+            faces=mesh.faces,
+            filled=mesh.filled.astype(np.uint8) if fill_m > 0 else None,
+        )
+        self._cache.answered.put(epoch.number, asked, made)
+        return made
+
+
+def _check_tiles(tiles: Ints) -> None:
+    """Refuse indices [T, 3] of tiles that are out of range, and too many, or none.
+
+    Raises:
+        RefusedError: they are.
+    """
+    if not 1 <= len(tiles) <= MAX_TILES_ASKED:
+        raise RefusedError("bad_request", f"{len(tiles)} tiles: ask for 1 to {MAX_TILES_ASKED}")
+    beyond = (np.abs(tiles.astype(np.int64)) > TILE_INDEX_LIMIT).any(axis=1)
+    if beyond.any():
+        raise RefusedError(
+            "bad_request",
+            f"tile {tiles[beyond][0].tolist()} is out of range: "
+            f"use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
+        )
+
+
+def _joined(tiles: Sequence[MeshReply]) -> MeshReply:
+    """The meshes of tiles of one epoch, one behind the other."""
+    counts = np.concatenate([tile.counts for tile in tiles])
+    firsts = np.cumsum(counts) - counts
+    faces = [tile.faces + np.int32(first) for tile, first in zip(tiles, firsts, strict=True)]
+    filled = [tile.filled for tile in tiles if tile.filled is not None]
+    return MeshReply(
+        epoch=tiles[0].epoch,
+        origins=np.concatenate([tile.origins for tile in tiles]),
+        counts=counts,
+        vertices=np.concatenate([tile.vertices for tile in tiles]),
+        faces=np.concatenate(faces),
+        filled=np.concatenate(filled) if filled else None,
+    )
 
 
 def surface_tiles(epoch: Epoch, lattice: TileLattice, fill_m: float = 0.0) -> Ints:

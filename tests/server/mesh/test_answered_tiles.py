@@ -4,16 +4,16 @@ import tracemalloc
 from dataclasses import replace
 
 import numpy as np
-from triquad_format.wire.messages import Tile
+from triquad_format.wire.messages import MeshReply
 from triquad_server.mesh.answered_tiles import AnsweredTiles
 
 
-def tile(epoch: int, vertices: int = 100) -> Tile:
+def tile(epoch: int, vertices: int = 100) -> MeshReply:
     rng = np.random.default_rng(epoch)
-    return Tile(
+    return MeshReply(
         epoch=epoch,
-        changed=0,
-        origin=np.array([6.4, 0.0, -6.4]),
+        origins=np.array([[6.4, 0.0, -6.4]]),
+        counts=np.array([vertices]),
         vertices=rng.uniform(0, 6.4, (vertices, 3)).astype(np.float32),
         faces=rng.integers(0, vertices, (2 * vertices, 3)).astype(np.int32),
     )
@@ -31,7 +31,7 @@ def test_a_tile_is_the_same_again() -> None:
     assert again is not None
     np.testing.assert_array_equal(again.vertices, put.vertices)
     np.testing.assert_array_equal(again.faces, put.faces)
-    np.testing.assert_array_equal(again.origin, put.origin)
+    np.testing.assert_array_equal(again.origins, put.origins)
     assert again.filled is None
     assert tiles.get(7, asked(2)) is None
     assert tiles.get(7, asked(1, fill_m=0.5)) is None
@@ -59,7 +59,7 @@ def test_what_does_not_fit_is_not_kept_and_pushes_nothing_out() -> None:
 
 
 def test_what_is_kept_takes_no_more_memory_than_is_told() -> None:
-    def zeros(epoch: int) -> Tile:  # which shrink to next to nothing
+    def zeros(epoch: int) -> MeshReply:  # which shrink to next to nothing
         return replace(tile(epoch, vertices=5_000), vertices=np.zeros((5_000, 3), np.float32))
 
     tiles, many = AnsweredTiles(10_000_000), 50
