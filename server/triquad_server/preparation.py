@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from triquad_map.compiled.bitcode import pack_bitcode
 from triquad_map.compiled.kernel import COMPILING
 
 from triquad_server import compilers
@@ -115,6 +116,7 @@ class Preparation:
             for stage in MESHING:
                 self._go_through(stage, self._look_for_close)
             self._tell("all is compiled")
+            pack_bitcode()
         except _ClosedError:
             pass
         except Exception:

@@ -35,6 +35,15 @@ def callee(x):
 """
 
 
+AFTER_PACKING = """
+import triquad_toy.callee
+from triquad_map.compiled.bitcode import pack_bitcode
+
+assert triquad_toy.callee.callee(1) == 2  # found compiled
+pack_bitcode()
+"""
+
+
 @pytest.fixture
 def package(tmp_path):
     folder = tmp_path / "source" / "triquad_toy"
@@ -75,6 +84,13 @@ def edit(package, module, old, new):
 def test_compiled_code_is_found_by_the_next_process(package):
     assert run(package) == (33, 0)
     assert run(package) == (33, 1)
+
+
+def test_a_kernel_is_compiled_that_calls_one_whose_bitcode_was_packed(package):
+    run(package)
+    edit(package, "caller", "10 * callee(x)", "100 * callee(x)")  # is compiled anew, callee is not
+    edit(package, "caller", "from triquad_toy.callee", AFTER_PACKING + "from triquad_toy.callee")
+    assert run(package) == (303, 0)
 
 
 def test_who_waits_while_it_is_compiled_is_told_once(package):

@@ -27,6 +27,8 @@ import numpy as np
 from llvmlite import binding
 from numba.core import caching, event
 
+from triquad_map.compiled.bitcode import add_bitcode, unpack_bitcode
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -114,6 +116,10 @@ class _KeptCode(_FunctionCache):  # type: ignore[misc]
             code = self._load(sig, target_context)
             if code is not None:
                 self._end_turn()
+        if code is None:
+            unpack_bitcode()
+        else:
+            add_bitcode(code.library)
         return code
 
     def save_overload(self, sig: Any, data: Any) -> None:
