@@ -112,7 +112,8 @@ class AsyncClient(AsyncMapQueries):
         return await self._run(fetch_tiles(bounds, level))
 
     async def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
-        return await self._run(fetch_tile((x, y, z), level))
+        limit = self._connection.max_download_bytes
+        return await self._run(fetch_tile((x, y, z), level, limit))
 
     async def mesh(self, bounds: Bounds | None = None, level: int = 0, fill_m: float = 0.0) -> Mesh:
         limit = self._connection.max_download_bytes

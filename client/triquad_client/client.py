@@ -189,7 +189,7 @@ class Client(MapQueries):
 
     def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
         """The newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
-        return self._run(fetch_tile((x, y, z), level))
+        return self._run(fetch_tile((x, y, z), level, self._connection.max_download_bytes))
 
     def mesh(self, bounds: Bounds | None = None, level: int = 0, fill_m: float = 0.0) -> Mesh:
         """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch.

@@ -247,9 +247,10 @@ def test_single_tiles_have_levels_too(client: Client, endpoint: str) -> None:
         assert (listed.changed > 0).all()
         answer = peer.ask(keys.MESH, codec.encode(MeshRequest(listed.tiles[:1], listed.epoch, 2)))
         assert isinstance(answer, bytes)
-        tile = codec.decode(MeshReply, answer)
+        reply = codec.decode(MeshReply, answer)
+        tile = decode_tile(reply.data)
         assert len(tile.faces) > 0
-        assert 3.0 < tile.vertices.max() <= 6.4
+        assert 3.0 < tile.positions(reply.cell_m).max() <= 6.4
 
 
 @pytest.mark.parametrize(

@@ -185,11 +185,9 @@ def _tiles(request: TileListRequest) -> TileList:
 
 
 def _mesh(request: MeshRequest) -> MeshReply:
-    filled = np.zeros(len(FACE), np.uint8) if request.fill_m > 0 else None
-    counts = np.zeros(len(request.tiles), np.int64)
-    counts[0] = len(CORNERS)
-    origins = np.zeros((len(counts), 3))
-    return MeshReply(_epoch(request), origins, counts, vertices=CORNERS, faces=FACE, filled=filled)
+    filled = np.zeros(len(FACE) * len(request.tiles), np.uint8) if request.fill_m > 0 else None
+    sizes = np.full(len(request.tiles), len(TILE))
+    return MeshReply(_epoch(request), 6.4, 0.1, sizes, TILE * len(sizes), filled)
 
 
 def _updates(request: TileUpdatesRequest) -> TileUpdates:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from support.honest_replies import CHUNK_BYTES, EPOCH
+from support.honest_replies import CHUNK_BYTES, EPOCH, TILE
 from support.hostile_server import Body, packed
 from triquad_client import Client
 from triquad_format.wire import keys
@@ -179,14 +179,16 @@ _LIES: list[tuple[str, str, Callable[[Body], object]]] = [
     ("tiles", "one epoch too few", _sets(changed=packed([], "<i8"))),
     ("tiles", "side no number", _sets(tile_side_m=NAN)),
     ("tiles", "no side", _sets(tile_side_m=0.0)),
-    ("tile", "corner that is not there", _sets(faces=packed([[0, 1, 99]], "<i4"))),
-    ("tile", "negative corner", _sets(faces=packed([[0, 1, -1]], "<i4"))),
-    ("tile", "vertices no number", _sets(vertices=all_values(NAN, shape=(3, 3)))),
-    ("mesh", "corner that is not there", _sets(faces=packed([[0, 1, 99]], "<i4"))),
-    ("mesh", "vertices of no tile", _sets(counts=packed([2], "<i8"))),
-    ("mesh", "more tiles", _sets(counts=packed([3, 0], "<i8"))),
-    ("mesh", "vertices fewer than none", _sets(counts=packed([-3], "<i8"))),
-    ("mesh", "tiles nowhere", _sets(origins=all_values(NAN, "<f8", (1, 3)))),
+    ("tile", "no tile", _sets(data=bytes(len(TILE)))),
+    ("tile", "half a tile", _sets(data=TILE[:9], sizes=packed([9], "<i8"))),
+    ("tile", "cells no number", _sets(cell_m=NAN)),
+    ("tile", "side 1e30 m", _sets(tile_side_m=1e30)),
+    ("tile", "marks unasked", _sets(filled=packed([0], "|u1"))),
+    ("mesh", "more bytes than told", _sets(data=TILE + b"x")),
+    ("mesh", "fewer bytes than told", _sets(data=TILE[:-1])),
+    ("mesh", "more tiles", _sets(data=2 * TILE, sizes=packed([len(TILE)] * 2, "<i8"))),
+    ("mesh", "bytes fewer than none", _sets(sizes=packed([-3], "<i8"))),
+    ("filled mesh", "fewer marks than faces", _sets(filled=packed([], "|u1"))),
     ("mesh", "another epoch", _sets(epoch=EPOCH + 1)),
     ("filled mesh", "without marks", _sets(filled=None)),
     ("filled mesh", "more marks than faces", _sets(filled=packed([0, 1, 0], "|u1"))),

@@ -8,17 +8,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.errors import InvalidInputError, WireError
+from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
-from triquad_format.wire.tile_codec import decode_tile, decoded_bytes
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.mesh_calls import too_large_error
+from triquad_client.mesh.tile_decoder import TileDecoder
 from triquad_client.mesh.tile_join import joined
 
 _REPLY_BYTES = 1_000_000
@@ -151,7 +150,7 @@ class FollowedMesh:
         """
         self._check_order(reply)
         kept = sum(tile.nbytes for tile in self.tiles.values())
-        changed = _unpacked(reply, self.max_bytes - kept)
+        changed = _unpacked(reply, TileDecoder(self.max_bytes, kept))
         old = frozenset(self.tiles) if reply.restart else self.stale
         stale = old - changed.keys()
         removed = {(x, y, z) for x, y, z in reply.removed.tolist()}
@@ -196,36 +195,18 @@ class FollowedMesh:
         )
 
 
-def _unpacked(updates: TileUpdates, most_bytes: int) -> dict[TileIndex, MeshTile]:
-    """The tiles of a reply, which together take so many bytes of memory at most.
-
-    Raises:
-        BadReplyError: they are not valid.
-        DownloadError: they take more.
-    """
-    if int(updates.sizes.sum()) != len(updates.data):
-        raise BadReplyError(
-            f"tiles of {updates.sizes.sum()} bytes came in {len(updates.data)} bytes"
-        )
-    ends = np.cumsum(updates.sizes).tolist()
+def _unpacked(updates: TileUpdates, decoder: TileDecoder) -> dict[TileIndex, MeshTile]:
+    """The tiles of a reply; errors as of :meth:`TileDecoder.decode`."""
     tiles: dict[TileIndex, MeshTile] = {}
-    left = most_bytes
-    for row, (x, y, z) in enumerate(updates.tiles.tolist()):
-        data = updates.data[ends[row] - int(updates.sizes[row]) : ends[row]]
-        try:
-            left -= decoded_bytes(data)  # before any of it is made
-            if left < 0:
-                raise too_large_error(most_bytes)
-            surface = decode_tile(data)
-        except WireError as error:
-            raise BadReplyError(f"tile {(x, y, z)}: {error}") from error
+    decoded = decoder.decode(updates.sizes, updates.data)
+    for row, (tile, (x, y, z)) in enumerate(zip(decoded, updates.tiles.tolist(), strict=True)):
         tiles[x, y, z] = MeshTile(
             index=(x, y, z),
             version=int(updates.versions[row]),
-            digest=hashlib.sha256(data).hexdigest(),
-            size_bytes=len(data),
+            digest=hashlib.sha256(tile.data).hexdigest(),
+            size_bytes=len(tile.data),
             origin=np.array((x, y, z)) * updates.tile_side_m,
-            vertices=surface.positions(updates.cell_m),
-            faces=surface.faces,
+            vertices=tile.surface.positions(updates.cell_m),
+            faces=tile.surface.faces,
         )
     return tiles

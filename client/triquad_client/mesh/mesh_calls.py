@@ -1,6 +1,6 @@
 """Calls that fetch a surface as triangles, in the background of all else."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from triquad_format.records.arrays import Ints
@@ -9,8 +9,9 @@ from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileL
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import BadReplyError, DownloadError
+from triquad_client.errors import BadReplyError
 from triquad_client.mesh.mesh import Mesh
+from triquad_client.mesh.tile_decoder import TileDecoder
 from triquad_client.mesh.tile_join import TileJoin
 from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried, take_each
 
@@ -31,11 +32,12 @@ def fetch_tiles(bounds: Bounds | None, level: int, fill_m: float = 0.0) -> Call[
     return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
 
 
-def fetch_tile(index: Sequence[int], level: int) -> Call[Mesh]:
-    """The newest mesh of one tile."""
-    level = checks.level_of_detail(level)
-    reply = yield from ask(_ask_mesh(checks.tile_indices(index), NEWEST, level, fill_m=0.0))
-    return _mesh_of(reply)
+def fetch_tile(index: Sequence[int], level: int, max_bytes: int) -> Call[Mesh]:
+    """The newest mesh of one tile; errors as of :func:`fetch_mesh`."""
+    level, tiles = checks.level_of_detail(level), checks.tile_indices(index)
+    reply = yield from ask(_ask_mesh(tiles, NEWEST, level, fill_m=0.0))
+    (tile,) = _decoded(reply, tiles, TileDecoder(max_bytes), filled=False)
+    return tile
 
 
 def fetch_mesh(
@@ -44,7 +46,7 @@ def fetch_mesh(
     """The faces whose centroids lie in the bounds, from one epoch.
 
     Raises:
-        BadReplyError: holes were to be filled, which a server of an earlier release does not do.
+        BadReplyError: a reply is not valid.
         DownloadError: its tiles take more than ``max_bytes``.
     """
     box = checks.box(bounds)
@@ -52,35 +54,20 @@ def fetch_mesh(
     def fetch() -> Call[Mesh]:
         listed = yield from fetch_tiles(bounds, level, fill_m)
         join = TileJoin(listed.tile_side_m, box, marked=fill_m > 0)
-        nbytes = 0
+        firsts = range(0, len(listed.tiles), _TILES_EACH)
+        parts = [listed.tiles[first : first + _TILES_EACH] for first in firsts]
+        asked, decoder = iter(parts), TileDecoder(max_bytes)
 
         def take(reply: MeshReply) -> None:
-            nonlocal nbytes
-            if fill_m > 0 and reply.filled is None:
-                raise BadReplyError("the reply lacks filled, which was asked for by fill_m")
-            nbytes += reply.vertices.nbytes + reply.faces.nbytes
-            if nbytes > max_bytes:
-                raise too_large_error(max_bytes)
-            join.add(_mesh_of(reply))
+            for tile in _decoded(reply, next(asked), decoder, filled=fill_m > 0):
+                join.add(tile)
 
         yield from take_each(
-            range(0, len(listed.tiles), _TILES_EACH),
-            lambda first: _ask_mesh(
-                listed.tiles[first : first + _TILES_EACH], listed.epoch, level, fill_m=fill_m
-            ),
-            take,
+            parts, lambda tiles: _ask_mesh(tiles, listed.epoch, level, fill_m=fill_m), take
         )
         return (yield from offload(lambda _: join.mesh(listed.epoch)))
 
     return (yield from retried("epoch_gone", fetch))
-
-
-def too_large_error(max_bytes: int) -> DownloadError:
-    """The error for a mesh of more bytes."""
-    return DownloadError(
-        f"the mesh takes more than {max_bytes} bytes: ask for a smaller box or a coarser level, or "
-        "connect with a larger max_download_bytes"
-    )
 
 
 def _ask_mesh(tiles: Ints, epoch: int, level: int, fill_m: float) -> Ask[MeshReply]:
@@ -88,7 +75,23 @@ def _ask_mesh(tiles: Ints, epoch: int, level: int, fill_m: float) -> Ask[MeshRep
     return Ask(keys.MESH, request, MeshReply, background=True)
 
 
-def _mesh_of(reply: MeshReply) -> Mesh:
-    vertices = np.repeat(reply.origins, reply.counts, axis=0) + reply.vertices
-    marks = None if reply.filled is None else reply.filled.astype(np.bool_)
-    return Mesh(vertices, reply.faces, reply.epoch, filled=marks)
+def _decoded(
+    reply: MeshReply, tiles: Ints, decoder: TileDecoder, *, filled: bool
+) -> Iterator[Mesh]:
+    """The meshes of the tiles [T, 3] that were asked for, maybe ``filled``."""
+    if filled != (reply.filled is not None):
+        raise BadReplyError("filled: it came unasked, or did not come although it was asked for")
+    first = 0
+    decoded = decoder.decode(reply.sizes, reply.data)
+    for index, tile in zip(tiles.tolist(), decoded, strict=True):
+        surface = tile.surface
+        marks = None
+        if reply.filled is not None:
+            marks = reply.filled[first : first + len(surface.faces)].astype(np.bool_)
+            if len(marks) != len(surface.faces):
+                raise BadReplyError("filled: it tells of fewer faces than there are")
+            first += len(marks)
+        corner = np.array(index) * reply.tile_side_m
+        yield Mesh(corner + surface.positions(reply.cell_m), surface.faces, reply.epoch, marks)
+    if reply.filled is not None and first < len(reply.filled):
+        raise BadReplyError("filled: it tells of more faces than there are")

@@ -16,7 +16,6 @@ from triquad_format.wire.limits import MAX_CELL_M, MAX_CHUNK_BYTES, MAX_TILE_M, 
 from triquad_format.wire.reply import (
     MAX_COUNT,
     AskedBy,
-    IndicesOf,
     PartsOf,
     RowsOf,
     SameAsAsked,
@@ -128,17 +127,16 @@ class MeshRequest(Message):
 
 @dataclass(frozen=True)
 class MeshReply(MapReply):
-    """Answer to :class:`MeshRequest`: the tiles one behind the other, as they were asked for."""
+    """Answer to :class:`MeshRequest`: the tiles as they were asked for, one behind the other."""
 
-    # [T, 3] metres, map frame: the tiles' minimum corners
-    origins: Annotated[FinitePoints, AskedBy("tiles")]
-    # [T] vertices of each
-    counts: Annotated[Integers, Within(0, MAX_COUNT), AskedBy("tiles"), PartsOf("vertices")]
-    vertices: FinitePositions  # [V, 3] metres, relative to the origin of their tile
-    # [F, 3], counter-clockwise seen from free space
-    faces: Annotated[Faces, IndicesOf("vertices")]
-    # [F] 1 where the surface was continued and no ray met it, else 0; None: was not asked for
-    filled: Annotated[StatusCodes, Within(0, 1), RowsOf("faces")] | None = None
+    tile_side_m: Annotated[float, Within(MIN_LENGTH_M, MAX_TILE_M)]
+    cell_m: Annotated[float, Within(MIN_LENGTH_M, MAX_CELL_M)]
+    # [T] bytes of each
+    sizes: Annotated[Integers, Within(0, MAX_MESSAGE_BYTES), AskedBy("tiles"), PartsOf("data")]
+    data: bytes  # of all: triquad_format.wire.tile_codec
+    # [F] of all faces, 1 where the surface was continued and no ray met it, else 0; None: was not
+    # asked for
+    filled: Annotated[StatusCodes, Within(0, 1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ class TileUpdates(Message):
     tiles: TileIndices  # [T, 3] that changed
     versions: Annotated[Epochs, RowsOf("tiles")]  # [T] epoch of which each is
     # [T] bytes of each
-    sizes: Annotated[Integers, Within(0, MAX_MESSAGE_BYTES), RowsOf("tiles")]
+    sizes: Annotated[Integers, Within(0, MAX_MESSAGE_BYTES), RowsOf("tiles"), PartsOf("data")]
     data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
     removed: TileIndices  # [R, 3] that have no faces any more
 

@@ -173,17 +173,6 @@ class PartsOf:
 
 
 @dataclass(frozen=True)
-class IndicesOf:
-    """Indices of the rows of another array of the reply."""
-
-    field: str
-
-    def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """What has no such row."""
-        return Within(0, exchange.rows(self.field) - 1).problem(value, exchange)
-
-
-@dataclass(frozen=True)
 class RigidPose:
     """A rotation and a translation."""
 

@@ -23,7 +23,8 @@ MAX_CELLS = 256
 _HEADER = struct.Struct("<II")  # vertices, faces
 _MAX_COUNT = 1 << 25
 _VERTEX_BYTES = 8  # three coordinates of two bytes, the axis, the step
-_LEVEL = 9
+_LEVEL = 3
+"""Of zstandard: level 9 makes 6 % less of it, and takes twice and a half the time in all."""
 
 
 @dataclass(frozen=True)

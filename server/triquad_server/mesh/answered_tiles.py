@@ -1,18 +1,33 @@
 """Tiles as they were answered with, for whoever asks for the same epoch next."""
 
 import threading
+from dataclasses import dataclass
+from typing import NamedTuple
 
-import zstandard
-from triquad_format.wire import codec
-from triquad_format.wire.messages import MeshReply
+from triquad_format.records.arrays import Bytes
 
 from triquad_server.mesh.mesher import TileIndex
 
-_LEVEL = 1
-"""Of compression: a street's tiles then take 40 % of their bytes; level 3 makes it 39 %."""
 
-AskedTile = tuple[int, TileIndex, float]
-"""Level of detail and index of a tile, and how far holes are filled in it, metres."""
+@dataclass(frozen=True)
+class AskedTile:
+    """What is asked of a tile."""
+
+    level: int  # of detail
+    index: TileIndex
+    fill_m: float  # how far holes are filled in it
+
+
+class AnsweredTile(NamedTuple):
+    """A tile as it travels."""
+
+    data: bytes  # of triquad_format.wire.tile_codec
+    filled: Bytes | None  # [F] 1 where a face fills a hole; None: none was to be filled
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory that it takes."""
+        return len(self.data) + (0 if self.filled is None else self.filled.nbytes)
 
 
 class AnsweredTiles:
@@ -27,27 +42,20 @@ class AnsweredTiles:
         self._limit = limit
         self._lock = threading.Lock()
         self._epoch = 0
-        self._data: dict[AskedTile, bytes] = {}
+        self._tiles: dict[AskedTile, AnsweredTile] = {}
         self.nbytes = 0
 
-    def get(self, epoch: int, asked: AskedTile) -> MeshReply | None:
+    def get(self, epoch: int, asked: AskedTile) -> AnsweredTile | None:
         """The tile of an epoch as it was put; None where it was not, or is gone."""
         with self._lock:
-            data = self._data.get(asked) if epoch == self._epoch else None
-        return None if data is None else codec.decode(MeshReply, zstandard.decompress(data))
+            return self._tiles.get(asked) if epoch == self._epoch else None
 
-    def put(self, epoch: int, asked: AskedTile, tile: MeshReply) -> None:
+    def put(self, epoch: int, asked: AskedTile, tile: AnsweredTile) -> None:
         """Keep a tile while there is room, and none of earlier epochs any more."""
         with self._lock:
             if epoch > self._epoch:
-                self._epoch, self._data, self.nbytes = epoch, {}, 0
-            if epoch < self._epoch or self.nbytes >= self._limit:
-                return
-        compressed = zstandard.ZstdCompressor(level=_LEVEL).compress(codec.encode(tile))
-        # What zstandard returns has the room of the worst case behind it, two thirds of its memory.
-        data = bytes(memoryview(compressed))
-        with self._lock:
-            grown = self.nbytes + len(data)
-            if epoch == self._epoch and grown <= self._limit and asked not in self._data:
-                self._data[asked] = data
+                self._epoch, self._tiles, self.nbytes = epoch, {}, 0
+            grown = self.nbytes + tile.nbytes
+            if epoch == self._epoch and grown <= self._limit and asked not in self._tiles:
+                self._tiles[asked] = tile
                 self.nbytes = grown

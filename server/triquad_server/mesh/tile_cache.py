@@ -24,8 +24,8 @@ _AROUND = [
     (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
 ]
 
-_ANSWERED_BYTES = 16_000_000
-"""Of tiles of one epoch that somebody asked for by name: some 130 m of street."""
+_ANSWERED_BYTES = 8_000_000
+"""Of tiles of one epoch that somebody asked for by name: some 250 m of street."""
 
 TileKey = tuple[int, TileIndex]
 """Level of detail and index of a tile."""

@@ -1,6 +1,6 @@
 """Answers to queries of mesh tiles, and of which there are."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from triquad_format.errors import RefusedError
@@ -8,11 +8,12 @@ from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.limits import MAX_TILES_ASKED, TILE_INDEX_LIMIT
 from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
+from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.mesh.answered_tiles import AskedTile
+from triquad_server.mesh.answered_tiles import AnsweredTile, AskedTile
 from triquad_server.mesh.holes import check_fill
 from triquad_server.mesh.mesher import TileLattice, check_box, check_level, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
@@ -68,30 +69,32 @@ class TileQueries:
         check_level(request.level)
         check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
+        lattice = self._cache.lattice(request.level)
         tiles = []
         for x, y, z in request.tiles.tolist():
             turn()
-            tiles.append(self._tile(epoch, (request.level, (x, y, z), request.fill_m)))
-        return _joined(tiles)
+            tiles.append(self._tile(epoch, AskedTile(request.level, (x, y, z), request.fill_m)))
+        filled = [tile.filled for tile in tiles if tile.filled is not None]
+        return MeshReply(
+            epoch=epoch.number,
+            tile_side_m=lattice.tile_side_m,
+            cell_m=lattice.cell_m,
+            sizes=np.array([len(tile.data) for tile in tiles]),
+            data=b"".join(tile.data for tile in tiles),
+            filled=np.concatenate(filled) if filled else None,
+        )
 
-    def _tile(self, epoch: Epoch, asked: AskedTile) -> MeshReply:
-        """The mesh of one tile, from what was answered before or made anew."""
+    def _tile(self, epoch: Epoch, asked: AskedTile) -> AnsweredTile:
+        """The mesh of one tile, as it was answered before or made anew."""
         kept = self._cache.answered.get(epoch.number, asked)
         if kept is not None:
             return kept
-        level, index, fill_m = asked
         # On the thread that answers alone: of a box full of tiles, others make more of them.
         view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
-        mesh = mesh_tile(view, index, self._cache.lattice(level), fill_m=fill_m)
-        vertices = mesh.vertices
-        made = MeshReply(
-            epoch=epoch.number,
-            origins=mesh.origin[None],
-            counts=np.array([len(vertices)]),
-            vertices=vertices,
-            faces=mesh.faces,
-            filled=mesh.filled.astype(np.uint8) if fill_m > 0 else None,
-        )
+        lattice = self._cache.lattice(asked.level)
+        mesh = mesh_tile(view, asked.index, lattice, fill_m=asked.fill_m)
+        filled = mesh.filled.astype(np.uint8) if asked.fill_m > 0 else None
+        made = AnsweredTile(encode_tile(mesh.surface), filled)
         self._cache.answered.put(epoch.number, asked, made)
         return made
 
@@ -111,22 +114,6 @@ def _check_tiles(tiles: Ints) -> None:
             f"tile {tiles[beyond][0].tolist()} is out of range: "
             f"use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
         )
-
-
-def _joined(tiles: Sequence[MeshReply]) -> MeshReply:
-    """The meshes of tiles of one epoch, one behind the other."""
-    counts = np.concatenate([tile.counts for tile in tiles])
-    firsts = np.cumsum(counts) - counts
-    faces = [tile.faces + np.int32(first) for tile, first in zip(tiles, firsts, strict=True)]
-    filled = [tile.filled for tile in tiles if tile.filled is not None]
-    return MeshReply(
-        epoch=tiles[0].epoch,
-        origins=np.concatenate([tile.origins for tile in tiles]),
-        counts=counts,
-        vertices=np.concatenate([tile.vertices for tile in tiles]),
-        faces=np.concatenate(faces),
-        filled=np.concatenate(filled) if filled else None,
-    )
 
 
 def surface_tiles(epoch: Epoch, lattice: TileLattice, fill_m: float = 0.0) -> Ints:
