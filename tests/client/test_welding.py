@@ -1,18 +1,29 @@
+from dataclasses import replace
+
 import numpy as np
-from triquad_client.mesh.mesh import compacted
-from triquad_client.mesh.tile_join import on_sides, welded
+from triquad_client.mesh.mesh import Mesh, compacted
+from triquad_client.mesh.tile_join import TileJoin, joined
+
+EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
+
+
+def of(*corners):
+    """The mesh of a tile with one triangle."""
+    return Mesh(np.array(corners, np.float64), np.array([[0, 1, 2]], np.int32))
 
 
 def test_vertices_on_a_common_face_become_one():
     # Two triangles in the tiles left and right of x = 1, which share an edge on that face.
-    left = np.array([[0.5, 0.5, 0.5], [1, 0.2, 0.3], [1, 0.8, 0.3]])
-    right = np.array([[1, 0.2, 0.3], [1, 0.8, 0.3], [1.5, 0.5, 0.5]])
-    faces = np.array([[0, 1, 2], [3, 5, 4]], np.int32)
-    vertices = np.concatenate([left, right])
-    mesh = welded(vertices, faces, on_sides(vertices, 1.0))
+    left = of([0.5, 0.5, 0.5], [1, 0.2, 0.3], [1, 0.8, 0.3])
+    right = of([1, 0.2, 0.3], [1.5, 0.5, 0.5], [1, 0.8, 0.3])
+    mesh = joined([left, right], 1.0, box=EVERYWHERE, epoch=3)
     assert len(mesh.vertices) == 4
     assert len(mesh.faces) == 2
     assert len(set(mesh.faces.ravel())) == 4
+    for face, tile in zip(mesh.faces, (left, right), strict=True):
+        np.testing.assert_array_equal(mesh.vertices[face], tile.vertices)
+    assert mesh.epoch == 3
+    assert mesh.filled is None
 
 
 def test_rounding_boundaries_do_not_leave_cracks():
@@ -21,29 +32,40 @@ def test_rounding_boundaries_do_not_leave_cracks():
     edge[:, 1] = np.round(edge[:, 1] / 1e-3) * 1e-3 + 0.5e-4  # on boundaries of the rounding
     edge = np.unique(edge, axis=0)
     copy = edge + rng.normal(0, 1e-7, edge.shape) * (0, 1, 0)
-    apexes = np.array([[6.0, 3.0, 0.5], [6.8, 3.0, 0.5]])
     count = len(edge)
     index = np.arange(count - 1)
-    first = np.stack([index, index + 1, np.full(count - 1, 2 * count)], axis=1)
-    second = np.stack([index + 1, index, np.full(count - 1, count + 1)], axis=1) + count
-    vertices = np.concatenate([edge, copy, apexes])
-    faces = np.concatenate([first, second]).astype(np.int32)
-    mesh = welded(vertices, faces, on_sides(vertices, 6.4))
+    fan = np.stack([index, index + 1, np.full(count - 1, count)], axis=1).astype(np.int32)
+    left = Mesh(np.concatenate([edge, [[6.0, 3.0, 0.5]]]), fan)
+    right = Mesh(np.concatenate([copy, [[6.8, 3.0, 0.5]]]), fan[:, ::-1])
+    mesh = joined([left, right], 6.4, box=EVERYWHERE, epoch=1)
     assert len(mesh.vertices) == count + 2
 
 
 def test_faces_that_become_degenerate_are_left_out():
-    vertices = np.array([[1, 0, 0], [1, 1e-6, 0], [0.5, 0.5, 0.5]])
-    mesh = welded(vertices, np.array([[0, 1, 2]], np.int32), on_sides(vertices, 1.0))
-    assert mesh.faces.shape == (0, 3)
+    join = TileJoin(1.0, EVERYWHERE, marked=True)
+    join.add(of([1, 0, 0], [1, 1e-6, 0], [0.5, 0.5, 0.5]))
+    join.add(replace(of([1, 0, 0], [1, 1, 0], [1.5, 0.5, 0.5]), filled=np.array([True])))
+    mesh = join.mesh(1)
+    assert mesh.faces.shape == (1, 3)
+    assert len(mesh.vertices) == 3
+    assert mesh.filled.tolist() == [True]
 
 
 def test_an_empty_mesh_stays_empty():
-    vertices = np.zeros((0, 3))
-    mesh = welded(vertices, np.zeros((0, 3), np.int32), on_sides(vertices, 6.4))
+    mesh = joined([], 6.4, box=EVERYWHERE, epoch=1)
     assert mesh.vertices.shape == (0, 3)
     assert mesh.faces.shape == (0, 3)
     assert mesh.faces.dtype == np.int32
+
+
+def test_faces_out_of_the_box_go_with_their_vertices():
+    tile = Mesh(
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [3, 0, 0], [3, 1, 0]], np.float64) + 0.1,
+        np.array([[0, 1, 2], [1, 3, 4]], np.int32),
+    )
+    mesh = joined([tile], 6.4, box=(np.zeros(3), np.full(3, 1.4)), epoch=1)
+    np.testing.assert_allclose(mesh.vertices, tile.vertices[:3])
+    assert mesh.faces.tolist() == [[0, 1, 2]]
 
 
 def test_unused_vertices_go():

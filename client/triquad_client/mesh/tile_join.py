@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 
-from triquad_client.mesh.mesh import Mesh, compacted
+from triquad_client.mesh.mesh import Mesh
 
 WELD_M = 1e-4
 """Vertices closer than about this are one."""
@@ -41,20 +41,35 @@ class TileJoin:
         cut = _within(tile, self._box)
         self._vertices.append(cut.vertices)
         self._faces.append(cut.faces + np.int32(self._count))
-        self._shared.append(on_sides(cut.vertices, self._tile_side_m) + self._count)
-        if cut.filled is not None:
-            self._filled.append(cut.filled)
+        self._shared.append(_on_sides(cut.vertices, self._tile_side_m) + self._count)
+        unmarked = np.zeros(len(cut.faces), np.bool_)
+        self._filled.append(unmarked if cut.filled is None else cut.filled)
         self._count += len(cut.vertices)
 
     def mesh(self, epoch: int) -> Mesh:
-        """All tiles so far as one mesh, which shows the ``epoch``."""
-        whole = welded(
-            np.concatenate(self._vertices),
-            np.concatenate(self._faces),
-            np.concatenate(self._shared),
-            filled=np.concatenate(self._filled) if self._marked else None,
+        """All tiles so far as one mesh, which shows the ``epoch``.
+
+        It has one vertex where tiles had several, and no faces that this made degenerate. Faces are
+        gone through tile by tile: to touch fresh memory for all at once takes as long as the rest.
+        """
+        vertices, shared = np.concatenate(self._vertices), np.concatenate(self._shared)
+        target = np.arange(len(vertices), dtype=np.int32)
+        target[shared] = shared[_representatives(vertices[shared])]
+        used = np.zeros(len(vertices), np.bool_)
+        pieces = []
+        for faces, filled in zip(self._faces, self._filled, strict=True):
+            corners = target.take(faces)
+            a, b, c = corners.T
+            kept = (a != b) & (b != c) & (c != a)
+            pieces.append((corners[kept], filled[kept]))
+            used[pieces[-1][0]] = True
+        number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        return Mesh(
+            vertices[used],
+            np.concatenate([number.take(corners) for corners, _ in pieces]),
+            epoch,
+            filled=np.concatenate([filled for _, filled in pieces]) if self._marked else None,
         )
-        return dataclasses.replace(whole, epoch=epoch)
 
 
 def joined(
@@ -78,26 +93,12 @@ def _within(tile: Mesh, box: tuple[Doubles, Doubles]) -> Mesh:
     return dataclasses.replace(tile, faces=tile.faces[inside], filled=filled)
 
 
-def on_sides(vertices: Doubles, tile_side_m: float) -> Longs:
+def _on_sides(vertices: Doubles, tile_side_m: float) -> Longs:
     """Which of vertices [V, 3], metres, lie on the sides of tiles: others may have them, too."""
     steps = vertices / tile_side_m
     steps -= np.rint(steps)
     near = np.abs(steps, out=steps) < WELD_M / tile_side_m
     return np.flatnonzero(near[:, 0] | near[:, 1] | near[:, 2])
-
-
-def welded(vertices: Doubles, faces: Ints, shared: Longs, filled: Bools | None = None) -> Mesh:
-    """The mesh with one vertex where tiles had several, without faces that this made degenerate.
-
-    Of ``vertices`` [V, 3], metres, only the ``shared`` ones can be the same; ``filled`` [F] is as
-    of :class:`Mesh`.
-    """
-    target = np.arange(len(vertices), dtype=np.int32)
-    target[shared] = shared[_representatives(vertices[shared])]
-    joined = target.take(faces)
-    a, b, c = joined.T
-    kept = (a != b) & (b != c) & (c != a)
-    return compacted(vertices, joined[kept], filled=None if filled is None else filled[kept])
 
 
 def _representatives(points: Doubles) -> NDArray[np.intp]:
