@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
+from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_client.mesh.mesh import Mesh
 
