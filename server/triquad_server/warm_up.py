@@ -116,7 +116,7 @@ class WarmUp:
         surfels.find_nearest(points, no_surfels(np.full(len(points), float(BLOCK_VOXELS))))
         distances = np.ones(len(points))
         frozen.find_unknown(points, field.owned_blocks, distances, nearest=np.empty(points.shape))
-        evidence.set_discs(surfels.voxels, surfels.surfels)
+        evidence.set_discs(surfels.voxels(), surfels.surfels)
 
     def steps(self) -> None:
         """A field takes steps of training."""

@@ -67,7 +67,7 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
     live.mark_surface(rng.uniform(0, 64, (count, 3)) * (1, 1, 0.3))
     evidence = live.freeze()
     places = surfel_places(evidence.cells, evidence.surface)
-    surfels = random_surfels(rng, len(places.voxels))
+    surfels = random_surfels(rng, len(places.voxels()))
     points = rng.uniform(-20, 84, (400, 3))
     points[:200] = rng.uniform(0, 64, (200, 3)) * (1, 1, 0.3)
     fast, slow = nearest_both_ways(places, surfels, points, reach)
@@ -85,9 +85,9 @@ def test_the_nearest_surfel_is_the_same(seed, count, reach):
 def nearest_both_ways(places, surfels, points, reach):
     """What compiled code finds, and what the reference does."""
     fast, slow = (no_surfels(np.full(len(points), reach)) for _ in range(2))
-    find_nearest(points, surfel_tree(places.shape, places.voxels, surfels), fast)
-    count = len(places.voxels)
-    cloud = SurfelCloud(places.voxels, surfels, np.ones(count), np.zeros(count, int))
+    find_nearest(points, surfel_tree(places.shape, places.voxels(), surfels), fast)
+    count = len(places.voxels())
+    cloud = SurfelCloud(places.voxels(), surfels, np.ones(count), np.zeros(count, int))
     cloud.find_nearest(points, slow)
     return fast, slow
 
@@ -100,7 +100,7 @@ def test_the_nearest_surfel_is_the_same_where_surfaces_are_far_apart(reach):
     live.mark_surface(middles[rng.integers(12, size=3000)] + rng.uniform(-6, 6, (3000, 3)))
     evidence = live.freeze()
     places = surfel_places(evidence.cells, evidence.surface)
-    surfels = random_surfels(rng, len(places.voxels))
+    surfels = random_surfels(rng, len(places.voxels()))
     near = middles[rng.integers(12, size=200)] + rng.uniform(-40, 40, (200, 3))
     points = np.concatenate([near, rng.uniform(-900, 5000, (200, 3))])
     fast, slow = nearest_both_ways(places, surfels, points, reach)
@@ -120,7 +120,7 @@ def test_of_more_surfels_than_count_in_the_direction_the_nearest_is_found():
     live.mark_surface(middle + 25.0 * directions)  # as seen from inside a ball
     evidence = live.freeze()
     places = surfel_places(evidence.cells, evidence.surface)
-    away = places.voxels + 0.5 - middle
+    away = places.voxels() + 0.5 - middle
     lengths = np.linalg.norm(away, axis=1, keepdims=True)
     offsets = (25.0 / lengths - 1.0) * away
     kinds = np.full(len(away), SurfelKind.DISC, np.uint8)
@@ -138,8 +138,8 @@ def test_what_is_found_for_a_point_hangs_on_no_other_point():
     live.mark_surface(rng.uniform(0, 64, (3000, 3)) * (1, 1, 0.1))
     evidence = live.freeze()
     places = surfel_places(evidence.cells, evidence.surface)
-    surfels = random_surfels(rng, len(places.voxels))
-    tree = surfel_tree(places.shape, places.voxels, surfels)
+    surfels = random_surfels(rng, len(places.voxels()))
+    tree = surfel_tree(places.shape, places.voxels(), surfels)
     points = rng.uniform(-10, 74, (300, 3))
     together = no_surfels(np.full(300, 50.0))
     find_nearest(points, tree, together)

@@ -341,7 +341,7 @@ class LiveRegion:
         evidence = self.evidence.freeze(self._setup.team.split)
         surfels = self._surfels(evidence, samples, epoch, before)
         if self._restored:
-            self.evidence.set_discs(surfels.voxels, surfels.surfels)
+            self.evidence.set_discs(surfels.voxels(), surfels.surfels)
             self._restored = False
         self._forget_gone(surfels)
         if self._is_to_be_judged:

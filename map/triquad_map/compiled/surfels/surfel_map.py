@@ -46,19 +46,22 @@ Rows = NDArray[np.intp]
 class SurfelPlaces:
     """Where the surfels of the voxels in which rays ended stand."""
 
+    cells: Longs  # [blocks, 3]
     surface: Bytes  # [blocks, BLOCK_BYTES] these voxels
     starts: Ints  # [blocks + 1] first surfel of each block
-    voxels: Longs  # [S, 3] voxel of each surfel
     shape: TreeShape
+
+    def voxels(self) -> Longs:
+        """The voxel [S, 3] of each surfel. Nobody keeps them: they take a quarter of the memory."""
+        used = np.flatnonzero(np.diff(self.starts))  # most blocks are of open air
+        return surfel_voxels(self.cells[used], self.surface[used], int(self.starts[-1]))
 
 
 def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
     """Places for the voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks at ``cells`` [, 3]."""
     counts = surface_counts(surface)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    used = np.flatnonzero(counts)  # most blocks are of open air
-    voxels = surfel_voxels(cells[used], surface[used], int(starts[-1]))
-    return SurfelPlaces(surface, starts, voxels, tree_shape(cells, surface, starts))
+    return SurfelPlaces(cells, surface, starts, tree_shape(cells, surface, starts))
 
 
 @kernel()
@@ -142,11 +145,11 @@ class _Fitted:
 class SurfelMap:
     """Immutable: epochs share it."""
 
-    def __init__(self, evidence: FrozenEvidence, fitted: _Fitted) -> None:
+    def __init__(self, evidence: FrozenEvidence, fitted: _Fitted, voxels: Longs) -> None:
         """Use :func:`first_surfels` or :meth:`updated`."""
         self._fitted = fitted
         places = fitted.places
-        self._tree = surfel_tree(places.shape, places.voxels, fitted.surfels)
+        self._tree = surfel_tree(places.shape, voxels, fitted.surfels)
         kinds = fitted.surfels.kinds
         self._shown = ShownSurfels(
             kinds,
@@ -158,10 +161,9 @@ class SurfelMap:
     def __len__(self) -> int:
         return len(self._fitted.epochs)
 
-    @property
     def voxels(self) -> Longs:
         """The voxel [S, 3] of each surfel."""
-        return self._fitted.places.voxels
+        return self._fitted.places.voxels()
 
     @property
     def surfels(self) -> Surfels:
@@ -204,7 +206,7 @@ def first_surfels(
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
-    count = len(places.voxels)
+    count = int(places.starts[-1])
     offsets, normals = np.zeros((2, count, 3), np.float32)
     surfels = Surfels(offsets, normals, np.zeros(count, np.uint8))
     return _Fitted(places, surfels, np.full(count, _NEVER, np.int64))
@@ -219,7 +221,7 @@ def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
     after = _nothing_in(surfel_places(evidence.cells, evidence.surface))
     carried = carry(before.rows, after.rows)
     if not carried.all():
-        after.epochs[_beside(after, old.voxels[~carried])] = _NEVER
+        after.epochs[_beside(after, old.voxels()[~carried])] = _NEVER
     return after
 
 
@@ -227,7 +229,7 @@ def _beside(fitted: _Fitted, gone: Longs) -> Rows:
     """The surfels whose surface may have lain in voxels ``gone`` [N, 3] beside theirs."""
     rows = np.flatnonzero(fitted.surfels.kinds == SurfelKind.NONE)
     around = (gone[:, None] + _AROUND).reshape(-1, 3)
-    return rows[np.isin(keys_of(fitted.places.voxels[rows]), keys_of(around))]
+    return rows[np.isin(keys_of(fitted.places.voxels()[rows]), keys_of(around))]
 
 
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:
@@ -262,10 +264,11 @@ def _fitted_again(
     epoch: int,
 ) -> SurfelMap:
     """Fit the surfels in some rows; changes ``fitted``."""
+    voxels = fitted.places.voxels()
     for first in range(0, len(rows), _FITTED_AT_ONCE):
         part = rows[first : first + _FITTED_AT_ONCE]
-        new = fit_surfels(fitted.places.voxels[part], field, evidence.ended_in, by_rays)
+        new = fit_surfels(voxels[part], field, evidence.ended_in, by_rays)
         for name, array in vars(new).items():
             getattr(fitted.surfels, name)[part] = array
     fitted.epochs[rows] = epoch
-    return SurfelMap(evidence, fitted)
+    return SurfelMap(evidence, fitted, voxels)
