@@ -1,14 +1,16 @@
 """Where the surface of a map changed: what mesh tiles have to follow."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.compiled.team import Team
 
+from triquad_server.engine.memory import FrozenField
 from triquad_server.epochs.epoch import FrozenRegion
 
 _KEY_BITS = 20  # of each coordinate of a voxel, or of a group, in its region
@@ -44,10 +46,12 @@ class _Voxels:
 class _Recorded:
     """The surface of a region when its changes were last reported."""
 
-    region: FrozenRegion
+    centre: Doubles  # [3] of the region, map frame
+    engine: FrozenField
+    evidence: FrozenEvidence
     voxels: _Voxels
     offsets: Floats | None
-    """[V] metres from each voxel's centre to the surface; None: what the region's field tells."""
+    """[V] metres from each voxel's centre to the surface; None: what the engine tells."""
 
     margins: NDArray[np.int8]  # [V, 6] of the voxels
 
@@ -82,16 +86,15 @@ class SurfaceChanges:
             old = before.pop(region.index, None)
             if old is None:
                 new = self._seen(region, None)
-                found.append(Changes(self._centres(region, new.voxels.keys), nothing))
-            elif old.region is region:
+                found.append(Changes(self._centres(new, new.voxels.keys), nothing))
+            elif old.engine is region.engine and old.evidence is region.evidence:
                 new = old
             else:
                 new, changes = self._compare(old, self._seen(region, old))
                 found.append(changes)
             self._recorded[region.index] = new
         found += [
-            Changes(self._centres(gone.region, gone.voxels.keys), nothing)
-            for gone in before.values()
+            Changes(self._centres(gone, gone.voxels.keys), nothing) for gone in before.values()
         ]
         return Changes(
             np.concatenate([changes.places for changes in found]),
@@ -129,17 +132,24 @@ class SurfaceChanges:
         margins = np.where(is_told[:, None], voxels.margins, margins)
         places = is_new | (left & many_left[voxels.group])
         keys = np.concatenate([gone, voxels.keys[places]])
-        return _Recorded(new.region, voxels, offsets, margins), Changes(
-            self._centres(new.region, keys), voxels.groups[drifted]
+        return replace(new, offsets=offsets, margins=margins), Changes(
+            self._centres(new, keys), voxels.groups[drifted]
         )
 
     def _seen(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
         """A region without offsets: whoever asks for the first list of tiles needs none."""
-        if old is not None and old.region.evidence is region.evidence:
+        if old is not None and old.evidence is region.evidence:
             voxels = old.voxels
         else:
             voxels = self._voxels(region)
-        return _Recorded(region, voxels, None, voxels.margins)
+        return _Recorded(
+            region.centre,
+            region.engine,
+            region.evidence,
+            voxels,
+            offsets=None,
+            margins=voxels.margins,
+        )
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
         evidence = region.evidence
@@ -154,7 +164,7 @@ class SurfaceChanges:
         margins = evidence.margins[order].astype(np.int8)
         return _Voxels(keys, margins, groups, group.ravel().astype(np.int32))
 
-    def _centres(self, region: FrozenRegion, keys: Longs) -> Doubles:
+    def _centres(self, region: FrozenRegion | _Recorded, keys: Longs) -> Doubles:
         """The centres [N, 3] of voxels of a region, metres, map frame."""
         corner = region.centre - self._settings.region_side_m / 2
         return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
@@ -163,15 +173,14 @@ class SurfaceChanges:
         """How far [V] the surface is from voxels' centres; at most a voxel: beyond are others."""
         if recorded.offsets is not None:
             return recorded.offsets
-        region = recorded.region
-        centres = self._centres(region, recorded.voxels.keys)
+        centres = self._centres(recorded, recorded.voxels.keys)
         offsets = np.empty(len(centres), np.float32)
         leaf_m = self._settings.leaf_m
 
         def work(first: int, last: int) -> None:
             part = slice(first, last)
-            local = (centres[part] - region.centre).astype(np.float32)
-            values = region.engine.evaluate(local, True)
+            local = (centres[part] - recorded.centre).astype(np.float32)
+            values = recorded.engine.evaluate(local, True)
             slope = np.maximum(np.linalg.norm(values.gradient, axis=1), 0.1)
             offsets[part] = np.clip(values.sdf / slope, -leaf_m, leaf_m)
 

@@ -174,8 +174,8 @@ class TileCache:
         self._settings = settings
         self._levels = [_TileLevel(tile_lattice(settings, level)) for level in range(LEVELS)]
         self._changes: SurfaceChanges | None = None
-        self._epoch: Epoch | None = None
-        self._view: ComposedView | None = None  # of that epoch
+        self.epoch = -1  # number of that of the last refresh
+        self._view: ComposedView | None = None  # of which tiles are made
         self.revision = 0  # how often bytes of any tile came to differ
         self.tiles_made = 0  # so far
         self._bytes = TileBytes(settings.cache_bytes)
@@ -183,9 +183,10 @@ class TileCache:
         self.answered = AnsweredTiles(min(_ANSWERED_BYTES, settings.cache_bytes))
 
     @property
-    def epoch(self) -> int:
-        """Number of the epoch of the last refresh; -1 before any."""
-        return -1 if self._epoch is None else self._epoch.number
+    def made_from(self) -> int:
+        """Number of the epoch from which tiles are made; -1: of none, after :meth:`let_go`."""
+        view = self._view
+        return -1 if view is None else view.epoch
 
     @property
     def nbytes(self) -> int:
@@ -196,24 +197,21 @@ class TileCache:
         """Where the tiles of a level lie."""
         return self._levels[level].lattice
 
-    def refresh(self, epoch: Epoch) -> None:
-        """Find out what changed until ``epoch``; one older than the last changes nothing."""
+    def refresh(self, epoch: Epoch, *, to_make: bool = True) -> None:
+        """Find out what changed until ``epoch``; one older than the last changes nothing.
+
+        Tiles are made from it from now on, unless that is not wanted (``to_make``).
+        """
         with self._lock:
-            if epoch.number <= self.epoch:
-                return
-            if self._changes is None:
-                self._changes = SurfaceChanges(
-                    epoch.field_settings,
-                    tolerance_m=self._settings.tolerance_m,
-                    group_m=self.lattice(0).tile_side_m,
-                    team=self._team,
-                )
-            changes = self._changes.since_last(epoch.frozen_regions)
-            for level in self._levels:
-                level.record(changes, epoch.field_settings.leaf_m / 2, epoch.number)
-            self._epoch = epoch
-            # Without the threads that answer queries: those that make tiles give way to them.
-            self._view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
+            if epoch.number > self.epoch:
+                self._record_changes(epoch)
+            if to_make and epoch.number == self.epoch:
+                # Without the threads that answer queries: those that make tiles give way to them.
+                self._view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
+
+    def let_go(self) -> None:
+        """Hold no epoch for tiles to be made from, until the next refresh: it takes memory."""
+        self._view = None
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
         """Epochs [T] in which the surface of tiles [T, 3] last changed; 0 where none was seen."""
@@ -290,6 +288,19 @@ class TileCache:
         """The bytes of a tile, None where they are gone; it has to be made anew then."""
         with self._lock:
             return self._bytes.get((level, tile.index))
+
+    def _record_changes(self, epoch: Epoch) -> None:
+        if self._changes is None:
+            self._changes = SurfaceChanges(
+                epoch.field_settings,
+                tolerance_m=self._settings.tolerance_m,
+                group_m=self.lattice(0).tile_side_m,
+                team=self._team,
+            )
+        changes = self._changes.since_last(epoch.frozen_regions)
+        for level in self._levels:
+            level.record(changes, epoch.field_settings.leaf_m / 2, epoch.number)
+        self.epoch = epoch.number
 
     def _agreeing(
         self,

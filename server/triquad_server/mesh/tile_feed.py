@@ -140,6 +140,7 @@ class TileFeed:
         while True:
             with self._changed:
                 if not self._pending and not self._stopping:
+                    self._cache.let_go()
                     self._changed.wait()
                 if self._stopping:
                     break
@@ -157,7 +158,8 @@ class TileFeed:
         """Find out what changed, where there may be something and it is time."""
         started = time.monotonic()
         newest = self._epochs.newest
-        if newest.number <= self._cache.epoch or started < self._next_refresh_s:
+        made_from = self._cache.made_from
+        if newest.number <= made_from or (made_from >= 0 and started < self._next_refresh_s):
             return
         try:
             with self._epochs.gate.turn():

@@ -46,7 +46,7 @@ class TileQueries:
         tiles = tiles[lattice.meets(tiles, request.minimum, request.maximum)]
         if len(tiles) > MAX_TILES:
             raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
-        self._cache.refresh(epoch)
+        self._cache.refresh(epoch, to_make=False)
         changed = self._cache.changed(request.level, tiles)
         return TileList(
             epoch=epoch.number,

@@ -1,5 +1,7 @@
 """Tiles that are made where the surface changed, and that meet whenever they were made."""
 
+import gc
+import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -377,3 +379,20 @@ def test_when_tiles_changed_is_told_for_any_of_them() -> None:
     cache.refresh(first)  # an older one tells nothing
     asked = np.array([[2, 2, 0], [-2, -2, 0], [900, 0, 0]])
     assert cache.changed(0, asked).tolist() == [second.number, first.number, 0]
+
+
+def test_no_epoch_is_held_for_tiles_that_nobody_wants() -> None:
+    cache = TileCache(MESH, TEAM)
+    first, second = ground(flat(0.3)), ground(flat(0.4))
+    cache.refresh(first)
+    made = make_all(cache, 0)
+    cache.refresh(second, to_make=False)  # somebody asked for a list
+    assert cache.made_from == first.number
+    surfels = [weakref.ref(region.surfels) for region in first.frozen_regions]
+    cache.let_go()
+    del first
+    gc.collect()
+    assert [held() for held in surfels] == [None] * len(surfels)
+    cache.refresh(second)
+    assert cache.made_from == second.number
+    assert {index[:2] for index in make_all(cache, 0)} == {index[:2] for index in made}
