@@ -277,6 +277,7 @@ class LiveRegion:
         """
         if self._marks is not None:
             self.evidence.set_normals(self._marks, normals)
+            self._marks = None  # with the room for those of all its rays
 
     @property
     def owed(self) -> float:
