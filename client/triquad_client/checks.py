@@ -169,7 +169,7 @@ def tile_indices(index: Sequence[int]) -> Ints:
     """The index of one tile, as a row [1, 3] of several."""
     for axis, number in zip("xyz", index, strict=True):
         is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
-        if not is_whole or abs(number) > TILE_INDEX_LIMIT:
+        if not is_whole or not -TILE_INDEX_LIMIT <= number <= TILE_INDEX_LIMIT:
             raise InvalidInputError(
                 f"{axis} = {_shown(number)}: use a whole number from -{TILE_INDEX_LIMIT} to "
                 f"{TILE_INDEX_LIMIT}, such as client.tiles() lists"

@@ -176,6 +176,8 @@ def test_tiles_make_one_mesh(client):
         client.mesh_tile(0, 0.5, 0)
     with pytest.raises(InvalidInputError, match="z = -1000001: use a whole number"):
         client.mesh_tile(0, 0, -1_000_001)
+    with pytest.raises(InvalidInputError, match="x = .*: use a whole number"):
+        client.mesh_tile(np.int64(-(2**63)), 0, 0)
 
 
 def test_tiles_that_are_asked_for_together_are_those_asked_for_alone(endpoint, client):

@@ -30,7 +30,9 @@ def pack_bitcode() -> None:
     with global_compiler_lock:
         while _unpacked:
             library = _unpacked.pop()
-            module = library._shared_module
+            module = getattr(library, "_shared_module", None)
+            if module is None:  # another release of numba keeps it otherwise
+                continue
             _packed.append(_Packed(library, zlib.compress(module.as_bitcode())))
             library._shared_module = None
             module.close()
