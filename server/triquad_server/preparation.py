@@ -116,7 +116,7 @@ class Preparation:
             for stage in MESHING:
                 self._go_through(stage, self._look_for_close)
             self._tell("all is compiled")
-            pack_bitcode()
+            _pack()
         except _ClosedError:
             pass
         except Exception:
@@ -136,3 +136,11 @@ class Preparation:
     def _look_for_close(self) -> None:
         if self._closing.is_set():
             raise _ClosedError
+
+
+def _pack() -> None:
+    """Keep the bitcode of kernels in less memory; without it, the server merely takes more."""
+    try:
+        pack_bitcode()
+    except Exception:
+        _log.warning("the bitcode of compiled code could not be packed", exc_info=True)

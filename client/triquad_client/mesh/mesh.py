@@ -74,17 +74,12 @@ class Mesh:
         return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
 
 
-def compacted(
-    vertices: Doubles,
-    faces: NDArray[np.integer],
-    epoch: int = 0,
-    filled: Bools | None = None,
-) -> Mesh:
+def compacted(vertices: Doubles, faces: NDArray[np.integer]) -> Mesh:
     """The mesh without vertices that no face uses."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return Mesh(vertices[used], number.take(faces).reshape(-1, 3), epoch, filled)
+    return Mesh(vertices[used], number.take(faces).reshape(-1, 3))
 
 
 def _ply(mesh: Mesh) -> bytes:

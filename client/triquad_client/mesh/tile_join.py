@@ -25,7 +25,7 @@ class TileJoin:
     ) -> None:
         """Faces stay whose centroids lie in the ``box``, given by its corners [3], metres.
 
-        Where tiles are ``marked``, all tell which of their faces fill holes.
+        Where tiles are ``marked``, the mesh tells which of its faces fill holes.
         """
         self._tile_side_m = tile_side_m
         self._box = box

@@ -30,7 +30,6 @@ Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
 Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Integers = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
-Faces = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 
 # What replies hold, within its bounds: triquad_format.wire.reply.
 Count = Annotated[int, Within(0, MAX_COUNT)]
@@ -39,7 +38,6 @@ Epochs = Annotated[Integers, Within(0, MAX_COUNT)]
 Duration = Annotated[float, Within(0)]  # seconds
 Length = Annotated[float, Within(0)]  # metres
 Statuses = Annotated[StatusCodes, Within(0, 2)]  # triquad_format.records.status.Status
-FinitePoint = Annotated[Point, Within()]
 FinitePositions = Annotated[Positions, Within()]
 FinitePoints = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3)), Within()]
 Lengths = Annotated[Values, Within(0)]

@@ -25,7 +25,7 @@ _AROUND = [
 ]
 
 _ANSWERED_BYTES = 8_000_000
-"""Of tiles of one epoch that somebody asked for by name: some 250 m of street."""
+"""Of tiles of one epoch that somebody asked for by name: some 230 m of street."""
 
 TileKey = tuple[int, TileIndex]
 """Level of detail and index of a tile."""
@@ -200,18 +200,20 @@ class TileCache:
     def refresh(self, epoch: Epoch, *, to_make: bool = True) -> None:
         """Find out what changed until ``epoch``; one older than the last changes nothing.
 
-        Tiles are made from it from now on, unless that is not wanted (``to_make``).
+        Tiles are made from it from now on, but for where none are made and none are to be
+        (``to_make``).
         """
         with self._lock:
             if epoch.number > self.epoch:
                 self._record_changes(epoch)
-            if to_make and epoch.number == self.epoch:
+            if epoch.number == self.epoch and (to_make or self._view is not None):
                 # Without the threads that answer queries: those that make tiles give way to them.
                 self._view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
 
     def let_go(self) -> None:
         """Hold no epoch for tiles to be made from, until the next refresh: it takes memory."""
-        self._view = None
+        with self._lock:
+            self._view = None
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
         """Epochs [T] in which the surface of tiles [T, 3] last changed; 0 where none was seen."""

@@ -30,6 +30,9 @@ from triquad_server.settings import MeshSettings
 _log = logging.getLogger(__name__)
 
 _STOPPING = "the server is stopping"
+_HOLDS_S = 5.0
+"""For so long after the last follower an epoch is held, of which tiles may be made."""
+
 _PAUSE_S = 0.1
 _SLICE_S = 0.2  # tiles are made so long for one follower, then for the next
 _GIVE_WAY_S = 0.1
@@ -139,9 +142,9 @@ class TileFeed:
         lower_priority(NICENESS)
         while True:
             with self._changed:
-                if not self._pending and not self._stopping:
+                if not self._changed.wait_for(self._is_wanted, _HOLDS_S):
                     self._cache.let_go()
-                    self._changed.wait()
+                    self._changed.wait_for(self._is_wanted)
                 if self._stopping:
                     break
                 pending = list(self._pending)
@@ -154,12 +157,14 @@ class TileFeed:
         for follower in self._pending:
             self._senders.refuse(follower, "timeout", _STOPPING)
 
+    def _is_wanted(self) -> bool:
+        return bool(self._pending) or self._stopping
+
     def _refresh(self) -> None:
         """Find out what changed, where there may be something and it is time."""
         started = time.monotonic()
         newest = self._epochs.newest
-        made_from = self._cache.made_from
-        if newest.number <= made_from or (made_from >= 0 and started < self._next_refresh_s):
+        if newest.number <= self._cache.made_from or started < self._next_refresh_s:
             return
         try:
             with self._epochs.gate.turn():
@@ -187,7 +192,8 @@ class TileFeed:
         if self._senders.is_sending_to(follower):
             return False
         state = (self._cache.epoch, self._cache.revision)
-        if follower.nothing_at == state or not self._senders.may_send(follower):
+        can_make = self._cache.made_from >= 0
+        if not can_make or follower.nothing_at == state or not self._senders.may_send(follower):
             return self._answer_if_late(follower, knows_all=follower.nothing_at == state)
         asks = follower.asks
         delta = self._cache.delta(

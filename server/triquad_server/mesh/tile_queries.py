@@ -56,7 +56,7 @@ class TileQueries:
         )
 
     def answer_mesh(self, request: Request) -> None:
-        """Answer a :class:`MeshRequest`; between tiles, others have their turn."""
+        """Answer a :class:`MeshRequest`; after the first few tiles, others have their turn."""
         request.answer(self.mesh(request.read(MeshRequest), request.turn))
 
     def mesh(self, request: MeshRequest, turn: Callable[[], object]) -> MeshReply:

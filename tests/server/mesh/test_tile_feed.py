@@ -1,16 +1,20 @@
 """Who may wait for tiles, where too many do."""
 
+import threading
 from contextlib import closing
 
 import pytest
 from support import servers
 from support.requests import PendingRequest, held_tile_updates
+from triquad_format.wire.messages import TileUpdates
+from triquad_map.compiled.team import Team
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh import tile_feed
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.process.threads import Teams
+from triquad_server.settings import MeshSettings
 
 LIMIT = 4
 
@@ -49,3 +53,34 @@ def test_who_names_too_many_tiles_is_refused_and_no_other(feed, monkeypatch):
     assert greedy[-1].reply == "busy"
     assert greedy[0].waits
     assert all(request.waits for request in honest)
+
+
+class WatchedCache(TileCache):
+    """Tells when it lets go."""
+
+    def __init__(self, settings: MeshSettings, team: Team) -> None:
+        super().__init__(settings, team)
+        self.lets_go = threading.Event()
+
+    def let_go(self) -> None:
+        super().let_go()
+        self.lets_go.set()
+
+
+def test_an_epoch_is_held_for_those_who_follow_alone(monkeypatch):
+    monkeypatch.setattr(tile_feed, "_HOLDS_S", 0.01)
+    settings, teams = servers.SMALL, Teams()
+    epochs = EpochHistory(Mapper("m", settings, "cpu", teams=teams).publish(), settings.service)
+    mesh = MeshSettings(update_period_s=0.1)
+    cache = WatchedCache(mesh, teams.meshing)
+    feed = TileFeed(cache, epochs, server="s", settings=mesh, limit=LIMIT)
+    with closing(teams), closing(feed):
+        for _ in range(2):
+            cache.lets_go.clear()
+            follower = PendingRequest(held_tile_updates(0, timeout_s=1.0), "follower")
+            feed.add(follower)
+            reply = follower.reply
+            assert isinstance(reply, TileUpdates)
+            assert reply.complete
+            assert cache.lets_go.wait(servers.WAIT_S)
+            assert cache.made_from == -1

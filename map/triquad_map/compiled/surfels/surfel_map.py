@@ -146,7 +146,7 @@ class SurfelMap:
     """Immutable: epochs share it."""
 
     def __init__(self, evidence: FrozenEvidence, fitted: _Fitted, voxels: Longs) -> None:
-        """Use :func:`first_surfels` or :meth:`updated`."""
+        """Use :func:`first_surfels` or :meth:`updated`; ``voxels`` [S, 3] are the surfels'."""
         self._fitted = fitted
         places = fitted.places
         self._tree = surfel_tree(places.shape, voxels, fitted.surfels)
