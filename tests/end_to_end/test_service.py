@@ -207,7 +207,7 @@ def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):
         client.publish_scan(points[np.abs(points[:, 0]) > 0.3], np.eye(4))
     client.flush(servers.WAIT_S)
     client.settle(servers.WAIT_S)
-    plain, mesh = client.mesh(), client.mesh(fill_m=0.6)
+    plain, mesh = client.mesh(), client.mesh(fill_m=np.float64(0.6))
     assert plain.filled is None
     assert (~mesh.filled).sum() == len(plain.faces)
     centres = mesh.vertices[mesh.faces].mean(axis=1)
