@@ -67,8 +67,10 @@ FILE = bytes(range(256)) * 40
 CHUNK_BYTES = 4096
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.float32)
 FACE = np.array([(0, 1, 2)], np.int32)
-TILE = encode_tile(TileSurface(CORNERS.astype(np.uint16), np.zeros(3, np.uint8),
-                               np.zeros(3, np.uint8), FACE))  # fmt: skip
+SURFACE = TileSurface(
+    CORNERS.astype(np.uint16), np.zeros(3, np.uint8), np.zeros(3, np.uint8), faces=FACE
+)
+TILE = encode_tile(SURFACE)
 
 
 def honest_reply(request: Message) -> Message:

@@ -1,14 +1,15 @@
 """Lies of a server, each with the question that it is the answer to."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from support.honest_replies import CHUNK_BYTES, EPOCH, TILE
+from support.honest_replies import CHUNK_BYTES, EPOCH, SURFACE, TILE
 from support.hostile_server import Body, packed
 from triquad_client import Client
 from triquad_format.wire import keys
+from triquad_format.wire.tile_codec import encode_tile
 
 COUNT = 100
 POINTS = np.random.default_rng(1).normal(size=(COUNT, 3))
@@ -118,6 +119,13 @@ def _questions() -> dict[str, tuple[str, Ask]]:
 
 QUESTIONS = _questions()
 
+
+def _has_faces(faces: list[list[int]]) -> Callable[[Body], object]:
+    """A reply of one tile with these faces."""
+    tile = encode_tile(replace(SURFACE, faces=np.array(faces, np.int32)))
+    return _sets(data=tile, sizes=packed([len(tile)], "<i8"))
+
+
 _LIES: list[tuple[str, str, Callable[[Body], object]]] = [
     ("sdf", "one value for 100 points", _sets(sdf=packed([1.0]), status=packed([1], "|u1"))),
     ("sdf", "fewer statuses", _sets(status=packed([1] * 50, "|u1"))),
@@ -179,6 +187,9 @@ _LIES: list[tuple[str, str, Callable[[Body], object]]] = [
     ("tiles", "one epoch too few", _sets(changed=packed([], "<i8"))),
     ("tiles", "side no number", _sets(tile_side_m=NAN)),
     ("tiles", "no side", _sets(tile_side_m=0.0)),
+    ("tile", "corner that is not there", _has_faces([[0, 1, 99]])),
+    ("tile", "negative corner", _has_faces([[0, 1, -1]])),
+    ("mesh", "corner that is not there", _has_faces([[0, 1, 99]])),
     ("tile", "no tile", _sets(data=bytes(len(TILE)))),
     ("tile", "half a tile", _sets(data=TILE[:9], sizes=packed([9], "<i8"))),
     ("tile", "cells no number", _sets(cell_m=NAN)),

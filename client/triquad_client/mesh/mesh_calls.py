@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from triquad_format.records.arrays import Ints
+from triquad_format.records.arrays import Bools, Ints
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
 
@@ -59,10 +59,10 @@ def fetch_mesh(
         join = TileJoin(listed.tile_side_m, box, marked=fill_m > 0)
         firsts = range(0, len(listed.tiles), each)
         parts = [listed.tiles[first : first + each] for first in firsts]
-        asked, decoder = iter(parts), TileDecoder(max_bytes)
+        decoder = TileDecoder(max_bytes)
 
-        def take(reply: MeshReply) -> None:
-            for tile in _decoded(reply, next(asked), decoder, filled=fill_m > 0):
+        def take(tiles: Ints, reply: MeshReply) -> None:
+            for tile in _decoded(reply, tiles, decoder, filled=fill_m > 0):
                 join.add(tile)
 
         yield from take_each(
@@ -84,17 +84,17 @@ def _decoded(
     """The meshes of the tiles [T, 3] that were asked for, maybe ``filled``."""
     if filled != (reply.filled is not None):
         raise BadReplyError("filled: it came unasked, or did not come although it was asked for")
-    first = 0
-    decoded = decoder.decode(reply.sizes, reply.data)
-    for index, tile in zip(tiles.tolist(), decoded, strict=True):
-        surface = tile.surface
-        marks = None
-        if reply.filled is not None:
-            marks = reply.filled[first : first + len(surface.faces)].astype(np.bool_)
-            if len(marks) != len(surface.faces):
-                raise BadReplyError("filled: it tells of fewer faces than there are")
-            first += len(marks)
+    surfaces = [tile.surface for tile in decoder.decode(reply.sizes, reply.data)]
+    marks = _marks(reply, [len(surface.faces) for surface in surfaces])
+    for index, surface, mark in zip(tiles.tolist(), surfaces, marks, strict=True):
         corner = np.array(index) * reply.tile_side_m
-        yield Mesh(corner + surface.positions(reply.cell_m), surface.faces, reply.epoch, marks)
-    if reply.filled is not None and first < len(reply.filled):
-        raise BadReplyError("filled: it tells of more faces than there are")
+        yield Mesh(corner + surface.positions(reply.cell_m), surface.faces, reply.epoch, mark)
+
+
+def _marks(reply: MeshReply, faces: list[int]) -> list[Bools | None]:
+    """Which faces fill holes, for each tile, given the number of its ``faces``; None: not asked."""
+    if reply.filled is None:
+        return [None] * len(faces)
+    if len(reply.filled) != sum(faces):
+        raise BadReplyError(f"filled: {len(reply.filled)} marks came for {sum(faces)} faces")
+    return [*np.split(reply.filled.astype(np.bool_), np.cumsum(faces)[:-1])]

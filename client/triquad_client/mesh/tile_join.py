@@ -42,8 +42,8 @@ class TileJoin:
         self._vertices.append(cut.vertices)
         self._faces.append(cut.faces + np.int32(self._count))
         self._shared.append(_on_sides(cut.vertices, self._tile_side_m) + self._count)
-        unmarked = np.zeros(len(cut.faces), np.bool_)
-        self._filled.append(unmarked if cut.filled is None else cut.filled)
+        filled = np.zeros(len(cut.faces), np.bool_) if cut.filled is None else cut.filled
+        self._filled.append(filled)
         self._count += len(cut.vertices)
 
     def mesh(self, epoch: int) -> Mesh:

@@ -50,12 +50,12 @@ class Ask(Generic[ReplyT]):
 
 @dataclass(frozen=True)
 class Batch:
-    """A step: one request per item. It is sent what ``take`` makes of the replies, in the order of
-    the items: of each while the next are on their way."""
+    """A step: one request per item. It is sent what ``take`` makes of items and their replies, in
+    the order of the items: of each while the next are on their way."""
 
     items: Iterable[Any]
     request: Callable[[Any], Ask[Any]]
-    take: Callable[[Any], Any]
+    take: Callable[[Any, Any], Any]
     at_once: int  # requests that wait for their replies at the same time
 
 
@@ -104,16 +104,16 @@ def ask_each(
     items: Iterable[ItemT], request: Callable[[ItemT], Ask[ReplyT]], at_once: int = _PARTS_IN_FLIGHT
 ) -> Call[list[ReplyT]]:
     """The replies to one request per item; each is made when its turn comes, maybe in a thread."""
-    return (yield from take_each(items, request, lambda reply: reply, at_once))
+    return (yield from take_each(items, request, lambda _, reply: reply, at_once))
 
 
 def take_each(
     items: Iterable[ItemT],
     request: Callable[[ItemT], Ask[ReplyT]],
-    take: Callable[[ReplyT], ResultT],
+    take: Callable[[ItemT, ReplyT], ResultT],
     at_once: int = _PARTS_IN_FLIGHT,
 ) -> Call[list[ResultT]]:
-    """As :func:`ask_each`: what ``take``, which must be quick, makes of each reply."""
+    """As :func:`ask_each`: what ``take``, which must be quick, makes of each item and its reply."""
     taken: list[ResultT] = yield Batch(items, request, take, at_once)
     return taken
 
@@ -203,13 +203,18 @@ async def exchange(
     receive: Callable[[Ask[Any], PendingT], Awaitable[Any]],
 ) -> list[Any]:
     """What is made of the replies to a batch, of which ``batch.at_once`` are awaited at a time."""
-    waiting: deque[tuple[Ask[Any], PendingT]] = deque()
+    waiting: deque[tuple[Any, Ask[Any], PendingT]] = deque()
     taken = []
+
+    async def take_first() -> None:
+        item, request, pending = waiting.popleft()
+        taken.append(batch.take(item, await receive(request, pending)))
+
     for item in batch.items:
         request = batch.request(item)
-        waiting.append((request, await send(request)))
+        waiting.append((item, request, await send(request)))
         if len(waiting) >= batch.at_once:
-            taken.append(batch.take(await receive(*waiting.popleft())))
+            await take_first()
     while waiting:
-        taken.append(batch.take(await receive(*waiting.popleft())))
+        await take_first()
     return taken

@@ -48,7 +48,10 @@ class LocalDriver(BlockingDriver):
         self.opened.close()
 
     async def _replies(self, batch: Batch) -> list[Any]:
-        return [self._answers.answer(batch.request(item).message) for item in batch.items]
+        return [
+            batch.take(item, self._answers.answer(batch.request(item).message))
+            for item in batch.items
+        ]
 
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:

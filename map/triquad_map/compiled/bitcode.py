@@ -30,9 +30,7 @@ def pack_bitcode() -> None:
     with global_compiler_lock:
         while _unpacked:
             library = _unpacked.pop()
-            module = getattr(library, "_shared_module", None)
-            if module is None:  # another release of numba keeps it otherwise
-                continue
+            module = library._shared_module
             _packed.append(_Packed(library, zlib.compress(module.as_bitcode())))
             library._shared_module = None
             module.close()

@@ -11,6 +11,7 @@ from triquad_format.records.region import MapRecord, Region
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
 from triquad_map.composition.composed_view import ComposedView
+from triquad_map.composition.field_view import in_one
 from triquad_map.composition.region import Split
 
 from triquad_server.array_memory import Buffers
@@ -63,6 +64,13 @@ class Epoch(ComposedView):
         self.frozen_regions = regions
         self.progress = progress or MapProgress()
         self._name = name
+
+    def asked_with(self, split: Split = in_one) -> ComposedView:
+        """The same map for questions at which ``split`` works: who asks alone, by default.
+
+        For those who give way to queries: these have threads of their own.
+        """
+        return ComposedView(self.number, self.field_settings, self.frozen_regions, split=split)
 
     @property
     def regions(self) -> int:

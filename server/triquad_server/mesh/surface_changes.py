@@ -86,7 +86,7 @@ class SurfaceChanges:
             old = before.pop(region.index, None)
             if old is None:
                 new = self._seen(region, None)
-                found.append(Changes(self._centres(new, new.voxels.keys), nothing))
+                found.append(Changes(self._centres(region.centre, new.voxels.keys), nothing))
             elif old.engine is region.engine and old.evidence is region.evidence:
                 new = old
             else:
@@ -94,7 +94,8 @@ class SurfaceChanges:
                 found.append(changes)
             self._recorded[region.index] = new
         found += [
-            Changes(self._centres(gone, gone.voxels.keys), nothing) for gone in before.values()
+            Changes(self._centres(gone.centre, gone.voxels.keys), nothing)
+            for gone in before.values()
         ]
         return Changes(
             np.concatenate([changes.places for changes in found]),
@@ -133,7 +134,7 @@ class SurfaceChanges:
         places = is_new | (left & many_left[voxels.group])
         keys = np.concatenate([gone, voxels.keys[places]])
         return replace(new, offsets=offsets, margins=margins), Changes(
-            self._centres(new, keys), voxels.groups[drifted]
+            self._centres(new.centre, keys), voxels.groups[drifted]
         )
 
     def _seen(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
@@ -157,23 +158,23 @@ class SurfaceChanges:
         keys = _key(voxels)
         order = np.argsort(keys)
         keys = keys[order]
-        cells = np.floor(self._centres(region, keys) / self._group_m).astype(np.int64)
+        cells = np.floor(self._centres(region.centre, keys) / self._group_m).astype(np.int64)
         low = cells.min(axis=0, initial=0)
         _, first, group = np.unique(_key(cells - low), return_index=True, return_inverse=True)
         groups = ((cells[first] + 0.5) * self._group_m).astype(np.float64)
         margins = evidence.margins[order].astype(np.int8)
         return _Voxels(keys, margins, groups, group.ravel().astype(np.int32))
 
-    def _centres(self, region: FrozenRegion | _Recorded, keys: Longs) -> Doubles:
-        """The centres [N, 3] of voxels of a region, metres, map frame."""
-        corner = region.centre - self._settings.region_side_m / 2
+    def _centres(self, centre: Doubles, keys: Longs) -> Doubles:
+        """The centres [N, 3] of voxels of the region around ``centre``, metres, map frame."""
+        corner = centre - self._settings.region_side_m / 2
         return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
 
     def _offsets(self, recorded: _Recorded) -> Floats:
         """How far [V] the surface is from voxels' centres; at most a voxel: beyond are others."""
         if recorded.offsets is not None:
             return recorded.offsets
-        centres = self._centres(recorded, recorded.voxels.keys)
+        centres = self._centres(recorded.centre, recorded.voxels.keys)
         offsets = np.empty(len(centres), np.float32)
         leaf_m = self._settings.leaf_m
 

@@ -207,8 +207,7 @@ class TileCache:
             if epoch.number > self.epoch:
                 self._record_changes(epoch)
             if epoch.number == self.epoch and (to_make or self._view is not None):
-                # Without the threads that answer queries: those that make tiles give way to them.
-                self._view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
+                self._view = epoch.asked_with()
 
     def let_go(self) -> None:
         """Hold no epoch for tiles to be made from, until the next refresh: it takes memory."""

@@ -69,11 +69,13 @@ class TileQueries:
         check_level(request.level)
         check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
-        lattice = self._cache.lattice(request.level)
+        # On the thread that answers alone: of a box full of tiles, others make more of them.
+        view, lattice = epoch.asked_with(), self._cache.lattice(request.level)
         tiles = []
         for x, y, z in request.tiles.tolist():
             turn()
-            tiles.append(self._tile(epoch, AskedTile(request.level, (x, y, z), request.fill_m)))
+            asked = AskedTile(request.level, (x, y, z), request.fill_m)
+            tiles.append(self._tile(view, asked, lattice))
         filled = [tile.filled for tile in tiles if tile.filled is not None]
         return MeshReply(
             epoch=epoch.number,
@@ -84,18 +86,15 @@ class TileQueries:
             filled=np.concatenate(filled) if filled else None,
         )
 
-    def _tile(self, epoch: Epoch, asked: AskedTile) -> AnsweredTile:
+    def _tile(self, view: ComposedView, asked: AskedTile, lattice: TileLattice) -> AnsweredTile:
         """The mesh of one tile, as it was answered before or made anew."""
-        kept = self._cache.answered.get(epoch.number, asked)
+        kept = self._cache.answered.get(view.epoch, asked)
         if kept is not None:
             return kept
-        # On the thread that answers alone: of a box full of tiles, others make more of them.
-        view = ComposedView(epoch.number, epoch.field_settings, epoch.frozen_regions)
-        lattice = self._cache.lattice(asked.level)
         mesh = mesh_tile(view, asked.index, lattice, fill_m=asked.fill_m)
         filled = mesh.filled.astype(np.uint8) if asked.fill_m > 0 else None
         made = AnsweredTile(encode_tile(mesh.surface), filled)
-        self._cache.answered.put(epoch.number, asked, made)
+        self._cache.answered.put(view.epoch, asked, made)
         return made
 
 

@@ -1,6 +1,9 @@
 """Tiles are answered with again, and only of the newest epoch that was asked for."""
 
+import tracemalloc
+
 import numpy as np
+from triquad_format.wire.tile_codec import TileSurface, encode_tile
 from triquad_server.mesh.answered_tiles import AnsweredTile, AnsweredTiles, AskedTile
 
 
@@ -48,3 +51,23 @@ def test_marks_of_filled_faces_count() -> None:
     assert tiles.get(7, asked(1, fill_m=0.5)) is None
     tiles.put(7, asked(1, fill_m=0.5), tile(7)._replace(filled=np.zeros(500, np.uint8)))
     assert tiles.nbytes == 2_500
+
+
+def test_what_is_kept_takes_no_more_memory_than_is_told() -> None:
+    rng = np.random.default_rng(3)
+    count = 5_000
+    lattice = np.sort(rng.integers(0, 64, (count, 3)), axis=0).astype(np.uint16)
+    axes, steps = np.zeros(count, np.uint8), rng.integers(0, 256, count).astype(np.uint8)
+    faces = np.arange(count - count % 3, dtype=np.int32).reshape(-1, 3)
+    surface = TileSurface(lattice, axes, steps, faces=faces)  # which shrinks to a tenth
+    tiles, many = AnsweredTiles(10_000_000), 50
+    tiles.put(7, asked(-1), AnsweredTile(encode_tile(surface), None))
+    tracemalloc.start()
+    try:
+        for x in range(many):
+            tiles.put(7, asked(x), AnsweredTile(encode_tile(surface), None))
+        taken, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    told = tiles.nbytes * many / (many + 1)
+    assert told < taken < 1.1 * told

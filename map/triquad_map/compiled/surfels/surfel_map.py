@@ -191,9 +191,15 @@ class SurfelMap:
         At most so many of the others are fitted; ``None``: all. Those that rays alone show are
         whatever ``most`` is, since further rays show them better.
         """
-        fitted = _carried(self._fitted, evidence)
+        places = self._fitted.places
+        if not np.array_equal(places.surface, evidence.surface):
+            places = surfel_places(evidence.cells, evidence.surface)
+        voxels = places.voxels()
+        fitted = _carried(self._fitted, places, voxels)
         rows = _outdated(fitted, most)
-        return _fitted_again(evidence, fitted, rows, field=field, by_rays=by_rays, epoch=epoch)
+        return _fitted_again(
+            evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch
+        )
 
 
 def first_surfels(
@@ -201,8 +207,8 @@ def first_surfels(
 ) -> SurfelMap:
     """The surfels of all seen voxels, for an epoch."""
     fitted = _nothing_in(surfel_places(evidence.cells, evidence.surface))
-    rows = _outdated(fitted, None)
-    return _fitted_again(evidence, fitted, rows, field=field, by_rays=by_rays, epoch=epoch)
+    voxels, rows = fitted.places.voxels(), _outdated(fitted, None)
+    return _fitted_again(evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch)
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
@@ -212,24 +218,24 @@ def _nothing_in(places: SurfelPlaces) -> _Fitted:
     return _Fitted(places, surfels, np.full(count, _NEVER, np.int64))
 
 
-def _carried(before: _Fitted, evidence: FrozenEvidence) -> _Fitted:
-    """Copies of surfels in the places of later evidence."""
-    old = before.places
-    if np.array_equal(old.surface, evidence.surface):
+def _carried(before: _Fitted, places: SurfelPlaces, voxels: Longs) -> _Fitted:
+    """Copies of surfels in later ``places``, which are of ``voxels`` [S, 3]."""
+    if places is before.places:
         copies = {name: array.copy() for name, array in vars(before.surfels).items()}
-        return _Fitted(old, Surfels(**copies), before.epochs.copy())
-    after = _nothing_in(surfel_places(evidence.cells, evidence.surface))
+        return _Fitted(places, Surfels(**copies), before.epochs.copy())
+    after = _nothing_in(places)
     carried = carry(before.rows, after.rows)
     if not carried.all():
-        after.epochs[_beside(after, old.voxels()[~carried])] = _NEVER
+        beside = _beside(after.surfels, voxels, gone=before.places.voxels()[~carried])
+        after.epochs[beside] = _NEVER
     return after
 
 
-def _beside(fitted: _Fitted, gone: Longs) -> Rows:
-    """The surfels whose surface may have lain in voxels ``gone`` [N, 3] beside theirs."""
-    rows = np.flatnonzero(fitted.surfels.kinds == SurfelKind.NONE)
+def _beside(surfels: Surfels, voxels: Longs, gone: Longs) -> Rows:
+    """The surfels of ``voxels`` [S, 3] whose surface may have lain in ``gone`` [N, 3] beside."""
+    rows = np.flatnonzero(surfels.kinds == SurfelKind.NONE)
     around = (gone[:, None] + _AROUND).reshape(-1, 3)
-    return rows[np.isin(keys_of(fitted.places.voxels()[rows]), keys_of(around))]
+    return rows[np.isin(keys_of(voxels[rows]), keys_of(around))]
 
 
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:
@@ -257,14 +263,14 @@ def _oldest(fitted: _Fitted, chosen: Bools, most: int) -> Rows:
 def _fitted_again(
     evidence: FrozenEvidence,
     fitted: _Fitted,
+    voxels: Longs,
     rows: Rows,
     *,
     field: SampleField,
     by_rays: ShownByRays,
     epoch: int,
 ) -> SurfelMap:
-    """Fit the surfels in some rows; changes ``fitted``."""
-    voxels = fitted.places.voxels()
+    """Fit the surfels in some rows, of all ``voxels`` [S, 3]; changes ``fitted``."""
     for first in range(0, len(rows), _FITTED_AT_ONCE):
         part = rows[first : first + _FITTED_AT_ONCE]
         new = fit_surfels(voxels[part], field, evidence.ended_in, by_rays)

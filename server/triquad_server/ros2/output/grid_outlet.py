@@ -12,7 +12,6 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.compiled.priority import lower_priority
 from triquad_map.compiled.team import Team
-from triquad_map.composition.composed_view import ComposedView
 from triquad_map.questions.grid import Grid, GridShape, grid
 from triquad_sensors.ros.type_store import OCCUPANCY_GRID, encode_cdr, type_store
 
@@ -109,11 +108,7 @@ class GridOutlet:
         self._next_s = now + max(self._period_s, _MAX_SHARE * (now - started))
 
     def _slice(self, epoch: Epoch, shape: GridShape) -> Grid:
-        # The threads that answer queries are spared: these give way to them.
-        view = ComposedView(
-            epoch.number, epoch.field_settings, epoch.frozen_regions, split=self._team.split
-        )
-        return grid(view, shape, shape.cell_m)
+        return grid(epoch.asked_with(self._team.split), shape, shape.cell_m)
 
 
 def occupancy(found: Grid) -> NDArray[np.int8]:
