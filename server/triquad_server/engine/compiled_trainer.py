@@ -287,6 +287,7 @@ class CompiledTrainer:
             raise
 
     def _train(self, points: Floats, wanted: Floats, rates: Rates) -> float:
+        self._field.thaw()
         field = make_field(self._field.settings, self._field.tree, self._field.arrays)
         sums = self._sums
         sums.begin(*field.features.shape)

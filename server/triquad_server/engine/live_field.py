@@ -17,7 +17,8 @@ from triquad_server.engine.memory import FieldNumbers, FrozenField, Memory, Rows
 class Parameter:
     """Rows of trained values with the optimiser's state of each; growing keeps both together.
 
-    All four are views of the rows in use, which the optimiser changes in place.
+    All four are views of the rows in use, which the optimiser changes in place, after
+    :meth:`thaw`.
     """
 
     def __init__(self, values: Floats, memory: Memory) -> None:
@@ -28,6 +29,7 @@ class Parameter:
         self.variances: Rows = memory.put(np.zeros_like(values))  # of the squared gradients
         self.steps: Rows = memory.put(np.zeros(len(values), np.int32))  # [rows]
         self._room: tuple[Rows, ...] = (self.values, self.means, self.variances, self.steps)
+        self._is_frozen = False
 
     def __len__(self) -> int:
         return len(self.values)
@@ -38,10 +40,25 @@ class Parameter:
         if count > len(self._room[0]):
             capacity = max(count, 2 * len(self._room[0]))
             self._room = tuple(self._with_room(rows, capacity) for rows in self._room)
+            self._is_frozen = False
+        # Rows beyond those in use are in no frozen values.
         self._room[0][used:count] = self._memory.put(values)
         for state in self._room[1:]:
             state[used:count] = 0
         self.values, self.means, self.variances, self.steps = (rows[:count] for rows in self._room)
+
+    def freeze(self) -> Rows:
+        """The values as they are now, which stay so: they are copied before they change."""
+        self._is_frozen = True
+        return self.values
+
+    def thaw(self) -> None:
+        """Have values that may be changed in place: a copy of those that are frozen."""
+        if self._is_frozen:
+            values = self._with_room(self.values, len(self._room[0]))
+            self._room = (values, *self._room[1:])
+            self.values = values[: len(self)]
+            self._is_frozen = False
 
     def restore(self, means: Floats, variances: Floats, steps: Ints) -> None:
         """Take over optimiser state, shaped as this parameter's."""
@@ -204,11 +221,15 @@ class LiveField:
         self._vertices_held = 0 if rows is None else int(rows[1:].sum())
 
     def freeze(self) -> FrozenField:
-        """The field as it is now, in memory of its own."""
-        now, copy = self.numbers, self.memory.copy
-        # The frequencies never change.
-        copied = FieldNumbers(copy(now.features), tuple(map(copy, now.mlp)), now.frequencies)
-        return self.memory.field(self.settings, self.tree.freeze(), copied)
+        """The field as it is now; it shares its numbers with this one, until these change."""
+        mlp = tuple(part.freeze()[0] for part in self.mlp)
+        frozen = FieldNumbers(self.features.freeze(), mlp, self._frequencies)
+        return self.memory.field(self.settings, self.tree.freeze(), frozen)
+
+    def thaw(self) -> None:
+        """Before a step: have numbers of its own, which may be changed in place."""
+        for parameter in (self.features, *self.mlp):
+            parameter.thaw()
 
 
 def initial_field(settings: FieldSettings, memory: Memory, seed: int) -> LiveField:

@@ -57,9 +57,6 @@ class Memory(Protocol):
     def room(self, count: int, like: Rows) -> Rows:
         """So many rows as those of ``like``, in which nothing is written yet."""
 
-    def copy(self, rows: Rows) -> Rows:
-        """A copy of rows that are in this memory."""
-
     def array(self, rows: Rows) -> Array:
         """Rows as an array, which may share memory with them."""
 
@@ -83,10 +80,6 @@ class ArrayMemory:
     def room(self, count: int, like: Array) -> Array:
         """So many rows as those of ``like``, in which nothing is written yet."""
         return _empty((count, *like.shape[1:]), like.dtype)
-
-    def copy(self, rows: Array) -> Array:
-        """A copy of rows."""
-        return self.put(rows)
 
     def array(self, rows: Array) -> Array:
         """The rows themselves."""

@@ -23,10 +23,6 @@ class TensorMemory:
         """So many rows as those of ``like``, in which nothing is written yet."""
         return like.new_empty((count, *like.shape[1:]))
 
-    def copy(self, rows: Tensor) -> Tensor:
-        """A copy of rows."""
-        return rows.clone()
-
     def array(self, rows: Tensor) -> Array:
         """Rows as an array; from another device, it is a copy, for which all work there ends."""
         array: Array = rows.cpu().numpy()

@@ -58,10 +58,13 @@ class TensorTrainer:
         return loss.detach()
 
     def _up_to_date(self) -> TensorField:
-        """The field with all vertices that it has now."""
-        if len(self._tensor_field.tensors.features) != len(self._field.features):
-            field = self._field
-            self._tensor_field = TensorField(field.settings, field.tree, FieldTensors.of(field))
+        """The field with all vertices that it has now, and in the memory that they are in now."""
+        field = self._field
+        field.thaw()
+        tensors = FieldTensors.of(field)
+        if len(self._tensor_field.tensors.features) != len(tensors.features):
+            self._tensor_field = TensorField(field.settings, field.tree, tensors)
+        self._tensor_field.tensors = tensors
         return self._tensor_field
 
     def _step_mlp(self, mlp: tuple[Tensor, ...], rates: Rates) -> None:

@@ -69,13 +69,41 @@ def test_growing_keeps_values_and_optimiser_state(memory: Memory) -> None:
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
-def test_a_frozen_field_stays_and_a_live_view_does_not(memory: Memory) -> None:
+def test_a_frozen_field_stays_and_a_live_view_follows_the_training(memory: Memory) -> None:
     field = grown(memory)
     frozen, view = field.freeze(), field.live_view()
     before = frozen.evaluate(POINTS, gradient=False).sdf
     train(field)
     np.testing.assert_array_equal(frozen.evaluate(POINTS, gradient=False).sdf, before)
-    assert (view.evaluate(POINTS, gradient=False).sdf != before).any()
+    # What is trained is a copy, since the frozen field has the numbers that the view saw.
+    np.testing.assert_array_equal(view.evaluate(POINTS, gradient=False).sdf, before)
+    view = field.live_view()
+    once = view.evaluate(POINTS, gradient=False).sdf
+    train(field)
+    twice = view.evaluate(POINTS, gradient=False).sdf
+    assert (once != before).any()
+    assert (twice != once).any()
+    np.testing.assert_array_equal(frozen.evaluate(POINTS, gradient=False).sdf, before)
+
+
+def test_frozen_fields_share_numbers_while_nothing_is_trained() -> None:
+    field = grown(ArrayMemory())
+    frozen = [field.freeze()]
+    # Twice: into the room that there is, and into more.
+    for size in (2, 60):
+        before = frozen[-1].evaluate(POINTS, gradient=False).sdf
+        side = np.arange(10, 10 + size)
+        field.grow(np.stack(np.meshgrid(side, side, [200]), -1).reshape(-1, 3))
+        np.testing.assert_array_equal(frozen[-1].evaluate(POINTS, gradient=False).sdf, before)
+        frozen += [field.freeze(), field.freeze()]
+        features = [one.arrays.features for one in frozen[-2:]]
+        assert np.shares_memory(*features)
+        assert np.shares_memory(frozen[-1].arrays.mlp[0], frozen[-2].arrays.mlp[0])
+    kept = [one.evaluate(POINTS, gradient=False).sdf for one in frozen]
+    train(field)
+    assert not np.shares_memory(field.features.values, frozen[-1].arrays.features)
+    for one, sdf in zip(frozen, kept, strict=True):
+        np.testing.assert_array_equal(one.evaluate(POINTS, gradient=False).sdf, sdf)
 
 
 @pytest.mark.parametrize(("device", "other"), [("cpu", IN_TENSORS), (IN_TENSORS, "cpu")])
