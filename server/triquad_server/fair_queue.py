@@ -94,6 +94,8 @@ class FairQueue(Generic[ItemT]):
 
         Owners of whose oldest item ``may`` says no are passed over.
         """
+        if not self._count:  # mostly: whoever puts something in takes it out at once
+            return None
         for owner in self._in_turn():
             lane = self._groups[owner.group][owner.name]
             if may(lane.items[0][0]):

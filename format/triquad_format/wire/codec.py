@@ -34,9 +34,15 @@ _MAX_DEPTH = 16
 # To begin with: a refusal for want of memory must not want 256 KiB.
 _BUFFER_BYTES = 4096
 
-_DTYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"})
+_ITEM_BYTES = {
+    name: np.dtype(name).itemsize
+    for name in ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
+}
+"""The dtypes of arrays that travel, and how many bytes an item of each has."""
+
 _ARRAY_KEYS = {"dtype", "shape", "data"}
 _MAX_DIMENSIONS = 4
+_MAX_SIZE = 2**40  # of an array along one axis, and of all axes together
 
 # How many bytes follow the first of a header: a length, or a count.
 _LENGTH_BYTES = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}  # binaries and strings
@@ -85,15 +91,19 @@ class ArraySpec:
 
     def check(self, name: str, array: NDArray[np.generic]) -> None:
         """Raise :class:`WireError` naming ``name`` where ``array`` does not fit."""
-        fits = array.ndim == len(self.shape) and all(
-            want is None or want == have for want, have in zip(self.shape, array.shape, strict=True)
-        )
-        if array.dtype.str != self.dtype or not fits:
+        if array.dtype.str != self.dtype or not self._has_room_for(array.shape):
             shape = ", ".join("N" if size is None else str(size) for size in self.shape)
             raise WireError(
                 f"{name}: expected an array [{shape}] of {self.dtype}, "
                 f"got {list(array.shape)} of {array.dtype.str}"
             )
+
+    def _has_room_for(self, shape: tuple[int, ...]) -> bool:
+        # Not by all(): every message comes by here, and a generator takes longer than the rest.
+        for want, have in zip(self.shape, shape, strict=False):
+            if want is not None and want != have:
+                return False
+        return len(shape) == len(self.shape)
 
 
 def encode(message: Message) -> bytes:
@@ -133,11 +143,12 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
 def pack_array(array: NDArray[np.generic]) -> dict[str, object]:
     """The msgpack form of an array, little endian and C order."""
     dtype = array.dtype.str
-    if dtype not in _DTYPES:
+    if dtype not in _ITEM_BYTES:
         array = array.astype(array.dtype.newbyteorder("<"))
         dtype = array.dtype.str
-        if dtype not in _DTYPES:
-            raise WireError(f"arrays of {array.dtype} do not travel; use one of {sorted(_DTYPES)}")
+        if dtype not in _ITEM_BYTES:
+            names = sorted(_ITEM_BYTES)
+            raise WireError(f"arrays of {array.dtype} do not travel; use one of {names}")
     return {"dtype": dtype, "shape": list(array.shape), "data": array.tobytes()}
 
 
@@ -151,15 +162,18 @@ def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
     if not isinstance(packed, dict) or packed.keys() != _ARRAY_KEYS:
         raise WireError(f"{name}: expected an array with dtype, shape and data")
     dtype, shape, data = packed["dtype"], packed["shape"], packed["data"]
-    if not isinstance(dtype, str) or dtype not in _DTYPES:
-        raise WireError(f"{name}: dtype {dtype!r} is not one of {sorted(_DTYPES)}")
+    if not isinstance(dtype, str) or dtype not in _ITEM_BYTES:
+        raise WireError(f"{name}: dtype {dtype!r} is not one of {sorted(_ITEM_BYTES)}")
     if not isinstance(shape, list) or len(shape) > _MAX_DIMENSIONS:
         raise WireError(f"{name}: shape {shape!r} is not a list of at most {_MAX_DIMENSIONS} sizes")
-    # Sizes beside a zero count too: numpy does not form shapes beyond 64 bits, however empty.
-    counts = all(type(size) is int and 0 <= size < 2**40 for size in shape)
-    if not counts or math.prod(size or 1 for size in shape) >= 2**40:
+    items = 1  # but for sizes of zero: numpy does not form shapes beyond 64 bits, however empty
+    for size in shape:
+        if type(size) is not int or not 0 <= size < _MAX_SIZE:
+            raise WireError(f"{name}: shape {shape!r} has a size that is not a count")
+        items *= size or 1
+    if items >= _MAX_SIZE:
         raise WireError(f"{name}: shape {shape!r} has a size that is not a count")
-    if not isinstance(data, bytes) or math.prod(shape) * np.dtype(dtype).itemsize != len(data):
+    if not isinstance(data, bytes) or math.prod(shape) * _ITEM_BYTES[dtype] != len(data):
         raise WireError(f"{name}: shape {shape!r} of {dtype} does not fill its data")
     return np.frombuffer(data, dtype).reshape(shape)
 

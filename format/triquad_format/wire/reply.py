@@ -65,12 +65,14 @@ class Within:
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
         """What is out of bounds, or not finite."""
-        array = np.asarray(value)
-        if array.size == 0:
-            return None
-        low, high = (np.fmin, np.fmax) if self.nan else (np.minimum, np.maximum)
-        # Whole numbers as they are: as doubles, what is beyond MAX_COUNT could round down to it.
-        ends = [end.reduce(array, axis=None).item() for end in (low, high)]
+        if isinstance(value, np.ndarray):
+            if value.size == 0:
+                return None
+            low, high = (np.fmin, np.fmax) if self.nan else (np.minimum, np.maximum)
+            # Whole numbers as they are: as doubles, those beyond MAX_COUNT could round down to it.
+            ends = (low.reduce(value, axis=None).item(), high.reduce(value, axis=None).item())
+        else:
+            ends = (value,)
         if self.nan and math.isnan(ends[0]):
             return None
         least, most = exchange.number(self.least), exchange.number(self.most)

@@ -70,7 +70,10 @@ class Team:
             self._callers += 1
         try:
             parts = min(cores, max(1, count // least))
-            self._run(lambda part: work(*share(count, part, parts)), parts)
+            if parts == 1:
+                work(0, count)
+            else:
+                self._run(lambda part: work(*share(count, part, parts)), parts)
         finally:
             with self._counting:
                 self._callers -= 1

@@ -87,8 +87,7 @@ class ComposedView(FieldView):
         """Regions that come within ``reach_m`` of the box around the points [N, 3]."""
         if not len(points):
             return
-        places = np.ascontiguousarray(points.T)  # ten times as fast as along the other axis
-        low, high = places.min(axis=1) - reach_m, places.max(axis=1) + reach_m
+        low, high = _box_around(points, reach_m)
         half = self._settings.region_side_m / 2
         for region in self.region_views:
             if (region.centre - half <= high).all() and (region.centre + half >= low).all():
@@ -137,8 +136,7 @@ class ComposedView(FieldView):
 
     def _cells_around(self, points: Doubles, reach_m: float) -> list[RegionIndex]:
         """Cells that come within ``reach_m`` of the box around the points."""
-        low = self._cells_of(points.min(axis=0) - reach_m).tolist()
-        high = self._cells_of(points.max(axis=0) + reach_m).tolist()
+        low, high = (self._cells_of(corner).tolist() for corner in _box_around(points, reach_m))
         x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
         return list(itertools.product(x, y, z))
 
@@ -166,3 +164,12 @@ class ComposedView(FieldView):
         found.distance[nearer] = distances[nearer] * leaf_m
         corner = region.centre - self._settings.region_side_m / 2
         found.point[nearer] = corner + nearest[nearer] * leaf_m
+
+
+def _box_around(points: Doubles, reach_m: float) -> tuple[Doubles, Doubles]:
+    """The least and the largest corner [3] of the box around points [N, 3], and ``reach_m`` more.
+
+    There are some.
+    """
+    by_axis = np.ascontiguousarray(points.T)  # ten times as fast as along the other axis
+    return by_axis.min(axis=1) - reach_m, by_axis.max(axis=1) + reach_m

@@ -5,6 +5,7 @@ nearest and has the status that this one gives it; the field is blended where re
 its core, away from the overlap, a region is the only one that covers a point.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -42,7 +43,20 @@ class _Owners:
     """Who answers for N points."""
 
     groups: Sequence[_Owned]  # the points that have an owner, region by region
-    shared: Bools  # [N] whether other regions may cover each point, too
+    shared: NDArray[np.intp]  # points that other regions may cover, too
+
+    @property
+    def only(self) -> FieldRegion | None:
+        """The region that owns all points, and alone covers them, if one does."""
+        if len(self.groups) == 1 and not len(self.shared):
+            (owned,) = self.groups
+            if isinstance(owned.points, slice):
+                return owned.region
+        return None
+
+
+_NONE_SHARED = np.zeros(0, np.intp)
+_ALL = slice(None)
 
 
 def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
@@ -60,6 +74,7 @@ class FieldView:
         self._settings = settings
         self._field_regions = tuple(regions)
         self._split = split
+        self._regions_at = {region.index: region for region in regions}
         self._cells = np.array([region.index for region in regions], np.float64).reshape(-1, 3).T
 
     def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
@@ -99,7 +114,7 @@ class FieldView:
             axes: [3, S] its coordinates on each axis, metres, map frame.
             points: [N, 3] the points, by their numbers on the axes.
         """
-        region = self._only_region(axes)
+        region = self._only_region(axes.min(axis=1), axes.max(axis=1))
         if region is None:
             return self.distances(in_grid(axes, points))
         local = (axes - region.centre[:, None]).astype(np.float32)
@@ -111,15 +126,19 @@ class FieldView:
         self._split(len(points), work)
         return distances
 
-    def _only_region(self, axes: Doubles) -> FieldRegion | None:
-        """The region that alone covers a grid with coordinates ``axes`` [3, S], if one does."""
-        places = axes / self._settings.region_pitch_m
-        home = np.floor(places[:, :1] + 0.5)
+    def _only_region(self, low: Doubles, high: Doubles) -> FieldRegion | None:
+        """The region that alone covers the box between two corners [3], if one does."""
+        pitch_m = self._settings.region_pitch_m
         core_m = self._settings.region_side_m / 2 - self._settings.overlap_m
-        if np.abs(places - home).max() * self._settings.region_pitch_m > core_m:
-            return None
-        numbers = np.flatnonzero((self._cells == home).all(axis=0))
-        return self._field_regions[numbers[0]] if len(numbers) else None
+        cells = []
+        for least, most in zip(low.tolist(), high.tolist(), strict=True):
+            if not math.isfinite(least):  # of no points, or of some that are nowhere
+                return None
+            cell = math.floor(least / pitch_m + 0.5)
+            if not cell * pitch_m - core_m <= least <= most <= cell * pitch_m + core_m:
+                return None
+            cells.append(cell)
+        return self._regions_at.get((cells[0], cells[1], cells[2]))
 
     def status(self, points: Doubles, reach_m: float | None = None) -> Bytes:
         """Status values [N] of points [N, 3]: what the evidence of each point's region says.
@@ -174,7 +193,13 @@ class FieldView:
     def _owners(self, points: Doubles) -> _Owners:
         """Who answers for points [N, 3], metres, map frame."""
         # Axis by axis, which makes every step here one of long vectors.
-        places = np.ascontiguousarray(points.T) / self._settings.region_pitch_m
+        by_axis = np.ascontiguousarray(points.T)
+        only = self._only_region(
+            by_axis.min(axis=1, initial=np.inf), by_axis.max(axis=1, initial=-np.inf)
+        )
+        if only is not None:
+            return _Owners([_Owned(only, _ALL)], _NONE_SHARED)
+        places = by_axis / self._settings.region_pitch_m
         cells = np.floor(places + 0.5)
         with np.errstate(invalid="ignore"):  # of points that are nowhere
             places -= cells
@@ -187,38 +212,40 @@ class FieldView:
         for number in np.flatnonzero(~outside).tolist():
             region = self._field_regions[number]
             if (low == high).all():
-                groups.append(_Owned(region, slice(None)))
+                groups.append(_Owned(region, _ALL))
                 continue
             x, y, z = region.index
             mine = np.flatnonzero((cells[0] == x) & (cells[1] == y) & (cells[2] == z))
             if len(mine):
                 groups.append(_Owned(region, mine))
-        return _Owners(groups, off_m > core_m)
+        return _Owners(groups, np.flatnonzero(off_m > core_m))
 
     def _status(self, points: Doubles, owners: _Owners, reach: float) -> Bytes:
+        if owners.only is not None:
+            return self._status_in(owners.only, points, reach)
         status = np.full(len(points), Status.UNKNOWN, np.uint8)
         for owned in owners.groups:
-            offsets = points[owned.points] - owned.region.centre
-            voxels = self._settings.leaf_coordinates(offsets)
-            status[owned.points] = owned.region.evidence.status(voxels, reach)
+            status[owned.points] = self._status_in(owned.region, points[owned.points], reach)
         return status
+
+    def _status_in(self, region: FieldRegion, points: Doubles, reach: float) -> Bytes:
+        voxels = self._settings.leaf_coordinates(points - region.centre)
+        return region.evidence.status(voxels, reach)
 
     def _values(self, points: Doubles, owners: _Owners, gradient: bool) -> FieldValues:
         """The field at points [N, 3], whose owners are known."""
-        several = np.flatnonzero(owners.shared)
-        if len(owners.groups) == 1 and not len(several):
-            (owned,) = owners.groups
-            if isinstance(owned.points, slice):
-                return _owners_values(owned, points, gradient)
+        if owners.only is not None:
+            return _values_in(owners.only, points, gradient)
         count = len(points)
         values = FieldValues(
             np.full(count, np.nan, np.float32),
             np.full((count if gradient else 0, 3), np.nan, np.float32),
         )
         for owned in owners.groups:
-            _put(values, owned.points, _owners_values(owned, points, gradient))
-        if len(several):
-            _put(values, several, self._blend(points[several], gradient))
+            mine = points[owned.points]
+            _put(values, owned.points, _values_in(owned.region, mine, gradient))
+        if len(owners.shared):
+            _put(values, owners.shared, self._blend(points[owners.shared], gradient))
         return values
 
     def _blend(self, points: Doubles, gradient: bool) -> FieldValues:
@@ -250,10 +277,9 @@ class FieldView:
         return FieldValues(sdf.astype(np.float32), slopes.astype(np.float32))
 
 
-def _owners_values(owned: _Owned, points: Doubles, gradient: bool) -> FieldValues:
-    """The field of the region that owns some of the points [N, 3]."""
-    local = (points[owned.points] - owned.region.centre).astype(np.float32)
-    return owned.region.engine.evaluate(local, gradient)
+def _values_in(region: FieldRegion, points: Doubles, gradient: bool) -> FieldValues:
+    """The field of a region at points [N, 3]."""
+    return region.engine.evaluate((points - region.centre).astype(np.float32), gradient)
 
 
 def _put(values: FieldValues, where: slice | NDArray[np.intp], new: FieldValues) -> None:

@@ -81,7 +81,10 @@ class EpochHistory:
             self._tidy()
 
     def let_go(self) -> bool:
-        """Let go of those whose time is over; whether none was published for a while."""
+        """Let go of those whose time is over; whether none was published for a while.
+
+        To be called from time to time: those who ask for the newest leave older ones as they are.
+        """
         with self._lock:
             self._tidy()
             return not self._is_recent
@@ -104,7 +107,8 @@ class EpochHistory:
         """
         with self._lock:
             epoch = self._get(number)
-            self._tidy()
+            if number:  # who pins may exceed a limit
+                self._tidy()
             return epoch
 
     @contextmanager
@@ -118,12 +122,15 @@ class EpochHistory:
             with self._lock:
                 epoch = self._get(number)
                 self._viewed[epoch.number] += 1
-                self._tidy()
+                if number:  # as in get
+                    self._tidy()
             try:
                 yield epoch
             finally:
                 with self._lock:
-                    self._viewed -= Counter([epoch.number])
+                    self._viewed[epoch.number] -= 1
+                    if not self._viewed[epoch.number]:
+                        del self._viewed[epoch.number]
                     if epoch is not self.newest:
                         self._pin(asking_client.get(), epoch.number)
 

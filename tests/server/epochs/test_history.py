@@ -87,7 +87,7 @@ def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
     epochs.get(1)
     epochs.add(epoch(2))
     clock.now = 31.0
-    epochs.get(0)
+    epochs.let_go()
     assert is_gone(epochs, 1)
 
 
