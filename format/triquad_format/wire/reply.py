@@ -70,9 +70,9 @@ class Within:
                 return None
             low, high = (np.fmin, np.fmax) if self.nan else (np.minimum, np.maximum)
             # Whole numbers as they are: as doubles, those beyond MAX_COUNT could round down to it.
-            ends = (low.reduce(value, axis=None).item(), high.reduce(value, axis=None).item())
+            ends = [low.reduce(value, axis=None).item(), high.reduce(value, axis=None).item()]
         else:
-            ends = (value,)
+            ends = [value]
         if self.nan and math.isnan(ends[0]):
             return None
         least, most = exchange.number(self.least), exchange.number(self.most)
