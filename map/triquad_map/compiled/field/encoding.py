@@ -10,7 +10,7 @@ import numpy as np
 from triquad_format.records.arrays import Floats, Ints, Longs
 from triquad_format.records.region import AXES
 
-from triquad_map.compiled.field.feature_rows import add_rows, add_to_row
+from triquad_map.compiled.field.feature_rows import add_rows, add_to_row, row_slopes
 from triquad_map.compiled.field.quadtree import Shape, Vertices, block_key
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.row_access import prefetch_row
@@ -153,6 +153,13 @@ def _find_cells(batch: PointBatch, plane: int, geometry: Geometry) -> None:
             batch.corners[at, t] = start + cell_u * side + cell_v
 
 
+@kernel(inline="always")
+def _corner_rows(batch: PointBatch, at: int, t: int) -> tuple[int, int, int, int]:
+    """Rows of the 4 vertices around a point, on one plane and level."""
+    i = 4 * at
+    return batch.rows[t, i], batch.rows[t, i + 1], batch.rows[t, i + 2], batch.rows[t, i + 3]
+
+
 @kernel(fastmath=True, inline="always")
 def _weights(batch: PointBatch, at: int, t: int) -> tuple[float, float, float, float]:
     """Bilinear weights of the 4 vertices, in the order of their rows."""
@@ -167,21 +174,11 @@ def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
     size = features.shape[1]
     batch.features[:] = 0
     for t in range(BATCH):
-        for at in range(3 * levels):
-            first = 4 * at
-            add_rows(
-                batch.features,
-                t,
-                (at % levels) * size,
-                features,
-                (
-                    batch.rows[t, first],
-                    batch.rows[t, first + 1],
-                    batch.rows[t, first + 2],
-                    batch.rows[t, first + 3],
-                ),
-                _weights(batch, at, t),
-            )
+        for plane in range(3):
+            for h in range(levels):
+                at = plane * levels + h
+                weights = _weights(batch, at, t)
+                add_rows(batch.features, t, h * size, features, _corner_rows(batch, at, t), weights)
     _transpose_features(batch, levels * size)
 
 
@@ -223,13 +220,14 @@ def add_feature_gradient(batch: PointBatch, count: int, levels: int, sums: Float
     size = sums.shape[1]
     _transpose_gradient(batch, levels * size)
     for t in range(count):
-        for at in range(3 * levels):
-            start = (at % levels) * size
-            weights = _weights(batch, at, t)
-            add_to_row(sums, batch.rows[t, 4 * at], weights[0], batch.features, t, start)
-            add_to_row(sums, batch.rows[t, 4 * at + 1], weights[1], batch.features, t, start)
-            add_to_row(sums, batch.rows[t, 4 * at + 2], weights[2], batch.features, t, start)
-            add_to_row(sums, batch.rows[t, 4 * at + 3], weights[3], batch.features, t, start)
+        for plane in range(3):
+            for h in range(levels):
+                at = plane * levels + h
+                rows, weights = _corner_rows(batch, at, t), _weights(batch, at, t)
+                add_to_row(sums, rows[0], weights[0], batch.features, t, h * size)
+                add_to_row(sums, rows[1], weights[1], batch.features, t, h * size)
+                add_to_row(sums, rows[2], weights[2], batch.features, t, h * size)
+                add_to_row(sums, rows[3], weights[3], batch.features, t, h * size)
 
 
 @inner_kernel(fastmath=True)
@@ -239,21 +237,17 @@ def add_feature_slopes(batch: PointBatch, geometry: Geometry, features: Floats) 
     size = features.shape[1]
     _transpose_gradient(batch, levels * size)
     for t in range(BATCH):
-        for at in range(3 * levels):
-            plane, h = at // levels, at % levels
-            a, b = batch.across[at, t], batch.along[at, t]
-            r00, r10 = batch.rows[t, 4 * at], batch.rows[t, 4 * at + 1]
-            r01, r11 = batch.rows[t, 4 * at + 2], batch.rows[t, 4 * at + 3]
+        for plane in range(3):
             across, along = np.float32(0), np.float32(0)
-            for k in range(size):
-                f00, f10, f01 = features[r00, k], features[r10, k], features[r01, k]
-                twist = features[r11, k] - f10 - f01 + f00
-                g = batch.features[t, h * size + k]
-                across += g * (f10 - f00 + b * twist)
-                along += g * (f01 - f00 + a * twist)
-            per_m = np.float32(1 << h) / (np.float32(1 << (levels - 1)) * geometry.leaf_m)
-            batch.gradient[PLANE_AXES[plane, 0], t] += across * per_m
-            batch.gradient[PLANE_AXES[plane, 1], t] += along * per_m
+            for h in range(levels):
+                at = plane * levels + h
+                rows, place = _corner_rows(batch, at, t), (batch.across[at, t], batch.along[at, t])
+                slopes = row_slopes(batch.features, t, h * size, features, rows, place)
+                per_leaf = np.float32(1 << h) / np.float32(1 << (levels - 1))
+                across += slopes[0] * per_leaf
+                along += slopes[1] * per_leaf
+            batch.gradient[PLANE_AXES[plane, 0], t] += across / geometry.leaf_m
+            batch.gradient[PLANE_AXES[plane, 1], t] += along / geometry.leaf_m
 
 
 @inner_kernel()

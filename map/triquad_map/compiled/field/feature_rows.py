@@ -32,6 +32,15 @@ def _spread(builder: Any, number: Any) -> Any:
     return builder.shuffle_vector(first, undefined, lanes)
 
 
+def _sum(builder: Any, vector: Any) -> Any:
+    """The sum of a vector's numbers."""
+    float_ = ir.FloatType()
+    call = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(float_, [float_, _VECTOR]), "llvm.vector.reduce.fadd.v8f32"
+    )
+    return builder.call(call, [ir.Constant(float_, 0.0), vector], fastmath=["fast"])
+
+
 def _multiply_add(builder: Any, total: Any, factor: Any, vector: Any) -> Any:
     product = builder.fmul(vector, _spread(builder, factor), flags=["fast"])
     return builder.fadd(total, product, flags=["fast"])
@@ -75,6 +84,35 @@ def _add_to_row_of_8(
         return context.get_dummy_value()
 
     return types.void(table, row, weight, values, point, start), generate
+
+
+@kernel_code
+def _slopes_of_8(
+    _: Any, values: Any, point: Any, start: Any, table: Any, rows: Any, place: Any
+) -> Any:
+    """As :func:`row_slopes`."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pairs = list(zip(signature.args, args, strict=True))
+        source = _vector(builder, address_of(context, builder, *pairs[:3]))
+        value = builder.load(source, align=4)
+        corners = []
+        for corner in range(4):
+            row = builder.extract_value(args[4], corner)
+            address = address_of(context, builder, pairs[3], (signature.args[4].dtype, row))
+            corners.append(builder.load(_vector(builder, address), align=4))
+        fast = {"flags": ["fast"]}
+        across = builder.fsub(corners[1], corners[0], **fast)
+        along = builder.fsub(corners[2], corners[0], **fast)
+        twist = builder.fsub(builder.fsub(corners[3], corners[1], **fast), along, **fast)
+        slopes = (
+            _multiply_add(builder, slope, builder.extract_value(args[5], other), twist)
+            for slope, other in ((across, 1), (along, 0))
+        )
+        sums = [_sum(builder, builder.fmul(slope, value, **fast)) for slope in slopes]
+        return context.make_tuple(builder, signature.return_type, sums)
+
+    return types.UniTuple(types.float32, 2)(values, point, start, table, rows, place), generate
 
 
 @kernel_code
@@ -153,6 +191,33 @@ def add_to_row(
     else:
         for k in range(table.shape[1]):
             table[row, k] += weight * values[point, start + k]
+
+
+@kernel(fastmath=True, inline="always")
+def row_slopes(
+    values: Floats,
+    point: int,
+    start: int,
+    table: Floats,
+    rows: tuple[int, int, int, int],
+    place: tuple[float, float],
+) -> tuple[float, float]:
+    """How ``values[point, start:start + size] @ row`` changes across and along a cell.
+
+    The row is interpolated between those of the cell's corners, in the order of
+    :class:`triquad_map.compiled.field.encoding.PointBatch`, at a ``place`` in it, float32.
+    """
+    if table.shape[1] == _LANES:
+        across, along = _slopes_of_8(values, point, start, table, rows, place)
+    else:
+        across, along = np.float32(0), np.float32(0)
+        for k in range(table.shape[1]):
+            low, high = table[rows[0], k], table[rows[1], k]
+            twist = table[rows[3], k] - high - table[rows[2], k] + low
+            value = values[point, start + k]
+            across += value * (high - low + place[1] * twist)
+            along += value * (table[rows[2], k] - low + place[0] * twist)
+    return across, along
 
 
 @kernel(fastmath=True, inline="always")
