@@ -8,7 +8,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 # The stub has it as if callers passed the typing context, which they do not.
-kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., None]]", intrinsic)
+kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., Any]]", intrinsic)
 
 _INT32 = ir.IntType(32)
 
