@@ -7,20 +7,19 @@ type of its own: ``+ - * /`` of two of them go lane by lane, and so do the funct
 
 import operator
 from collections.abc import Callable
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
+
+from triquad_map.compiled.row_access import kernel_code
 
 LANES = 8
 
 Lanes: TypeAlias = Any
 """[LANES] numbers in single precision."""
-
-# The stub has it as if callers passed the typing context, which they do not.
-_kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., Any]]", intrinsic)
 
 _FLOAT, _INT32, _INT64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
@@ -81,7 +80,7 @@ def _address(context: Any, builder: Any, kinds: Any, args: Any) -> Any:
     return builder.bitcast(element, _VECTOR.as_pointer())
 
 
-@_kernel_code
+@kernel_code
 def load(_: Any, array: Any, place: Any) -> Any:
     """The lanes from ``array[place]`` on; a place has an index for each axis."""
 
@@ -91,7 +90,7 @@ def load(_: Any, array: Any, place: Any) -> Any:
     return _KIND(array, place), generate
 
 
-@_kernel_code
+@kernel_code
 def store(_: Any, array: Any, place: Any, lanes: Any) -> Any:
     """Put ``lanes`` into ``array[place]`` and what follows."""
 
@@ -102,7 +101,7 @@ def store(_: Any, array: Any, place: Any, lanes: Any) -> Any:
     return types.void(array, place, lanes), generate
 
 
-@_kernel_code
+@kernel_code
 def fill(_: Any, number: Any) -> Any:
     """The same number in all lanes."""
 
@@ -116,7 +115,7 @@ def fill(_: Any, number: Any) -> Any:
     return _KIND(number), generate
 
 
-@_kernel_code
+@kernel_code
 def larger(_: Any, first: Any, second: Any) -> Any:
     """The larger number of each lane."""
 
@@ -126,7 +125,7 @@ def larger(_: Any, first: Any, second: Any) -> Any:
     return _KIND(first, second), generate
 
 
-@_kernel_code
+@kernel_code
 def root(_: Any, lanes: Any) -> Any:
     """The square roots."""
 
@@ -136,7 +135,7 @@ def root(_: Any, lanes: Any) -> Any:
     return _KIND(lanes), generate
 
 
-@_kernel_code
+@kernel_code
 def whole(_: Any, lanes: Any) -> Any:
     """The nearest whole numbers."""
 
@@ -146,7 +145,7 @@ def whole(_: Any, lanes: Any) -> Any:
     return _KIND(lanes), generate
 
 
-@_kernel_code
+@kernel_code
 def least(_: Any, lanes: Any) -> Any:
     """The least number of all."""
 
@@ -156,7 +155,7 @@ def least(_: Any, lanes: Any) -> Any:
     return types.float32(lanes), generate
 
 
-@_kernel_code
+@kernel_code
 def total(_: Any, lanes: Any) -> Any:
     """Their sum."""
 
@@ -167,7 +166,7 @@ def total(_: Any, lanes: Any) -> Any:
     return types.float32(lanes), generate
 
 
-@_kernel_code
+@kernel_code
 def at_most(_: Any, lanes: Any, limit: Any) -> Any:
     """In which lanes numbers are at most those of ``limit``, as bits, the lowest for lane 0."""
 
@@ -178,7 +177,7 @@ def at_most(_: Any, lanes: Any, limit: Any) -> Any:
     return types.int64(lanes, limit), generate
 
 
-@_kernel_code
+@kernel_code
 def lowest_bit(_: Any, bits: Any) -> Any:
     """Number of the lowest bit that is set; there is one."""
 

@@ -1,166 +1,15 @@
 """Rows of a feature table, as kernels read and write them.
 
 A row of 8 numbers is one vector of the processor. The compiler does not find that out by itself
-where a loop over a row reads one array and writes another that might be the same, so vectors are
-spelt out here; rows of another length are loops.
+where a loop over a row reads one array and writes another that might be the same; rows of another
+length are loops.
 """
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils, types
 from triquad_format.records.arrays import Floats
 
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.row_access import address_of, kernel_code
-
-_LANES = 8
-_VECTOR = ir.VectorType(ir.FloatType(), _LANES)
-_INT32 = ir.IntType(32)
-
-
-def _vector(builder: Any, address: Any) -> Any:
-    return builder.bitcast(address, _VECTOR.as_pointer())
-
-
-def _spread(builder: Any, number: Any) -> Any:
-    """A vector of the same number in all lanes."""
-    undefined = ir.Constant(_VECTOR, ir.Undefined)
-    first = builder.insert_element(undefined, number, ir.Constant(_INT32, 0))
-    lanes = ir.Constant(ir.VectorType(_INT32, _LANES), [0] * _LANES)
-    return builder.shuffle_vector(first, undefined, lanes)
-
-
-def _sum(builder: Any, vector: Any) -> Any:
-    """The sum of a vector's numbers."""
-    float_ = ir.FloatType()
-    call = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(float_, [float_, _VECTOR]), "llvm.vector.reduce.fadd.v8f32"
-    )
-    return builder.call(call, [ir.Constant(float_, 0.0), vector], fastmath=["fast"])
-
-
-def _multiply_add(builder: Any, total: Any, factor: Any, vector: Any) -> Any:
-    product = builder.fmul(vector, _spread(builder, factor), flags=["fast"])
-    return builder.fadd(total, product, flags=["fast"])
-
-
-@kernel_code
-def _add_rows_of_8(
-    _: Any, out: Any, point: Any, start: Any, table: Any, rows: Any, weights: Any
-) -> Any:
-    """``out[point, start:start + 8] += weights @ table[rows]`` for 4 rows and weights."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pairs = list(zip(signature.args, args, strict=True))
-        target = _vector(builder, address_of(context, builder, *pairs[:3]))
-        total = builder.load(target, align=4)
-        for corner in range(4):
-            row = builder.extract_value(args[4], corner)
-            address = address_of(context, builder, pairs[3], (signature.args[4].dtype, row))
-            vector = builder.load(_vector(builder, address), align=4)
-            weight = builder.extract_value(args[5], corner)
-            total = _multiply_add(builder, total, weight, vector)
-        builder.store(total, target, align=4)
-        return context.get_dummy_value()
-
-    return types.void(out, point, start, table, rows, weights), generate
-
-
-@kernel_code
-def _add_to_row_of_8(
-    _: Any, table: Any, row: Any, weight: Any, values: Any, point: Any, start: Any
-) -> Any:
-    """``table[row] += weight * values[point, start:start + 8]``."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pairs = list(zip(signature.args, args, strict=True))
-        source = _vector(builder, address_of(context, builder, *pairs[3:]))
-        target = _vector(builder, address_of(context, builder, *pairs[:2]))
-        vector = builder.load(source, align=4)
-        total = builder.load(target, align=4)
-        builder.store(_multiply_add(builder, total, args[2], vector), target, align=4)
-        return context.get_dummy_value()
-
-    return types.void(table, row, weight, values, point, start), generate
-
-
-@kernel_code
-def _slopes_of_8(
-    _: Any, values: Any, point: Any, start: Any, table: Any, rows: Any, place: Any
-) -> Any:
-    """As :func:`row_slopes`."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pairs = list(zip(signature.args, args, strict=True))
-        source = _vector(builder, address_of(context, builder, *pairs[:3]))
-        value = builder.load(source, align=4)
-        corners = []
-        for corner in range(4):
-            row = builder.extract_value(args[4], corner)
-            address = address_of(context, builder, pairs[3], (signature.args[4].dtype, row))
-            corners.append(builder.load(_vector(builder, address), align=4))
-        fast = {"flags": ["fast"]}
-        across = builder.fsub(corners[1], corners[0], **fast)
-        along = builder.fsub(corners[2], corners[0], **fast)
-        twist = builder.fsub(builder.fsub(corners[3], corners[1], **fast), along, **fast)
-        slopes = (
-            _multiply_add(builder, slope, builder.extract_value(args[5], other), twist)
-            for slope, other in ((across, 1), (along, 0))
-        )
-        sums = [_sum(builder, builder.fmul(slope, value, **fast)) for slope in slopes]
-        return context.make_tuple(builder, signature.return_type, sums)
-
-    return types.UniTuple(types.float32, 2)(values, point, start, table, rows, place), generate
-
-
-@kernel_code
-def _move_row_of_8(
-    _: Any,
-    gradients: Any,
-    values: Any,
-    means: Any,
-    variances: Any,
-    row: Any,
-    blends: Any,
-    scales: Any,
-    epsilon: Any,
-) -> Any:
-    """As :func:`move_row`; ``blends`` are of mean and variance, and so are ``scales``.
-
-    A training step moves some hundred thousand rows. As a loop that takes 2.5 times as long, since
-    the compiler cannot tell the four arrays from each other.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pairs = list(zip(signature.args, args, strict=True))
-        addresses = [
-            _vector(builder, address_of(context, builder, pair, pairs[4])) for pair in pairs[:4]
-        ]
-        gradient, value, mean, variance = (builder.load(at, align=4) for at in addresses)
-        fast = {"flags": ["fast"]}
-
-        def blended(old: Any, new: Any, which: int) -> Any:
-            blend = builder.extract_value(args[5], which)
-            return _multiply_add(builder, old, blend, builder.fsub(new, old, **fast))
-
-        mean = blended(mean, gradient, 0)
-        variance = blended(variance, builder.fmul(gradient, gradient, **fast), 1)
-        scale = _spread(builder, builder.extract_value(args[6], 1))
-        root = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(_VECTOR, [_VECTOR]), "llvm.sqrt.v8f32"
-        )
-        deviation = builder.call(root, [builder.fmul(variance, scale, **fast)])
-        deviation = builder.fadd(deviation, _spread(builder, args[7]), **fast)
-        rate = builder.fneg(builder.extract_value(args[6], 0))
-        value = _multiply_add(builder, value, rate, builder.fdiv(mean, deviation, **fast))
-        results = (ir.Constant(_VECTOR, None), value, mean, variance)
-        for address, result in zip(addresses, results, strict=True):
-            builder.store(result, address, align=4)
-        return context.get_dummy_value()
-
-    return types.void(gradients, values, means, variances, row, blends, scales, epsilon), generate
+from triquad_map.compiled.lanes import LANES, fill, load, root, store, total
 
 
 @kernel(fastmath=True, inline="always")
@@ -173,8 +22,12 @@ def add_rows(
     weights: tuple[float, float, float, float],
 ) -> None:
     """``out[point, start:start + size] += weights @ table[rows]``; ``weights`` are float32."""
-    if table.shape[1] == _LANES:
-        _add_rows_of_8(out, point, start, table, rows, weights)
+    if table.shape[1] == LANES:
+        first, second = load(table, (rows[0], 0)), load(table, (rows[1], 0))
+        third, fourth = load(table, (rows[2], 0)), load(table, (rows[3], 0))
+        low = fill(weights[0]) * first + fill(weights[1]) * second
+        high = fill(weights[2]) * third + fill(weights[3]) * fourth
+        store(out, (point, start), load(out, (point, start)) + low + high)
     else:
         for corner in range(4):
             for k in range(table.shape[1]):
@@ -186,8 +39,9 @@ def add_to_row(
     table: Floats, row: int, weight: float, values: Floats, point: int, start: int
 ) -> None:
     """``table[row] += weight * values[point, start:start + size]``; ``weight`` is a float32."""
-    if table.shape[1] == _LANES:
-        _add_to_row_of_8(table, row, weight, values, point, start)
+    if table.shape[1] == LANES:
+        added = fill(weight) * load(values, (point, start))
+        store(table, (row, 0), load(table, (row, 0)) + added)
     else:
         for k in range(table.shape[1]):
             table[row, k] += weight * values[point, start + k]
@@ -207,17 +61,26 @@ def row_slopes(
     The row is interpolated between those of the cell's corners, in the order of
     :class:`triquad_map.compiled.field.encoding.PointBatch`, at a ``place`` in it, float32.
     """
-    if table.shape[1] == _LANES:
-        across, along = _slopes_of_8(values, point, start, table, rows, place)
+    if table.shape[1] == LANES:
+        corner, right = load(table, (rows[0], 0)), load(table, (rows[1], 0))
+        across, along = right - corner, load(table, (rows[2], 0)) - corner
+        twist = load(table, (rows[3], 0)) - right - along
+        value = load(values, (point, start))
+        slopes = (
+            total(value * (across + fill(place[1]) * twist)),
+            total(value * (along + fill(place[0]) * twist)),
+        )
     else:
-        across, along = np.float32(0), np.float32(0)
+        slopes = (np.float32(0), np.float32(0))
         for k in range(table.shape[1]):
             low, high = table[rows[0], k], table[rows[1], k]
-            twist = table[rows[3], k] - high - table[rows[2], k] + low
-            value = values[point, start + k]
-            across += value * (high - low + place[1] * twist)
-            along += value * (table[rows[2], k] - low + place[0] * twist)
-    return across, along
+            bend = table[rows[3], k] - high - table[rows[2], k] + low
+            of_point = values[point, start + k]
+            slopes = (
+                slopes[0] + of_point * (high - low + place[1] * bend),
+                slopes[1] + of_point * (table[rows[2], k] - low + place[0] * bend),
+            )
+    return slopes
 
 
 @kernel(fastmath=True, inline="always")
@@ -233,7 +96,7 @@ def move_row(
 ) -> None:
     """One step of Adam, as in :mod:`triquad_server.engine.compiled_trainer`; clears the gradient.
 
-    Numbers are float32.
+    Numbers are float32. A training step moves some hundred thousand rows.
 
     Args:
         gradients, values, means, variances: tables of the same shape.
@@ -242,8 +105,20 @@ def move_row(
         scales: the learning rate times the correction of the mean, and that of the variance.
         epsilon: keeps the division finite.
     """
-    if values.shape[1] == _LANES:
-        _move_row_of_8(gradients, values, means, variances, row, blends, scales, epsilon)
+    if values.shape[1] == LANES:
+        steep, mean, variance = (
+            load(gradients, (row, 0)),
+            load(means, (row, 0)),
+            load(variances, (row, 0)),
+        )
+        mean = mean + fill(blends[0]) * (steep - mean)
+        variance = variance + fill(blends[1]) * (steep * steep - variance)
+        spread = root(variance * fill(scales[1])) + fill(epsilon)
+        moved = load(values, (row, 0)) - fill(scales[0]) * mean / spread
+        store(gradients, (row, 0), fill(np.float32(0)))
+        store(means, (row, 0), mean)
+        store(variances, (row, 0), variance)
+        store(values, (row, 0), moved)
     else:
         for k in range(values.shape[1]):
             gradient = gradients[row, k]
