@@ -54,14 +54,20 @@ class QueryGate:
         self._pressure = pressure
 
     def wait_for_mapping(self) -> None:
-        """Within a query: return once it may go on, which is at once but where it is held back."""
+        """Within a query: return once it may go on, which is at once but where it is held back.
+
+        It is so once: on busy cores a query may wake up when queries are held back again already,
+        and time after time.
+        """
         with self._idle:
-            if not self._held_s():
+            held_s = self._held_s()
+            if not held_s:
                 return
             self._in_flight -= 1  # meanwhile nobody gives way to it
             self._idle.notify_all()
-            while (held_s := self._held_s()) > 0:
-                self._idle.wait(held_s)
+            until_s = time.monotonic() + held_s
+            while (left_s := until_s - time.monotonic()) > 0:
+                self._idle.wait(left_s)
             self._in_flight += 1
 
     def _held_s(self) -> float:

@@ -40,6 +40,7 @@ class Askers:
 
     def __init__(self, session: zenoh.Session) -> None:
         """Begin to watch who is linked to ``session``."""
+        self._info = session.info
         self.own_name = secrets.token_hex(16)  # in what the server asks itself, and known to none
         self._lock = threading.Lock()
         self._latest = Owner(_UNLINKED)  # who was heard of
@@ -87,9 +88,19 @@ class Askers:
             return Asker(Owner(_UNLINKED), deadline_s=now + longest_s)
         # Written so that NaN counts as not given.
         wait_s = origin.timeout_s if 0 <= origin.timeout_s <= longest_s else longest_s
-        is_known = origin.client in self._links or origin.client == self.own_name
+        is_known = origin.client == self.own_name or self._is_linked(origin.client)
         group = origin.client if is_known else _UNLINKED
         return Asker(Owner(group, origin.client), deadline_s=now + wait_s + _GRACE_S)
+
+    def _is_linked(self, client: str) -> bool:
+        """Whether a client is linked to the session.
+
+        One that is new may ask before its link was heard of: Zenoh knows. In the group of those who
+        are not linked it might wait for all that others sent under invented names.
+        """
+        return client in self._links or any(
+            str(transport.zid) == client for transport in self._info.transports()
+        )
 
     def _watch(self) -> None:
         for event in self._listener:

@@ -1,9 +1,11 @@
 """Queries come first, and work in the background takes turns."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from triquad_server.epochs import query_gate as module
 from triquad_server.epochs.query_gate import QueryGate
 
 _LONG_S = 60.0
@@ -74,3 +76,27 @@ def test_what_is_held_back_is_answered_in_the_end() -> None:
     gate.hold_back_by(lambda: 0.0)
     with gate.query():
         gate.wait_for_mapping()
+
+
+def test_who_wakes_up_late_is_not_held_back_again() -> None:
+    gate = QueryGate()
+    asked = []
+
+    def pressure() -> float:
+        if asked:  # the query woke up, and its core was busy for longer than queries may go on
+            time.sleep(0.01)
+        while not asked and time.monotonic() % module._PERIOD_S > 0.01:
+            time.sleep(0.001)  # it comes while they are held back
+        asked.append(True)
+        return 1.0
+
+    gate.hold_back_by(pressure)
+
+    def query() -> None:
+        with gate.query():
+            gate.wait_for_mapping()
+
+    thread = threading.Thread(target=query, daemon=True)
+    thread.start()
+    thread.join(5.0)
+    assert not thread.is_alive()

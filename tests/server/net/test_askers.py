@@ -1,9 +1,10 @@
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import pytest
 import zenoh
-from support.servers import raw_session
+from support.servers import WAIT_S, free_endpoint, raw_session
 from triquad_format.wire import codec
 from triquad_format.wire.origin import RequestOrigin
 from triquad_server.fair_queue import Owner
@@ -47,3 +48,15 @@ def test_what_the_server_asks_itself_has_turns_that_nobody_else_can_take(askers)
     own = askers.asker(Query(askers.own_name), longest_s=60.0).owner
     assert own.group == askers.own_name
     assert askers.asker(Query("invented"), longest_s=60.0).owner.group == ""
+
+
+def test_one_who_asks_before_the_link_was_heard_of_is_known():
+    endpoint = free_endpoint()
+    with raw_session("peer", listen=endpoint) as session:
+        askers = Askers(session)
+        askers.close()  # from now on, it hears of no link
+        with raw_session(connect=endpoint) as client, ThreadPoolExecutor(1) as receiver:
+            name = str(client.info.zid())
+            asked = receiver.submit(askers.asker, Query(name), 60.0)
+            assert asked.result(WAIT_S).owner.group == name
+            assert askers.asker(Query("invented"), longest_s=60.0).owner.group == ""
