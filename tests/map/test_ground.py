@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import ground_scenes, servers
-from support.ground_scenes import HOLE_M, KERB_M, RAMP_DEG, STEP_M, TABLE_M, TREAD_M
+from support.ground_scenes import HOLE_M, KERB_M, RAMP_DEG, STEP_M, TABLE_M, TABLE_THICK_M, TREAD_M
 from support.small_world import settings, settle
 from triquad_client import Status
 from triquad_map.questions.ground import ground
@@ -146,7 +146,9 @@ def test_far_ground_is_right_where_it_is_told(client):
 def test_the_first_surface_below_counts(client):
     over = points_over((8.2, 9.0), (2.4, 3.2), 0.9)
     check_level(client.query_ground(over), TABLE_M)
-    check_level(client.query_ground(over - [0, 0, 0.6]), 0.0)  # which is seen under the table
+    # Under the table the ground is seen, from where its underside, which is not, is no longer felt.
+    below = over - [0, 0, 0.9 - (TABLE_M - TABLE_THICK_M - 1.5 * VOXEL_M)]
+    check_level(client.query_ground(below), 0.0)
 
 
 def test_what_lies_below_unseen_space_is_no_ground(client):

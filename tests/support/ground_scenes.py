@@ -16,6 +16,7 @@ RAMP_DEG = 15.0
 HOLE_M = 0.6  # deep, both
 BELOW_EDGE_M = -3.0
 TABLE_M = 0.6  # its top
+TABLE_THICK_M = 0.1
 
 _WALL_M = 4.0
 _EYE_M = 1.2
@@ -74,7 +75,7 @@ def _scene() -> Scene:
         _block((20, 21), (-13, 9), _WALL_M),
     ]
     corridor = _block((-20, 20), (-1, 1), 0.0)
-    table = box((8.6, 2.8, TABLE_M - 0.05), (0.6, 0.6, 0.05))
+    table = box((8.6, 2.8, TABLE_M - TABLE_THICK_M / 2), (0.6, 0.6, TABLE_THICK_M / 2))
     solids = (half_space(BELOW_EDGE_M), corridor, table, *north, *south, *walls)
     return Scene(solids, np.array([[-21.0, -13, -4], [21, 9, 5]]))
 

@@ -91,14 +91,14 @@ class ArraySpec:
 
     def check(self, name: str, array: NDArray[np.generic]) -> None:
         """Raise :class:`WireError` naming ``name`` where ``array`` does not fit."""
-        if array.dtype.str != self.dtype or not self._has_room_for(array.shape):
+        if array.dtype.str != self.dtype or not self._fits(array.shape):
             shape = ", ".join("N" if size is None else str(size) for size in self.shape)
             raise WireError(
                 f"{name}: expected an array [{shape}] of {self.dtype}, "
                 f"got {list(array.shape)} of {array.dtype.str}"
             )
 
-    def _has_room_for(self, shape: tuple[int, ...]) -> bool:
+    def _fits(self, shape: tuple[int, ...]) -> bool:
         # Not by all(): every message comes by here, and a generator takes longer than the rest.
         for want, have in zip(self.shape, shape, strict=False):
             if want is not None and want != have:

@@ -20,12 +20,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any, TypeVar, cast
 
 import numba
 import numpy as np
 from llvmlite import binding
 from numba.core import caching, event
+from numba.extending import intrinsic
 
 from triquad_map.compiled.bitcode import add_bitcode, unpack_bitcode
 
@@ -62,6 +63,10 @@ _FunctionCache: Any = caching.FunctionCache
 _choosing_folder = threading.Lock()
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+# The stub has it as if callers passed the typing context, which they do not.
+kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., Any]]", intrinsic)
+"""Decorates what generates code for kernels by itself, of what Python cannot say."""
 
 
 def kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:

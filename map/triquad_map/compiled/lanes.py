@@ -14,7 +14,7 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import lower_builtin, models, register_model
 
-from triquad_map.compiled.row_access import kernel_code
+from triquad_map.compiled.kernel import kernel_code
 
 LANES = 8
 

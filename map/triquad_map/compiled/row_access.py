@@ -1,14 +1,11 @@
 """Rows of arrays in memory, for what kernels cannot say in Python."""
 
-from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
 
-# The stub has it as if callers passed the typing context, which they do not.
-kernel_code = cast("Callable[[Callable[..., Any]], Callable[..., Any]]", intrinsic)
+from triquad_map.compiled.kernel import kernel_code
 
 _INT32 = ir.IntType(32)
 

@@ -167,9 +167,9 @@ class ComposedView(FieldView):
 
 
 def _box_around(points: Doubles, reach_m: float) -> tuple[Doubles, Doubles]:
-    """The least and the largest corner [3] of the box around points [N, 3], and ``reach_m`` more.
+    """The least and the largest corner [3] of a box around points [N, 3], of which N is at least 1.
 
-    There are some.
+    It reaches ``reach_m`` beyond them on each side.
     """
     by_axis = np.ascontiguousarray(points.T)  # ten times as fast as along the other axis
     return by_axis.min(axis=1) - reach_m, by_axis.max(axis=1) + reach_m

@@ -132,9 +132,10 @@ class FieldView:
         core_m = self._settings.region_side_m / 2 - self._settings.overlap_m
         cells = []
         for least, most in zip(low.tolist(), high.tolist(), strict=True):
-            if not math.isfinite(least):  # of no points, or of some that are nowhere
+            place = least / pitch_m
+            if not math.isfinite(place):  # of no points, or of some that are nowhere
                 return None
-            cell = math.floor(least / pitch_m + 0.5)
+            cell = math.floor(place + 0.5)
             if not cell * pitch_m - core_m <= least <= most <= cell * pitch_m + core_m:
                 return None
             cells.append(cell)
@@ -199,9 +200,9 @@ class FieldView:
         )
         if only is not None:
             return _Owners([_Owned(only, _ALL)], _NONE_SHARED)
-        places = by_axis / self._settings.region_pitch_m
-        cells = np.floor(places + 0.5)
-        with np.errstate(invalid="ignore"):  # of points that are nowhere
+        with np.errstate(invalid="ignore", over="ignore"):  # of points that are nowhere
+            places = by_axis / self._settings.region_pitch_m
+            cells = np.floor(places + 0.5)
             places -= cells
         core_m = self._settings.region_side_m / 2 - self._settings.overlap_m
         off_m = np.abs(places, out=places).max(axis=0, initial=0.0) * self._settings.region_pitch_m

@@ -13,11 +13,13 @@ from triquad_map.compiled.field.quadtree import LiveQuadtree
 from triquad_server.engine.initial_mlp import initial_mlp
 from triquad_server.engine.memory import FieldNumbers, FrozenField, Memory, Rows
 
+_SPARE = 4  # a row more for every so many, when rows are copied to where there is more room
+
 
 class Parameter:
     """Rows of trained values with the optimiser's state of each; growing keeps both together.
 
-    All four are views of the rows in use, which the optimiser changes in place, after
+    All four are views of the rows in use, which the optimiser changes in place; the values after
     :meth:`thaw`.
     """
 
@@ -37,15 +39,17 @@ class Parameter:
     def append(self, values: Floats) -> None:
         """Add rows [N, ...] that took no step yet; the state of the others stays."""
         used, count = len(self), len(self) + len(values)
-        if count > len(self._room[0]):
-            capacity = max(count, 2 * len(self._room[0]))
-            self._room = tuple(self._with_room(rows, capacity) for rows in self._room)
-            self._is_frozen = False
-        # Rows beyond those in use are in no frozen values.
-        self._room[0][used:count] = self._memory.put(values)
-        for state in self._room[1:]:
+        # All that takes memory comes first: where there is too little, nothing has changed.
+        added = self._memory.put(values)
+        room = tuple(
+            rows if count <= len(rows) else self._with_room(rows, count) for rows in self._room
+        )
+        room[0][used:count] = added  # rows beyond those in use are in no frozen values
+        for state in room[1:]:
             state[used:count] = 0
-        self.values, self.means, self.variances, self.steps = (rows[:count] for rows in self._room)
+        self._is_frozen = self._is_frozen and room[0] is self._room[0]
+        self._room = room
+        self.values, self.means, self.variances, self.steps = (rows[:count] for rows in room)
 
     def freeze(self) -> Rows:
         """The values as they are now, which stay so: they are copied before they change."""
@@ -55,7 +59,7 @@ class Parameter:
     def thaw(self) -> None:
         """Have values that may be changed in place: a copy of those that are frozen."""
         if self._is_frozen:
-            values = self._with_room(self.values, len(self._room[0]))
+            values = self._with_room(self.values, len(self))
             self._room = (values, *self._room[1:])
             self.values = values[: len(self)]
             self._is_frozen = False
@@ -66,9 +70,13 @@ class Parameter:
         self.variances[:] = self._memory.put(variances)
         self.steps[:] = self._memory.put(steps)
 
-    def _with_room(self, rows: Rows, capacity: int) -> Rows:
-        roomy = self._memory.room(capacity, rows)
-        roomy[: len(rows)] = rows
+    def _with_room(self, rows: Rows, count: int) -> Rows:
+        """A copy of those of ``rows`` that are in use, with room for ``count`` and some more.
+
+        It is little, since each epoch that was trained has its own, and on a device takes it.
+        """
+        roomy = self._memory.room(count + count // _SPARE, rows)
+        roomy[: len(self)] = rows[: len(self)]
         return roomy
 
 
@@ -171,13 +179,13 @@ class LiveField:
 
     @property
     def numbers(self) -> FieldNumbers:
-        """The numbers of the field as they are now; they change with it."""
+        """The numbers of the field as they are now; they change with it, until it is thawed."""
         mlp = tuple(part.values[0] for part in self.mlp)
         return FieldNumbers(self.features.values, mlp, self._frequencies)
 
     @property
     def arrays(self) -> FieldArrays:
-        """The numbers as arrays, which share memory with the field where it is in arrays."""
+        """The numbers as arrays; where the field is in arrays, those of :attr:`numbers`."""
         features, mlp, frequencies = self.numbers
         array = self.memory.array
         return FieldArrays(array(features), tuple(map(array, mlp)), array(frequencies))

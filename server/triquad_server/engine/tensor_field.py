@@ -41,7 +41,7 @@ class FieldTensors:
 
     @classmethod
     def of(cls, field: LiveField) -> "FieldTensors":
-        """The numbers of a field as they are now; they change with it, arrays as well."""
+        """The numbers of a field as they are now, those that are in arrays as well; see there."""
         features, mlp, frequencies = field.numbers
         tensor = torch.as_tensor
         return cls(tensor(features), tuple(map(tensor, mlp)), tensor(frequencies))

@@ -64,7 +64,8 @@ class TensorTrainer:
         tensors = FieldTensors.of(field)
         if len(self._tensor_field.tensors.features) != len(tensors.features):
             self._tensor_field = TensorField(field.settings, field.tree, tensors)
-        self._tensor_field.tensors = tensors
+        else:
+            self._tensor_field.tensors = tensors
         return self._tensor_field
 
     def _step_mlp(self, mlp: tuple[Tensor, ...], rates: Rates) -> None:

@@ -80,14 +80,18 @@ class EpochHistory:
             self._epochs[epoch.number] = epoch
             self._tidy()
 
-    def let_go(self) -> bool:
-        """Let go of those whose time is over; whether none was published for a while.
+    def let_go(self) -> None:
+        """Let go of those whose time is over.
 
         To be called from time to time: those who ask for the newest leave older ones as they are.
         """
         with self._lock:
             self._tidy()
-            return not self._is_recent
+
+    @property
+    def is_recent(self) -> bool:
+        """Whether the newest was published a short time ago."""
+        return self._clock() - self._published_s <= self._recent_s
 
     def kept(self) -> KeptEpochs:
         """What is kept now."""
@@ -107,7 +111,7 @@ class EpochHistory:
         """
         with self._lock:
             epoch = self._get(number)
-            if number:  # who pins may exceed a limit
+            if number:  # whoever pins may exceed a limit
                 self._tidy()
             return epoch
 
@@ -134,11 +138,6 @@ class EpochHistory:
                     if epoch is not self.newest:
                         self._pin(asking_client.get(), epoch.number)
 
-    @property
-    def _is_recent(self) -> bool:
-        """Whether the newest was published a short time ago."""
-        return self._clock() - self._published_s <= self._recent_s
-
     def _get(self, number: int) -> Epoch:
         epoch = self._epochs.get(number) if number else self.newest
         if epoch is None:
@@ -160,7 +159,7 @@ class EpochHistory:
 
     def _tidy(self) -> None:
         """Let go of older epochs whose time is over, or that exceed a limit."""
-        kept = self._settings.epochs_kept if self._is_recent else 1
+        kept = self._settings.epochs_kept if self.is_recent else 1
         recent = list(self._epochs)[-kept:]
         room = _Room(self.newest, self._older_bytes)
         stay = {self.newest.number, *self._viewed}

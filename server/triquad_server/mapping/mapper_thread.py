@@ -236,6 +236,7 @@ class MapperThread:
     def _turn(self) -> None:
         """One round: commands, scans, a slice of training, an epoch where one is due."""
         self._wake.clear()
+        self.epochs.let_go()  # first: where memory is short, nothing below may come to its end
         self._run_commands()
         if self._resting.is_set():
             self.time.begin(Activity.IDLE)
@@ -262,7 +263,7 @@ class MapperThread:
         self._else_s = time.monotonic() - ingested_s
         if self._mapper.settled and not took_scans:
             self.time.begin(Activity.IDLE)
-            if self.epochs.let_go():
+            if not self.epochs.is_recent:
                 self._mapper.release()
             self._wake.wait(self._rest_s())
 

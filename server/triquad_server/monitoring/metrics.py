@@ -68,7 +68,8 @@ class Metrics:
     def _memory_bytes(self, epochs: tuple[Epoch, ...]) -> dict[str, int]:
         """What parts of the server take; memory that epochs and the live map share is the epochs'.
 
-        The live map is as of the newest epoch.
+        The live map is as of the newest epoch: where training went on since, its copy of the
+        features is in no part.
         """
         health = self.health
         regions = [region for epoch in epochs for region in epoch.frozen_regions]

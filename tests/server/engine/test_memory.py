@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from support import small_world
 from triquad_format.records.field_settings import FieldSettings
+from triquad_server.array_memory import buffers_of
 from triquad_server.engine.compiled_trainer import GradientSums
-from triquad_server.engine.live_field import Batch, LiveField, Rates, initial_field
+from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
 from triquad_server.engine.memory import ArrayMemory, Memory
 from triquad_server.engine.tensor_memory import TensorMemory
 from triquad_server.engine.trainer import trainer_of
@@ -88,22 +89,78 @@ def test_a_frozen_field_stays_and_a_live_view_follows_the_training(memory: Memor
 
 def test_frozen_fields_share_numbers_while_nothing_is_trained() -> None:
     field = grown(ArrayMemory())
-    frozen = [field.freeze()]
-    # Twice: into the room that there is, and into more.
-    for size in (2, 60):
-        before = frozen[-1].evaluate(POINTS, gradient=False).sdf
-        side = np.arange(10, 10 + size)
-        field.grow(np.stack(np.meshgrid(side, side, [200]), -1).reshape(-1, 3))
-        np.testing.assert_array_equal(frozen[-1].evaluate(POINTS, gradient=False).sdf, before)
-        frozen += [field.freeze(), field.freeze()]
-        features = [one.arrays.features for one in frozen[-2:]]
-        assert np.shares_memory(*features)
-        assert np.shares_memory(frozen[-1].arrays.mlp[0], frozen[-2].arrays.mlp[0])
-    kept = [one.evaluate(POINTS, gradient=False).sdf for one in frozen]
+    frozen = [field.freeze(), field.freeze()]
+    first, second = (one.arrays for one in frozen)
+    assert np.shares_memory(first.features, second.features)
+    assert np.shares_memory(first.mlp[0], second.mlp[0])
     train(field)
-    assert not np.shares_memory(field.features.values, frozen[-1].arrays.features)
-    for one, sdf in zip(frozen, kept, strict=True):
-        np.testing.assert_array_equal(one.evaluate(POINTS, gradient=False).sdf, sdf)
+    assert not np.shares_memory(field.features.values, first.features)
+    assert not np.shares_memory(field.mlp[0].values, first.mlp[0])
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+@pytest.mark.parametrize("more", [1, 2**16], ids=["into its room", "beyond it"])
+def test_what_is_frozen_stays_where_rows_are_added_before_a_step(memory: Memory, more: int) -> None:
+    parameter = Parameter(np.zeros((8, 4), np.float32), memory)
+    parameter.append(np.ones((1000, 4), np.float32))
+    frozen = parameter.freeze()
+    kept = memory.array(frozen).copy()
+    parameter.append(np.full((more, 4), 2, np.float32))
+    is_copied = not np.shares_memory(memory.array(parameter.values), memory.array(frozen))
+    assert is_copied == (more > 1)
+    parameter.thaw()
+    parameter.values[:] = 3
+    np.testing.assert_array_equal(memory.array(frozen), kept)
+    assert (memory.array(parameter.values) == 3).all()
+    assert len(parameter) == 8 + 1000 + more
+
+
+class LittleMemory(ArrayMemory):
+    """Memory that does not suffice for the next array, once it is told."""
+
+    is_full = False
+
+    def room(self, count: int, like: np.ndarray) -> np.ndarray:
+        if self.is_full:
+            raise MemoryError
+        return super().room(count, like)
+
+    def put(self, array: np.ndarray) -> np.ndarray:
+        if self.is_full:
+            raise MemoryError
+        return super().put(array)
+
+
+def test_where_memory_does_not_suffice_to_add_rows_what_is_frozen_stays() -> None:
+    memory = LittleMemory()
+    parameter = Parameter(np.zeros((8, 4), np.float32), memory)
+    frozen = parameter.freeze()
+    memory.is_full = True
+    for more in (1, 1000):
+        with pytest.raises(MemoryError):
+            parameter.append(np.ones((more, 4), np.float32))
+    memory.is_full = False
+    parameter.thaw()
+    parameter.values[:] = 3
+    assert not frozen.any()
+    parameter.append(np.ones((1000, 4), np.float32))
+    assert [len(rows) for rows in (parameter.values, parameter.means, parameter.steps)] == 3 * [
+        1008
+    ]
+    assert (parameter.values[:8] == 3).all()
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_an_epoch_takes_little_more_than_its_numbers(memory: Memory) -> None:
+    parameter = Parameter(np.zeros((8, 4), np.float32), memory)
+    for more in (1000, 700, 300):
+        parameter.append(np.ones((more, 4), np.float32))
+        parameter.freeze()
+        parameter.thaw()
+        frozen = parameter.freeze()
+        (taken,) = buffers_of(frozen).values()
+        used = memory.array(frozen).nbytes
+        assert used <= taken <= 1.25 * used + 64
 
 
 @pytest.mark.parametrize(("device", "other"), [("cpu", IN_TENSORS), (IN_TENSORS, "cpu")])

@@ -143,6 +143,21 @@ def test_few_clients_with_many_pins_leave_one_to_whoever_comes_later():
         assert not of_client(epochs, "late", 6)
 
 
+@pytest.mark.parametrize("by_view", [False, True])
+def test_who_asks_for_an_epoch_by_number_has_the_others_let_go(by_view):
+    clock = Clock()
+    epochs = history(kept=4, pinned=1, clock=clock)
+    for number in range(2, 5):
+        epochs.add(epoch(number))
+    clock.now += 10 * ServiceSettings().publish_period_s + 1
+    if by_view:
+        with epochs.view(2):
+            pass
+    else:
+        epochs.get(2)
+    assert [kept.number for kept in epochs.kept().epochs] == [2, 4]
+
+
 class LargeEpoch(Epoch):
     """One with memory of its own, and some that all share."""
 

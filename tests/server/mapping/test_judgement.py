@@ -136,6 +136,7 @@ def test_forgetting_is_found_told_and_repaired() -> None:
     assert fit is not None
     assert fit.repairing == 0
     for region in mapper.regions:
+        region.field.thaw()  # what was published stays as it is
         values = region.field.features.values
         values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
         region.budget.samples = 1  # for a step, since what was not trained was not judged

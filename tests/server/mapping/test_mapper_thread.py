@@ -25,9 +25,11 @@ SETTINGS = ServiceSettings(publish_period_s=NEVER_S, epochs_kept=4, epochs_pinne
 
 
 @contextmanager
-def running(mapper: Mapper, failed: Callable[[], None] = lambda: None) -> Iterator[MapperThread]:
-    """The thread of a mapper, which publishes when a command asks for it."""
-    with closing(MapperThread(mapper, ScanQueue(8), SETTINGS, failed)) as thread:
+def running(
+    mapper: Mapper, failed: Callable[[], None] = lambda: None, settings: ServiceSettings = SETTINGS
+) -> Iterator[MapperThread]:
+    """The thread of a mapper; with these settings it publishes when a command asks for it."""
+    with closing(MapperThread(mapper, ScanQueue(8), settings, failed)) as thread:
         thread.start()
         yield thread
 
@@ -111,6 +113,40 @@ def test_too_little_memory_for_a_moment_does_not_end_it(monkeypatch: pytest.Monk
         while thread.call(lambda mapper: mapper.samples_trained) == trained:
             pass
         assert thread.epochs.newest.number > 0
+
+
+class OutOfMemory(Mapper):
+    """There is too little memory to train, from some moment on."""
+
+    is_short = False
+
+    def train(self) -> None:
+        if self.is_short:
+            raise MemoryError
+        super().train()
+
+
+def test_older_epochs_are_let_go_while_memory_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To which only those came who ask for the newest."""
+    monkeypatch.setattr(mapper_thread, "_NO_MEMORY_S", 0.0)
+    quick = SETTINGS.model_copy(update={"publish_period_s": 0.01})
+    mapper = learning_mapper(OutOfMemory)
+    with running(mapper, settings=quick) as thread:
+        while len(thread.epochs.kept().epochs) < 2:
+            thread.publish_soon()
+        mapper.is_short = True
+        while len(thread.epochs.kept().epochs) > 1:
+            thread.epochs.get(0)
+
+
+def test_older_epochs_are_let_go_while_mapping_rests() -> None:
+    quick = SETTINGS.model_copy(update={"publish_period_s": 0.01})
+    with running(learning_mapper(), settings=quick) as thread:
+        while len(thread.epochs.kept().epochs) < 2:
+            thread.publish_soon()
+        thread.rest()
+        while len(thread.epochs.kept().epochs) > 1:
+            thread.wake()  # as a heartbeat does
 
 
 def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:

@@ -73,12 +73,13 @@ def row_slopes(
     else:
         slopes = (np.float32(0), np.float32(0))
         for k in range(table.shape[1]):
-            low, high = table[rows[0], k], table[rows[1], k]
-            bend = table[rows[3], k] - high - table[rows[2], k] + low
-            of_point = values[point, start + k]
+            of_corner, of_right = table[rows[0], k], table[rows[1], k]
+            of_across, of_along = of_right - of_corner, table[rows[2], k] - of_corner
+            of_twist = table[rows[3], k] - of_right - of_along
+            of_value = values[point, start + k]
             slopes = (
-                slopes[0] + of_point * (high - low + place[1] * bend),
-                slopes[1] + of_point * (table[rows[2], k] - low + place[0] * bend),
+                slopes[0] + of_value * (of_across + place[1] * of_twist),
+                slopes[1] + of_value * (of_along + place[0] * of_twist),
             )
     return slopes
 
@@ -96,7 +97,7 @@ def move_row(
 ) -> None:
     """One step of Adam, as in :mod:`triquad_server.engine.compiled_trainer`; clears the gradient.
 
-    Numbers are float32. A training step moves some hundred thousand rows.
+    Numbers are float32.
 
     Args:
         gradients, values, means, variances: tables of the same shape.
@@ -106,19 +107,19 @@ def move_row(
         epsilon: keeps the division finite.
     """
     if values.shape[1] == LANES:
-        steep, mean, variance = (
+        gradient, mean, variance = (
             load(gradients, (row, 0)),
             load(means, (row, 0)),
             load(variances, (row, 0)),
         )
-        mean = mean + fill(blends[0]) * (steep - mean)
-        variance = variance + fill(blends[1]) * (steep * steep - variance)
-        spread = root(variance * fill(scales[1])) + fill(epsilon)
-        moved = load(values, (row, 0)) - fill(scales[0]) * mean / spread
+        mean = mean + fill(blends[0]) * (gradient - mean)
+        variance = variance + fill(blends[1]) * (gradient * gradient - variance)
+        deviation = root(variance * fill(scales[1])) + fill(epsilon)
+        value = load(values, (row, 0)) - fill(scales[0]) * mean / deviation
         store(gradients, (row, 0), fill(np.float32(0)))
         store(means, (row, 0), mean)
         store(variances, (row, 0), variance)
-        store(values, (row, 0), moved)
+        store(values, (row, 0), value)
     else:
         for k in range(values.shape[1]):
             gradient = gradients[row, k]
