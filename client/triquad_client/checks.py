@@ -19,6 +19,7 @@ from triquad_format.wire.limits import (
     LEVELS,
     MAX_DISTANCE_M,
     MAX_FILL_M,
+    MAX_POSITION_M,
     MIN_LENGTH_M,
     TILE_INDEX_LIMIT,
 )
@@ -33,7 +34,6 @@ PoseLike: TypeAlias = ArrayLike | Pose
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
 
-FARTHEST_M = 1e9
 LONGEST_S = 1e6  # that a request may take
 
 _MAX_COLUMNS = 16  # of a scan's points: more is rather an array that was transposed
@@ -41,16 +41,16 @@ _MAX_CELLS = 100_000_000  # of a grid
 
 
 def query_points(points: ArrayLike) -> Doubles:
-    """Points [N, 3] as float64, all finite and at most ``FARTHEST_M`` from the map's origin."""
+    """Points [N, 3] as float64, all finite and at most ``MAX_POSITION_M`` from the map's origin."""
     array = _points(points, np.float64, InvalidInputError)
     # All at once, as point by point takes ten times as long.
     if not np.isfinite(array).all():
         index = int(np.isfinite(array).all(axis=1).argmin())
         raise InvalidInputError(f"point {index} is not finite: {array[index]}")
-    if np.abs(array).max(initial=0.0) > FARTHEST_M:
-        index = int((np.abs(array) > FARTHEST_M).any(axis=1).argmax())
+    if np.abs(array).max(initial=0.0) > MAX_POSITION_M:
+        index = int((np.abs(array) > MAX_POSITION_M).any(axis=1).argmax())
         raise InvalidInputError(
-            f"point {index} is {array[index]}, more than {FARTHEST_M:g} m from the map's origin; "
+            f"point {index} is {array[index]}, more than {MAX_POSITION_M:g} m from the map's origin; "
             "are these metres of the map frame?"
         )
     return array
@@ -197,8 +197,8 @@ def bytes_per_second(limit: int | None) -> int:
 
 
 def finite_box(bounds: Bounds) -> tuple[Doubles, Doubles]:
-    """The corners [3] of ``bounds``, infinite sides at ``FARTHEST_M``."""
-    minimum, maximum = (np.clip(corner, -FARTHEST_M, FARTHEST_M) for corner in box(bounds))
+    """The corners [3] of ``bounds``, infinite sides at ``MAX_POSITION_M``."""
+    minimum, maximum = (np.clip(corner, -MAX_POSITION_M, MAX_POSITION_M) for corner in box(bounds))
     if not (minimum < maximum).all():
         raise InvalidInputError(f"bounds = {bounds!r} hold nothing")
     return minimum, maximum

@@ -19,10 +19,16 @@ from triquad_format.wire.messages import (
     StatusRequest,
     TileListRequest,
 )
-from triquad_format.wire.query_messages import GroundRequest, RaysRequest, SegmentsRequest
+from triquad_format.wire.query_messages import (
+    DistanceRequest,
+    GroundRequest,
+    RaysRequest,
+    SegmentsRequest,
+)
 
 ORIGIN = np.zeros(3)
 ONE_POINT = np.zeros((1, 3), np.float32)
+FAR_POINT = np.full((1, 3), 1e18, np.float32)
 
 
 def segments(count, length_m):
@@ -207,6 +213,9 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
         (keys.SDF, changed(StatusRequest(), triquad=9), "bad_version"),
         (keys.SDF, SdfRequest(ORIGIN, ONE_POINT * np.nan, False, 0), "bad_request"),
         (keys.SDF, SdfRequest(ORIGIN + np.inf, ONE_POINT, False, 0), "bad_request"),
+        (keys.SDF, SdfRequest(ORIGIN + 1.1e9, ONE_POINT, False, 0), "bad_request"),
+        (keys.SDF, SdfRequest(ORIGIN - 1.7e308, ONE_POINT, False, 0), "bad_request"),
+        (keys.DISTANCE, DistanceRequest(ORIGIN, FAR_POINT, 1.0, False, False, 0), "bad_request"),
         (keys.SDF, SdfRequest(ORIGIN, ONE_POINT, False, -1), "epoch_gone"),
         (
             keys.SDF,

@@ -3,6 +3,9 @@
 MIN_LENGTH_M = 1e-6
 """Of distances, ranges and grid cells: what is smaller is a mistake."""
 
+MAX_POSITION_M = 1e9
+"""Of a coordinate that is asked about: what is larger is hardly one in metres of the map frame."""
+
 MAX_DISTANCE_M = 100.0
 """How far around a point surfaces may be looked for; also the largest radius and grid cell."""
 

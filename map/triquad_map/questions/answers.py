@@ -13,7 +13,13 @@ from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.pose import is_rigid
 from triquad_format.wire.codec import Message
-from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_ITERATIONS, MAX_RANGE_M, MIN_LENGTH_M
+from triquad_format.wire.limits import (
+    MAX_DISTANCE_M,
+    MAX_ITERATIONS,
+    MAX_POSITION_M,
+    MAX_RANGE_M,
+    MIN_LENGTH_M,
+)
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
     AlignReply,
@@ -270,19 +276,24 @@ def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
     """Points [N, 3] of the map frame.
 
     Raises:
-        RefusedError: they are too many, or not all finite.
+        RefusedError: they are too many, or not all of them are places.
     """
     if len(offsets) > most:
         raise RefusedError(
             "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
         )
-    # Single precision from an origin is good to that. Unrounded, a point that somebody chose on a
-    # face of voxels would lie on one side or the other by what else is in the request.
-    points = np.round(origin + offsets.astype(np.float64), _DECIMALS)
-    if not np.isfinite(points).all():
-        index = int(np.isfinite(points).all(axis=1).argmin())
+    points = origin + offsets.astype(np.float64)
+    # Of NaN, neither holds.
+    if points.min(initial=0.0) >= -MAX_POSITION_M and points.max(initial=0.0) <= MAX_POSITION_M:
+        # Single precision from an origin is good to that. Unrounded, a point that somebody chose on
+        # a face of voxels would lie on one side or the other by what else is in the request.
+        rounded: Doubles = np.round(points, _DECIMALS)
+        return rounded
+    index = int((np.abs(points) <= MAX_POSITION_M).all(axis=1).argmin())
+    if not np.isfinite(points[index]).all():
         raise RefusedError("bad_request", f"{what} {index} is not finite: {points[index]}")
-    return points
+    far = f"{what} {index} is {points[index]}: use coordinates up to {MAX_POSITION_M:g} m"
+    raise RefusedError("bad_request", far)
 
 
 def _within(name: str, value: float, most: float, least: float = MIN_LENGTH_M) -> float:
