@@ -50,8 +50,8 @@ def query_points(points: ArrayLike) -> Doubles:
     if np.abs(array).max(initial=0.0) > MAX_POSITION_M:
         index = int((np.abs(array) > MAX_POSITION_M).any(axis=1).argmax())
         raise InvalidInputError(
-            f"point {index} is {array[index]}, more than {MAX_POSITION_M:g} m from the map's origin; "
-            "are these metres of the map frame?"
+            f"point {index} is {array[index]}, more than {MAX_POSITION_M:g} m from the map's "
+            "origin; are these metres of the map frame?"
         )
     return array
 
