@@ -75,6 +75,15 @@ def settle(mapper: Mapper) -> None:
         mapper.train()
 
 
+def damage(mapper: Mapper) -> None:
+    """Have the field forget, and be trained for a step: what was not is not judged."""
+    for region in mapper.regions:
+        region.field.thaw()  # what was published stays as it is
+        values = region.field.features.values
+        values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
+        region.budget.samples = 1
+
+
 def surface_error(
     epoch: Epoch,
     drive_through: World,

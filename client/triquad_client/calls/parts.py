@@ -27,9 +27,8 @@ def in_parts(
         InvalidInputError: ``at_epoch`` is neither the number of an epoch nor ``None``, the newest.
     """
 
-    def parts(
-        epoch: int,
-    ) -> "Call[Sequence[MapReplyT]]":  # quoted: it would be evaluated anew with each call
+    # Its annotation is quoted: it would be evaluated anew with each call.
+    def parts(epoch: int) -> "Call[Sequence[MapReplyT]]":
         first = yield from ask(request(slice(0, most), epoch))
         if count <= most:
             return [first]

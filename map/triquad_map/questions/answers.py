@@ -292,8 +292,10 @@ def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
     index = int((np.abs(points) <= MAX_POSITION_M).all(axis=1).argmin())
     if not np.isfinite(points[index]).all():
         raise RefusedError("bad_request", f"{what} {index} is not finite: {points[index]}")
-    far = f"{what} {index} is {points[index]}: use coordinates up to {MAX_POSITION_M:g} m"
-    raise RefusedError("bad_request", far)
+    raise RefusedError(
+        "bad_request",
+        f"{what} {index} is {points[index]}: use coordinates up to {MAX_POSITION_M:g} m",
+    )
 
 
 def _within(name: str, value: float, most: float, least: float = MIN_LENGTH_M) -> float:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.small_world import settings, settle, settled_mapper, surface_error, world
+from support.small_world import damage, settings, settle, settled_mapper, surface_error, world
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT
@@ -135,11 +135,7 @@ def test_forgetting_is_found_told_and_repaired() -> None:
     fit = map_fit(mapper.regions)
     assert fit is not None
     assert fit.repairing == 0
-    for region in mapper.regions:
-        region.field.thaw()  # what was published stays as it is
-        values = region.field.features.values
-        values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
-        region.budget.samples = 1  # for a step, since what was not trained was not judged
+    damage(mapper)
     settle(mapper)
     assert surface_error(mapper.publish(), world()) > 1.2 * before_m
     assert map_fit(mapper.regions).repairing > 0

@@ -127,7 +127,7 @@ class OutOfMemory(Mapper):
 
 
 def test_older_epochs_are_let_go_while_memory_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """To which only those came who ask for the newest."""
+    """Nobody asks for one by number, which would have the others let go, too."""
     monkeypatch.setattr(mapper_thread, "_NO_MEMORY_S", 0.0)
     quick = SETTINGS.model_copy(update={"publish_period_s": 0.01})
     mapper = learning_mapper(OutOfMemory)

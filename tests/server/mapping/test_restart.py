@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.small_world import World, settings, settle, settled_mapper, world
+from support.small_world import World, damage, settings, settle, settled_mapper, world
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.map_progress import MapProgress
@@ -100,15 +100,6 @@ def test_what_is_forgotten_after_a_restart_is_found_repaired_and_counted(restart
     assert after.median_m < 1.1 * before.median_m
     again = Mapper("test", settings(), "cpu", restarted.changes_since(None).record)
     assert map_fit(again.regions).repaired == after.repaired
-
-
-def damage(mapper: Mapper) -> None:
-    """Have the field forget, and be trained for a step: what was not is not judged."""
-    for region in mapper.regions:
-        region.field.thaw()  # what was published stays as it is
-        values = region.field.features.values
-        values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
-        region.budget.samples = 1
 
 
 def settle_all(mapper: Mapper) -> None:
