@@ -158,6 +158,13 @@ def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
     return minimum, maximum
 
 
+def flag(name: str, value: bool) -> bool:
+    """``value`` where it is a truth value, also one of numpy's."""
+    if not isinstance(value, bool | np.bool_):
+        raise InvalidInputError(f"{name} = {_shown(value)}: use True or False")
+    return bool(value)
+
+
 def level_of_detail(level: int) -> int:
     """``level`` where the mesh has such a level of detail."""
     if type(level) is not int or not 0 <= level < LEVELS:
@@ -200,7 +207,10 @@ def finite_box(bounds: Bounds) -> tuple[Doubles, Doubles]:
     """The corners [3] of ``bounds``, infinite sides at ``MAX_POSITION_M``."""
     minimum, maximum = (np.clip(corner, -MAX_POSITION_M, MAX_POSITION_M) for corner in box(bounds))
     if not (minimum < maximum).all():
-        raise InvalidInputError(f"bounds = {bounds!r} hold nothing")
+        raise InvalidInputError(
+            f"bounds = {bounds!r} hold nothing: each side needs a length, within "
+            f"{MAX_POSITION_M:g} m from the map's origin"
+        )
     return minimum, maximum
 
 
@@ -306,7 +316,8 @@ def _points(
     if array.size == 0 and array.ndim == 1:
         array = array.reshape(0, 3)
     if array.ndim != 2 or not 3 <= array.shape[1] <= columns:
-        raise error(f"{what} are {list(array.shape)}, not [N, 3]")
+        one = "; a single one is [[x, y, z]]" if array.shape == (3,) else ""
+        raise error(f"{what} are {list(array.shape)}, not [N, 3]{one}")
     return array[:, :3].astype(dtype, copy=False)
 
 

@@ -98,8 +98,6 @@ def _run(options: argparse.Namespace) -> int:
     check_name("map", options.map)
     assignments = [*options.set, *_implied(options)]
     settings = load_settings(options.settings, assignments, preset=options.preset)
-    if options.restore is not None and options.store is None:
-        raise ServerError("--restore needs the --store that the map is taken from")
     if options.print_settings:
         sys.stdout.write(settings_toml(settings))
         return OK

@@ -166,10 +166,12 @@ def serve(
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     listen: str | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
+    restore: int | None = None,
 ) -> Server:
     """Start a map server within this program, and return once it serves.
 
-    The very first start compiles for half a minute, as a warning in the log says.
+    The very first start compiles for some 15 s, as a warning in the log says; scans wait for as
+    long again.
 
     Args:
         store: folder for checkpoints; without one the map is not kept. The server goes on from
@@ -181,6 +183,8 @@ def serve(
         listen: where other processes reach it, ``HOST:PORT`` or an endpoint of Zenoh; ``None``: a
             free port of the loopback.
         device: what it computes on; ``"auto"``: a GPU where there is one.
+        restore: the epoch of an older checkpoint of the store, to which the map is taken back,
+            such as ``client.reset().kept_epoch``; ``None``: the newest.
 
     Raises:
         ServerError: the server cannot start: :class:`ListenError`, :class:`StoreError`, or a
@@ -198,7 +202,7 @@ def serve(
     folder = None if store is None else Path(store)
     with _free_endpoint() if listen is None else nullcontext(full_endpoint(listen)) as endpoint:
         network = NetworkOptions(listen=(endpoint,))
-        return Server(LaunchOptions(map, network, settings=loaded, store=folder, device=device))
+        return Server(LaunchOptions(map, network, loaded, folder, device, restore))
 
 
 def _loaded(settings: "Settings | str | Path | None") -> "Settings":

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from triquad_server.errors import ServerError
 from triquad_server.net.configuration import NetworkOptions
 from triquad_server.settings import Settings
 
@@ -17,3 +18,12 @@ class LaunchOptions:
     store: Path | None
     device: str  # "cpu", "cuda" or "auto"
     restore: int | None = None  # the epoch that the map is taken back to; None: the newest
+
+    def __post_init__(self) -> None:
+        """Refuse to restore from nowhere.
+
+        Raises:
+            ServerError: there is no store.
+        """
+        if self.restore is not None and self.store is None:
+            raise ServerError("--restore needs the --store that the map is taken from")

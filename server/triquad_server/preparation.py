@@ -110,6 +110,7 @@ class Preparation:
     def _prepare_mapping(self, done: Callable[[], None], failed: Callable[[], None]) -> None:
         try:
             for stage in MAPPING:
+                self._tell(f"next, while scans wait: {stage.replace('_', ' ')}")
                 self._go_through(stage, self._look_for_close)
             self._tell("scans are taken in from now on")
             done()

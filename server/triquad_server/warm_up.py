@@ -1,6 +1,6 @@
 """Has kernels compiled before they are needed, by maps and questions that are made up.
 
-At the very first start that takes a minute of one core; then the compiled code is found on disk.
+At the very first start that takes half a minute or more; then the compiled code is found on disk.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """What the client refuses to send, by name, and what it takes."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ def client() -> Iterator[Client]:
     [
         (np.zeros((0, 3)), "no points"),
         (np.zeros((5, 2)), r"\[5, 2\], not \[N, 3\]"),
-        (np.zeros(3), r"\[3\], not"),
+        (np.zeros(3), r"\[3\], not \[N, 3\]; a single one is \[\[x, y, z\]\]"),
         (np.zeros((3, 500)), r"\[3, 500\], not"),  # transposed
         (np.zeros((2, 3), complex), "complex128"),
         (np.full((2, 3), "x"), "dtype"),
@@ -42,6 +42,30 @@ def test_columns_after_the_third_are_left_out(client: Client) -> None:
     client.publish_scan(cloud, POSE, source="coloured")
     assert client.flush(servers.WAIT_S).taken == 1
     assert (client.query_sdf(servers.sphere(50)).status == Status.SURFACE).all()
+
+
+@pytest.mark.parametrize(
+    ("question", "name"),
+    [
+        (lambda client: client.query_sdf(CLOUD, "yes"), "gradient = 'yes'"),
+        (lambda client: client.query_sdf(CLOUD, 5), "gradient = 5"),
+        (lambda client: client.query_distance(CLOUD, surface_point=None), "surface_point = None"),
+        (lambda client: client.query_distance(CLOUD, unknown_distance=1), "unknown_distance = 1"),
+        (
+            lambda client: client.query_rays((0, 0, 0), CLOUD, 5.0, through_unknown="no"),
+            "through_unknown = 'no'",
+        ),
+    ],
+)
+def test_what_is_neither_true_nor_false_is_refused_here(
+    client: Client, question: Callable[[Client], object], name: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=f"{name}: use True or False"):
+        question(client)
+
+
+def test_truth_values_of_numpy_are_taken(client: Client) -> None:
+    assert client.query_sdf(CLOUD, gradient=np.bool_(True)).gradient.shape == CLOUD.shape
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from triquad_format.mapfile.reader import read_map
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "docs" / "deploy"
 INSTALLED, STORE = "/opt/triquad", "/var/lib/triquad"  # in the image
-COMPILING = "compiling, up to a minute"
+COMPILING = "compiling, half a minute"
 
 
 class Image(NamedTuple):

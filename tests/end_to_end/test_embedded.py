@@ -143,11 +143,23 @@ def test_a_last_checkpoint_that_cannot_be_written_is_an_error(tmp_path):
         ({"map": "a/b"}, FormatError, "a/b"),
         ({"listen": "robot:http"}, FormatError, "'http' is not a port"),
         ({"device": "gpu"}, ServerError, "use auto, cpu or cuda"),
+        ({"restore": 3}, ServerError, "needs the --store"),
     ],
 )
 def test_what_cannot_be_is_refused(arguments, error, text):
     with pytest.raises(error, match=text):
         triquad_server.serve(**arguments)
+
+
+def test_a_map_is_taken_back_to_the_epoch_that_a_reset_kept(tmp_path):
+    with triquad_server.serve(store=tmp_path, settings=servers.SMALL) as server:
+        client = server.client()
+        servers.learn(client)
+        kept = client.reset().kept_epoch
+        assert kept is not None
+    assert statuses(tmp_path) == {Status.UNKNOWN}
+    triquad_server.serve(store=tmp_path, settings=servers.SMALL, restore=kept).close()
+    assert statuses(tmp_path) == {Status.SURFACE}
 
 
 def test_a_port_or_a_store_in_use_is_refused_and_tells_why(tmp_path):
@@ -156,7 +168,7 @@ def test_a_port_or_a_store_in_use_is_refused_and_tells_why(tmp_path):
         assert server.endpoint == endpoint
         with pytest.raises(ListenError, match="is another server running there"):
             triquad_server.serve(settings=servers.SMALL, listen=endpoint)
-        with pytest.raises(StoreError, match="in use by another server"):
+        with pytest.raises(StoreError, match="in use by another server: stop that one first"):
             triquad_server.serve(store=tmp_path, settings=servers.SMALL)
         assert server.client().status().map_name == servers.MAP
 

@@ -18,6 +18,7 @@ from triquad_format.wire.endpoints import full_endpoint
         ("[fe80::2]:7448", "tcp/[fe80::2]:7448"),
         ("tcp/robot:7447", "tcp/robot:7447"),
         ("tls/robot:7447#root_ca=ca.pem", "tls/robot:7447#root_ca=ca.pem"),
+        ("tcp/[::1]:0?rel=0", "tcp/[::1]:0?rel=0"),
         ("unixsock-stream//run/triquad.sock", "unixsock-stream//run/triquad.sock"),
     ],
 )
@@ -47,6 +48,22 @@ def test_what_is_neither_is_refused_with_what_to_write(text: str, words: str) ->
         full_endpoint(text)
     assert words in str(raised.value)
     assert "use HOST, HOST:PORT or an endpoint of Zenoh such as tcp/robot:7447" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "port"),
+    [
+        ("tcp/robot:99999", "99999"),
+        ("tls/robot:http#root_ca=ca.pem", "http"),
+        ("udp/[::1]", "1]"),
+        ("tcp/robot", "robot"),
+    ],
+)
+def test_an_endpoint_of_zenoh_without_a_port_is_refused(text: str, port: str) -> None:
+    with pytest.raises(FormatError) as raised:
+        full_endpoint(text)
+    protocol = text.partition("/")[0]
+    assert f"{port!r} is not a port up to 65535; write {protocol}/HOST:PORT" in str(raised.value)
 
 
 def test_a_host_is_reached_by_the_protocol_that_is_asked_for() -> None:

@@ -34,6 +34,9 @@ class MapQueries:
     ) -> SdfResult:
         """The trained field at ``points`` [N, 3]: right near surfaces, saturated beyond.
 
+        Where the map has no region, which is far from all that was seen, field and gradient are
+        NaN.
+
         Args:
             points: metres, map frame.
             gradient: whether the gradient is wanted.

@@ -78,6 +78,7 @@ class SdfResult:
 
 def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResult]:
     """The trained field at ``points`` [N, 3]."""
+    gradient = checks.flag("gradient", gradient)
     if isinstance(points, np.ndarray) and points.size > 3 * _PART_SDF_POINTS:
         checked = yield from offload(lambda _: checks.query_points(points))
     else:
@@ -116,7 +117,9 @@ def distance(
     """True distances to the nearest surface at ``points`` [N, 3]."""
     checked = checks.query_points(points)
     policy = checks.unknown_policy(unknown)
-    unknown_distance = options.unknown_distance or policy is not Unknown.FREE
+    surface_point = checks.flag("surface_point", options.surface_point)
+    asked_distance = checks.flag("unknown_distance", options.unknown_distance)
+    unknown_distance = asked_distance or policy is not Unknown.FREE
     reach_m = checks.within("max_distance_m", options.max_distance_m)
 
     def request(part: slice, epoch: int) -> Ask[DistanceReply]:
@@ -125,7 +128,7 @@ def distance(
             origin=origin,
             points=offsets_from(checked[part], origin),
             max_distance_m=reach_m,
-            surface_point=options.surface_point,
+            surface_point=surface_point,
             unknown_distance=unknown_distance,
             epoch=epoch,
         )
@@ -133,7 +136,7 @@ def distance(
 
     parts = yield from in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
     asked_for = {
-        "surface_point": options.surface_point,
+        "surface_point": surface_point,
         "unknown_distance_m": unknown_distance,
         "unknown_point": unknown_distance,
     }
@@ -209,6 +212,7 @@ def rays(
     ways = checks.directions(directions)
     starts = checks.ray_origins(origins, len(ways))
     reach_m = checks.within("max_range_m", options.max_range_m, MAX_RANGE_M)
+    through_unknown = checks.flag("through_unknown", options.through_unknown)
 
     def request(part: slice, epoch: int) -> Ask[RaysReply]:
         origin = origin_of(starts[part])
@@ -217,7 +221,7 @@ def rays(
             starts=offsets_from(starts[part], origin),
             directions=ways[part].astype(np.float32),
             max_range_m=reach_m,
-            through_unknown=options.through_unknown,
+            through_unknown=through_unknown,
             epoch=epoch,
         )
         return Ask(keys.RAYS, message, RaysReply)

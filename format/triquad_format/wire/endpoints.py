@@ -6,6 +6,7 @@ DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 
 _FORMS = "use HOST, HOST:PORT or an endpoint of Zenoh such as tcp/robot:7447"
+_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
 
 
 def full_endpoint(text: str, protocol: str = "tcp") -> str:
@@ -21,13 +22,32 @@ def full_endpoint(text: str, protocol: str = "tcp") -> str:
     if not isinstance(text, str) or not text.strip() or text != text.strip():
         raise FormatError(f"endpoint {text!r}: {_FORMS}")
     if "/" in text:
+        _check_port(text)
         return text
     host, port = _host_and_port(text)
     if not host or host.isdigit() or any(c.isspace() or c in "#?;" for c in host):
         raise FormatError(f"endpoint {text!r}: {host!r} is not a host; {_FORMS}")
-    if not (port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):
+    if not _is_port(port) or int(port) == 0:
         raise FormatError(f"endpoint {text!r}: {port!r} is not a port from 1 to 65535; {_FORMS}")
     return f"{protocol}/{host}:{port}"
+
+
+def _check_port(endpoint: str) -> None:
+    """Refuse an endpoint of Zenoh whose port is none; at port 0 the system chooses one.
+
+    Raises:
+        FormatError: it is.
+    """
+    protocol, _, address = endpoint.partition("/")
+    port = address.partition("#")[0].partition("?")[0].rpartition(":")[2]
+    if protocol in _WITH_PORT and not _is_port(port):
+        raise FormatError(
+            f"endpoint {endpoint!r}: {port!r} is not a port up to 65535; write {protocol}/HOST:PORT"
+        )
+
+
+def _is_port(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) <= 5 and int(text) < 1 << 16
 
 
 def is_of_this_machine(endpoint: str) -> bool:

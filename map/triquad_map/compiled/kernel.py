@@ -43,7 +43,7 @@ _IMPORT = re.compile(
 )
 """An import of a module of these, and the names after it; to parse the files takes 0.2 s."""
 
-COMPILING = "compiling, up to a minute in all: this is done once for each release"
+COMPILING = "compiling, half a minute or more in all: this is done once for each release"
 """What is told where compiled code is not found."""
 
 _LONGEST_TURN_S = 60.0

@@ -141,8 +141,12 @@ class EpochHistory:
     def _get(self, number: int) -> Epoch:
         epoch = self._epochs.get(number) if number else self.newest
         if epoch is None:
+            kept = sorted(self._epochs)
             raise RefusedError(
-                "epoch_gone", f"epoch {number} is not kept; kept are {sorted(self._epochs)}"
+                "epoch_gone",
+                f"epoch {number} is not kept; kept are {kept}"
+                if number < kept[-1]
+                else f"there is no epoch {number} yet: the newest is {kept[-1]}",
             )
         if number:
             self._pin(asking_client.get(), number)

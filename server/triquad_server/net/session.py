@@ -39,4 +39,6 @@ def _what_failed(config: Configuration, reason: str) -> str:
         remedy = "check the credentials of the Zenoh configuration: triquad-keys makes them"
     elif "not supported" in reason:
         remedy = "write --listen tcp/HOST:PORT"
+    elif "lookup address" in reason:
+        remedy = "give --listen an address of this machine, or 0.0.0.0 for all of them"
     return f"cannot open {', '.join(config.listen)}: {reason} ({remedy})"

@@ -138,7 +138,9 @@ def _read_file(file: Path) -> dict[str, Any]:
         file.open("rb").close()  # what is missing, or a folder, would count as empty
         # As it is written: a call would take [Scan] for [scan], and of both drop one.
         return TomlConfigSettingsSource(_NamedSettings, file).toml_data
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise SettingsError(f"settings file {file}: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
         raise SettingsError(f"settings file {file}: {error}") from error
 
 

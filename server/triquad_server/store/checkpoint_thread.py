@@ -105,12 +105,13 @@ class CheckpointThread:
         if self._store is None:
             return
         try:
-            self.write()
+            info = self.write()
         except (StoreError, MapperStoppedError) as error:
             raise LastCheckpointError(
                 f"the last checkpoint was not written, and what was mapped since {self._kept()} "
                 f"is lost: {error}"
             ) from error
+        _log.info("the map is in %s, as of epoch %d", info.path, info.epoch)
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
         """A checkpoint of the map as it is now; the last one where nothing changed.

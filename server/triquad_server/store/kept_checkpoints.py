@@ -217,5 +217,8 @@ def _locked(path: Path) -> IO[bytes]:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         file.close()
-        raise StoreError(f"store {path.parent} is in use by another server") from None
+        raise StoreError(
+            f"store {path.parent} is in use by another server: stop that one first, or give "
+            "another --store or --map"
+        ) from None
     return file

@@ -62,7 +62,10 @@ class Store:
         try:
             self._files = KeptCheckpoints(self.folder, settings)
         except OSError as error:
-            raise StoreError(f"store {self.folder} cannot be written to: {error}") from error
+            raise StoreError(
+                f"store {self.folder} cannot be written to: {error.strerror or error}; choose "
+                "another --store, or let this user write there"
+            ) from error
 
     def close(self) -> None:
         """Let go of the folder."""

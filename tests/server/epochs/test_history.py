@@ -66,6 +66,9 @@ def test_older_epochs_that_nobody_asked_for_go():
     with pytest.raises(RefusedError, match=r"epoch 1 is not kept; kept are \[2, 3\]") as caught:
         epochs.get(1)
     assert caught.value.code == "epoch_gone"
+    with pytest.raises(RefusedError, match="there is no epoch 4 yet: the newest is 3") as caught:
+        epochs.get(4)
+    assert caught.value.code == "epoch_gone"
 
 
 def test_an_epoch_that_is_asked_for_stays_for_its_time_and_each_time_renews_it():

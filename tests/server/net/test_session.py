@@ -40,6 +40,12 @@ def test_a_port_in_use_is_told_as_such(protocol: str, tmp_path: Path) -> None:
     assert "is another server running there" in why
 
 
+def test_a_host_that_nobody_knows_is_not_taken_for_another_server() -> None:
+    why = failure(listen=("tcp/no-such-host.invalid:7447",))
+    assert "give --listen an address of this machine" in why
+    assert "another server" not in why
+
+
 def test_a_protocol_that_is_none_is_told_with_what_to_write() -> None:
     endpoint = servers.free_endpoint().replace("tcp/", "http://")
     assert "(write --listen tcp/HOST:PORT)" in failure(listen=(endpoint,))

@@ -8,7 +8,6 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure, seconds, typical
 from triquad_tools.benchmarks.street import LENGTH_M, SCANS
@@ -27,7 +26,6 @@ _POINTS = 100_000
 def measure_air(seed: int) -> list[Figure]:
     """Figures of a drive whose lidar looks up, without and with its rays without a return."""
     settings = Settings()
-    warm_up(settings, "cpu")
     scene = street(seed, LENGTH_M)
     poses = drive(scene, SCANS, LENGTH_M / SCANS)
     scans = list(SimulatedDrive(scene, _UPWARDS, poses, seed=seed))

@@ -19,7 +19,6 @@ from triquad_server.mesh.mesher import mesh_tile, tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure, compare, seconds, typical
 from triquad_tools.benchmarks.street import BenchStreet
@@ -33,7 +32,6 @@ _RATE = 1e-4  # of learning: so slow that the baseline leaves the field as it is
 def measure_core(made: BenchStreet) -> list[Figure]:
     """Figures of the map's core."""
     settings = Settings()
-    warm_up(settings, "cpu")
     mapper = Mapper("bench", settings, "cpu")
     with progress("core", 4) as report:
         report(0, "taking in scans")

@@ -15,7 +15,6 @@ from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.marching_cubes import centroids
 from triquad_server.mesh.mesher import mesh_tile, tile_lattice
 from triquad_server.settings import MeshSettings, Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.align import check_recorded
 from triquad_tools.benchmarks.ended_voxels import (
@@ -62,7 +61,6 @@ def measure_moving(seed: int, folder: Path | None) -> list[Figure]:
         ToolError: the folder cannot be read.
     """
     check_recorded("moving", folder)
-    warm_up(Settings(), "cpu")
     thin = tuple(thin_things(_THIN_X_M, _THIN_Y_M))
     traffic = street_traffic(seed, BUSY_SCANS, BUSY_SCANS + LOOKS[-1]).among(thin)
     figures = _street_figures(follow(traffic, thin, LOOKS))

@@ -10,7 +10,6 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_sensors.sweep import PosedScan
 from triquad_server.settings import Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import StreamedMap, learn_all, sdf_error_cm
@@ -34,7 +33,6 @@ def measure_parked(seed: int) -> list[Figure]:
     scene = street(seed, _LENGTH_M)
     way = drive(scene, _DRIVEN, _STEP_M)
     driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), way, seed=seed))
-    warm_up(Settings(), "cpu")
     robot = StreamedMap(Settings())
     for taken in driven.scans:
         robot.take_in(taken)

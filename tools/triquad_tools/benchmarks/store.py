@@ -13,7 +13,6 @@ from triquad_format.records.region import MapRecord
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_server.store.store import Store
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.served import MAP, served, stream_beside_planner
@@ -35,7 +34,6 @@ def measure_store(made: BenchStreet) -> list[Figure]:
 def _row(made: BenchStreet) -> MapRecord:
     """A street's region, settled, 16 times in a row."""
     settings = Settings()
-    warm_up(settings, "cpu")
     mapper = Mapper(MAP, settings, "cpu")
     for scan in made.scans[:_SCANS]:
         mapper.ingest(scan.points, scan.world_from_sensor)

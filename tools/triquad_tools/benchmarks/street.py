@@ -10,7 +10,6 @@ from triquad_sensors.sweep import PosedScan
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import seconds
 from triquad_tools.console.progress import progress
@@ -66,7 +65,6 @@ def settled_mapper(
 ) -> Mapper:
     """A mapper that has learnt all it can of some scans; ``name`` is told while one waits."""
     settings = settings or Settings()
-    warm_up(settings, "cpu")
     mapper = Mapper("bench", settings, "cpu")
     with progress(f"mapping {name}", len(scans) + 1) as report:
         for number, scan in enumerate(scans):

@@ -16,7 +16,6 @@ from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.preview import previews_of
 from triquad_server.settings import Settings
-from triquad_server.warm_up import warm_up
 
 from triquad_tools.benchmarks.figures import CurvePoint, Figure
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
@@ -48,7 +47,6 @@ def _by_time(made: BenchStreet) -> tuple[list[Figure], Epoch]:
     The epoch is that of the settled map, of all scans.
     """
     settings = Settings()
-    warm_up(settings, "cpu")
     mapper = Mapper("bench", settings, "cpu")
     began_s = time.process_time()
     for scan in made.scans:

@@ -105,7 +105,7 @@ def run_demo(
     street = driven_street(street_drive(street_seed, scans))
     laps.end("simulate")
     print_remark(
-        "starting triquad-server (the first run of all compiles kernels: half a minute more) ..."
+        "starting triquad-server (the first run of all compiles for half a minute or more) ..."
     )
     with DemoServer(out, steps.MAP, endpoint=endpoint) as server:
         laps.end("start")

@@ -76,7 +76,7 @@ def _map(options: argparse.Namespace) -> int:
 
 
 def _prepare(settings: Settings, device: str, teams: Teams, *, stop: Callable[[], bool]) -> None:
-    """Have all kernels compiled, which takes a minute the first time.
+    """Have all kernels compiled, which takes half a minute or more the first time.
 
     Raises:
         KeyboardInterrupt: the user wants to stop.

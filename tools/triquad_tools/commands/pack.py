@@ -25,6 +25,7 @@ from triquad_tools.mapfiles.source import (
     SourceMap,
     chosen_file,
     cropped,
+    is_endpoint,
     read_source,
 )
 
@@ -141,6 +142,9 @@ def _check_usage(options: argparse.Namespace) -> None:
     suffix = options.output.suffix
     rounds = options.precision or options.max_error
     problems = {
+        f"{options.input} is a server: give its store, or what client.download_map saved": (
+            is_endpoint(str(options.input))
+        ),
         f"{options.output}: use a name that ends in {', '.join(_SUFFIXES)}": (
             suffix not in _SUFFIXES
         ),
