@@ -29,7 +29,7 @@ def saved_figures(path: Path, street: int = 1) -> Path:
         for cost in costs:
             figures.append(Figure("F", 99.0, "%", point=CurvePoint(curve, F_SCORE, cost)))
             figures.append(Figure("error", 0.9, "cm", point=CurvePoint(curve, ACCURACY, cost)))
-    shown = [dataclasses.asdict(figure) for figure in figures]
+    shown = [{"part": "tradeoffs"} | dataclasses.asdict(figure) for figure in figures]
     path.write_text(json.dumps({"title": "today", "street": street, "figures": shown}))
     return path
 
@@ -68,6 +68,21 @@ def test_files_that_cannot_be_written_are_refused_before_anything_is_measured(
         missing = tmp_path / "nowhere" / "figures.png"
         assert bench.main([option, str(missing)]) == bench.BAD_INPUT
         assert str(missing) in capsys.readouterr().err
+
+
+def test_what_was_measured_is_told_and_kept_by_part(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved, page = tmp_path / "figures.json", tmp_path / "page.md"
+    page.write_text("# Benchmarks\n")
+    assert bench.main(["ros2", "--json", str(saved), "--record", str(page)]) == bench.OK
+    figures = json.loads(saved.read_text())["figures"]
+    assert {figure["part"] for figure in figures} == {"ros2"}
+    heading, _, *lines = page.read_text().partition("\n## ")[2].splitlines()
+    assert heading.endswith(", street 1, part ros2")
+    assert len(lines) == 2 + len(figures)
+    printed = capsys.readouterr().out
+    assert all(figure["name"] in printed for figure in figures)
 
 
 def test_unknown_parts_are_refused() -> None:

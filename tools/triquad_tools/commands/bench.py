@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from triquad_tools.benchmarks.figures import Figure
     from triquad_tools.benchmarks.street import BenchStreet
 
+    _Measures = dict[str, Callable[[], list[Figure]]]
+
 _COMMAND = "triquad-bench"
 _USUAL_ON_STREET = (
     "core",
@@ -82,13 +84,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    parts = options.parts or (("tradeoffs",) if options.plot is not None else USUAL_PARTS)
-    if options.plot is not None and "tradeoffs" not in parts:
-        parts = (*parts, "tradeoffs")
+    """Measure part after part; what is known of one is told and kept before the next begins."""
+    wanted = options.parts or (("tradeoffs",) if options.plot is not None else USUAL_PARTS)
+    if options.plot is not None and "tradeoffs" not in wanted:
+        wanted = (*wanted, "tradeoffs")
+    on_street = [part for part in _ON_STREET if part in wanted]
+    alone = [part for part in PARTS if part in wanted and part not in _ON_STREET]
     _compile()
-    figures = _on_street([part for part in _ON_STREET if part in parts], options)
-    figures += _alone([part for part in PARTS if part in parts and part not in _ON_STREET], options)
-    _present(figures, options)
+    measured: dict[str, list[Figure]] = {}
+    for measures in (_on_street(on_street, options), _alone(alone, options)):
+        for part, measure in measures.items():
+            measured[part] = measure()
+            _present(part, measured, options)
     return OK
 
 
@@ -108,10 +115,10 @@ def _draw_saved(options: argparse.Namespace) -> int:
     return OK
 
 
-def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
-    """The figures of parts that are measured on one drive, each after the other."""
+def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "_Measures":
+    """What measures parts on one drive."""
     if not parts:
-        return []
+        return {}
     from triquad_tools.benchmarks.align import measure_align  # slow to import
     from triquad_tools.benchmarks.borders import measure_borders
     from triquad_tools.benchmarks.core import measure_core
@@ -145,7 +152,7 @@ def _on_street(parts: Sequence[str], options: argparse.Namespace) -> "list[Figur
         "viewer": _viewer,
     }
     made = bench_street(options.seed)
-    return [figure for part in parts for figure in measures[part](made)]
+    return {part: partial(measures[part], made) for part in parts}
 
 
 def _viewer(made: "BenchStreet") -> "list[Figure]":
@@ -159,10 +166,10 @@ def _viewer(made: "BenchStreet") -> "list[Figure]":
     return measure_viewer(made)
 
 
-def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
-    """The figures of parts that each drive for themselves."""
+def _alone(parts: Sequence[str], options: argparse.Namespace) -> "_Measures":
+    """What measures parts that each drive for themselves."""
     if not parts:
-        return []
+        return {}
     from triquad_tools.benchmarks.ablation import measure_ablation  # slow to import
     from triquad_tools.benchmarks.air import measure_air
     from triquad_tools.benchmarks.far_scan import measure_far_scan
@@ -189,7 +196,7 @@ def _alone(parts: Sequence[str], options: argparse.Namespace) -> "list[Figure]":
         "long-drive": measure_long_drive,
         "ablation": partial(measure_ablation, scans=options.scans, step_m=options.step),
     }
-    return [figure for part in parts for figure in measures[part](options.seed)]
+    return {part: partial(measures[part], options.seed) for part in parts}
 
 
 def _growth(street_seed: int) -> "list[Figure]":
@@ -211,20 +218,22 @@ def machine() -> str:
     return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def _present(figures: "list[Figure]", options: argparse.Namespace) -> None:
+def _present(part: str, measured: "dict[str, list[Figure]]", options: argparse.Namespace) -> None:
+    """Tell the figures of a part, and keep those of all parts so far."""
     from triquad_tools.benchmarks.figures import markdown
 
+    figures = measured[part]
     title = f"{datetime.date.today().isoformat()}, {machine()}, street {options.seed}"
     rows = [Row(figure.name, figure.shown, _note(figure)) for figure in figures]
-    print_rows(title, rows)
+    print_rows(f"{title}, part {part}", rows)
     if options.json is not None:
-        shown = [asdict(figure) for figure in figures]
+        shown = [{"part": of} | asdict(one) for of in measured for one in measured[of]]
         result = {"title": title, "street": options.seed, "figures": shown}
         options.json.write_text(json_text(result) + "\n", encoding="utf-8")
     if options.record is not None:
         with options.record.open("a", encoding="utf-8") as page:
-            page.write("\n" + markdown(title, figures))
-    if options.plot is not None:
+            page.write("\n" + markdown(f"{title}, part {part}", figures))
+    if options.plot is not None and part == "tradeoffs":
         from triquad_tools.benchmarks.tradeoff_sheet import Tradeoffs, draw_tradeoffs
 
         draw_tradeoffs(Tradeoffs(title, options.seed, figures), options.plot)
