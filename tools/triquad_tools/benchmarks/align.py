@@ -10,6 +10,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_map.questions.align import Alignment, AlignOptions, align
 from triquad_map.view import MapView
 from triquad_sensors.sweep import PosedScan
+from triquad_server.settings import Settings
 
 from triquad_tools.benchmarks.figures import Figure
 from triquad_tools.benchmarks.street import BenchStreet, settled_mapper
@@ -89,10 +90,11 @@ def on_street(made: BenchStreet) -> PlacedScans:
     return PlacedScans(view, tuple(scan(scene, pose, rng) for pose in poses))
 
 
-def recorded(path: Path, scans: int | None = None) -> PlacedScans:
+def recorded(path: Path, scans: int | None = None, settings: Settings | None = None) -> PlacedScans:
     """The map of a recorded folder (of its first ``scans``) without every 7th, and those."""
     of_folder = recorded_scans(path, scans)
-    return PlacedScans(settled_mapper(path.name, of_folder.mapped).publish(), of_folder.withheld)
+    mapper = settled_mapper(path.name, of_folder.mapped, settings)
+    return PlacedScans(mapper.publish(), of_folder.withheld)
 
 
 def check_recorded(part: str, folder: Path | None) -> None:
