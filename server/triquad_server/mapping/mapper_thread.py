@@ -3,11 +3,9 @@
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from triquad_format.wire.messages import FieldFit, ResetReply, ResetRequest, Scan
 from triquad_map.compiled.priority import lower_priority
@@ -15,10 +13,11 @@ from triquad_map.compiled.priority import lower_priority
 from triquad_server.counter import Counter
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import SurfaceHistory
-from triquad_server.errors import MapLostError, MapperStoppedError, ScanRefusedError
+from triquad_server.errors import MapLostError, ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mapping.command_queue import CommandQueue
 from triquad_server.mapping.map_fit import map_fit
 from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper import Mapper
@@ -78,14 +77,6 @@ class Forgotten:
     epoch: int  # the first that shows it
 
 
-@dataclass(frozen=True)
-class _Command:
-    """What is to be run on the mapper thread, and who waits for it."""
-
-    run: Callable[[Mapper], Any]
-    result: Future[Any]
-
-
 class MapperThread:
     """Runs a :class:`Mapper`; everything that touches the live map goes through here."""
 
@@ -109,9 +100,7 @@ class MapperThread:
         self._failed = failed
         self.time = ThreadTime()
         self._warnings = warnings
-        self._lock = threading.Lock()
-        self._commands: deque[_Command] = deque()
-        self.ended: str | None = None  # why there are no more commands
+        self._commands = CommandQueue()
         self._wake = threading.Event()
         self._publish_soon = threading.Event()
         self._resting = threading.Event()
@@ -133,6 +122,11 @@ class MapperThread:
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
 
+    @property
+    def ended(self) -> str | None:
+        """Why the thread takes no more commands, once it does not."""
+        return self._commands.ended
+
     def start(self) -> None:
         """Begin to map."""
         self._thread.start()
@@ -152,7 +146,7 @@ class MapperThread:
         self._stopping.set()
         self._wake.set()
         if self._thread.ident is None:
-            self._refuse_commands("the mapper was never started")
+            self._commands.end("the mapper was never started")
         else:
             self._thread.join()
 
@@ -171,11 +165,7 @@ class MapperThread:
         Raises:
             MapperStoppedError: the thread has ended, or ends before it comes to the command.
         """
-        result: Future[ResultT] = Future()
-        with self._lock:
-            if self.ended is not None:
-                raise MapperStoppedError(self.ended)
-            self._commands.append(_Command(command, result))
+        result = self._commands.add(command)
         self._wake.set()
         return result.result()
 
@@ -221,7 +211,7 @@ class MapperThread:
             _log.exception("the mapper was stopped by an internal error")
             self._failed()
         finally:
-            self._refuse_commands(ended)
+            self._commands.end(ended)
 
     def _turn_safely(self) -> None:
         """As :meth:`_turn`; too little memory to train or publish holds it up for a while only."""
@@ -274,7 +264,7 @@ class MapperThread:
         return self._unpublished and now >= self._next_publish
 
     def _run_commands(self) -> None:
-        while (command := self._next_command()) is not None:
+        while (command := self._commands.take()) is not None:
             self.time.begin(Activity.COMMANDS)
             try:
                 result = command.run(self._mapper)
@@ -284,18 +274,6 @@ class MapperThread:
                 command.result.set_exception(error)
             else:
                 command.result.set_result(result)
-
-    def _next_command(self) -> _Command | None:
-        with self._lock:
-            return self._commands.popleft() if self._commands else None
-
-    def _refuse_commands(self, why: str) -> None:
-        """Take no more commands; those that are pending fail."""
-        with self._lock:
-            self.ended = why
-            pending, self._commands = self._commands, deque()
-        for command in pending:
-            command.result.set_exception(MapperStoppedError(why))
 
     def _ingest_scans(self) -> bool:
         """Take in the oldest scan of each source, for a moment; False where none waits.

@@ -1,0 +1,56 @@
+"""Commands for the thread that owns the live map, and whoever waits for what they return."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from triquad_server.errors import MapperStoppedError
+from triquad_server.mapping.mapper import Mapper
+
+ResultT = TypeVar("ResultT")
+
+
+@dataclass(frozen=True)
+class Command:
+    """What is to be run, and who waits for it."""
+
+    run: Callable[[Mapper], Any]
+    result: Future[Any]
+
+
+class CommandQueue:
+    """Commands in the order in which they came, until there are no more."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._commands: deque[Command] = deque()
+        self.ended: str | None = None  # why there are no more
+
+    def add(self, run: Callable[[Mapper], ResultT]) -> Future[ResultT]:
+        """Add a command; what it returns, or raises, is the future's result.
+
+        Raises:
+            MapperStoppedError: there are no more.
+        """
+        result: Future[ResultT] = Future()
+        with self._lock:
+            if self.ended is not None:
+                raise MapperStoppedError(self.ended)
+            self._commands.append(Command(run, result))
+        return result
+
+    def take(self) -> Command | None:
+        """The oldest command, which is no longer in the queue; None where there is none."""
+        with self._lock:
+            return self._commands.popleft() if self._commands else None
+
+    def end(self, why: str) -> None:
+        """Take no more commands; those that wait fail with :class:`MapperStoppedError`."""
+        with self._lock:
+            self.ended = why
+            pending, self._commands = self._commands, deque()
+        for command in pending:
+            command.result.set_exception(MapperStoppedError(why))
