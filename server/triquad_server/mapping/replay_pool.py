@@ -9,23 +9,28 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
+from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.row_access import prefetch_row
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import (
     Index,
     VoxelIndex,
-    block_key,
-    find_row,
-    pack,
     with_room,
 )
 from triquad_map.places import place_keys
 
 from triquad_server.engine.live_field import Batch
 from triquad_server.engine.memory import ArrayMemory, Memory
+from triquad_server.mapping.ray_bins import (
+    BIN_LEAVES,
+    BINS,
+    best_to_push_out,
+    bins_of,
+    count_in_bins,
+    put_rays,
+    rays_ending_in,
+    remove_ending_in,
+)
 from triquad_server.mapping.ray_table import (
     COLUMNS,
     END,
@@ -39,144 +44,11 @@ from triquad_server.mapping.ray_table import (
 if TYPE_CHECKING:
     from triquad_server.mapping.device_rays import DeviceRays
 
-_BIN_LEAVES = 4.0
-_BINS = 1 << 18
-_AHEAD = 16  # places that are brought into the cache before their turn
 _NO_LIMIT = 1 << 62
 _ROOM = 1.1  # at most, of the capacity: it grows with the map
 
 RAY_BYTES = math.ceil(_ROOM * 4 * (COLUMNS + 1))
 """Of a ray, with where its origin is, and with the room beside it."""
-
-
-@inner_kernel()
-def _bin(row: Floats, bin_m: float) -> int:
-    mixed: int = np.int64(0)
-    for axis, prime in enumerate((73856093, 19349663, 83492791)):
-        mixed ^= int(np.floor(row[END + axis] / bin_m)) * prime
-    return mixed & (_BINS - 1)
-
-
-@kernel()
-def _count(rows: Floats, bin_m: float) -> Ints:
-    """How many rays [N] end in each bin."""
-    occupancy = np.zeros(_BINS, np.int32)
-    for i in range(len(rows)):
-        occupancy[_bin(rows[i], bin_m)] += 1
-    return occupancy
-
-
-@kernel()
-def _best_to_push_out(
-    size: int,
-    count: int,
-    first: int,
-    stride: int,
-    offset: int,
-    rows: Floats,
-    bin_m: float,
-    occupancy: Ints,
-) -> Longs:
-    """Different places whose rays are the best to push out, ``count <= size // 2`` of them.
-
-    The pool is paired up, each place once, and of a pair the one goes whose bin holds more.
-    """
-    half = size // 2
-    chosen = np.empty(count, np.int64)
-    for i in range(count):
-        left = (first + i * stride) % half
-        right = half + (left + offset) % half
-        on_left, on_right = (
-            occupancy[_bin(rows[left], bin_m)],
-            occupancy[_bin(rows[right], bin_m)],
-        )
-        chosen[i] = left if on_left > on_right else right
-    return chosen
-
-
-@kernel()
-def _put(
-    new: RayTable,
-    bin_m: float,
-    places: Longs,
-    used: int,
-    rows: Floats,
-    origin_of: Ints,
-    occupancy: Ints,
-) -> None:
-    """Put new rays into places; those below ``used`` hold one that is pushed out."""
-    for i in range(len(places)):
-        prefetch_row(rows, places[min(i + _AHEAD, len(places) - 1)])
-        place = places[i]
-        if place < used:
-            occupancy[_bin(rows[place], bin_m)] -= 1
-        rows[place] = new.rows[i]
-        origin_of[place] = new.origin_of[i]
-        occupancy[_bin(new.rows[i], bin_m)] += 1
-
-
-@kernel(inline="always")
-def _voxel(row: Floats, leaf_m: float, middle: float) -> tuple[int, int, int]:
-    """The voxel in which a ray ends."""
-    return (
-        int(np.floor(row[END] / leaf_m + middle)),
-        int(np.floor(row[END + 1] / leaf_m + middle)),
-        int(np.floor(row[END + 2] / leaf_m + middle)),
-    )
-
-
-@kernel()
-def _ending_in(blocks: Index, leaf_m: float, middle: float, rows: Floats) -> Longs:
-    """Which rays [N] end in blocks of voxels."""
-    chosen = np.empty(len(rows), np.int64)
-    count = 0
-    for i in range(len(rows)):
-        x, y, z = _voxel(rows[i], leaf_m, middle)
-        if find_row(blocks, block_key(x, y, z)) >= 0:
-            chosen[count] = i
-            count += 1
-    ending: Longs = chosen[:count].copy()
-    return ending
-
-
-@kernel()
-def _bins_of(voxels: Longs, leaf_m: float, middle: float) -> Bools:
-    """Which bins hold any part of ``voxels`` [N, 3]."""
-    chosen = np.zeros(_BINS, np.bool_)
-    corner = np.zeros(COLUMNS, np.float32)
-    for voxel in voxels:
-        for number in range(8):
-            for axis in range(3):
-                inset = 0.99 if number >> axis & 1 else 0.01
-                corner[END + axis] = (voxel[axis] + inset - middle) * leaf_m
-            chosen[_bin(corner, _BIN_LEAVES * leaf_m)] = True
-    return chosen
-
-
-@kernel()
-def _remove_ending_in(
-    gone: Index,
-    bins_of_gone: Bools,
-    leaf_m: float,
-    middle: float,
-    size: int,
-    rows: Floats,
-    origin_of: Ints,
-    occupancy: Ints,
-) -> int:
-    """Remove the rays that end in voxels, and put the last ones there; returns the size."""
-    i = 0
-    while i < size:
-        own_bin = _bin(rows[i], _BIN_LEAVES * leaf_m)
-        if bins_of_gone[own_bin]:
-            x, y, z = _voxel(rows[i], leaf_m, middle)
-            if find_row(gone, pack(x, y, z)) >= 0:
-                occupancy[own_bin] -= 1
-                size -= 1
-                rows[i], origin_of[i] = rows[size], origin_of[size]
-                continue
-        i += 1
-    return size
 
 
 class ReplayPool:
@@ -193,7 +65,7 @@ class ReplayPool:
         """No limit yet; ``team`` draws samples, unless ``memory`` is that of another device."""
         self._settings = settings
         self._capacity = _NO_LIMIT
-        self._bin_m = _BIN_LEAVES * settings.leaf_m
+        self._bin_m = BIN_LEAVES * settings.leaf_m
         self._middle = float(1 << (settings.depth - 1))  # of the region, voxels
         self._team = team
         self.placement = placement
@@ -205,7 +77,7 @@ class ReplayPool:
         self._origins = np.zeros((0, 3), np.float32)
         self._origin_count = 0
         self._on_device = _rays_on_device(memory, placement, seed)
-        self._occupancy = np.zeros(_BINS, np.int32)  # rays that end in each bin
+        self._occupancy = np.zeros(BINS, np.int32)  # rays that end in each bin
         self._fresh = np.zeros(0, np.int64)
         self._attended = np.zeros(0, np.int64)
         self._blocks: Index | None = None  # in which the rays end that are drawn on at random
@@ -238,7 +110,7 @@ class ReplayPool:
         new = RayTable(rows, origin_of, self._origins)
         self._extend(used + room)
         self._select_anew(places, new.rows)
-        _put(
+        put_rays(
             new,
             self._bin_m,
             places,
@@ -323,9 +195,9 @@ class ReplayPool:
     def forget_ends(self, voxels: Longs) -> None:
         """Drop the rays that end in ``voxels`` [N, 3]."""
         leaf_m, middle = self._settings.leaf_m, self._middle
-        self._size = _remove_ending_in(
+        self._size = remove_ending_in(
             VoxelIndex.of_cells(voxels).arrays,
-            _bins_of(voxels, leaf_m, middle),
+            bins_of(voxels, leaf_m, middle),
             leaf_m,
             middle,
             self._size,
@@ -354,7 +226,7 @@ class ReplayPool:
             return None
         if self._focused is None:
             rows = self._rows[: self._size]
-            self._focused = _ending_in(self._blocks, self._settings.leaf_m, self._middle, rows)
+            self._focused = rays_ending_in(self._blocks, self._settings.leaf_m, self._middle, rows)
         return self._focused if len(self._focused) else None
 
     def _select_anew(self, places: Longs, rows: Floats) -> None:
@@ -365,7 +237,7 @@ class ReplayPool:
         is_other[places] = True
         self._attended = self._attended[~is_other[self._attended]]
         if self._blocks is not None and self._focused is not None:
-            inside = _ending_in(self._blocks, self._settings.leaf_m, self._middle, rows)
+            inside = rays_ending_in(self._blocks, self._settings.leaf_m, self._middle, rows)
             kept = self._focused[~is_other[self._focused]]
             self._focused = np.concatenate([kept, places[inside]])
 
@@ -374,7 +246,7 @@ class ReplayPool:
         rows, origin_of = self._rows[places], self._origin_of[places]
         self._rows, self._origin_of = rows, origin_of
         self._size = len(places)
-        self._occupancy = _count(rows, self._bin_m)
+        self._occupancy = count_in_bins(rows, self._bin_m)
         self._fresh = self._fresh[:0]
         self._attended = self._attended[:0]
         self._focused = None
@@ -429,7 +301,7 @@ class ReplayPool:
             return self._fresh[:0]
         first, offset = self._rng.integers(half, size=2)
         stride = _coprime(half)
-        return _best_to_push_out(
+        return best_to_push_out(
             self._size, count, first, stride, offset, self._rows, self._bin_m, self._occupancy
         )
 
