@@ -26,6 +26,10 @@ _SURE = 5.0
 _LEAST_RISE = 0.02
 """And as if by so much more error, in leaves: 4 mm at the default leaf."""
 
+_LEAST_SHARE = 0.15
+"""And by this share of its mean square error, most of which is the sensor's noise: where leaves are
+small and a camera is noisy, far more than the rise above."""
+
 _SEEN_ANEW = 0.1
 """Where this share of the rays is new, the place is being learnt."""
 
@@ -65,23 +69,26 @@ class Judgement:
         self._best = np.zeros(0)
         self._repairs: dict[int, int] = {}  # in a row, of places that have forgotten
 
-    def judge(self, rows: Floats, sdf: NDArray[np.floating]) -> JudgedPlaces:
+    def judge(
+        self, rows: Floats, sdf: NDArray[np.floating], *, may_repair: bool = True
+    ) -> JudgedPlaces:
         """Judge the field by held-out rays.
 
         Args:
             rows: [N, COLUMNS] of the rays' table.
             sdf: [N] what the field says where they end, metres.
+            may_repair: what has forgotten may be learnt again; else it is taken as it is.
         """
         keys = ray_keys(rows, self._settings)
         best = self._best_of(keys)
         places = Places.of(rows[:, END : END + 3], self._settings)
         rises = _rises(sdf, best, places)
         seen_anew = rises.counts < (1 - _SEEN_ANEW) * places.rays
-        worse = _are_sure(rises, _LEAST_RISE * self._settings.leaf_m) & ~seen_anew
-        before = len(self._repairs)
-        forgotten = worse & self._may_be_repaired(places.keys, worse)
-        given_up = int((worse & ~forgotten).sum())
-        still = sum(count > 1 for count in self._repairs.values())
+        worse = self._are_sure(rises, _means_of_squares(best, places)) & ~seen_anew
+        still_worse = set(places.keys[worse].tolist())
+        repaired = sum(place not in still_worse for place in self._repairs)
+        forgotten = worse & may_repair
+        forgotten &= self._may_be_repaired(places.keys, forgotten)
         is_best = ((rises.means < 0) | seen_anew | worse) & ~forgotten
         now_best = is_best[places.place_of] | np.isnan(best)
         self._remember(keys, np.where(now_best, sdf, best))
@@ -89,9 +96,15 @@ class Judgement:
             **vars(PlaceFits.of(places, sdf)),
             forgotten=forgotten,
             forgotten_keys=places.keys[forgotten],
-            repaired=before - still - given_up,
-            given_up=given_up,
+            repaired=repaired,
+            given_up=int((worse & ~forgotten).sum()),
         )
+
+    def _are_sure(self, rises: GroupMeans, before: Doubles) -> Bools:
+        """Where the field is worse for sure than its mean square errors ``before`` [P]."""
+        least = np.maximum((_LEAST_RISE * self._settings.leaf_m) ** 2, _LEAST_SHARE * before)
+        sure = rises.means > np.maximum(_SURE * rises.errors, least)
+        return sure & (rises.counts >= _LEAST_RAYS)
 
     def _best_of(self, keys: Longs) -> Doubles:
         """What is remembered of rays; NaN where nothing is."""
@@ -120,7 +133,7 @@ def _rises(sdf: NDArray[np.floating], best: Doubles, places: Places) -> GroupMea
     return GroupMeans.of(rises[is_known], places.place_of[is_known], len(places.keys))
 
 
-def _are_sure(rises: GroupMeans, rise_m: float) -> Bools:
-    """Where the field is worse for sure, as if by an error of ``rise_m`` beside the noise."""
-    sure = rises.means > np.maximum(_SURE * rises.errors, rise_m**2)
-    return sure & (rises.counts >= _LEAST_RAYS)
+def _means_of_squares(best: Doubles, places: Places) -> Doubles:
+    """The mean square [P] of what is known of the rays of each place; 0 where nothing is."""
+    is_known = ~np.isnan(best)
+    return GroupMeans.of(best[is_known] ** 2, places.place_of[is_known], len(places.keys)).means

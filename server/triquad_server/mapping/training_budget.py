@@ -8,6 +8,9 @@ from triquad_server.settings import TrainingSettings
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
 _REPAIR_SHARE = 0.5  # of a batch, that is drawn where the field has forgotten
 _REPAIR_VISITS = 16  # to each ray there
+_REPAIR_ROUNDS = 3
+"""So often in a row what was forgotten is learnt again; then there must be new rays first. Else two
+places that make each other forget would do so for ever."""
 
 
 class Step(NamedTuple):
@@ -29,6 +32,7 @@ class TrainingBudget:
         self._most = 0  # that may be owed
         self._fresh = 0  # of the samples, those that are to be on rays of the newest scan
         self._repair = 0  # and those in places that have forgotten
+        self._rounds = 0  # of repair, since there were new rays
         self._new_rays = 0  # since nothing was owed
 
     @property
@@ -36,8 +40,15 @@ class TrainingBudget:
         """Whether rays of the newest scan have yet to be learnt from."""
         return self._fresh > 0
 
+    @property
+    def may_repair(self) -> bool:
+        """Whether what was forgotten may be learnt again."""
+        return self._rounds < _REPAIR_ROUNDS
+
     def add(self, rays: int) -> None:
         """There are new rays to learn from."""
+        if rays:
+            self._rounds = 0
         if self.samples == 0:
             self._new_rays = 0
         self._new_rays += rays
@@ -65,6 +76,8 @@ class TrainingBudget:
 
     def repair(self, rays: int) -> None:
         """So many rays are in places that have forgotten: learn these again, and nothing else."""
+        if rays:
+            self._rounds += 1
         self._repair = _REPAIR_VISITS * rays
         needed = int(self._repair / _REPAIR_SHARE)
         self.samples = max(self.samples, min(needed, self._most))

@@ -84,6 +84,31 @@ def test_what_cannot_be_repaired_is_taken_as_it_is() -> None:
     assert sum(places.repaired for places in tries) == 0
 
 
+def test_what_may_not_be_repaired_is_taken_as_it_is() -> None:
+    judgement = Judgement(FIELD)
+    judged(judgement, off(FIRST, 0.0))
+    assert judged(judgement, off(FIRST, 0.03)).forgotten.sum() == 1
+    worse = (NOISE + off(SECOND, 0.03)).astype(np.float32)
+    places = judgement.judge(ROWS, worse, may_repair=False)
+    assert (places.forgotten.any(), places.repaired, places.given_up) == (False, 1, 1)
+    assert judged(judgement, off(SECOND, 0.03)).given_up == 0  # it is what is known now
+
+
+@pytest.mark.parametrize("noise_m", [0.002, 0.02])
+def test_a_rise_that_is_small_beside_the_noise_is_none(noise_m: float) -> None:
+    noise = RNG.normal(0, noise_m, 100_000)
+    rows = RNG.uniform(0.01, 0.3, (len(noise), 4)).astype(np.float32)
+    side = np.where(np.arange(len(noise)) % 2, 1, -1)
+
+    def is_forgotten(share: float) -> bool:
+        judgement = Judgement(FieldSettings(leaf_m=0.01))
+        judgement.judge(rows, noise)
+        return bool(judgement.judge(rows, noise + share * noise_m * side).forgotten.any())
+
+    assert not is_forgotten(0.3)  # 9 % of its square
+    assert is_forgotten(0.5)
+
+
 def test_a_place_that_is_seen_anew_may_change() -> None:
     judgement = Judgement(FIELD)
     judgement.judge(ROWS[FIRST][:300], NOISE[:300].astype(np.float32))
@@ -145,6 +170,23 @@ def test_forgetting_is_found_told_and_repaired() -> None:
         after = mapper.publish()
     assert surface_error(after, world()) < 1.1 * before_m
     assert map_fit(mapper.regions).repaired > 0
+
+
+def test_a_map_that_forgets_again_and_again_settles() -> None:
+    mapper = settled_mapper(settings(samples_per_ray=6.0), world(3))
+    mapper.publish()
+    rounds = 0
+    while True:
+        damage(mapper)
+        settle(mapper)
+        mapper.publish()  # judged, and learnt again
+        if mapper.settled:
+            break
+        rounds += 1
+    assert 1 <= rounds <= 4 * len(mapper.regions)
+    fit = map_fit(mapper.regions)
+    assert fit is not None
+    assert fit.given_up > 0
 
 
 def test_where_all_rays_are_held_out_there_is_nothing_to_train_on() -> None:
