@@ -24,6 +24,7 @@ from triquad_tools.recordings.folders.kitti import KittiFolder, read_kitti_folde
 
 SEOSAN = Path(__file__).resolve().parents[3] / "shared" / "data" / "seosan01"
 PERIOD_S = 0.1
+SCANS = 12
 WITHHELD_EVERY = 4
 RANGES_M = (2.0, 50.0)
 SETTINGS = Settings(
@@ -42,8 +43,8 @@ def mapped(
     folder: KittiFolder, way: Callable[[Client, str], AbstractContextManager[Publish]]
 ) -> float:
     """The median |SDF| at scans that were withheld, of a map of the others, in metres."""
-    withheld = [i for i in range(len(folder)) if is_withheld(i, WITHHELD_EVERY)]
-    taken = [i for i in range(len(folder)) if i not in withheld]
+    withheld = [i for i in range(SCANS) if is_withheld(i, WITHHELD_EVERY)]
+    taken = [i for i in range(SCANS) if i not in withheld]
     with (
         servers.running_service(SETTINGS) as endpoint,
         triquad_client.connect(endpoint) as client,

@@ -18,7 +18,7 @@ from triquad_tools.simulation.solids import box, half_space
 
 VOXEL_M = 0.2
 SETTINGS = Settings.model_validate(
-    {"field": {"depth": 8}, "training": {"batch": 4096, "samples_per_ray": 20.0}}
+    {"field": {"depth": 8}, "training": {"batch": 4096, "samples_per_ray": 10.0}}
 )
 
 

@@ -41,9 +41,7 @@ def _check_port(endpoint: str) -> None:
     protocol, _, address = endpoint.partition("/")
     port = address.partition("#")[0].partition("?")[0].rpartition(":")[2]
     if protocol in _WITH_PORT and not _is_port(port):
-        raise FormatError(
-            f"endpoint {endpoint!r}: {port!r} is not a port up to 65535; write {protocol}/HOST:PORT"
-        )
+        raise FormatError(f"endpoint {endpoint!r}: {port!r} is not a port up to 65535; {_FORMS}")
 
 
 def _is_port(text: str) -> bool:
