@@ -101,11 +101,6 @@ def _run(options: argparse.Namespace) -> int:
     if options.print_settings:
         sys.stdout.write(settings_toml(settings))
         return OK
-    # Only now, since it takes seconds to import.
-    from triquad_server.launch import run_server
-
-    stops: Stops = queue.SimpleQueue()
-    _on_signals(lambda *_: stops.put(Stop.ASKED))
     network = NetworkOptions(
         listen=tuple(map(full_endpoint, options.listen)),
         connect=tuple(map(full_endpoint, options.connect)),
@@ -113,17 +108,20 @@ def _run(options: argparse.Namespace) -> int:
         config_file=options.config,
         multicast_scouting=options.multicast_scouting,
     )
-    why = run_server(
-        LaunchOptions(
-            map_name=options.map,
-            network=network,
-            settings=settings,
-            store=options.store,
-            device=options.device,
-            restore=options.restore,
-        ),
-        stops,
+    launch = LaunchOptions(
+        map_name=options.map,
+        network=network,
+        settings=settings,
+        store=options.store,
+        device=options.device,
+        restore=options.restore,
     )
+    # Only now, since it takes seconds to import.
+    from triquad_server.launch import run_server
+
+    stops: Stops = queue.SimpleQueue()
+    _on_signals(lambda *_: stops.put(Stop.ASKED))
+    why = run_server(launch, stops)
     return OK if why is Stop.ASKED else UNEXPECTED
 
 

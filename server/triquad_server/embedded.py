@@ -170,8 +170,8 @@ def serve(
 ) -> Server:
     """Start a map server within this program, and return once it serves.
 
-    The very first start compiles for some 15 s, as a warning in the log says; scans wait for as
-    long again.
+    The very first start compiles for half a minute or more, as a warning in the log says: it
+    answers after about half of that, and scans wait for the rest.
 
     Args:
         store: folder for checkpoints; without one the map is not kept. The server goes on from
@@ -202,7 +202,16 @@ def serve(
     folder = None if store is None else Path(store)
     with _free_endpoint() if listen is None else nullcontext(full_endpoint(listen)) as endpoint:
         network = NetworkOptions(listen=(endpoint,))
-        return Server(LaunchOptions(map, network, loaded, folder, device, restore))
+        return Server(
+            LaunchOptions(
+                map_name=map,
+                network=network,
+                settings=loaded,
+                store=folder,
+                device=device,
+                restore=restore,
+            )
+        )
 
 
 def _loaded(settings: "Settings | str | Path | None") -> "Settings":

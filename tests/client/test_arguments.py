@@ -55,6 +55,7 @@ def test_columns_after_the_third_are_left_out(client: Client) -> None:
             lambda client: client.query_rays((0, 0, 0), CLOUD, 5.0, through_unknown="no"),
             "through_unknown = 'no'",
         ),
+        (lambda client: client.download_map("map.triquad", "yes"), "training = 'yes'"),
     ],
 )
 def test_what_is_neither_true_nor_false_is_refused_here(

@@ -64,6 +64,7 @@ def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(tmp_pa
         server.process.send_signal(signal.SIGTERM)
         assert server.wait() == 0
     assert f"ready: map 'default' on {server.endpoint}, epoch 1" in server.log
+    assert "stopped" in server.log
     newest = checkpoints(tmp_path)[-1]
     assert f"the map is in {newest}, as of epoch {before.epoch}" in server.log
     assert read_map(newest).epoch == before.epoch

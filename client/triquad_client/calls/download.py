@@ -29,10 +29,10 @@ def newest_file(training: bool, max_bytes: int) -> Call[MapInfo]:
     Raises:
         DownloadError: it is larger than ``max_bytes``.
     """
-    request = Ask(
-        keys.MAP_INFO, MapInfoRequest(training), MapInfo, background=True, min_timeout_s=_PREPARE_S
+    request = MapInfoRequest(checks.flag("training", training))
+    info = yield from ask(
+        Ask(keys.MAP_INFO, request, MapInfo, background=True, min_timeout_s=_PREPARE_S)
     )
-    info = yield from ask(request)
     if info.bytes > max_bytes:
         raise DownloadError(
             f"the server announces a map file of {info.bytes} bytes, more than the {max_bytes} "

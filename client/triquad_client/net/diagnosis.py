@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
+from triquad_format.wire.endpoints import Locator
 
 _PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "serial", "vsock", "unixsock-stream", "unixpipe")
 _LONGEST_S = 1.0  # for each attempt
@@ -61,12 +62,11 @@ def _of_files(config: zenoh.Config) -> Iterator[str]:
 
 
 def _of_endpoint(endpoint: str, config: zenoh.Config, timeout_s: float) -> str | None:
-    protocol, _, address = endpoint.partition("/")
+    protocol, host, port = Locator.of(endpoint)
     if protocol not in _PROTOCOLS:
         return (
             f"{protocol.rstrip(':')!r} is no protocol of Zenoh: use tcp/HOST:PORT, or tls/HOST:PORT"
         )
-    host, _, port = address.partition("#")[0].partition("?")[0].rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if protocol not in ("tcp", "tls") or not host or not (port.isascii() and port.isdigit()):
         return None

@@ -1,5 +1,7 @@
 """Where a server listens and is found, as people write it and as Zenoh takes it."""
 
+from typing import NamedTuple
+
 from triquad_format.errors import FormatError
 
 DEFAULT_PORT = 7447
@@ -7,6 +9,21 @@ DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 
 _FORMS = "use HOST, HOST:PORT or an endpoint of Zenoh such as tcp/robot:7447"
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
+
+
+class Locator(NamedTuple):
+    """An endpoint of Zenoh without its metadata and configuration."""
+
+    protocol: str
+    host: str  # an address of IPv6 in brackets; of what has no port, empty
+    port: str
+
+    @classmethod
+    def of(cls, endpoint: str) -> "Locator":
+        """The parts of an endpoint, such as ``tcp/robot:7447``, whatever they are."""
+        protocol, _, address = endpoint.partition("/")
+        host, _, port = address.partition("#")[0].partition("?")[0].rpartition(":")
+        return cls(protocol, host, port)
 
 
 def full_endpoint(text: str, protocol: str = "tcp") -> str:
@@ -38,8 +55,7 @@ def _check_port(endpoint: str) -> None:
     Raises:
         FormatError: it is.
     """
-    protocol, _, address = endpoint.partition("/")
-    port = address.partition("#")[0].partition("?")[0].rpartition(":")[2]
+    protocol, _, port = Locator.of(endpoint)
     if protocol in _WITH_PORT and not _is_port(port):
         raise FormatError(f"endpoint {endpoint!r}: {port!r} is not a port up to 65535; {_FORMS}")
 
@@ -50,10 +66,9 @@ def _is_port(text: str) -> bool:
 
 def is_of_this_machine(endpoint: str) -> bool:
     """Whether only programs of this machine reach an endpoint of Zenoh that is listened on."""
-    protocol, _, address = endpoint.partition("/")
+    protocol, host, _ = Locator.of(endpoint)
     if protocol.startswith("unix"):
         return True
-    host, _, _ = address.partition("#")[0].partition("?")[0].rpartition(":")
     return host in ("localhost", "[::1]") or host.startswith("127.")
 
 

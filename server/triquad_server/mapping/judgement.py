@@ -82,9 +82,10 @@ class Judgement:
         keys = ray_keys(rows, self._settings)
         best = self._best_of(keys)
         places = Places.of(rows[:, END : END + 3], self._settings)
-        rises = _rises(sdf, best, places)
+        # By how much the squares rose at the same rays' ends.
+        rises = _means(sdf.astype(np.float64) ** 2 - best**2, places)
         seen_anew = rises.counts < (1 - _SEEN_ANEW) * places.rays
-        worse = self._are_sure(rises, _means_of_squares(best, places)) & ~seen_anew
+        worse = self._are_sure(rises, _means(best**2, places).means) & ~seen_anew
         still_worse = set(places.keys[worse].tolist())
         repaired = sum(place not in still_worse for place in self._repairs)
         forgotten = worse & may_repair
@@ -126,14 +127,7 @@ class Judgement:
         return fine
 
 
-def _rises(sdf: NDArray[np.floating], best: Doubles, places: Places) -> GroupMeans:
-    """By how much the squares of the field at the same rays' ends rose, for each place."""
-    rises = sdf.astype(np.float64) ** 2 - best**2
-    is_known = ~np.isnan(rises)
-    return GroupMeans.of(rises[is_known], places.place_of[is_known], len(places.keys))
-
-
-def _means_of_squares(best: Doubles, places: Places) -> Doubles:
-    """The mean square [P] of what is known of the rays of each place; 0 where nothing is."""
-    is_known = ~np.isnan(best)
-    return GroupMeans.of(best[is_known] ** 2, places.place_of[is_known], len(places.keys)).means
+def _means(values: Doubles, places: Places) -> GroupMeans:
+    """Of the rays' ``values`` [N] in each place, but for those that are NaN: nothing is known."""
+    is_known = ~np.isnan(values)
+    return GroupMeans.of(values[is_known], places.place_of[is_known], len(places.keys))

@@ -405,8 +405,7 @@ class LiveRegion:
             return field.evaluate(points, gradient=False).sdf
 
         sdf = at_ends(ends)
-        may_repair = self.budget.may_repair
-        self.places = places = self._judgement.judge(rows, sdf, may_repair=may_repair)
+        self.places = places = self._judgement.judge(rows, sdf, may_repair=self.budget.may_repair)
         rose = self.learnt.judge(ends, sdf, at_ends, settled=self.budget.samples == 0)
         self.repairs = self.repairs.after(places)
         if len(places.forgotten_keys):

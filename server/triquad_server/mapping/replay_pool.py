@@ -12,11 +12,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.team import Team
-from triquad_map.compiled.voxel_index import (
-    Index,
-    VoxelIndex,
-    with_room,
-)
+from triquad_map.compiled.voxel_index import Index, VoxelIndex, with_room
 from triquad_map.places import place_keys
 
 from triquad_server.engine.live_field import Batch

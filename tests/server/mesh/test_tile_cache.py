@@ -1,10 +1,10 @@
 """Tiles that are made where the surface changed, and that meet whenever they were made."""
 
+import functools
 import gc
 import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -136,9 +136,9 @@ def strip(scan: SimulatedScan, low_m: float) -> NDArray[np.float32]:
     return scan.points[(ends > low_m) & (ends < low_m + 2.5)]
 
 
-@cache
+@functools.cache
 def seen_in_strips() -> tuple[Epoch, ...]:
-    """A street of which more is seen from epoch to epoch, and all that was is trained on."""
+    """Epochs of a street of which more and more is seen, with training in between."""
     mapper = Mapper("test", settings(), "cpu")
     epochs: list[Epoch] = []
     for number, scan in enumerate(world(6).scans):

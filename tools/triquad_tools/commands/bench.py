@@ -92,8 +92,8 @@ def _bench(options: argparse.Namespace) -> int:
     alone = [part for part in PARTS if part in wanted and part not in _ON_STREET]
     _compile()
     measured: dict[str, list[Figure]] = {}
-    for measures in (_on_street(on_street, options), _alone(alone, options)):
-        for part, measure in measures.items():
+    for measures_of, parts in ((_on_street, on_street), (_alone, alone)):
+        for part, measure in measures_of(parts, options).items():
             measured[part] = measure()
             _present(part, measured, options)
     return OK
