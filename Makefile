@@ -1,8 +1,10 @@
 # make test      set up a virtual environment and run every check and test
+# make test-long   campaigns, deep fuzzing, every page of the browser, whole demonstrations: 45 minutes
 # make check     the checks alone: style, types, which package may import which
 # make docs      write the tables of docs/settings.md from the settings
 # make pictures  make the pictures of the documentation anew; those of the viewer need Chromium
 # make pretrained   train the MLP that regions begin with, on simulated streets: 10 minutes
+# make bench     how fast and how good triquad is on this machine; PART=core: one part of it
 # make campaign  try for 5 minutes to break a server and its files; CAMPAIGN_MINUTES=60: for an hour
 # make demo      set up a virtual environment and map a street, end to end
 VENV ?= .venv
@@ -15,14 +17,17 @@ CAMPAIGN_MINUTES ?= 5
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 
-.PHONY: campaign check clean demo docs pictures pretrained test
+.PHONY: bench campaign check clean demo docs pictures pretrained test test-long
 
 demo: $(INSTALLED)
 	$(BIN)/triquad-demo --out demo-out
 
 # Where several processes test, torch's threads would wait for each other: seven times as long.
 test: check
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m "not long" --durations=10
+
+test-long: $(INSTALLED)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m long --durations=10
 
 docs: $(INSTALLED)
 	$(BIN)/python docs/settings_tables.py
@@ -32,14 +37,17 @@ pictures: $(INSTALLED)
 	$(BIN)/python docs/top_picture.py
 	$(BIN)/python docs/viewer_pictures.py
 
+bench: $(INSTALLED)
+	$(BIN)/python -m bench $(PART) $(BENCH_FLAGS)
+
 campaign: $(INSTALLED)
-	PYTHONPATH=tests $(BIN)/python -m campaign --minutes $(CAMPAIGN_MINUTES)
+	PYTHONPATH=tests $(BIN)/python -m bench.campaign --minutes $(CAMPAIGN_MINUTES)
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/lint-imports
+	PYTHONPATH=. $(BIN)/lint-imports
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -48,7 +56,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $(INSTALLED)
 
 pretrained: $(INSTALLED)
-	$(BIN)/python -m triquad_tools.pretraining
+	$(BIN)/python -m bench.studies.pretraining
 
 clean:
 	rm -rf $(VENV) demo-out

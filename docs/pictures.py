@@ -88,7 +88,7 @@ def preview(out: Path) -> None:
 
 def tradeoffs(out: Path) -> None:
     """Accuracy by time, bytes and scan spacing; this one takes ten minutes."""
-    _run("triquad-bench", "tradeoffs", "--plot", out)
+    _run("python", "-m", "bench.studies.tradeoffs", out)
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {

@@ -14,12 +14,13 @@ from pictures import IMAGES, for_pages
 from PIL import Image
 from playwright.sync_api import Page
 from triquad_client import Client, connect
-from triquad_tools.benchmarks.browser import opened_page, running_browser, wait_until_drawn
 from triquad_tools.demo.server import DemoServer
 from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.simulation.street import street_drive
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
+
+from bench.clients.browser import opened_page, running_browser, wait_until_drawn
 
 PICTURES = ("viewer.gif", "viewer.png")
 

@@ -9,7 +9,8 @@ import triquad_client
 from support import servers
 from support.attacked import attacked_server, operation, points
 from triquad_format.wire import keys
-from triquad_tools.benchmarks.noisy_neighbours import neighbour
+
+from bench.clients.noisy_neighbours import neighbour
 
 LIMIT_S = 10.0  # a hundredth of what the requests would take
 

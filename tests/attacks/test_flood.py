@@ -8,8 +8,9 @@ import triquad_client
 from support import servers
 from support.attacked import attacked_server, operation, points
 from triquad_format.wire import keys
-from triquad_tools.benchmarks.noisy_neighbours import frozen_neighbours, neighbour
 from triquad_tools.demo.probe import Probe
+
+from bench.clients.noisy_neighbours import frozen_neighbours, neighbour
 
 SCANS = 40
 PERIOD_S = 0.1

@@ -8,7 +8,8 @@ from support import servers
 from support.attacked import attacked_server, operation
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.wire import keys
-from triquad_tools.benchmarks.noisy_neighbours import frozen_neighbours, neighbour
+
+from bench.clients.noisy_neighbours import frozen_neighbours, neighbour
 
 LIMIT_S = 10.0
 

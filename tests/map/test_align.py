@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support.alignments import Offset, attempts, displaced, recorded
 from support.exact_view import ExactView
 from support.small_world import settled_epoch, world
 from triquad_format.records.status import Status
 from triquad_map.questions.align import Alignment, AlignOptions, align, thinned
 from triquad_server.settings import Settings, TrainingSettings
-from triquad_tools.benchmarks.align import Offset, attempts, displaced, recorded
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid, box, cylinder, half_space

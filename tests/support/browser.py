@@ -5,8 +5,9 @@ from contextlib import contextmanager
 
 import pytest
 from playwright.sync_api import Browser
-from triquad_tools.benchmarks import browser
 from triquad_tools.console.command import ToolError
+
+from bench.clients import browser
 
 
 @contextmanager

@@ -9,7 +9,6 @@ import pytest
 WAIT_S = 60.0
 
 NAMES = {
-    "bench": "triquad-bench",
     "demo": "triquad-demo",
     "evaluate": "triquad-eval",
     "inspect": "triquad-inspect",

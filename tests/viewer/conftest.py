@@ -8,11 +8,12 @@ import pytest
 import triquad_client
 from playwright.sync_api import Browser, Page, expect
 from support.browser import running_browser
-from triquad_tools.benchmarks.browser import opened_page
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.open_maps import OpenMaps
 from triquad_tools.viewer.viewer import Viewer
+
+from bench.clients.browser import opened_page
 
 expect.set_options(timeout=60_000)  # a browser that draws in software takes seconds at times
 

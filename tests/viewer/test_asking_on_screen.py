@@ -10,11 +10,12 @@ from matplotlib.colors import to_rgb
 from playwright.sync_api import Browser, Locator, Page, expect
 from support.servers import WAIT_S, running_service, sphere
 from triquad_client import Client, Status, connect
-from triquad_tools.benchmarks.browser import opened_page, picture, wait_until, wait_until_drawn
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import BEHIND, DISTANCE_COLOURS
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import Viewer
+
+from bench.clients.browser import opened_page, picture, wait_until, wait_until_drawn
 
 TIMEOUT_MS = 60_000
 NUMBER = re.compile(r"-?\d+\.\d+")

@@ -7,11 +7,12 @@ from pathlib import Path
 from playwright.sync_api import Browser
 from support.changing_store import EMPTY, write_checkpoint
 from triquad_client.checks import Bounds
-from triquad_tools.benchmarks.browser import wait_until
 from triquad_tools.viewer.sources.file_source import FileFollower, FileSource
 from triquad_tools.viewer.sources.open_maps import OpenMaps
 from triquad_tools.viewer.sources.tile_maker import TileMaker, TileOrder
 from triquad_tools.viewer.viewer import Viewer
+
+from bench.clients.browser import wait_until
 
 
 class SlowSource(FileSource):

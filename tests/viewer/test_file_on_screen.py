@@ -8,7 +8,8 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, expect
 from support.changing_store import EMPTY, box_at, write_checkpoint
-from triquad_tools.benchmarks.browser import drawn_share, picture, wait_until, wait_until_drawn
+
+from bench.clients.browser import drawn_share, picture, wait_until, wait_until_drawn
 
 PageWithoutServer = Callable[[Path], Page]
 

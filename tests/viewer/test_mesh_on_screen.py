@@ -10,8 +10,9 @@ from support import servers
 from support.servers import learn, running_service, sphere
 from triquad_client import connect
 from triquad_format.records.arrays import Bytes
-from triquad_tools.benchmarks.browser import drawn_share, picture, wait_until, wait_until_drawn
 from triquad_tools.recordings.publishing import wait_until_settled
+
+from bench.clients.browser import drawn_share, picture, wait_until, wait_until_drawn
 
 GONE = re.compile("no server has a map|the link to the server is down")
 """Whichever of both is found out first."""

@@ -6,7 +6,8 @@ import numpy as np
 from playwright.sync_api import Page, expect
 from support.servers import running_service, sphere
 from triquad_client import Client, connect
-from triquad_tools.benchmarks.browser import picture, wait_until, wait_until_drawn
+
+from bench.clients.browser import picture, wait_until, wait_until_drawn
 
 
 def test_trail_newest_scan_and_figures(page_of: Callable[[str], Page]) -> None:

@@ -47,9 +47,8 @@ def _leaving_on_interrupt(command: str) -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-_run_with_server = partial(_run, extra="demo", needs=("torch", "foxglove_schemas_protobuf"))
+_run_with_server = partial(_run, extra="demo", needs=("numba", "foxglove_schemas_protobuf"))
 
-bench = partial(_run_with_server, "triquad-bench", "bench")
 demo = partial(_run_with_server, "triquad-demo", "demo")
 evaluate = partial(_run, "triquad-eval", "evaluate")
 inspect = partial(_run, "triquad-inspect", "inspect")

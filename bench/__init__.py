@@ -1,0 +1,1 @@
+"""Benchmarks, campaigns and studies: what measures triquad, and is not installed."""

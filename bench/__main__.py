@@ -1,0 +1,167 @@
+"""``make bench``: how fast and how good triquad is on this machine, part by part.
+
+Each part guards a promise of the README. Its figures are kept in ``bench/results``, and
+``docs/benchmarks.md`` is made of all that lie there.
+"""
+
+import argparse
+import datetime
+import sys
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from pathlib import Path
+
+from triquad_tools.console.arguments import seed
+from triquad_tools.console.command import ToolError, run
+from triquad_tools.console.progress import progress
+from triquad_tools.console.report import Row, print_rows
+
+from bench.figures import Figure
+from bench.results import RESULTS, Result, machine, write_page
+from bench.street import BenchStreet, bench_street
+
+_Measure = Callable[[argparse.Namespace], list[Figure]]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmarks: 0 done, whatever the figures; 1 a part failed; 2 wrong usage or input."""
+    options = _parser().parse_args(argv)
+    return run("bench", partial(_bench, options), failures=(ToolError, OSError))
+
+
+def _bench(options: argparse.Namespace) -> int:
+    """Measure part after part; the figures of one are kept before the next begins."""
+    _compile()
+    for part in options.parts or PARTS:
+        figures = PARTS[part](options)
+        today = datetime.date.today().isoformat()
+        earlier = Result.read(options.results, part)
+        remark = "" if earlier is None else earlier.remark
+        result = Result(part, today, machine(), options.seed, figures=figures, remark=remark)
+        print_rows(result.title, [Row(one.name, one.shown, one.verdict) for one in figures])
+        result.write(options.results)
+    write_page(options.results)
+    return 0
+
+
+def _compile() -> None:
+    """Compile all kernels, so that no part but "start" meets a first start."""
+    from triquad_server.settings import Settings  # slow to import
+    from triquad_server.warm_up import warm_up
+
+    with progress("compiling") as report:
+        warm_up(Settings(), "cpu", report=lambda stage: report(0.0, stage))
+
+
+@cache
+def _street(number: int) -> BenchStreet:
+    return bench_street(number)
+
+
+def _core(options: argparse.Namespace) -> list[Figure]:
+    from bench.parts.core import measure_core
+
+    return measure_core(_street(options.seed))
+
+
+def _server(options: argparse.Namespace) -> list[Figure]:
+    from bench.parts.neighbours import measure_neighbours
+    from bench.parts.server import measure_server
+
+    return measure_server(_street(options.seed)) + measure_neighbours(_street(options.seed))
+
+
+def _answers(options: argparse.Namespace) -> list[Figure]:
+    from bench.parts.answers import measure_planners
+
+    return measure_planners(_street(options.seed))
+
+
+def _file(options: argparse.Namespace) -> list[Figure]:
+    from bench.parts.file import measure_file
+    from bench.parts.offline import measure_offline
+    from bench.parts.store import measure_store
+
+    made = _street(options.seed)
+    return measure_file(made) + measure_offline(made) + measure_store(made)
+
+
+def _moving(options: argparse.Namespace) -> list[Figure]:
+    from bench.parts.moving import measure_moving
+    from bench.parts.parked import measure_parked
+
+    return measure_moving(options.seed, options.recorded) + measure_parked(options.seed)
+
+
+def _presets(options: argparse.Namespace) -> list[Figure]:
+    from bench.parts.presets import measure_presets
+
+    return measure_presets(options.seed)
+
+
+def _start(options: argparse.Namespace) -> list[Figure]:  # noqa: ARG001
+    from bench.parts.start import measure_start
+
+    return measure_start()
+
+
+def _viewer(options: argparse.Namespace) -> list[Figure]:
+    from bench.parts.viewer import measure_viewer  # needs a browser
+
+    return measure_viewer(_street(options.seed))
+
+
+PARTS: dict[str, _Measure] = {
+    "core": _core,
+    "server": _server,
+    "answers": _answers,
+    "file": _file,
+    "moving": _moving,
+    "presets": _presets,
+    "start": _start,
+    "viewer": _viewer,
+}
+
+
+def _part(name: str) -> str:
+    if name not in PARTS:
+        raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(PARTS)}")
+    return name
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bench",
+        description=f"Measure triquad on this machine: {', '.join(PARTS)}. All of it takes more "
+        "than an hour; nothing else should run meanwhile.",
+        epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage or input",
+    )
+    add = parser.add_argument
+    add(
+        "parts", nargs="*", type=_part, metavar="PART", help=f"of {', '.join(PARTS)} (default: all)"
+    )
+    add(
+        "--seed",
+        type=seed,
+        default=2,
+        metavar="N",
+        help="of streets, rooms and tables (default: 2)",
+    )
+    add(
+        "--recorded",
+        type=Path,
+        metavar="FOLDER",
+        help="KITTI-style scans that part moving maps twice over, too",
+    )
+    add(
+        "--results",
+        type=Path,
+        default=RESULTS,
+        metavar="FOLDER",
+        help="where figures are kept (default: bench/results)",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

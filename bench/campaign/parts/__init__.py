@@ -1,0 +1,1 @@
+"""What a campaign does to a server, one part a file."""

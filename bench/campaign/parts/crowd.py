@@ -1,0 +1,70 @@
+"""A crowd of clients that want too much, come and go, and invent names."""
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+import numpy as np
+import triquad_client
+from support import servers
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import Scan
+
+from bench.campaign.server_under_test import (
+    MAX_GROWTH_BYTES,
+    expect,
+    expect_honest_service,
+    server_under_test,
+)
+from bench.campaign.turn import Turn
+from bench.clients.noisy_neighbours import KINDS, neighbour
+
+_ROUND_S = 10
+_MOST_AT_ONCE = 4
+_SOURCES_A_SECOND = 50
+_HONEST_AT_M = 60.0  # where no ray of the others contradicts what an honest client has seen
+
+
+def run(turn: Turn) -> None:
+    """Let others come and go, round after round; an honest client comes after each."""
+    with server_under_test(turn) as server:
+        _use_honestly(server.endpoint)  # then all code that the others use is loaded
+        before = _beside_the_map(server.endpoint)
+        while not turn.over:
+            count = turn.random.randint(1, _MOST_AT_ONCE)
+            _round(turn, server.endpoint, turn.random.choices(sorted(KINDS), k=count))
+            expect_honest_service(server.endpoint, _HONEST_AT_M)
+            turn.did("seconds", _ROUND_S)
+            growth = _beside_the_map(server.endpoint) - before
+            turn.measured("growth MB", growth / 2**20)
+            expect(growth < MAX_GROWTH_BYTES, f"memory grew by {growth} bytes")
+
+
+def _use_honestly(endpoint: str) -> None:
+    """Ask once, and for little, for all that the others ask for."""
+    expect_honest_service(endpoint, _HONEST_AT_M)
+    with triquad_client.connect(endpoint) as client:
+        points = servers.sphere(100)
+        client.query_distance(points, unknown_distance=True)
+        client.query_segments(points[:50], points[50:], radius_m=0.3)
+
+
+def _beside_the_map(endpoint: str) -> int:
+    """Memory of the server without that of the map, which the crowd's scans make larger."""
+    with triquad_client.connect(endpoint) as client:
+        metrics = client.metrics()
+    return metrics.resident_bytes - sum(metrics.memory_bytes.values())
+
+
+def _round(turn: Turn, endpoint: str, kinds: Sequence[str]) -> None:
+    """Neighbours of these kinds at once, and scans of sources that were never heard of."""
+    with ExitStack() as stack, servers.raw_session(connect=endpoint) as session:
+        for kind in kinds:
+            stack.enter_context(neighbour(kind, endpoint, servers.MAP))
+        ends_s = time.monotonic() + _ROUND_S
+        while time.monotonic() < ends_s:
+            name = f"invented-{turn.random.getrandbits(60):x}"
+            points = np.array([[turn.random.gauss(0, 4) for _ in range(3)]], np.float32)
+            scan = Scan(points, np.eye(4), time.time_ns(), name, turn.random.getrandbits(60), 0)
+            session.put(keys.scan_key(servers.MAP, name), codec.encode(scan))
+            time.sleep(1 / _SOURCES_A_SECOND)

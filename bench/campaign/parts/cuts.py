@@ -1,0 +1,95 @@
+"""A network that drops connections amid messages, and holds them up."""
+
+import contextlib
+import threading
+import time
+from contextlib import closing
+
+import numpy as np
+import triquad_client
+from support import servers
+from triquad_client import TriquadError
+
+from bench.campaign.cutting_proxy import CuttingProxy
+from bench.campaign.server_under_test import (
+    MAX_GROWTH_BYTES,
+    WITHIN_S,
+    expect,
+    expect_honest_service,
+    expect_known,
+    resident_bytes,
+    server_under_test,
+    sphere_at,
+)
+from bench.campaign.turn import BrokenError, Turn
+
+_SPACING_M = 9.0
+_PLACES = 4
+
+
+def run(turn: Turn) -> None:
+    """Cut connections under load; after each cut clients are served again."""
+    with server_under_test(turn) as server, closing(CuttingProxy(server.endpoint)) as proxy:
+        with triquad_client.connect(server.endpoint) as client:
+            servers.learn(client)
+        before = resident_bytes(server.process.pid)
+        while not turn.over:
+            _cut_amid_load(turn, proxy)
+        growth = resident_bytes(server.process.pid) - before
+        turn.measured("growth MB", growth / 2**20)
+        expect(growth < MAX_GROWTH_BYTES, f"memory grew by {growth} bytes")
+        expect_honest_service(server.endpoint)
+
+
+def _cut_amid_load(turn: Turn, proxy: CuttingProxy) -> None:
+    place = turn.random.randrange(_PLACES) * _SPACING_M
+    stopping = threading.Event()
+    with triquad_client.connect(proxy.endpoint, timeout_s=5.0) as client:
+        failures: list[str] = []
+        load = threading.Thread(target=_load, args=(client, place, stopping, failures))
+        load.start()
+        try:
+            for _ in range(min(5, turn.most)):
+                time.sleep(turn.random.uniform(0, 0.1))
+                if turn.random.random() < 0.3:
+                    proxy.hold()
+                    time.sleep(turn.random.uniform(0, 0.3))
+                turn.did("cut", proxy.cut())
+                proxy.heal()
+        finally:
+            stopping.set()
+            load.join()
+        for text in failures:
+            turn.broke(text)
+        _expect_served_again(client, place)
+
+
+def _load(
+    client: triquad_client.Client, place: float, stopping: threading.Event, failures: list[str]
+) -> None:
+    """Publish and ask, with whatever errors of triquad that brings, but no others."""
+    queries = servers.sphere(20_000)
+    while not stopping.is_set():
+        try:
+            client.publish_scan(*sphere_at(place))
+            client.query_sdf(queries)
+        except TriquadError:
+            continue
+        except Exception as error:
+            failures.append(f"a client met {type(error).__name__}: {error}")
+            return
+
+
+def _expect_served_again(client: triquad_client.Client, place: float) -> None:
+    """The same client has its connection again, in time, and what it flushes is in the map."""
+    by = time.monotonic() + WITHIN_S
+    while time.monotonic() < by:
+        with contextlib.suppress(TriquadError):
+            before = client.flush(5.0).taken
+            client.publish_scan(*sphere_at(place))
+            if client.flush(5.0).taken == before + 1:
+                expect_known(client, place)
+                expect(bool(np.isfinite(client.query_sdf(servers.sphere(5)).sdf).all()), "no sdf")
+                return
+        time.sleep(0.05)
+    raise BrokenError(f"a client was not served again within {WITHIN_S:g} s of the cuts")

@@ -1,0 +1,195 @@
+"""Mutated map files, against all that reads them, in a child that is watched."""
+
+import contextlib
+import io
+import itertools
+import multiprocessing
+import os
+import resource
+import signal
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from fuzz.choices import Mutation
+from fuzz.damage import DAMAGE, add_bombs
+from fuzz.forgery import FORGERY, forge_bombs
+from fuzz.valid_maps import READERS, ValidMap, valid_maps
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from support.map_records import assert_same
+from triquad_format.errors import FormatError
+from triquad_format.records.record_check import check_record
+from triquad_format.records.region import MapRecord
+from triquad_format.recovery.recovered_map import recover
+from triquad_tools.commands import inspect
+
+from bench.campaign.turn import Turn
+
+_START_S = 120.0
+"""Time for a child to import all that reads files, and to make valid ones."""
+_HANG_S = 20.0
+_LIMIT_BYTES = 64 * 2**20
+"""Memory that a reader may take beside the size of the file."""
+
+_MUTATIONS = (*DAMAGE * 3, *FORGERY * 3, add_bombs, forge_bombs)
+_READ, _ENDED = "read", "ended"
+_CHUNK = 50  # mutants between two looks at the time
+
+
+def run(turn: Turn) -> None:
+    """Read mutants in a child, which is replaced where it dies or hangs."""
+    part = 0
+    while not turn.over:
+        _run_child(turn, part)
+        part += 1
+
+
+def _run_child(turn: Turn, part: int) -> None:
+    """One child's files, until it has ended in whatever way."""
+    # A forked child would wait for ever for the threads that compute in this process.
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    child = context.Process(target=_read_mutants, args=(turn, part, theirs))
+    child.start()
+    theirs.close()
+    try:
+        ours.poll(_START_S)
+        while ours.poll(_HANG_S):
+            what, text = ours.recv()
+            if what == _ENDED:
+                child.join()
+                return
+            turn.did(what)
+            if text:
+                turn.broke(text)
+        turn.broke(f"part {part}: a file was not read within {_HANG_S:g} s")
+    except EOFError:
+        child.join()
+        turn.broke(f"part {part}: the reading process ended with {child.exitcode}")
+    finally:
+        if child.is_alive():
+            os.kill(child.pid or 0, signal.SIGKILL)
+        child.join()
+    turn.did("broken")
+
+
+def _read_mutants(turn: Turn, part: int, tell: Connection) -> None:
+    """All of a child: it draws mutants and tells what becomes of each."""
+    folder = turn.folder / f"files-{part}"
+    folder.mkdir()
+    maps = valid_maps(folder)
+
+    for chunk in itertools.count():
+        _read_chunk(turn, maps, (turn.seed, part, chunk), tell)
+        if turn.over:
+            break
+    tell.send((_ENDED, ""))
+
+
+def _read_chunk(
+    turn: Turn, maps: list[ValidMap], seeds: tuple[int, int, int], tell: Connection
+) -> None:
+    """Some mutants, which follow from the seeds alone."""
+
+    @seed(repr(seeds))
+    @settings(
+        max_examples=min(_CHUNK, turn.most - turn.counts["done"]),
+        phases=[Phase.generate],
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(data=st.data())
+    def read_one(data: st.DataObject) -> None:
+        mutation = data.draw(st.sampled_from(_MUTATIONS))
+        tell.send(_outcome(maps, mutation, data))
+        turn.did(_READ)
+
+    read_one()
+
+
+def _outcome(maps: list[ValidMap], mutation: Mutation, data: st.DataObject) -> tuple[str, str]:
+    """What became of a mutant, and what broke, if anything did."""
+    valid = data.draw(st.sampled_from(maps))
+    name = data.draw(st.sampled_from(sorted(valid.files)))
+    mutant = mutation(data.draw, valid.files[name])
+    # A map knows the digests of the other files that it needs: no forgery of them passes.
+    forged = (mutation in FORGERY or mutation is forge_bombs) and name == valid.path.name
+    file = valid.path.parent / name
+    file.write_bytes(mutant)
+    try:
+        with _little_memory(len(mutant)), np.errstate(all="ignore"):
+            what = _read_all(valid, forged=forged)
+    except Exception as error:
+        kept = file.parent.parent / f"broken-{name}-{abs(hash(mutant)):x}"
+        kept.write_bytes(mutant)
+        how = f"{valid}, {mutation.__name__}: {type(error).__name__}: {error}"
+        return "broken", f"{how:.900}; the file is {kept.name}"
+    finally:
+        file.write_bytes(valid.files[name])
+    return what, ""
+
+
+def _read_all(valid: ValidMap, *, forged: bool) -> str:
+    """Read a mutant in every way; the sum of what came of it.
+
+    Raises:
+        AssertionError: it passed for what it is not, or took too much memory.
+        Exception: whatever a reader lets out and should not.
+    """
+    outcomes = set()
+    for read, wanted in zip(READERS, valid.results, strict=True):
+        try:
+            have = read(valid.path)
+        except FormatError as error:
+            _check_error(error)
+            outcomes.add("refused")
+            continue
+        if _is_same(have, wanted):
+            outcomes.add("as it was")
+        else:
+            assert forged, f"{read.__name__}: it is read as another map"
+            for record in have:
+                if isinstance(record, MapRecord):
+                    check_record(record)
+            outcomes.add("another valid map")
+    with contextlib.suppress(FormatError):
+        check_record(recover(valid.path).record)
+    _inspect(valid.path, readable="refused" not in outcomes)
+    return "refused" if "refused" in outcomes else min(outcomes)
+
+
+def _check_error(error: FormatError) -> None:
+    assert not isinstance(error.__cause__, MemoryError), "it takes too much memory"
+    assert str(error).strip(), "an error without a text"
+
+
+def _inspect(path: Path, *, readable: bool) -> None:
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        status = inspect.main([str(path)])
+    assert status in (0, 1, 2), f"triquad-inspect ended with {status}"
+    assert status == 0 or not readable, f"triquad-inspect refuses it: {printed.getvalue()}"
+
+
+def _is_same(results: tuple[object, ...], wanted: tuple[object, ...]) -> bool:
+    try:
+        assert_same(results, wanted)
+    except AssertionError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _little_memory(file_bytes: int) -> Iterator[None]:
+    """Limit the address space of this process, which must be a child's."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + _LIMIT_BYTES + file_bytes
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)

@@ -1,0 +1,104 @@
+"""Too little memory: an address space that is limited, as under ``ulimit -v``."""
+
+import contextlib
+import resource
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import triquad_client
+from support import servers
+from triquad_client import TriquadError
+
+from bench.campaign.server_under_test import (
+    expect,
+    expect_known,
+    server_under_test,
+    sphere_at,
+    virtual_bytes,
+)
+from bench.campaign.turn import Turn
+
+_SPACING_M = 9.0
+_PLACES = 8
+_MOST_ROOM_BYTES = 48 * 2**20
+_SQUEEZE_S = 3.0
+
+
+@dataclass
+class _Kept:
+    """What has to be there after a restart."""
+
+    epoch: int = 0
+    place: int = 0
+
+
+def run(turn: Turn) -> None:
+    """Limit the memory of a server under load; where it ends, start it again on its store."""
+    kept = _Kept()
+    while not turn.over:
+        _serve_with_limits(turn, kept)
+    aside = [path.name for path in (turn.folder / "store").rglob("*.damaged")]
+    expect(not aside, f"checkpoints were taken for damaged: {aside}")
+
+
+def _serve_with_limits(turn: Turn, kept: _Kept) -> None:
+    """One server, until it ended or the turn is over."""
+    with server_under_test(turn, stop_status=None) as server:
+        pid = server.process.pid
+        with triquad_client.connect(server.endpoint, timeout_s=10.0) as client:
+            epoch = client.status().epoch
+            expect(epoch >= kept.epoch, f"epoch {kept.epoch} was acknowledged, {epoch} is back")
+            if kept.epoch:
+                expect_known(client, kept.place * _SPACING_M)
+            while not turn.over:
+                _keep(turn, client, kept)
+                room = int(_MOST_ROOM_BYTES * turn.random.random() ** 2)
+                with _address_space(pid, virtual_bytes(pid) + room):
+                    _load(turn, client)
+                if server.process.poll() is not None:
+                    turn.did("ended")
+                    return
+                _expect_alive(client, kept)
+                turn.did("went on")
+
+
+def _keep(turn: Turn, client: triquad_client.Client, kept: _Kept) -> None:
+    place = turn.random.randrange(_PLACES)
+    for _ in range(2):
+        client.publish_scan(*sphere_at(place * _SPACING_M), source="honest")
+    client.flush(servers.WAIT_S)
+    kept.epoch, kept.place = client.checkpoint().epoch, place
+
+
+def _load(turn: Turn, client: triquad_client.Client) -> None:
+    """Whatever takes memory, with whatever errors of triquad that brings."""
+    until = time.monotonic() + turn.random.uniform(0.2, _SQUEEZE_S)
+    points = np.tile(servers.sphere(20_000), (turn.random.choice((1, 10)), 1))
+    while time.monotonic() < until:
+        with contextlib.suppress(TriquadError):
+            x_m = turn.random.randrange(_PLACES) * _SPACING_M  # elsewhere it shows free space
+            client.publish_scan(*sphere_at(x_m, 20_000))
+            client.query_sdf(points)
+            client.checkpoint()
+
+
+def _expect_alive(client: triquad_client.Client, kept: _Kept) -> None:
+    """With memory again, the server maps and answers as before."""
+    for _ in range(2):
+        client.publish_scan(*sphere_at(kept.place * _SPACING_M), source="honest")
+    client.flush(servers.WAIT_S)
+    expect_known(client, kept.place * _SPACING_M)
+
+
+@contextlib.contextmanager
+def _address_space(pid: int, size: int) -> Iterator[None]:
+    """Another process may not take more address space than this, for a while."""
+    try:
+        _, hard = resource.prlimit(pid, resource.RLIMIT_AS)
+        resource.prlimit(pid, resource.RLIMIT_AS, (size, hard))
+        yield
+        resource.prlimit(pid, resource.RLIMIT_AS, (hard, hard))
+    except ProcessLookupError:
+        pass  # it has ended

@@ -1,0 +1,100 @@
+"""SIGSTOP: processes that are alive but do not run."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import triquad_client
+from support import servers
+from triquad_client import TriquadError
+
+from bench.campaign.server_under_test import (
+    MAX_GROWTH_BYTES,
+    expect,
+    expect_honest_service,
+    resident_bytes,
+    server_under_test,
+)
+from bench.campaign.turn import Turn
+
+_LONGEST_S = 2.0
+_MOST_WAIT_S = 10.0  # of an honest client, beside one that is stopped
+_GREEDY = """
+import sys
+import numpy as np
+import triquad_client
+
+points = np.random.default_rng(1).uniform(-4, 4, (100_000, 3))
+with triquad_client.connect(sys.argv[1]) as client:
+    print("asks", flush=True)
+    while True:
+        client.query_sdf(points, gradient=True)
+"""
+
+
+def run(turn: Turn) -> None:
+    """Stop the server, or a client amid its replies, for a while."""
+    with server_under_test(turn) as server:
+        with triquad_client.connect(server.endpoint) as client:
+            servers.learn(client)
+        before = resident_bytes(server.process.pid)
+        while not turn.over:
+            stopped_s = turn.random.uniform(0, _LONGEST_S)
+            if turn.random.random() < 0.5:
+                _stop_server(server, stopped_s)
+                turn.did("server")
+            else:
+                _stop_client(turn, server.endpoint, stopped_s)
+                turn.did("client")
+        growth = resident_bytes(server.process.pid) - before
+        turn.measured("growth MB", growth / 2**20)
+        expect(growth < MAX_GROWTH_BYTES, f"memory grew by {growth} bytes")
+
+
+def _stop_server(server: servers.ServerProcess, stopped_s: float) -> None:
+    """Requests while it is stopped end with errors of triquad; then it serves again."""
+    with triquad_client.connect(server.endpoint, timeout_s=0.5) as client:
+        server.process.send_signal(signal.SIGSTOP)
+        try:
+            until = time.monotonic() + stopped_s
+            while time.monotonic() < until:
+                with contextlib.suppress(TriquadError):
+                    client.publish_scan(servers.sphere(500), np.eye(4))
+                    client.query_sdf(servers.sphere(10))
+        finally:
+            server.process.send_signal(signal.SIGCONT)
+    expect_honest_service(server.endpoint)
+
+
+def _stop_client(turn: Turn, endpoint: str, stopped_s: float) -> None:
+    """While a greedy client is stopped amid its replies, another is served."""
+    with _greedy_client(endpoint) as greedy:
+        time.sleep(turn.random.uniform(0, 0.2))
+        greedy.send_signal(signal.SIGSTOP)
+        until = time.monotonic() + stopped_s
+        with triquad_client.connect(endpoint, timeout_s=2 * _MOST_WAIT_S) as client:
+            while time.monotonic() < until:
+                asked = time.monotonic()
+                client.query_sdf(servers.sphere(100))
+                waited_s = time.monotonic() - asked
+                turn.measured("longest wait beside a stopped client, s", waited_s)
+                expect(waited_s < _MOST_WAIT_S, f"an honest client waited {waited_s:.1f} s")
+        greedy.send_signal(signal.SIGCONT)
+    expect_honest_service(endpoint)
+
+
+@contextlib.contextmanager
+def _greedy_client(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
+    """A client in a process of its own that asks without pause."""
+    command = [sys.executable, "-c", _GREEDY, endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            expect(process.stdout.readline() == "asks\n", "the greedy client did not start")
+            yield process
+        finally:
+            process.kill()

@@ -1,0 +1,1 @@
+"""Processes that the benchmarks need: servers, planners, noisy neighbours, a browser."""

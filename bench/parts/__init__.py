@@ -1,0 +1,1 @@
+"""The benchmarks: each part guards a promise of the README."""

@@ -1,0 +1,80 @@
+"""Maps opened offline: how true and how fast their answers are beside the server's epoch."""
+
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from triquad_client import OfflineMap, open_map
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.arrays import Doubles
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.reference.evaluator import MapEvaluator
+from triquad_server.epochs.epoch import Epoch
+
+from bench.figures import Figure, compare, seconds
+from bench.parts.core import seen_points
+from bench.street import BenchStreet, settled_mapper
+
+_OFFLINE_SEED = 4  # of the points at which both are asked
+_ROUNDS = 7
+
+
+def measure_offline(made: BenchStreet) -> list[Figure]:
+    """Figures of the street's map, opened offline, against the settled server's epoch."""
+    epoch = settled_mapper("the street", made.scans).publish()
+    points = seen_points(epoch, made, np.random.default_rng(_OFFLINE_SEED))
+    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
+        path = Path(name) / "street.triquad"
+        write_map(epoch.record(), path)
+        open_map(path).query_distance(points[:10])  # compiled code is loaded
+        opening_s = seconds(lambda: open_map(path))
+        with open_map(path) as offline:
+            first_s = seconds(lambda: offline.query_distance(points[:1]))
+            figures = _differences(offline, epoch, points) + _ratios(offline, epoch, points)
+        plain = MapEvaluator(read_map(path))
+    few = points[:1000]
+    distances(plain, few[:1], DistanceOptions())
+    plain_s = seconds(lambda: distances(plain, few, DistanceOptions()))
+    return [
+        *figures,
+        Figure("open the file of the street", opening_s, "s", at_most=2),
+        Figure("the first distance, with fitting all surfels", first_s, "s", at_most=2),
+        Figure("1,000 distances without compiled code", 1e3 * plain_s, "ms"),
+    ]
+
+
+def _differences(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Figure]:
+    field, live_field = offline.query_sdf(points), epoch.query(points)
+    have, want = offline.query_distance(points), distances(epoch, points, DistanceOptions())
+    sdf_m = np.quantile(np.abs(field.sdf - live_field.sdf), 0.99)
+    distance_m = np.quantile(np.abs(have.distance_m - want.distance_m), 0.99)
+    equal = np.mean((field.status == live_field.status) & (have.status == want.status))
+    return [
+        Figure("offline against live, SDF, 99 %", 1e3 * float(sdf_m), "mm", at_most=1),
+        Figure("offline against live, distance, 99 %", 1e3 * float(distance_m), "mm", at_most=1),
+        Figure("equal status", 100 * float(equal), "%", at_least=99.99),
+        Figure("found alike", 100 * float(np.mean(have.found == want.found)), "%", at_least=99.9),
+    ]
+
+
+def _ratios(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Figure]:
+    """How many times as long as the server's epoch the file takes."""
+    figures = []
+    for count in (1_000, 100_000):
+        some = points[:count]
+        repeats = 20 if count < 10_000 else 2
+        ways: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
+            "SDF": (partial(offline.query_sdf, some), partial(epoch.query, some)),
+            "distances": (
+                partial(offline.query_distance, some),
+                partial(distances, epoch, some, DistanceOptions()),
+            ),
+        }
+        for name, (here, there) in ways.items():
+            taken = 1 / compare(here, there, _ROUNDS, repeats=repeats).ratio
+            label = f"{count:,} {name}, times the server's epoch"
+            figures.append(Figure(label, taken, "", at_most=1.2))
+    return figures

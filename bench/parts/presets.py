@@ -1,0 +1,151 @@
+"""Presets: places and sensors that each is for, streamed at 10 Hz."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from triquad_client import Mesh
+from triquad_format.records.arrays import Doubles
+from triquad_sensors.sweep import PosedScan
+from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.metrics import (
+    STREET_SAMPLES_MAX,
+    MeshScores,
+    ScoreSettings,
+    score_against_scene,
+)
+from triquad_tools.recordings.cloud import merged
+from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
+from triquad_tools.simulation.street import street
+
+from bench.clients.served import served, stream
+from bench.figures import Figure
+from bench.scenes.room import room_by_camera, room_by_lidar
+from bench.scenes.tabletop import tabletop_by_camera
+
+_SETTLE_LIMIT_S = 300.0
+_SCANS = 200
+_STREET_SCANS, _STREET_M = 100, 110.0
+_LONG_SCANS, _LONG_M = 150, 300.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a preset is for: a place, a sensor, and how right its map should be."""
+
+    name: str
+    preset: str
+    make: Callable[[int], SimulatedDrive]  # for a seed
+    f_scores: Mapping[float, float | None]  # by distance, metres: what F should be there, %
+    voxel_m: float  # between the points of the truth and of the mesh that are compared
+
+
+def _street_by(lidar: Lidar, seed: int) -> SimulatedDrive:
+    scene = street(seed, _STREET_M)
+    return SimulatedDrive(
+        scene, lidar, drive(scene, _STREET_SCANS, _STREET_M / _STREET_SCANS), seed
+    )
+
+
+def _long_street(seed: int) -> SimulatedDrive:
+    """A lidar of 128 beams with a range of 120 m, at 72 km/h."""
+    lidar = Lidar(beams=128, columns=1024, range_max_m=120.0, noise_m=0.02)
+    scene = street(seed, _LONG_M)
+    return SimulatedDrive(scene, lidar, drive(scene, _LONG_SCANS, _LONG_M / _LONG_SCANS), seed)
+
+
+_SIXTEEN = Lidar(beams=16, columns=1800, elevation_min_deg=-15.0, elevation_max_deg=15.0)
+_FINE = {0.02: 90.0, 0.05: 99.0}
+
+PLACES = (
+    Place("room, depth camera", "indoor", partial(room_by_camera, scans=_SCANS), _FINE, 0.01),
+    Place("room, 64 beams", "indoor", partial(room_by_lidar, scans=_SCANS), _FINE, 0.01),
+    Place(
+        "street, 64 beams", "street", partial(_street_by, Lidar(columns=1024)), {0.1: 98.0}, 0.05
+    ),
+    Place("street, 16 beams", "street", partial(_street_by, _SIXTEEN), {0.1: 98.0}, 0.05),
+    Place(
+        "tabletop, depth camera",
+        "tabletop",
+        partial(tabletop_by_camera, scans=_SCANS),
+        {0.005: None, 0.01: 98.0, 0.02: None},
+        0.0025,
+    ),
+    Place("long street, 128 beams", "long-range", _long_street, {0.1: None, 0.2: 99.0}, 0.05),
+)
+
+
+def measure_presets(seed: int) -> list[Figure]:
+    """Figures of all places, each with a server of its preset."""
+    return [figure for place in PLACES for figure in _place_figures(place, seed)]
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """The scans of a drive, and what could be seen."""
+
+    drive: SimulatedDrive
+    scans: list[PosedScan]
+    visible: Doubles  # [M, 3] exact surface points within the scene's bounds
+
+
+def _driven(place: Place, seed: int) -> _Driven:
+    made = place.make(seed)
+    low, high = made.scene.bounds
+    scans: list[PosedScan] = []
+
+    def hits() -> Iterator[Doubles]:
+        with progress(f"{place.name}: simulating", len(made)) as report:
+            for scan in made:
+                scans.append(PosedScan(scan.points, scan.world_from_sensor))
+                report(len(scans), f"{len(scans)} of {len(made)} scans")
+                yield scan.true_hits[((scan.true_hits >= low) & (scan.true_hits <= high)).all(1)]
+
+    visible = merged(hits(), place.voxel_m)
+    return _Driven(made, scans, visible)
+
+
+def _place_figures(place: Place, seed: int) -> list[Figure]:
+    driven = _driven(place, seed)
+    with served(arguments=("--preset", place.preset)) as server:
+        client = server.client
+        stream(client, driven.scans, f"{place.name}: streaming at 10 Hz")
+        report = client.flush(FLUSH_TIMEOUT_S)
+        started = time.monotonic()
+        status = wait_until_settled(client, _SETTLE_LIMIT_S)
+        settled_s = time.monotonic() - started
+        mesh = client.mesh(driven.drive.scene.box)
+    points = float(np.mean([len(scan.points) for scan in driven.scans]))
+    lost = report.lost + report.refused
+    figures = [
+        Figure("points of a scan", points, ""),
+        Figure(f"scans lost of {len(driven.scans)}", lost, "", at_most=0),
+        *_f_figures(place, driven, mesh),
+        Figure("from the last scan until settled", settled_s, "s"),
+        Figure("parameters", status.parameters / 1e6, "M"),
+        Figure("resident memory of the server", status.memory_bytes / 1e6, "MB"),
+    ]
+    return [replace(figure, name=f"{place.name}: {figure.name}") for figure in figures]
+
+
+def _f_figures(place: Place, driven: _Driven, mesh: Mesh) -> list[Figure]:
+    figures = []
+    for within_m, wanted in place.f_scores.items():
+        scores = _scores(place, driven, mesh, within_m)
+        name = f"F-score at {100 * within_m:g} cm"
+        figures.append(Figure(name, 100 * scores.f_score, "%", at_least=wanted))
+    return [
+        *figures,
+        Figure("accuracy, mean", 100 * scores.accuracy_m, "cm"),
+        Figure("samples beyond 20 cm", 100 * scores.outlier_ratio, "%"),
+    ]
+
+
+def _scores(place: Place, driven: _Driven, mesh: Mesh, within_m: float) -> MeshScores:
+    settings = ScoreSettings(
+        threshold_m=within_m, voxel_m=place.voxel_m, samples_max=STREET_SAMPLES_MAX
+    )
+    return score_against_scene(mesh, driven.drive.scene, driven.visible, settings)

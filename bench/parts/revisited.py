@@ -1,0 +1,79 @@
+"""A recorded drive that is mapped over and over: what of it the map keeps.
+
+Things move there, and nobody knows which. What several scans saw should stay; what a single one
+saw, and later ones passed, may well have moved.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from triquad_format.records.arrays import Doubles
+from triquad_server.intake.rays import usable_rays
+from triquad_server.settings import Settings
+from triquad_tools.console.progress import progress
+
+from bench.figures import Figure
+from bench.parts.ended_voxels import (
+    EndedVoxels,
+    end_keys,
+    surface_share,
+    voxel_centres,
+)
+from bench.recorded import RecordedScans, recorded_scans
+from bench.street import StreamedMap
+
+_ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class Revisited:
+    """What a settled map keeps of where rays ended, and how right it is elsewhere."""
+
+    kept: float  # the share of voxels in which rays ended that are taken for surface
+    kept_of_several: float  # of those in which rays of at least two scans of one round ended
+    error_m: float  # median distance from the surface of the points of withheld scans
+
+
+def revisited_figures(path: Path) -> list[Figure]:
+    """Figures of a recorded folder, with things taken back and without."""
+    scans, usual = recorded_scans(path), Settings()
+    still = usual.model_copy(update={"change": usual.change.model_copy(update={"static": True})})
+    found = revisit(scans, usual, path.name)
+    error_cm = 100 * found.error_m
+    still_cm = 100 * revisit(scans, still, f"{path.name}, nothing taken back").error_m
+    several = f"{path.name}: lost of those that several scans saw"
+    return [
+        Figure(f"{path.name}: voxels lost", 100 * (1 - found.kept), "%"),
+        Figure(several, 100 * (1 - found.kept_of_several), "%"),
+        Figure(f"{path.name}: error at unseen points, median", error_cm, "cm"),
+        Figure(f"{path.name}: the same where nothing is taken back", still_cm, "cm"),
+    ]
+
+
+def revisit(scans: RecordedScans, settings: Settings, name: str) -> Revisited:
+    """Map a recorded drive over and over, and compare the map with where rays ended."""
+    streamed, ended = StreamedMap(settings), EndedVoxels()
+    rounds = _ROUNDS * scans.mapped
+    with progress(f"mapping {name}", len(rounds) + 1) as report:
+        for number, scan in enumerate(rounds):
+            if number < len(scans.mapped):
+                ended.add(end_keys(scan, settings))
+            streamed.take_in(scan)
+            report(number, f"scan {number}")
+        while not streamed.mapper.settled:
+            streamed.mapper.train()
+        report(len(rounds) + 1, "settled")
+    epoch = streamed.mapper.publish()
+    kept, kept_of_several = (
+        surface_share(epoch, voxel_centres(ended.keys(seen_by), epoch.voxel_m))
+        for seen_by in (1, 2)
+    )
+    off_m = np.abs(epoch.query(_unseen_points(scans, settings)).sdf)
+    return Revisited(kept, kept_of_several, error_m=float(np.nanmedian(off_m)))
+
+
+def _unseen_points(scans: RecordedScans, settings: Settings) -> Doubles:
+    """The points [N, 3] of withheld scans that a map would use, map frame."""
+    rays = (usable_rays(s.points, s.world_from_sensor, settings.scan) for s in scans.withheld)
+    return np.concatenate([of_scan.ends for of_scan in rays])

@@ -1,0 +1,57 @@
+"""A server's start: where nothing was ever compiled, and later."""
+
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from triquad_client import connect
+from triquad_format.records.arrays import Floats
+from triquad_tools.demo.server import DemoServer
+
+from bench.clients.served import MAP
+from bench.figures import Figure
+
+_STARTS = 5
+_TIMEOUT_S = 300.0
+
+
+def measure_start() -> list[Figure]:
+    """How soon a server answers, and takes a scan in, and what it takes of memory by then."""
+    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
+        first = _Start(Path(name))
+        later = [_Start(Path(name)) for _ in range(_STARTS)]
+    ready_s = statistics.median(start.ready_s for start in later)
+    return [
+        Figure("ready at the very first start", first.ready_s, "s", at_most=15),
+        Figure("a scan is taken in then, after", first.mapping_s, "s"),
+        Figure("resident memory after it", first.resident_mb, "MB"),
+        Figure("ready at a later start", ready_s, "s", at_most=1.5),
+        Figure("resident memory after that", later[-1].resident_mb, "MB"),
+    ]
+
+
+class _Start:
+    """A start of a server with an empty map, which ends again."""
+
+    def __init__(self, folder: Path) -> None:
+        """Compiled code is kept in a folder."""
+        variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
+        started = time.monotonic()
+        with tempfile.TemporaryDirectory(dir=folder) as name:
+            server = DemoServer(Path(name), MAP, ["--device", "cpu"], variables=variables)
+            self.ready_s = time.monotonic() - started
+            with server, connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client:
+                client.publish_scan(_sphere(), np.eye(4))
+                client.flush(_TIMEOUT_S)
+                self.mapping_s = time.monotonic() - started
+                self.resident_mb = client.status().memory_bytes / 1e6
+
+
+def _sphere() -> Floats:
+    """Points [N, 3] around a sensor, metres."""
+    directions = np.random.default_rng(0).normal(size=(1000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return (3 * directions).astype(np.float32)

@@ -1,0 +1,120 @@
+"""Checkpoints: a map of 16 regions while the robot drives on in one."""
+
+import dataclasses
+import statistics
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_format.records.region import MapRecord
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
+from triquad_server.store.store import Store
+
+from bench.clients.served import MAP, served, stream_beside_planner
+from bench.figures import Figure
+from bench.street import BenchStreet
+
+_REGIONS = 16
+_SCANS = 40  # that made the map
+_SAMPLES = 6_000_000
+_CHECKPOINTS = 6
+_EVERY_SCANS = 15
+
+
+def measure_store(made: BenchStreet) -> list[Figure]:
+    """Figures of checkpoints."""
+    record = _row(made)
+    return _costs(record, made) + _latencies(record, made)
+
+
+def _row(made: BenchStreet) -> MapRecord:
+    """A street's region, settled, 16 times in a row."""
+    settings = Settings()
+    mapper = Mapper(MAP, settings, "cpu")
+    for scan in made.scans[:_SCANS]:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    while mapper.samples_trained < _SAMPLES:
+        mapper.train()
+    record = mapper.changes_since(None).record
+    (region,) = record.regions
+    training = region.training
+    assert training is not None
+    settled = dataclasses.replace(region, training=dataclasses.replace(training, budget_samples=0))
+    return dataclasses.replace(
+        record,
+        regions=tuple(
+            dataclasses.replace(settled, index=(number, 0, 0)) for number in range(_REGIONS)
+        ),
+    )
+
+
+def _costs(record: MapRecord, made: BenchStreet) -> list[Figure]:
+    """Bytes and time of a complete checkpoint, and of those after driving on in one region."""
+    mapper = Mapper(MAP, Settings(), "cpu", record=record)
+    with (
+        tempfile.TemporaryDirectory(prefix="triquad-bench-") as root,
+        closing(Store(Path(root), MAP, Settings().store)) as store,
+    ):
+        whole = _checkpoint(mapper, store)
+        parts: list[_Cost] = []
+        for scan in made.scans[_SCANS : _SCANS + _CHECKPOINTS]:
+            mapper.ingest(scan.points, scan.world_from_sensor)
+            for _ in range(20):
+                mapper.train()
+            parts.append(_checkpoint(mapper, store))
+    # Copies of one region make the map: each is a sixteenth of its bytes.
+    share = 1 / _REGIONS
+    bytes_share = statistics.median(part.bytes for part in parts) / whole.bytes
+    time_share = statistics.median(part.seconds for part in parts) / whole.seconds
+    return [
+        Figure("complete checkpoint of 16 regions", whole.bytes / 1e6, "MB"),
+        Figure("complete checkpoint of 16 regions, time", whole.seconds, "s"),
+        Figure("changed share of the map", 100 * share, "%"),
+        Figure("checkpoint's bytes against that share", bytes_share / share, "", at_most=2),
+        Figure("checkpoint's time against that share", time_share / share, "", at_most=2),
+    ]
+
+
+@dataclass(frozen=True)
+class _Cost:
+    """What a checkpoint cost."""
+
+    bytes: int
+    seconds: float
+
+
+def _checkpoint(mapper: Mapper, store: Store) -> _Cost:
+    started = time.perf_counter()
+    info = store.write(mapper.changes_since(store.base_epoch))
+    return _Cost(info.bytes, time.perf_counter() - started)
+
+
+def _latencies(record: MapRecord, made: BenchStreet) -> list[Figure]:
+    """Replies while the robot drives on in one region, without and with checkpoints."""
+    with served(record) as server, ThreadPoolExecutor(1) as beside:
+
+        def published(number: int) -> None:
+            if number % _EVERY_SCANS == 0:
+                beside.submit(server.client.checkpoint)
+
+        quiet = stream_beside_planner(server, made)
+        busy = stream_beside_planner(server, made, published)
+        last = server.client.checkpoint()
+    name = "1,000 points with gradient, 16 regions, streaming"
+    return [
+        Figure(f"{name}, 99 %", quiet.latency_p99_ms, "ms"),
+        Figure(f"{name}, longest of {quiet.queries}", quiet.latency_max_ms, "ms"),
+        Figure(f"{name} and checkpoints, 99 %", busy.latency_p99_ms, "ms"),
+        Figure(
+            f"{name} and checkpoints, longest of {busy.queries}",
+            busy.latency_max_ms,
+            "ms",
+            at_most=15,
+        ),
+        Figure("errors meanwhile", quiet.errors + busy.errors, "", at_most=0),
+        Figure("size of such a checkpoint", last.bytes / 1e6, "MB"),
+    ]

@@ -1,0 +1,49 @@
+"""Recorded drives: the scans that are mapped, and those that are withheld to score the map."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_sensors.sweep import PosedScan
+from triquad_tools.console.lines import print_remark
+from triquad_tools.recordings.cloud import is_withheld, points_in_range
+from triquad_tools.recordings.folders.kitti import read_kitti_folder
+
+_SKIP_EVERY = 7
+_RANGE_MIN_M = 2.0  # nearer is the vehicle's own body
+
+
+@dataclass(frozen=True)
+class RecordedScans:
+    """Scans of a recorded drive: those to map, and those that the map is not to see."""
+
+    mapped: tuple[PosedScan, ...]
+    withheld: tuple[PosedScan, ...]
+
+
+def check_recorded(part: str, folder: Path | None) -> None:
+    """Try a folder before all else, which takes minutes; tell where a part has none.
+
+    Raises:
+        ToolError: it cannot be read.
+    """
+    if folder is None:
+        print_remark(f"{part}: recorded scans are left out: give --recorded FOLDER")
+    else:
+        read_kitti_folder(folder)
+
+
+def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
+    """The scans of a folder (the first ``scans`` of them), every 7th apart.
+
+    Raises:
+        ToolError: the folder cannot be read.
+    """
+    folder = read_kitti_folder(path)
+    mapped: list[PosedScan] = []
+    withheld: list[PosedScan] = []
+    indices = range(len(folder))[:scans]
+    for index, whole in zip(indices, folder.read(indices), strict=True):
+        near = points_in_range(whole.points, _RANGE_MIN_M)
+        scan = PosedScan(near, whole.world_from_sensor)
+        (withheld if is_withheld(index, _SKIP_EVERY) else mapped).append(scan)
+    return RecordedScans(tuple(mapped), tuple(withheld))

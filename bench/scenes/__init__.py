@@ -1,0 +1,1 @@
+"""Simulated places and sensors that only benchmarks and tests need."""

@@ -1,0 +1,111 @@
+"""The drive along which most parts are measured."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from triquad_client import Mesh
+from triquad_format.records.arrays import Doubles
+from triquad_sensors.sweep import PosedScan
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
+from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.map_scores import (
+    DrivenStreet,
+    StreetProbes,
+    driven_street,
+    score_street,
+)
+from triquad_tools.evaluation.metrics import (
+    STREET_SAMPLES_MAX,
+    STREET_VOXEL_M,
+    MeshScores,
+    ScoreSettings,
+    score_against_scene,
+)
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
+from triquad_tools.simulation.street import street
+
+from bench.figures import seconds
+
+SCANS = 100
+LENGTH_M = 110.0  # so that the map has some 2 million parameters
+_COLUMNS = 1024  # some 60,000 points a scan
+_STEPS = 14  # of training between two scans that a map streams in
+_PUBLISHED = 5  # one such scan in so many
+
+
+@dataclass(frozen=True)
+class BenchStreet(DrivenStreet):
+    """A drive of 10 s, and the truth about it."""
+
+    visible: Doubles  # [M, 3] exact surface points that the lidar hit
+    samples_max: int = STREET_SAMPLES_MAX  # of a mesh, to score it
+
+    def mesh_scores(self, mesh: Mesh) -> MeshScores:
+        """Scores of a mesh within the scene's bounds."""
+        settings = ScoreSettings(samples_max=self.samples_max)
+        return score_against_scene(mesh, self.drive.scene, self.visible, settings=settings)
+
+
+def bench_street(seed: int) -> BenchStreet:
+    """100 scans along the exact street ``seed``."""
+    scene = street(seed, LENGTH_M)
+    poses = drive(scene, SCANS, LENGTH_M / SCANS)
+    driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed=seed))
+    visible = driven.drive.true_hits(STREET_VOXEL_M)
+    low, high = scene.bounds  # to which meshes are cut
+    visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
+    return BenchStreet(driven.drive, driven.scans, driven.probes, visible=visible)
+
+
+def settled_mapper(
+    name: str, scans: Sequence[PosedScan], settings: Settings | None = None
+) -> Mapper:
+    """A mapper that has learnt all it can of some scans; ``name`` is told while one waits."""
+    settings = settings or Settings()
+    mapper = Mapper("bench", settings, "cpu")
+    with progress(f"mapping {name}", len(scans) + 1) as report:
+        for number, scan in enumerate(scans):
+            mapper.ingest(scan.points, scan.world_from_sensor)
+            report(number, f"scan {number}")
+        learn_all(mapper)
+        report(len(scans) + 1, "settled")
+    return mapper
+
+
+def learn_all(mapper: Mapper) -> None:
+    """Train until nothing is left to learn."""
+    while not mapper.settled:
+        mapper.train()
+
+
+def learn_again(mapper: Mapper) -> None:
+    """As :func:`learn_all`, with what was forgotten meanwhile: that is found as it is published."""
+    while not mapper.settled:
+        learn_all(mapper)
+        mapper.publish()
+
+
+def sdf_error_cm(epoch: Epoch, probes: StreetProbes) -> float:
+    """The mean error of the signed distance at points near the surface."""
+    return 100 * score_street(epoch.query, probes).sdf_error_m
+
+
+class StreamedMap:
+    """A map that trains and publishes between scans, as a server's does."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.mapper = Mapper("bench", settings, "cpu")
+        self.ingest_s: list[float] = []  # of each scan
+
+    def take_in(self, scan: PosedScan) -> None:
+        """Take in a scan, and train."""
+        ingest = partial(self.mapper.ingest, scan.points, scan.world_from_sensor)
+        self.ingest_s.append(seconds(ingest))
+        for _ in range(_STEPS):
+            self.mapper.train()
+        if len(self.ingest_s) % _PUBLISHED == 0:
+            self.mapper.publish()

@@ -1,1 +1,0 @@
-"""How fast and how good it is on this machine."""
