@@ -118,7 +118,8 @@ def raw_session(
         put(config, {"access_control": access_control})
     endpoints = {"listen": [listen] if listen else [], "connect": [connect] if connect else []}
     values = {f"{kind}/endpoints": there for kind, there in endpoints.items()}
-    put(config, {**QUIET, **values, "mode": mode, "timestamping/enabled": timestamps})
+    delay = {"scouting/delay": 1}  # ms: a router would wait for half a second for others
+    put(config, {**QUIET, **delay, **values, "mode": mode, "timestamping/enabled": timestamps})
     with zenoh.open(config) as session:
         yield session
 

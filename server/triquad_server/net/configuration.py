@@ -22,6 +22,10 @@ _LINKS: Mapping[str, Any] = {
     "transport/unicast/max_sessions": 500,
 }
 
+_NO_SCOUTING = {"scouting/delay": 1}
+"""Milliseconds [ms] for which a router waits for others as it starts, 500 by default. Where it looks
+for nobody, nobody comes."""
+
 
 @dataclass(frozen=True)
 class NetworkOptions:
@@ -103,6 +107,8 @@ def _configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Config
     fill(config, {"mode": "router"}, unset)
     is_own = not is_set(config, "access_control", unset)
     fill(config, _safe(defaults), unset)
+    if not json.loads(config.get_json("scouting/multicast/enabled")):
+        fill(config, _NO_SCOUTING, unset)
     found = Configuration(config, own_access_control=is_own)
     if found.mode != "client":
         fill(config, {"listen/endpoints": [DEFAULT_ENDPOINT]}, unset)

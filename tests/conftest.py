@@ -1,0 +1,65 @@
+"""What every run of the tests does: long modules come first, and what each took is kept.
+
+``tests/durations.json`` holds the seconds of each file in a run on two quiet cores; the newest run
+is kept in ``test-durations.json`` beside the project's configuration, and the files that grew most
+are told at the end.
+"""
+
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+_KNOWN = Path(__file__).with_name("durations.json")
+_GREW_S = 5.0  # growth of a file that is told
+_TOLD = 5  # files
+
+
+class Durations:
+    """The seconds that each file took, with what it set up; from all workers."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._config = config
+        self._seconds: dict[str, float] = defaultdict(float)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self._seconds[report.nodeid.partition("::")[0]] += report.duration
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        if not self._seconds:
+            return
+        took = {name: round(seconds, 1) for name, seconds in sorted(self._seconds.items())}
+        newest = self._config.rootpath / "test-durations.json"
+        newest.write_text(json.dumps(took, indent=1) + "\n", encoding="utf-8")
+        known = known_durations()
+        growth = {name: seconds - known.get(name, 0.0) for name, seconds in took.items()}
+        grown = sorted(growth, key=lambda name: -growth[name])[:_TOLD]
+        for name in grown:
+            if growth[name] > _GREW_S:
+                text = f"{name}: {took[name]} s, {growth[name]:+.1f} s against durations.json"
+                terminalreporter.write_line(text)
+
+
+def known_durations() -> dict[str, float]:
+    """The seconds of each file, as they were kept."""
+    if not _KNOWN.exists():
+        return {}
+    found: dict[str, float] = json.loads(_KNOWN.read_text(encoding="utf-8"))
+    return found
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput"):  # the process that hears of all workers
+        config.pluginmanager.register(Durations(config))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Long files first, so that none of them is what the other workers wait for in the end."""
+    known = known_durations()
+    root = config.rootpath
+
+    def seconds(item: pytest.Item) -> float:
+        return known.get(item.path.relative_to(root).as_posix(), 0.0)
+
+    items.sort(key=seconds, reverse=True)
