@@ -23,7 +23,7 @@ _LINKS: Mapping[str, Any] = {
 }
 
 _NO_SCOUTING = {"scouting/delay": 1}
-"""Milliseconds [ms] for which a router waits for others as it starts, 500 by default. Where it looks
+"""For how long a router waits for others as it starts [ms], 500 by default. Where it looks
 for nobody, nobody comes."""
 
 
