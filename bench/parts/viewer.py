@@ -1,4 +1,4 @@
-"""What the viewer shows how soon, and what it costs a planner."""
+"""What the viewer shows how soon, and how smoothly."""
 
 import statistics
 import time
@@ -18,8 +18,7 @@ from triquad_tools.viewer.sources.map_source import COARSEST, MapState, TileSize
 from triquad_tools.viewer.viewer import Viewer
 
 from bench.clients.browser import opened_page, running_browser, wait_until_drawn
-from bench.clients.onlooker import Onlooker
-from bench.clients.served import MAP, Served, served, stream_beside_planner
+from bench.clients.served import served, stream
 from bench.figures import Figure
 from bench.street import BenchStreet
 
@@ -48,34 +47,9 @@ seconds => new Promise(done => {
 def measure_viewer(made: BenchStreet) -> list[Figure]:
     """Figures of the viewer, in a browser that draws in software on the same two cores."""
     with served() as server:
-        figures = _beside_planner(server, made)
+        stream(server.client, made.scans)
         wait_until_settled(server.client, _SETTLE_LIMIT_S)
-        return figures + _first_mesh(server.client) + _long_street(server.client)
-
-
-def _beside_planner(server: Served, made: BenchStreet) -> list[Figure]:
-    """A planner while a lidar streams, in turns with and without somebody who looks."""
-    stream_beside_planner(server, made)
-    first: list[float] = []
-    watched_ms: list[float] = []
-    alone_ms: list[float] = []
-    with Onlooker(server.endpoint, MAP) as onlooker:
-        for _ in range(_ROUNDS):
-            alone_ms += stream_beside_planner(server, made).latencies_ms
-            first.append(onlooker.open())
-            onlooker.freeze()  # for on the same cores it would be in the planner's way by itself
-            watched_ms += stream_beside_planner(server, made).latencies_ms
-            onlooker.thaw()
-            onlooker.close()
-    alone, watched = (np.quantile(met, [0.5, 0.99]) for met in (alone_ms, watched_ms))
-    half, most = watched / alone
-    return [
-        Figure("first mesh, while the server trains", statistics.median(first), "s"),
-        Figure("planner, median, nobody looks", float(alone[0]), "ms"),
-        Figure("planner, median, somebody looks, times that", float(half), ""),
-        Figure(f"planner, 99 % of {len(alone_ms)}, nobody looks", float(alone[1]), "ms"),
-        Figure("planner, 99 %, somebody looks, times that", float(most), "", at_most=1.1),
-    ]
+        return _first_mesh(server.client) + _long_street(server.client)
 
 
 def _first_mesh(client: Client) -> list[Figure]:
