@@ -15,8 +15,8 @@ from rich.console import Console
 from triquad_client import Client
 from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive
 from triquad_tools.simulation.street import street
-from triquad_tools.top.page import Page
-from triquad_tools.top.watch import Target, Watch
+from triquad_tools.top.interval import Sample, rates
+from triquad_tools.top.page import Seen, page
 
 PICTURE = Path(__file__).parent / "images" / "top.svg"
 _WIDTH = 126  # characters: three columns
@@ -60,15 +60,15 @@ def main() -> None:
         time.sleep(_SECONDS / 2)
         client.checkpoint()
         time.sleep(_SECONDS / 4)
-        watch = Watch(server.client(), 1.0)
-        watch.observe()
-        time.sleep(watch.due_in_s)
-        seen = watch.observe()
+        before = Sample(client.status(), client.metrics())
+        time.sleep(1.0)
+        after = Sample(client.status(), client.metrics())
         over.set()
         planner.join()
         sensors.join()
     console = Console(width=_WIDTH, file=StringIO(), record=True)
-    console.print(Page(Target("tcp/robot:7447", "default"), seen))
+    seen = Seen(after, rates(before, after))
+    console.print(page("map default at tcp/robot:7447", seen, _WIDTH))
     console.save_svg(str(PICTURE), title="triquad-top --connect robot")
 
 

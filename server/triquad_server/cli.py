@@ -20,7 +20,7 @@ from triquad_server.errors import (
     StoreError,
 )
 from triquad_server.process.installed import require_libraries
-from triquad_server.process.log_output import LOG_FORMATS, TEXT, start_log
+from triquad_server.process.log import LOG_FORMATS, TEXT, start_log
 from triquad_server.process.memory import put_off_collection
 
 _PROGRAM = "triquad-server"
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the server until SIGINT or SIGTERM; returns the exit code."""
     _on_signals(_leave)
     log_options = _log_options()
-    start_log(log_options.parse_known_args(argv)[0].log_format)  # wrong usage is told in it, too
+    start_log(log_options.parse_known_args(argv)[0].log_format)
     options = _parser(log_options).parse_args(argv)
     logging.getLogger().setLevel(options.log_level.upper())
     return _exit_code(options)
@@ -60,7 +60,7 @@ def _on_signals(handler: Callable[..., None]) -> None:
 
 def _leave(*_: object) -> None:
     """Stop before anything is open: an exception could get lost in what is being imported."""
-    os.write(2, b"stopped\n")
+    _log.info("stopped")
     os._exit(OK)
 
 

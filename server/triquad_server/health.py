@@ -1,9 +1,9 @@
-"""The server's status: put together from its parts, published once a second, and logged."""
+"""How the server is doing: its status, published once a second, and whether it is well."""
 
-import collections
 import logging
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 
 import triquad_format
@@ -21,22 +21,17 @@ from triquad_server.store.checkpoint_thread import CheckpointThread
 _log = logging.getLogger(__name__)
 
 STATUS_PERIOD_S = 1.0
-
-STUCK_S = 120.0
-"""For no longer the mapper's thread waits without being stuck: for others that compile, at most."""
-
-ENDLESS_S = 1800.0
-"""Nothing that it computes takes longer, neither code to compile nor a large checkpoint."""
+STUCK_S = 120.0  # longer waits of the mapper's thread are a fault; compiling takes others a minute
+ENDLESS_S = 1800.0  # longer than compiling or the checkpoint of a large map takes
 
 _BEATS_PER_LOG_LINE = 5
-_BEATS_PER_TRIM = 10  # of the memory
+_BEATS_PER_TRIM = 10  # of the memory; at once where it grew by so much:
 _TRIMMED_AT_BYTES = 16 << 20
-"""Where memory grew by so much, it is trimmed at once: much was asked."""
 
 
 @dataclass(frozen=True)
 class Health:
-    """Knows how the server is doing."""
+    """Collects from its parts how the server is doing."""
 
     map_name: str
     server: str  # a name of this process
@@ -50,9 +45,12 @@ class Health:
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
-        """The status now."""
+        """Return the status now."""
         epoch = self.mapper.epochs.newest
         progress = self.mapper.progress
+        refused: Counter[str] = Counter()  # of all operations, by error code
+        for counts in self.operations.copy().values():
+            refused.update(counts.refused())
         return ServerStatus(
             map_name=self.map_name,
             server=self.server,
@@ -65,7 +63,7 @@ class Health:
             scans_lost=self.scans.ledger.lost(),
             scans_waiting=len(self.scans),
             points_dropped=self.mapper.points_dropped.counts(),
-            requests_refused=self._requests_refused(),
+            requests_refused=dict(refused),
             samples_trained=progress.samples_trained,
             rays_kept=progress.rays_kept,
             loss=float(progress.loss),
@@ -87,10 +85,10 @@ class Health:
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
-        """Why nothing is mapped any more, ``None`` where all is well.
+        """Return why nothing is mapped any more until a restart, ``None`` where all is well.
 
-        Nothing but a restart helps. A thread that computes is alive, for :data:`ENDLESS_S` at most;
-        one that waits is alive if it hears the :class:`Heartbeat`, which wakes it.
+        A thread that computes is alive, for :data:`ENDLESS_S` at most; one that waits is alive if
+        it hears the :class:`Heartbeat`, which wakes it.
         """
         if self.mapper.ended is not None:
             return self.mapper.ended
@@ -101,10 +99,9 @@ class Health:
         return f"mapping makes no progress: it is at {at} since {for_s:.0f} s"
 
     def problem(self) -> str | None:
-        """Why the server does not do all that it should, ``None`` where it does.
+        """Return why the server does not do all that it should, ``None`` where it does.
 
-        Beside :meth:`mapping_problem`: a store that cannot be written. A server that was started
-        without one keeps no map, as it should.
+        That is :meth:`mapping_problem`, or a store that cannot be written.
         """
         mapping = self.mapping_problem()
         if mapping is not None or not self.checkpoints.has_store or self.checkpoints.error is None:
@@ -112,33 +109,13 @@ class Health:
         return f"what is mapped is not kept: {self.checkpoints.error}"
 
     def summary(self) -> str:
-        """What the server does, and what keeps it from that, in a line."""
+        """Return in a line what the server does, and what keeps it from that."""
         doing = (
             f"serving map '{self.map_name}': epoch {self.mapper.epochs.newest.number}, "
             f"{self.mapper.progress.scans_taken} scans taken"
         )
         problem = self.problem()
         return doing if problem is None else f"{doing}; {problem}"
-
-    def report(self) -> dict[str, object]:
-        """What a program that watches the server is told; ``problem`` is as :meth:`problem`."""
-        epoch, progress = self.mapper.epochs.newest, self.mapper.progress
-        return {
-            "problem": self.problem(),
-            "map": self.map_name,
-            "server": self.server,
-            "epoch": epoch.number,
-            "settled": progress.settled and len(self.scans) == 0,
-            "scans_taken": progress.scans_taken,
-            "uptime_s": round(time.monotonic() - self.started_s, 3),
-        }
-
-    def _requests_refused(self) -> dict[str, int]:
-        """Refused requests of all operations, by error code."""
-        total: collections.Counter[str] = collections.Counter()
-        for counts in self.operations.copy().values():
-            total.update(counts.refused())
-        return dict(total)
 
 
 class Heartbeat:
@@ -154,7 +131,7 @@ class Heartbeat:
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_LOW,
         )
-        self._logged: ServerStatus | None = None
+        self._logged: tuple[object, ...] = ()  # what the last line told
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="heartbeat")
         self._thread.start()
@@ -185,26 +162,16 @@ class Heartbeat:
                 self._log_progress(status)
 
     def _log_progress(self, status: ServerStatus) -> None:
-        """One line, where anything happened since the last one."""
-        before, self._logged = self._logged, status
-        if before is not None and _activity(before) == _activity(status):
-            return
-        _log.info(
-            "epoch %d%s: %d scans taken, %d dropped, %d lost, %d waiting; "
-            "%.1f M samples trained, loss %.4f; %d regions, %d vertices; %.0f MB",
-            status.epoch,
-            " (settled)" if status.settled else "",
-            status.scans_taken,
-            sum(status.scans_dropped.values()),
-            sum(status.scans_lost.values()),
-            status.scans_waiting,
-            status.samples_trained / 1e6,
-            status.loss,
-            status.regions,
-            status.vertices,
-            status.memory_bytes / 1e6,
-        )
-
-
-def _activity(status: ServerStatus) -> tuple[object, ...]:
-    return status.epoch, status.scans_taken, status.scans_dropped, status.scans_lost
+        """Log a line, where anything happened since the last one."""
+        dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
+        now = (status.epoch, status.scans_taken, dropped, lost)
+        if now != self._logged:
+            self._logged = now
+            _log.info(
+                "epoch %d%s: %d scans taken, %d dropped, %d lost, %d waiting; %.1f M samples "
+                "trained, loss %.4f; %d regions, %d vertices; %.0f MB",
+                *(status.epoch, " (settled)" if status.settled else ""),
+                *(status.scans_taken, dropped, lost, status.scans_waiting),
+                *(status.samples_trained / 1e6, status.loss, status.regions, status.vertices),
+                status.memory_bytes / 1e6,
+            )

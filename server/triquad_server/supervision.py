@@ -37,7 +37,7 @@ class Supervision(Phases):
     def serving(self, health: Health, question: SelfQuestion) -> None:
         """Tell that the server serves, and from now on how it does."""
         spare_from_collection()
-        self._manager.ready(health.summary())
+        self._manager.tell("READY=1", status=health.summary())
         if self._manager.listens:
             self._thread = threading.Thread(
                 target=self._run, args=(health, question), name="supervision"
@@ -47,7 +47,9 @@ class Supervision(Phases):
     def stopping(self) -> None:
         """Tell that the server stops."""
         self._stopping.set()
-        self._manager.stopping("stopping: what waits is answered, and the last checkpoint written")
+        self._manager.tell(
+            "STOPPING=1", status="what waits is answered, and the last checkpoint is written"
+        )
 
     def close(self) -> None:
         """Say nothing more."""
@@ -64,13 +66,13 @@ class Supervision(Phases):
                 problem = _problem(health, question, watchdog_s)
             self._tell(None if self._stopping.is_set() else problem)
             if not self._stopping.is_set():
-                self._manager.status(health.summary())
+                self._manager.tell(status=health.summary())
 
     def _tell(self, problem: str | None) -> None:
         """Tell that the server is alive, or the log why that is not told."""
-        if problem is None:
-            self._manager.alive()
-        elif self._was_well:
+        if problem is None and self._manager.watchdog_s is not None:
+            self._manager.tell("WATCHDOG=1")
+        elif problem is not None and self._was_well:
             _log.error("the service manager is not told any more that all is well: %s", problem)
         self._was_well = problem is None
 

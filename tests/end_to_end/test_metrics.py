@@ -81,7 +81,6 @@ def test_scans_are_counted_by_source(client):
         client.publish_scan(points, np.eye(4), source=source)
     client.flush(servers.WAIT_S)
     metrics = client.metrics()
-    assert metrics.scans_received == 3
     assert metrics.scan_bytes_received > 3 * points.nbytes
     taken = {name: source.taken for name, source in metrics.sources.items()}
     assert taken == {"front": 2, "rear": 1}

@@ -252,7 +252,6 @@ def _metrics(_: MetricsRequest) -> ServerMetrics:
         operations={"query/sdf": asked},
         queues={},
         sources={},
-        scans_received=1,
         scan_bytes_received=1,
         memory_bytes={},
         resident_bytes=1,

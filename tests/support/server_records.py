@@ -1,6 +1,5 @@
-"""What a server could say of itself, made up for tests of what is shown of it."""
+"""What a server could say of itself, for tests of what is shown of it."""
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -84,7 +83,6 @@ METRICS = ServerMetrics(
         "roof": SourceMetrics(1, 12_000, 0, 0, 0.1),
         "camera": SourceMetrics(1, 345, 0, 12, 0.2),
     },
-    scans_received=12_360,
     scan_bytes_received=8_000_000_000,
     memory_bytes={"evidence": 120_000_000, "fields": 44_000_000},
     resident_bytes=612_000_000,
@@ -94,15 +92,10 @@ METRICS = ServerMetrics(
 )
 
 
-def sample(status: ServerStatus = STATUS, metrics: ServerMetrics | None = METRICS) -> Sample:
-    """A sample of these."""
-    return Sample(time.time_ns(), status, metrics, None if metrics else "this server is older")
-
-
 def later(seconds: float, status: Any = None, metrics: Any = None) -> Sample:
-    """A sample ``seconds`` after that of ``STATUS`` and ``METRICS``, but for these changes."""
+    """A sample ``seconds`` after ``STATUS`` and ``METRICS``, with these changes."""
     uptime_s = STATUS.uptime_s + seconds
-    return sample(
+    return Sample(
         replace(STATUS, uptime_s=uptime_s, **(status or {})),
         replace(METRICS, uptime_s=uptime_s, **(metrics or {})),
     )

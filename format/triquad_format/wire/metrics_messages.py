@@ -1,7 +1,7 @@
 """The messages in which a server tells how it is doing, in figures.
 
-Counts, sums and times only ever grow while a server runs: whoever wants to know of the last seconds
-takes the difference of two answers. ``docs/wire-protocol.md`` says more.
+Counts, sums and times only grow while a server runs: the difference of two answers tells of the
+seconds between them. ``docs/wire-protocol.md`` says more.
 """
 
 import math
@@ -99,15 +99,13 @@ class ServerMetrics(Message):
     operations: dict[Name, OperationMetrics]  # by name, such as "query/sdf"
     queues: dict[Name, QueueMetrics]
     sources: dict[Name, SourceMetrics]  # by name; "*" is of those there are too many of
-    scans_received: Count
     scan_bytes_received: Count
     memory_bytes: dict[Name, Count]  # by part
     resident_bytes: Count  # memory of the whole process
     mapper_s: dict[Name, Duration]  # how the mapper's thread spent its time, by activity
     checkpoints: CheckpointMetrics
     sessions: dict[Name, Name]  # Zenoh sessions that are connected, by id: client, peer or router
-    scans_taken: Count = 0  # by this process; the status counts those of the map
-    samples_trained: Count = 0  # likewise
+    samples_trained: Count = 0  # by this process; the status counts those of the map
 
     def answer_time_s(
         self, operation: str, quantile: float, since: "ServerMetrics | None" = None

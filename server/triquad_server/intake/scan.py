@@ -72,7 +72,6 @@ class ScanIntake:
                 self._keep(sample)
 
     def _keep(self, sample: zenoh.Sample) -> None:
-        self._queue.received += 1
         self._queue.received_bytes += len(sample.payload)
         self._inbox.put(Owner(str(sample.key_expr)), sample, len(sample.payload))
         self._inbox.excess(newest=False)  # which is a gap in the sequence, and counted as that

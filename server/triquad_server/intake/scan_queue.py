@@ -31,7 +31,7 @@ class ScanQueue:
         self.limit_bytes = limit_bytes
         self.ledger = SourceLedger()
         self.dropped = Counter()  # scans that are not in the map, by reason
-        self.received = self.received_bytes = 0  # messages of scans, whatever became of them
+        self.received_bytes = 0  # of all messages of scans that arrived
         self._lock = threading.Lock()
         self._scans: FairQueue[Scan] = FairQueue(limit * MAX_SOURCES_WAITING, limit_bytes)
         self._in_hand = False

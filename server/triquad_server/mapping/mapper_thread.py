@@ -56,8 +56,7 @@ class Progress:
     settled: bool = True  # nothing is left to learn, and the newest epoch shows all
     scans_taken: int = 0  # that are in the map, also those before a restart
     samples_trained: int = 0  # of the map, likewise
-    own_scans_taken: int = 0  # by this process
-    own_samples_trained: int = 0
+    own_samples_trained: int = 0  # by this process
     samples_left: int = 0
     rays_kept: int = 0
     rays_discarded: int = 0
@@ -107,7 +106,7 @@ class MapperThread:
         self._stopping = threading.Event()
         self._next_publish = self._soonest_publish = 0.0
         self._unpublished = False
-        self._scans_taken = self._samples_trained = 0
+        self._samples_trained = 0
         self._loss = mapper.loss  # as of the newest epoch
         self._step_s = _GIVE_WAY_S  # what the last step of training took
         self._else_s = 0.0  # what all but scans took in the last round
@@ -319,14 +318,12 @@ class MapperThread:
             if self._warnings is not None:
                 self._warnings.add(scan.source, len(scan.points), rays)
             self.trails.add(scan, rays)
-            self._scans_taken += 1
             self._unpublished = True
             self._scans.ledger.take(scan)
 
     def _take_back(self, why: str) -> None:
         """Count as refused what no epoch shows yet: a scan failed, and the map went back."""
         count = self._scans.ledger.take_back(why)
-        self._scans_taken -= count
         if count:
             _log.warning("%d scans were taken back with one that failed: %s", count, why)
 
@@ -356,7 +353,6 @@ class MapperThread:
             settled=self._mapper.settled and not self._unpublished,
             scans_taken=self._mapper.scans_taken,
             samples_trained=self._mapper.samples_trained,
-            own_scans_taken=self._scans_taken,
             own_samples_trained=self._samples_trained,
             samples_left=self._mapper.samples_left,
             rays_kept=self._mapper.rays_kept,

@@ -1,4 +1,4 @@
-"""The server in figures: put together from its parts when somebody asks."""
+"""The server in figures: collected from its parts when a client or a scrape asks."""
 
 import time
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _MAX_SESSIONS = 1024  # that are listed
 
 @dataclass(frozen=True)
 class Metrics:
-    """Knows the figures of a server."""
+    """Collects the figures of a server."""
 
     health: Health
     session: zenoh.Session
@@ -30,9 +30,11 @@ class Metrics:
     queues: dict[str, ReadQueue]  # of requests, by name
 
     def now(self) -> ServerMetrics:
-        """The figures as they are now."""
-        health, mapper = self.health, self.health.mapper
+        """Return the figures as they are now."""
+        health, mapper, scans = self.health, self.health.mapper, self.health.scans
         kept = mapper.epochs.kept()
+        queues = {name: read() for name, read in self.queues.copy().items()}
+        transports = self.session.info.transports()[:_MAX_SESSIONS]
         return ServerMetrics(
             server=health.server,
             uptime_s=time.monotonic() - health.started_s,
@@ -42,56 +44,41 @@ class Metrics:
             epochs_kept=len(kept.epochs),
             epochs_pinned=kept.pinned,
             bounds_s=np.array(BOUNDS_S),
-            operations={
-                name: counts.metrics() for name, counts in health.operations.copy().items()
-            },
-            queues=self._queues(),
-            sources=health.scans.ledger.sources(),
-            scans_received=health.scans.received,
-            scan_bytes_received=health.scans.received_bytes,
+            operations={name: one.metrics() for name, one in health.operations.copy().items()},
+            queues={"scans": QueueMetrics(len(scans), scans.limit), **queues},
+            sources=scans.ledger.sources(),
+            scan_bytes_received=scans.received_bytes,
             memory_bytes=self._memory_bytes(kept.epochs),
             resident_bytes=resident_bytes(),
             mapper_s=mapper.time.spent_s(),
             checkpoints=health.checkpoints.metrics(),
-            sessions=self._sessions(),
-            scans_taken=mapper.progress.own_scans_taken,
+            # Not the whole id: a program that knows it can ask in the name of that client.
+            sessions={str(one.zid)[:8]: str(one.whatami) for one in transports},
             samples_trained=mapper.progress.own_samples_trained,
         )
 
-    def _queues(self) -> dict[str, QueueMetrics]:
-        scans = self.health.scans
-        return {
-            "scans": QueueMetrics(len(scans), scans.limit),
-            **{name: read() for name, read in self.queues.copy().items()},
-        }
-
     def _memory_bytes(self, epochs: tuple[Epoch, ...]) -> dict[str, int]:
-        """What parts of the server take; memory that epochs and the live map share is the epochs'.
+        """Return the bytes of each part; what epochs and the live map share is the epochs'.
 
         The live map is as of the newest epoch: where training went on since, its copy of the
         features is in no part.
         """
-        health = self.health
         regions = [region for epoch in epochs for region in epoch.frozen_regions]
-        frozen = {
-            "epochs": [(region.engine, region.evidence) for region in regions],
-            "surfels": [region.surfels for region in regions],
-        }
         live = dict.fromkeys(("field", "evidence", "replay_pools"), 0)
         for region in epochs[-1].frozen_regions:
             for part, size in region.live_bytes.items():
                 live[part] += size
+        frozen = {
+            "epochs": [(region.engine, region.evidence) for region in regions],
+            "surfels": [region.surfels for region in regions],
+        }
+        mapper = self.health.mapper
         return {
             **live,
             **bytes_by_part(frozen),
-            "normals": health.mapper.progress.normals_bytes,
-            "surface_history": health.mapper.surface.nbytes,
+            "normals": mapper.progress.normals_bytes,
+            "surface_history": mapper.surface.nbytes,
             "tile_cache": self.tiles.nbytes,
             "downloads": self.downloads.nbytes,
-            "scan_queue": health.scans.bytes_waiting,
+            "scan_queue": self.health.scans.bytes_waiting,
         }
-
-    def _sessions(self) -> dict[str, str]:
-        transports = self.session.info.transports()[:_MAX_SESSIONS]
-        # Not the whole id: whoever knows it can ask in the name of another.
-        return {str(transport.zid)[:8]: str(transport.whatami) for transport in transports}

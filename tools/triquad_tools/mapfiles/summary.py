@@ -13,10 +13,10 @@ from triquad_format.records.region import MAX_LEVEL, MapRecord, Region
 from triquad_format.records.seen_space import evidence_box, owned_evidence
 from triquad_map.field_fit import MapFit
 
+from triquad_tools.console.amounts import millimetres, within
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import Row, print_columns, print_rows
 from triquad_tools.mapfiles.recorded_fit import recorded_fit
-from triquad_tools.top.amounts import millimetres, within
 
 
 @dataclass(frozen=True)

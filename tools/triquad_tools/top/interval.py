@@ -1,173 +1,84 @@
-"""What happened between two samples of a server: records in, rates and quantiles out."""
+"""What happened between two samples of a server: two pairs of messages in, rates out."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
 from triquad_format.wire.messages import ServerStatus
-from triquad_format.wire.metrics_messages import ServerMetrics, SourceMetrics
+from triquad_format.wire.metrics_messages import ServerMetrics
 
 
 @dataclass(frozen=True)
 class Sample:
     """What a server said of itself at one time."""
 
-    stamp_ns: int  # since 1970, of the clock here
     status: ServerStatus
-    metrics: ServerMetrics | None
-    metrics_missing: str | None = None  # why there are none
+    metrics: ServerMetrics
+
+    def each(self, field: str) -> dict[str, Any]:
+        """Return a field of all operations or sources, such as ``operations.answered``."""
+        records, _, name = field.partition(".")
+        return {key: getattr(one, name) for key, one in getattr(self.metrics, records).items()}
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Requests that were refused, by operation and error code, such as ``query/sdf: busy``."""
+        refused = self.each("operations.refused").items()
+        return {f"{name}: {code}": n for name, codes in refused for code, n in codes.items()}
 
 
 @dataclass(frozen=True)
 class Rates:
-    """What happened in an interval, a second of it, by the status."""
+    """What happened in an interval, per second of the server's clock."""
 
+    seconds: float  # length of the interval
+    epochs: float
+    samples_trained: float
     scans_taken: float
-    scans_lost: dict[str, float]  # by source
+    scan_bytes_received: float
     scans_dropped: dict[str, float]  # by reason
     points_dropped: dict[str, float]  # by reason
-    requests_refused: dict[str, float]  # by error code
-    samples_trained: float
-    epochs: float
-
-
-@dataclass(frozen=True)
-class SourceRates:
-    """The scans of one source, a second."""
-
-    taken: float
-    refused: float
-    lost: float
-
-
-@dataclass(frozen=True)
-class OperationRates:
-    """The requests of one operation, a second, and how long those took that were answered."""
-
-    answered: float
-    refused: dict[str, float]  # by error code
-    received_bytes: float
-    sent_bytes: float
-    p50_s: float | None  # None: nothing was answered
-    p99_s: float | None
-
-
-@dataclass(frozen=True)
-class Traffic:
-    """What happened in an interval, a second of it, by the metrics."""
-
-    scan_bytes_received: float
-    sources: dict[str, SourceRates]
-    operations: dict[str, OperationRates]
+    source_taken: dict[str, float]  # scans by source
+    source_lost: dict[str, float]  # scans by source
+    answered: dict[str, float]  # requests by operation
+    refused: dict[str, float]  # requests, as Sample.refused
+    p50_s: dict[str, float | None]  # of answered requests, by operation; None: there were none,
+    p99_s: dict[str, float | None]  # infinite: longer than the server measures
     mapper_share: dict[str, float]  # of the time, by what the mapper's thread did
 
-    @property
-    def requests_answered(self) -> float:
-        """Of all operations."""
-        return sum(operation.answered for operation in self.operations.values())
 
-    @property
-    def received_bytes(self) -> float:
-        """Of the requests of all operations."""
-        return sum(operation.received_bytes for operation in self.operations.values())
+def rates(before: Sample | None, after: Sample) -> Rates | None:
+    """Return the rates between two samples, ``None`` where they are not of the same server.
 
-    @property
-    def sent_bytes(self) -> float:
-        """Of the answers of all operations."""
-        return sum(operation.sent_bytes for operation in self.operations.values())
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A sample, and what happened since the one before, where that is of the same server."""
-
-    sample: Sample
-    seconds: float | None  # since the sample before
-    rates: Rates | None
-    traffic: Traffic | None
-    restarted: bool  # since the sample before
-
-
-def interval(before: Sample | None, after: Sample) -> Interval:
-    """What happened between two samples. A restarted server has counted anew: it has no rates.
-
-    The time between them is the server's own: samples may have been under way for long.
+    A restarted server counts from zero again, so that it has no rates until its second sample.
     """
-    if before is None:
-        return Interval(after, None, None, None, restarted=False)
-    if before.status.server != after.status.server:
-        return Interval(after, None, None, None, restarted=True)
-    seconds = _seconds(before.status.uptime_s, after.status.uptime_s)
-    rates = None if seconds is None else _rates(before.status, after.status, seconds)
-    traffic = _traffic_between(before.metrics, after.metrics)
-    return Interval(after, seconds, rates, traffic, restarted=False)
+    if before is None or before.status.server != after.status.server:
+        return None
+    old, new, was, now = before.status, after.status, before.metrics, after.metrics
+    seconds = now.uptime_s - was.uptime_s
+    if not 0.0 < seconds < math.inf:
+        return None
 
+    def per_s(earlier: float, later: float) -> float:
+        return max(0.0, later - earlier) / seconds  # counts of sources that are forgotten shrink
 
-def _seconds(before_s: float, after_s: float) -> float | None:
-    seconds = after_s - before_s
-    return seconds if 0.0 < seconds < math.inf else None
+    def each(earlier: Mapping[str, float], later: Mapping[str, float]) -> dict[str, float]:
+        return {name: per_s(earlier.get(name, 0.0), count) for name, count in later.items()}
 
-
-def _rates(before: ServerStatus, after: ServerStatus, seconds: float) -> Rates:
     return Rates(
-        scans_taken=_per_s(before.scans_taken, after.scans_taken, seconds),
-        scans_lost=_each_per_s(before.scans_lost, after.scans_lost, seconds),
-        scans_dropped=_each_per_s(before.scans_dropped, after.scans_dropped, seconds),
-        points_dropped=_each_per_s(before.points_dropped, after.points_dropped, seconds),
-        requests_refused=_each_per_s(before.requests_refused, after.requests_refused, seconds),
-        samples_trained=_per_s(before.samples_trained, after.samples_trained, seconds),
-        epochs=_per_s(before.epoch, after.epoch, seconds),
+        seconds=seconds,
+        epochs=per_s(old.epoch, new.epoch),
+        samples_trained=per_s(old.samples_trained, new.samples_trained),
+        scans_taken=per_s(old.scans_taken, new.scans_taken),
+        scan_bytes_received=per_s(was.scan_bytes_received, now.scan_bytes_received),
+        scans_dropped=each(old.scans_dropped, new.scans_dropped),
+        points_dropped=each(old.points_dropped, new.points_dropped),
+        source_taken=each(before.each("sources.taken"), after.each("sources.taken")),
+        source_lost=each(before.each("sources.lost"), after.each("sources.lost")),
+        answered=each(before.each("operations.answered"), after.each("operations.answered")),
+        refused=each(before.refused, after.refused),
+        p50_s={name: now.answer_time_s(name, 0.5, since=was) for name in now.operations},
+        p99_s={name: now.answer_time_s(name, 0.99, since=was) for name in now.operations},
+        mapper_share=each(was.mapper_s, now.mapper_s),
     )
-
-
-def _traffic_between(before: ServerMetrics | None, after: ServerMetrics | None) -> Traffic | None:
-    if before is None or after is None or before.server != after.server:
-        return None
-    seconds = _seconds(before.uptime_s, after.uptime_s)
-    if seconds is None or len(before.bounds_s) != len(after.bounds_s):
-        return None
-    return Traffic(
-        _per_s(before.scan_bytes_received, after.scan_bytes_received, seconds),
-        sources={
-            name: _source_rates(before.sources.get(name), source, seconds)
-            for name, source in after.sources.items()
-        },
-        operations={name: _operation_rates(name, before, after) for name in after.operations},
-        mapper_share=_each_per_s(before.mapper_s, after.mapper_s, seconds),
-    )
-
-
-def _source_rates(
-    before: SourceMetrics | None, after: SourceMetrics, seconds: float
-) -> SourceRates:
-    return SourceRates(
-        taken=_per_s(before.taken if before else 0, after.taken, seconds),
-        refused=_per_s(before.refused if before else 0, after.refused, seconds),
-        lost=_per_s(before.lost if before else 0, after.lost, seconds),
-    )
-
-
-def _operation_rates(name: str, before: ServerMetrics, after: ServerMetrics) -> OperationRates:
-    was, now = before.operations.get(name), after.operations[name]
-    seconds = after.uptime_s - before.uptime_s
-    grown = was is None or bool(np.all(now.answers.counts >= was.answers.counts))
-    return OperationRates(
-        answered=_per_s(was.answered if was else 0, now.answered, seconds),
-        refused=_each_per_s(was.refused if was else {}, now.refused, seconds),
-        received_bytes=_per_s(was.received_bytes if was else 0, now.received_bytes, seconds),
-        sent_bytes=_per_s(was.sent_bytes if was else 0, now.sent_bytes, seconds),
-        p50_s=after.answer_time_s(name, 0.5, since=before) if grown else None,
-        p99_s=after.answer_time_s(name, 0.99, since=before) if grown else None,
-    )
-
-
-def _per_s(before: float, after: float, seconds: float) -> float:
-    """A counter's rate: never below 0, for servers forget what concerns sources long silent."""
-    return max(0.0, after - before) / seconds
-
-
-def _each_per_s(
-    before: Mapping[str, float], after: Mapping[str, float], seconds: float
-) -> dict[str, float]:
-    return {name: _per_s(before.get(name, 0.0), count, seconds) for name, count in after.items()}

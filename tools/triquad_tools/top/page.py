@@ -1,164 +1,170 @@
-"""The page, drawn: what stands out first, then parts in as many columns as there is room for."""
+"""The page: what is out of order, then tables of figures in as many columns as there is room."""
 
-import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
-from rich.segment import Segment
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
+from triquad_format.errors import ERROR_CODES
 from triquad_format.printable import printable
 
-from triquad_tools.top.amounts import duration
-from triquad_tools.top.asked import asked
-from triquad_tools.top.incoming import incoming
-from triquad_tools.top.inside import inside
-from triquad_tools.top.interval import Interval
-from triquad_tools.top.problems import Grade, Problem, problems
-from triquad_tools.top.section import Section
-from triquad_tools.top.taken_up import taken_up
-from triquad_tools.top.watch import Silence, Target
+from triquad_tools.console.amounts import count, duration, milliseconds, rate, size, within
+from triquad_tools.top.interval import Rates, Sample
 
-_COLUMN_WIDTH = 39  # characters that a part needs
-_GAP = 2  # characters between columns
-_SIGNS = {Grade.GOOD: "   ", Grade.WARNING: "!  ", Grade.ERROR: "!! "}
-_LEAST_NAME = 12  # characters of a line's name that are shown in any case
-_STYLES = {Grade.GOOD: "", Grade.WARNING: "bold yellow", Grade.ERROR: "bold red"}
-_TITLE, _STALE = "bold cyan", "dim"
+_COLUMN_WIDTH, _GAP = 39, 2  # characters that a table needs, and between columns
+_SILENT_S = 5.0  # of a source, while others are heard
+_OVERDUE_EPOCH_S = 10.0  # while there is something to learn, two a second are published
+_NEARLY_FULL = 0.9  # of what the map may take
 
-Lines = list[list[Segment]]
+Rows = list[tuple[str, ...]]
 
 
 @dataclass(frozen=True)
-class Page:
-    """What is known of a server: the newest interval, and whether it answers."""
+class Seen:
+    """What is known of a server."""
 
-    target: Target
-    seen: Interval | None  # None: nothing yet
-    silence: Silence | None = None
-    height: int | None = None  # lines, to which it is cut; None: it is drawn whole
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """As wide as the terminal."""
-        options = options.reset_height()  # else lines are filled up to it
-        head = console.render_lines(self._head(), options)
-        left = None
-        if self.height is not None:
-            head = _cut(head, max(2, self.height // 2), console, options)
-            left = max(1, self.height - len(head))
-        body = self._body(console, options, left)
-        for line in head + body:
-            yield from line
-            yield Segment.line()
-
-    def _head(self) -> RenderableType:
-        lines: list[RenderableType] = [self._title()]
-        lines += [_problem(problem) for problem in self._problems()]
-        if self.seen is not None and self.seen.sample.metrics_missing is not None:
-            lines.append(_text(f"   {self.seen.sample.metrics_missing}"))
-        return Group(*lines)
-
-    def _title(self) -> RenderableType:
-        title = Table.grid(expand=True, padding=(0, _GAP, 0, 0))
-        title.add_column(ratio=1, no_wrap=True, overflow="ellipsis")
-        title.add_column(justify="right", no_wrap=True)
-        name = _text(f"map {self.target.map_name} at {self.target.endpoint}", "bold")
-        title.add_row(name.append(_server(self.seen), ""), _time_of_day(time.time()))
-        return title
-
-    def _problems(self) -> tuple[Problem, ...]:
-        if self.silence is not None:
-            return (Problem(Grade.ERROR, _unanswered(self.silence)),)
-        return () if self.seen is None else problems(self.seen)
-
-    def _body(self, console: Console, options: ConsoleOptions, height: int | None) -> Lines:
-        """The parts; closer together where they do not fit, and cut where that is not enough."""
-        if self.seen is None:
-            return []
-        groups = (incoming(self.seen), inside(self.seen), asked(self.seen), taken_up(self.seen))
-        style = console.get_style(_STALE if self.silence else "none")
-
-        def drawn(spaced: bool) -> Lines:
-            columns = _columns(groups, options.max_width, spaced=spaced)
-            return console.render_lines(columns, options, style=style)
-
-        lines = drawn(spaced=True)
-        if height is None or len(lines) <= height:
-            return lines
-        return _cut(drawn(spaced=False), height, console, options)
+    sample: Sample
+    rates: Rates | None  # None: this is the first sample of this server
+    restarted: bool = False  # since the sample before
+    silent: str | None = None  # why it does not answer any more
 
 
-def _unanswered(silence: Silence) -> str:
-    silent_s = time.monotonic() - silence.since_s
-    since = _time_of_day(time.time() - silent_s)
-    return f"no answer since {since}, for {duration(silent_s)}: {silence.reason}"
-
-
-def _time_of_day(stamp_s: float) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(stamp_s))
-
-
-def _server(seen: Interval | None) -> str:
-    if seen is None:
-        return ""
+def page(title: str, seen: Seen, width: int) -> Group:
+    """Draw what is known of a server; ``title`` says which it is, ``width`` is in characters."""
     status = seen.sample.status
-    up = f"up {duration(status.uptime_s)}"
-    return printable(f", triquad {status.version} on {status.device}, {up}")
+    up = f"triquad {status.version} on {status.device}, up {duration(status.uptime_s)}"
+    head = [Text(printable(f"{title}, {up}"), "bold")]
+    head += [Text(printable(f"!! {problem}"), "bold red") for problem in problems(seen)]
+    if seen.rates is None:
+        return Group(*head, "rates are told from the second sample on")
+    number = max(1, (width + _GAP) // (_COLUMN_WIDTH + _GAP))
+    stacks: list[list[Table]] = [[] for _ in range(number)]
+    for titles, rows in _tables(seen.sample, seen.rates):
+        shortest = min(stacks, key=lambda stack: sum(2 + table.row_count for table in stack))
+        shortest += [_table(titles, rows)] if rows else []
+    columns = Table.grid(*([""] * number), expand=True, padding=(0, _GAP, 0, 0))
+    for column in columns.columns:
+        column.ratio = 1
+    columns.add_row(*(Group(*stack) for stack in stacks), style="dim" if seen.silent else "")
+    return Group(*head, "", columns)
 
 
-def _problem(problem: Problem) -> RenderableType:
-    """A sign, and the text folded beside it."""
-    line = Table.grid()
-    line.add_column(no_wrap=True)
-    line.add_column(overflow="fold")
-    style = _STYLES[problem.grade]
-    line.add_row(_text(_SIGNS[problem.grade], style), _text(problem.text, style))
-    return line
+def problems(seen: Seen) -> list[str]:
+    """Return what is out of order now, in whole sentences, most serious first."""
+    found = [] if seen.silent is None else [seen.silent]
+    if seen.restarted:
+        found.append("the server was restarted: its counts began again")
+    return [*found, *_problems(seen.sample), *(_losses(seen.rates) if seen.rates else ())]
 
 
-def _columns(groups: tuple[tuple[Section, ...], ...], width: int, *, spaced: bool) -> Table:
-    """The groups side by side; where there is no room for all, the last ones below the first."""
-    number = max(1, min(len(groups), (width + _GAP) // (_COLUMN_WIDTH + _GAP)))
-    beside = Table.grid(expand=True, padding=(0, _GAP, 0, 0))
-    for _ in range(number):
-        beside.add_column(ratio=1)
-    stacks: list[list[RenderableType]] = [[] for _ in range(number)]
-    for position, group in enumerate(groups):
-        for section in group:
-            stacks[position % number] += _section(section, spaced)
-    beside.add_row(*(Group(*stack) for stack in stacks))
-    return beside
+def _problems(sample: Sample) -> Iterator[str]:
+    status, metrics, ages_s = sample.status, sample.metrics, sample.each("sources.age_s")
+    if metrics.problem is not None:
+        yield metrics.problem
+    for name, queue in metrics.queues.items():
+        if queue.waiting >= queue.limit > 0:
+            yield f"the queue of {name} is full: {count(queue.waiting)} wait"
+    if metrics.epoch_age_s > _OVERDUE_EPOCH_S and not status.settled:
+        yield f"no new epoch for {duration(metrics.epoch_age_s)}, although something is to learn"
+    if status.map_bytes >= _NEARLY_FULL * status.map_max_bytes > 0:
+        yield f"the map nears {size(status.map_max_bytes)}: beyond, scans are refused"
+    for name, age_s in ages_s.items():
+        if age_s >= _SILENT_S > min(ages_s.values()):
+            yield f"source {name} is silent for {duration(age_s)}"
+    yield from (status.warnings or "").splitlines()
 
 
-def _section(section: Section, spaced: bool) -> Iterator[RenderableType]:
-    """A table, perhaps with an empty line below; nothing where it has no lines."""
-    if not section.rows:
-        return
-    table = Table(
-        box=None, expand=True, padding=(0, 0, 0, _GAP), pad_edge=False, header_style=_TITLE
+def _losses(rates: Rates) -> Iterator[str]:
+    for name, per_s in rates.source_lost.items():
+        if per_s > 0.0:
+            yield f"source {name}: {rate(per_s)} scans a second are lost"
+    for reason, per_s in rates.scans_dropped.items():
+        if per_s > 0.0:
+            yield f"{rate(per_s)} scans a second are refused: {reason}"
+    for name, per_s in rates.refused.items():
+        code = name.rpartition(" ")[2]
+        if per_s > 0.0 and code in ("busy", "internal"):  # for others the client is to blame
+            yield f"{name}: {rate(per_s)} requests a second are refused: {ERROR_CODES[code]}"
+
+
+def _tables(sample: Sample, rates: Rates) -> Iterator[tuple[str, Rows]]:
+    """Yield titles and rows of all tables, the most important ones first."""
+    status, metrics = sample.status, sample.metrics
+    taken = ("taken", rate(rates.scans_taken), count(status.scans_taken))
+    received = (size(rates.scan_bytes_received), size(metrics.scan_bytes_received))
+    dropped = _each(rates.scans_dropped, status.scans_dropped, "dropped, ")
+    yield "SCANS|/s|total", [taken, ("bytes received", *received), *dropped]
+    yield "MAP|", list(_map(sample, rates))
+    yield "OPERATIONS|/s|p50 ms|p99 ms", list(_operations(sample, rates))
+    yield (
+        "SOURCES|/s|lost|heard",
+        [
+            (name, rate(rates.source_taken[name]), count(one.lost), f"{duration(one.age_s)} ago")
+            for name, one in metrics.sources.items()
+        ],
     )
-    name = f"{_SIGNS[Grade.GOOD]}{section.title}"
-    table.add_column(name, ratio=1, min_width=_LEAST_NAME, no_wrap=True, overflow="ellipsis")
-    for title in section.columns:
+    queues = [(n, one) for n, one in metrics.queues.items() if one.waiting or n == "scans"]
+    yield "QUEUES|waiting|limit", [(n, count(one.waiting), count(one.limit)) for n, one in queues]
+    yield "REQUESTS REFUSED|/s|total", _each(rates.refused, sample.refused)
+    parts = sorted(metrics.memory_bytes.items(), key=lambda part: -part[1])
+    memory = [("process", status.memory_bytes), ("map", status.map_bytes), *parts]
+    yield "MEMORY|", [(name, size(number)) for name, number in memory if number]
+    yield "POINTS DROPPED|/s|total", _each(rates.points_dropped, status.points_dropped)
+    kinds = Counter(metrics.sessions.values()).items()
+    yield "CONNECTED|", [(kind, count(number)) for kind, number in kinds]
+    shares = rates.mapper_share.items()
+    yield "MAPPER'S TIME|", [(name, f"{100.0 * share:.0f} %") for name, share in shares]
+
+
+def _map(sample: Sample, rates: Rates) -> Iterator[tuple[str, str]]:
+    status, checkpoints = sample.status, sample.metrics.checkpoints
+    yield "epoch", f"{status.epoch:,}, {duration(sample.metrics.epoch_age_s)} old"
+    yield "epochs /s", rate(rates.epochs)
+    yield "samples /s", rate(rates.samples_trained)
+    left = "nothing, settled" if status.settled else f"{count(status.samples_left)} samples"
+    if not status.settled and rates.samples_trained > 0.0:
+        left += f", {duration(status.samples_left / rates.samples_trained)}"
+    yield "to learn", left
+    yield "loss", f"{status.loss:.4f}"
+    if status.fit is not None:
+        yield "held-out rays within", within(status.fit.median_m, status.fit.upper_m)
+    yield "regions", count(status.regions)
+    if checkpoints.age_s is not None:
+        yield "last checkpoint", f"{duration(checkpoints.age_s)} ago"
+    yield "written, failed", f"{count(checkpoints.written)}, {count(checkpoints.failed)}"
+
+
+def _operations(sample: Sample, rates: Rates) -> Iterator[tuple[str, ...]]:
+    """Yield a row for each operation that was ever answered, the most frequent first."""
+    longest_s = max(sample.metrics.bounds_s.tolist(), default=0.0)
+
+    def shown(seconds: float | None) -> str:
+        if seconds is None:
+            return "-"
+        return milliseconds(seconds) if seconds <= longest_s else f">{milliseconds(longest_s)}"
+
+    for name, total in sorted(sample.each("operations.answered").items(), key=lambda one: -one[1]):
+        if total:
+            times = (shown(rates.p50_s[name]), shown(rates.p99_s[name]))
+            yield name.rpartition("/")[2], rate(rates.answered[name]), *times
+
+
+def _each(per_s: Mapping[str, float], totals: Mapping[str, int], prefix: str = "") -> Rows:
+    """Return a row for each count, the largest first."""
+    largest_first = sorted(totals.items(), key=lambda item: -item[1])
+    return [(prefix + name, rate(per_s[name]), count(total)) for name, total in largest_first]
+
+
+def _table(titles: str, rows: Rows) -> Table:
+    name, *figures = titles.split("|")
+    table = Table(
+        box=None, expand=True, padding=(0, 0, 0, _GAP), pad_edge=False, header_style="bold cyan"
+    )
+    table.add_column(name, ratio=1, min_width=12, no_wrap=True, overflow="ellipsis")
+    for title in figures:
         table.add_column(title, justify="right", no_wrap=True, overflow="ellipsis")
-    for row in section.rows:
-        cells = (f"{_SIGNS[row.grade]}{row.name}", *row.values)
-        table.add_row(*(_text(cell) for cell in cells), style=_STYLES[row.grade])
-    yield table
-    if spaced:
-        yield _text("")
-
-
-def _text(text: str, style: str = "") -> Text:
-    return Text(printable(text), style)
-
-
-def _cut(lines: Lines, height: int, console: Console, options: ConsoleOptions) -> Lines:
-    """The first lines, with a word of how many are left out."""
-    if len(lines) <= height:
-        return lines
-    hidden = len(lines) - height + 1
-    note = _text(f"   {hidden} more lines: make the window larger, or use --once", "reverse")
-    note.no_wrap, note.overflow = True, "ellipsis"
-    return lines[: height - 1] + console.render_lines(note, options)
+    for row in rows:
+        table.add_row(*(Text(printable(cell)) for cell in row))
+    return table

@@ -4,7 +4,7 @@ import time
 
 from triquad_format.wire.messages import ServerStatus
 
-from triquad_tools.top.amounts import duration
+from triquad_tools.console.amounts import duration
 from triquad_tools.top.interval import Rates, Sample, interval
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import problem_html, table_html
