@@ -23,7 +23,7 @@ from triquad_format.wire import keys
 from triquad_format.wire.roles import ROUTER, SERVER, Holder, Role
 from triquad_tools.commands import inspect, top
 from triquad_tools.console.command import FAILED, OK
-from triquad_tools.credentials.authority import Authority
+from triquad_tools.credentials.certificates import Authority
 from triquad_tools.credentials.key_folder import KeyFolder
 
 DAYS = 1.0
@@ -48,7 +48,7 @@ class Network:
     @contextmanager
     def session(self, who: str, path: str) -> Iterator[zenoh.Session]:
         """Of a member; a stranger comes with the file of the robot, and his own certificate."""
-        name = self.folder.register.holder("robot").common_name
+        name = self.folder.holder("robot").common_name
         changes = {
             "forged authority": showing(Authority.create("forged").client(name, DAYS)),
             "no certificate": {"transport__link__tls__enable_mtls": False},

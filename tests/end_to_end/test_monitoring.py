@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import math
 import re
 import resource
 import signal
@@ -21,10 +22,12 @@ import triquad_server
 from prometheus_client.parser import text_string_to_metric_families
 from support import servers
 from triquad_client import RefusedError
+from triquad_format.errors import SettingsError
 from triquad_format.printable import printable
 from triquad_server.errors import ListenError
 from triquad_server.monitoring.prometheus import FAMILIES
 from triquad_server.settings import MetricsSettings
+from triquad_server.settings.loading import load_settings
 from triquad_tools.demo.server import free_port
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -87,7 +90,14 @@ def test_prometheus_is_told_what_clients_are_told(port):
     sdf = (("operation", "query/sdf"),)
     assert found["triquad_request_duration_seconds_count", sdf] == 5
     assert 0 < found["triquad_request_duration_seconds_sum", sdf] < servers.WAIT_S
-    assert found["triquad_request_duration_seconds_bucket", (("le", "+Inf"), *sdf)] == 5
+    buckets = {
+        float(dict(labels)["le"]): count
+        for (name, labels), count in found.items()
+        if name == "triquad_request_duration_seconds_bucket" and sdf[0] in labels
+    }
+    assert len(buckets) > 20
+    assert [count for _, count in sorted(buckets.items())] == sorted(buckets.values())
+    assert buckets[math.inf] == 5
     gone = (("code", "epoch_gone"), ("operation", "query/distance"))
     assert found["triquad_requests_refused_total", gone] == 1
     taken = (("outcome", "taken"), ("source", "default"))
@@ -100,18 +110,6 @@ def test_prometheus_is_told_what_clients_are_told(port):
     assert found["triquad_sessions", (("kind", "client"),)] == 1
     assert not any("query/align" in dict(labels).values() for _, labels in found)
     assert get(port, "/metrics").content_type.startswith("text/plain; version=0.0.4")
-
-
-def test_buckets_count_up_to_their_bounds(port):
-    buckets = [
-        (float(dict(labels)["le"]), count)
-        for (name, labels), count in samples(port).items()
-        if name == "triquad_request_duration_seconds_bucket"
-        and ("operation", "query/mesh") in labels
-    ]
-    assert len(buckets) > 20
-    assert buckets == sorted(buckets)
-    assert [count for _, count in buckets] == sorted(count for _, count in buckets)
 
 
 def test_the_page_lists_what_is_exposed(port):
@@ -169,40 +167,29 @@ def test_nothing_else_is_answered_and_nothing_breaks_it(port):
 
 
 def test_a_probe_may_ask_for_the_head_alone(port):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=servers.WAIT_S)
-    with closing(connection):
-        connection.request("HEAD", "/healthz")
-        reply = connection.getresponse()
-        assert reply.status == 200
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=servers.WAIT_S)) as probe:
+        probe.request("HEAD", "/healthz")
+        reply = probe.getresponse()
+        assert (reply.status, reply.read()) == (200, b"")
         assert int(reply.headers["Content-Length"]) > 0
-        assert reply.read() == b""
 
 
-def test_idle_connections_take_no_more_than_some_threads(port):
+def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(port):
     with ExitStack() as stack:
-        silent = [
+        opened = [
             stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(20)
         ]
-        for connection in silent:
-            connection.settimeout(servers.WAIT_S)
-        closed = silent[-1].recv(1)  # at once, while the first ones are still waited for
-        assert closed == b""
-    until(lambda: is_healthy(port))  # once it noticed that they were closed
-
-
-def test_requests_that_trickle_in_are_given_up(port):
-    with ExitStack() as stack:
-        open_ones = [
-            stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(8)
-        ]
-        for connection in open_ones:
+        opened[-1].settimeout(servers.WAIT_S)
+        assert opened[-1].recv(1) == b""  # closed at once, while the first ones are waited for
+        for connection in opened:
             connection.settimeout(0.1)
-        while open_ones:  # a byte each second or so: never silent for long
-            open_ones = [connection for connection in open_ones if goes_on(connection)]
+        trickling = opened
+        while trickling:  # a byte each second or so: never silent for long
+            trickling = [connection for connection in trickling if stays_open(connection)]
     until(lambda: is_healthy(port))
 
 
-def goes_on(connection: socket.socket) -> bool:
+def stays_open(connection: socket.socket) -> bool:
     """Whether a connection that gets another byte stays open."""
     try:
         connection.sendall(b"G")
@@ -290,7 +277,7 @@ def test_a_port_that_is_taken_ends_the_server_at_once(arguments):
     assert "preparing" not in server.log
 
 
-@pytest.mark.parametrize("address", ["nowhere.invalid", "203.0.113.7", "a" * 200, "\0"])
+@pytest.mark.parametrize("address", ["203.0.113.7", "a" * 200, "\0"])
 def test_an_address_that_is_not_ours_is_named(address):
     settings = servers.SMALL.model_copy(
         update={"metrics": MetricsSettings(port=free_port(), address=address)}
@@ -314,14 +301,12 @@ def test_a_server_within_a_program_closes_its_port():
             socket.create_connection(("::1", port))
 
 
-@pytest.mark.parametrize("port", ["-1", "65536", "http"])
-def test_ports_that_are_none_are_refused(port):
-    command = [sys.executable, "-m", "triquad_server.cli", "--metrics-port", port]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert ended.returncode == 2
-    assert "metrics.port" in ended.stderr
-
-
 def test_prometheus_client_is_imported_only_where_it_is_wanted():
     script = "import sys, triquad_server.launch; sys.exit('prometheus_client' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("port", ["-1", "65536", "http"])
+def test_ports_that_are_none_are_refused(port):
+    with pytest.raises(SettingsError, match=r"metrics\.port"):
+        load_settings(None, [f"metrics.port={port}"])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
-from triquad_tools.credentials.certificate import Certificate
+from triquad_tools.credentials.certificates import Certificate
 from triquad_tools.demo.server import free_port
 
 
@@ -18,7 +18,7 @@ def free_tls_endpoint() -> str:
 
 @contextmanager
 def opened(file: Path, endpoint: str | None, **changes: Any) -> Iterator[zenoh.Session]:
-    """A session of ``file`` that connects there; as an attacker's, it minds no rules of its own.
+    """A session of ``file`` that connects there; as an attacker's, it keeps to no rules of its own.
 
     ``changes`` are values of the configuration, with ``__`` for ``/`` in their names.
     """

@@ -1,8 +1,8 @@
 """``triquad-keys``: who may do what on a server, by certificates."""
 
 import argparse
-import datetime
 from collections.abc import Sequence
+from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 from triquad_tools.credentials.key_folder import LISTENING, KeyFolder
 
-_COMMAND = "triquad-keys"
 _DAYS = 365.0
 _LAST_DOMAIN = 232  # of ROS 2
 _ROLES = {
@@ -23,24 +22,21 @@ _ROLES = {
     Role.ADMIN: "may reset the map and have checkpoints written, and what a viewer may; with "
     "--source, publish scans too",
 }
-_RESTART = "start servers and routers anew, for they read their file when they start"
+_RESTART = "start servers and routers again, for they read their file when they start"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 2 wrong usage, or a folder that cannot be used."""
     options = _parser().parse_args(argv)
-    return run(_COMMAND, partial(options.work, options))
+    return run("triquad-keys", partial(options.work, options))
 
 
 def _init(options: argparse.Namespace) -> int:
-    first = (
-        Holder("viewer", Role.VIEWER),
-        Holder("robot", Role.ROBOT, tuple(options.source or ["default"]), options.ros2_domain),
-        Holder("admin", Role.ADMIN),
-    )
     folder = KeyFolder.create(options.folder, options.host, options.days)
-    for holder in first:
-        folder.add(holder, options.days)
+    sources = tuple(options.source or ["default"])
+    folder.add(Holder("viewer", Role.VIEWER), options.days)
+    folder.add(Holder("robot", Role.ROBOT, sources, options.ros2_domain), options.days)
+    folder.add(Holder("admin", Role.ADMIN), options.days)
     print_line(
         f"{options.folder} is ready; keep it to yourself, {options.folder / 'authority'} above all."
         f"\n  triquad-server --config {options.folder / 'server.json5'}\n"
@@ -73,107 +69,77 @@ def _remove(options: argparse.Namespace) -> int:
 
 def _list(options: argparse.Namespace) -> int:
     folder = KeyFolder(options.folder)
-    hosts = ", ".join(folder.register.hosts) or "this machine"
+    hosts = ", ".join(folder.hosts) or "this machine"
     rows = [(name, name, hosts, "", _day(folder.certificate(name).expires)) for name in LISTENING]
-    for entry in folder.register.entries:
-        holder = entry.holder
+    for entry in folder.entries.values():
+        holder, expires = entry.holder, entry.expires
         domain = "" if holder.ros2_domain is None else str(holder.ros2_domain)
-        sources = ", ".join(holder.sources)
-        rows.append((holder.name, holder.role.value, sources, domain, _day(entry.expires)))
-    print_columns(
-        ("name", "role", "hosts or sources", "ROS 2 domain", "expires"),
-        rows,
-        words=("role", "hosts or sources", "expires"),
-    )
+        rows.append(
+            (holder.name, holder.role.value, ", ".join(holder.sources), domain, _day(expires))
+        )
+    titles = ("name", "role", "hosts or sources", "ROS 2 domain", "expires")
+    print_columns(titles, rows, words=("role", "hosts or sources", "expires"))
     return OK
 
 
-def _day(expires: datetime.datetime) -> str:
-    """The day, and whether it has passed."""
-    over = expires < datetime.datetime.now(datetime.timezone.utc)
-    return f"{expires:%Y-%m-%d}{' EXPIRED' if over else ''}"
+def _day(expires: datetime) -> str:
+    """Return the day, and whether it has passed."""
+    return f"{expires:%Y-%m-%d}{' EXPIRED' if expires < datetime.now(timezone.utc) else ''}"
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+        prog="triquad-keys",
         description="Give roles to those who use a map server: a certificate authority in a "
         "folder, and a Zenoh configuration for the server, routers and each client, who may do "
         "what their roles say, and nothing else. docs/security.md tells more.",
         epilog="Exit status: 0 done, 2 wrong usage, or a folder that cannot be used.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    _add_init(commands)
+
+    def command(name: str, what: str, work: object) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=what, description=what)
+        added.set_defaults(work=work, source=None, ros2_domain=None)
+        added.add_argument("folder", type=Path, metavar="DIR", help="the folder of keys")
+        return added
+
+    init = command("init", "make a new folder, with the clients viewer, robot and admin", _init)
+    hosts = "name or address by which others find the server, or a router, repeatable; the machine "
+    hosts += "itself finds it without"
+    init.add_argument("--host", action="append", default=[], metavar="HOST", help=hosts)
+    _add_sources(init, default=" (default: default)")
     for role, may in _ROLES.items():
-        add = _command(commands, role.value, f"add one who {may}", _add)
-        add.set_defaults(role=role, source=None, ros2_domain=None)
+        add = command(role.value, f"add one who {may}", _add)
+        add.set_defaults(role=role)
         add.add_argument("name", metavar="NAME", help="of the client")
         if role is not Role.VIEWER:
             _add_sources(add, required=role is Role.ROBOT)
         _add_days(add)
-    renew = _command(commands, "renew", "issue new certificates before the old ones expire", _renew)
+    renew = command("renew", "issue new certificates before the old ones expire", _renew)
     renew.add_argument("name", nargs="+", metavar="NAME", help="of a client, server or router")
-    _add_days(renew)
-    remove = _command(commands, "remove", "take a role away", _remove)
+    for with_days in (init, renew):
+        _add_days(with_days)
+    remove = command("remove", "take a role away", _remove)
     remove.add_argument("name", metavar="NAME", help="of a client")
-    _command(commands, "list", "tell who has which role, and until when", _list)
+    command("list", "tell who has which role, and until when", _list)
     add_version(parser)
     return parser
 
 
-def _add_init(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    init = _command(
-        commands, "init", "make a new folder, with the clients viewer, robot and admin", _init
-    )
-    init.add_argument(
-        "--host",
-        action="append",
-        default=[],
-        metavar="HOST",
-        help="name or address by which others find the server, or a router, repeatable; the "
-        "machine itself finds it without",
-    )
-    _add_sources(init, required=False)
-    _add_days(init)
-
-
-def _command(
-    commands: "argparse._SubParsersAction[argparse.ArgumentParser]",
-    name: str,
-    what: str,
-    work: object,
-) -> argparse.ArgumentParser:
-    command: argparse.ArgumentParser = commands.add_parser(name, help=what, description=what)
-    command.set_defaults(work=work)
-    command.add_argument("folder", type=Path, metavar="DIR", help="the folder of keys")
-    return command
-
-
-def _add_sources(command: argparse.ArgumentParser, *, required: bool) -> None:
+def _add_sources(
+    command: argparse.ArgumentParser, *, default: str = "", required: bool = False
+) -> None:
+    sources = f"of scans that the robot publishes, and nobody else, repeatable{default}"
     command.add_argument(
-        "--source",
-        action="append",
-        required=required,
-        metavar="NAME",
-        help="of scans that the robot publishes, and nobody else, repeatable"
-        + ("" if required else " (default: default)" if command.prog.endswith("init") else ""),
+        "--source", action="append", required=required, metavar="NAME", help=sources
     )
-    command.add_argument(
-        "--ros2-domain",
-        type=_domain,
-        metavar="N",
-        help="let nodes of ROS 2 with this certificate take part in this domain",
-    )
+    domain = "let nodes of ROS 2 with this certificate take part in this domain"
+    command.add_argument("--ros2-domain", type=_domain, metavar="N", help=domain)
 
 
 def _add_days(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--days",
-        type=positive,
-        default=_DAYS,
-        metavar="N",
-        help=f"until the certificate expires (default: {_DAYS:g})",
-    )
+    until = f"until the certificate expires (default: {_DAYS:g})"
+    command.add_argument("--days", type=positive, default=_DAYS, metavar="N", help=until)
 
 
 def _domain(text: str) -> int:

@@ -1,29 +1,33 @@
-"""A folder of keys: the authority with its register, and a file for each who takes part.
+"""A folder of keys: the authority with its register, and a file for each server and client.
 
 ::
 
     server.json5, router.json5   for triquad-server --config, and for a router of Zenoh
     NAME.json5                   all that a client needs, to be moved to where it runs
-    authority/                   the authority's own: whoever can read it can take any role
+    authority/                   the authority's own: a program that can read it can take any role
+
+Files and folders can be read by their owner alone, and each is written as a whole or not at all.
 """
 
+import json
+import os
 import re
 import secrets
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from triquad_format.wire.access_control import access_control
-from triquad_format.wire.roles import ROUTER, SERVER, Holder, client_grants, server_grants
+from triquad_format.wire.roles import ROUTER, SERVER, Holder, Role, client_grants, server_grants
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.credentials import configurations, private_files
-from triquad_tools.credentials.authority import LOCAL_HOSTS, Authority
-from triquad_tools.credentials.certificate import Certificate
-from triquad_tools.credentials.register import Entry, Register
+from triquad_tools.credentials import configurations
+from triquad_tools.credentials.certificates import LOCAL_HOSTS, Authority, Certificate
 
 LISTENING = (SERVER, ROUTER)
-"""Who listens; each has a file of its own, whose name nobody else can have."""
+"""Those that listen; each has a file of its own, whose name no client can have."""
 
 _HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
 _NAME_LENGTH = 48  # with role and issue it has to fit into the 64 characters of a common name
@@ -31,8 +35,20 @@ _AUTHORITY = "authority"
 _REGISTER = "register.json"
 
 
+@dataclass(frozen=True)
+class Entry:
+    """A role that was given."""
+
+    holder: Holder
+    expires: datetime  # UTC
+
+
 class KeyFolder:
-    """The keys of the servers and clients that trust one authority."""
+    """The keys of the servers and clients that trust one authority.
+
+    ``hosts`` are those of servers and routers, and ``entries`` the clients by name, in the order in
+    which they got their roles.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open a folder.
@@ -42,35 +58,39 @@ class KeyFolder:
             OSError: it cannot be read.
         """
         self.path = path
+        register = path / _AUTHORITY / _REGISTER
         try:
-            self.register = Register.read((path / _AUTHORITY / _REGISTER).read_bytes())
+            read = json.loads(register.read_bytes())
+            self.hosts = tuple(read["hosts"])
+            self.entries = {entry["name"]: _entry(**entry) for entry in read["roles"]}
         except FileNotFoundError as error:
             raise ToolError(f"{path} holds no keys: triquad-keys init {path}") from error
-        except ValueError as error:
-            raise ToolError(f"{path / _AUTHORITY / _REGISTER} is damaged: {error}") from error
-        self.authority = Authority(self._stored(_AUTHORITY))
+        except (ValueError, KeyError, TypeError) as error:
+            raise ToolError(f"{register} is damaged: {error!r}") from error
+        self.authority = Authority(self.certificate(_AUTHORITY))
 
     @classmethod
     def create(cls, path: Path, hosts: Sequence[str], days: float) -> "KeyFolder":
-        """A new folder, with an authority, a server and a router on ``hosts``, and no clients.
+        """Make a new folder, with an authority, a server and a router on ``hosts``, and no clients.
 
         Raises:
-            ToolError: the folder is there already, or a host cannot be one.
+            ToolError: the folder exists, or a host is neither a name nor an address.
             OSError: it cannot be written.
         """
         for host in hosts:
             if not _HOST.fullmatch(host):
                 raise ToolError(f"host {host!r}: use a name or an address, without a port")
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            private_files.create_folder(path)
+            path.mkdir(mode=0o700)
         except FileExistsError as error:
             raise ToolError(f"{path} is there already: choose another folder") from error
-        private_files.create_folder(path / _AUTHORITY)
+        (path / _AUTHORITY).mkdir(mode=0o700)
         authority = Authority.create(f"triquad authority {path.resolve().name}"[:64])
         _store(path, _AUTHORITY, authority.own)
         for name in LISTENING:
             _store(path, name, authority.server(name, hosts, days))
-        private_files.write(path / _AUTHORITY / _REGISTER, Register(tuple(hosts)).text())
+        _write(path / _AUTHORITY / _REGISTER, _register(hosts, {}))
         created = cls(path)
         created._write_access()
         return created
@@ -79,80 +99,119 @@ class KeyFolder:
         """Give a role; returns the file with which its holder connects.
 
         Raises:
-            ToolError: the name or a source is another's, or the name cannot be one.
+            ToolError: another client has the name or a source, or the name cannot be one.
             OSError: it cannot be written.
         """
         if holder.name in (*LISTENING, _AUTHORITY):
             raise ToolError(f"{holder.name!r} is not a name for a role: choose another")
         if len(holder.name) > _NAME_LENGTH:
             raise ToolError(f"{holder.name!r} has more than {_NAME_LENGTH} characters")
-        self.register.check_free(holder.name, holder.sources)
+        for other in self.holders:
+            if other.name == holder.name:
+                raise ToolError(
+                    f"{other.name!r} is there already, with the role {other.role.value}: "
+                    "remove it first, or renew it"
+                )
+            for source in set(holder.sources) & set(other.sources):
+                raise ToolError(
+                    f"source {source!r} is that of {other.name!r}: each source has one publisher"
+                )
         return self._issue(replace(holder, issue=secrets.token_hex(4)), days)
 
     def renew(self, name: str, days: float) -> Path:
-        """A new certificate for who has one; returns the file that takes the place of the old one.
+        """Issue a new certificate; returns the file that takes the place of the old one.
 
         Raises:
-            ToolError: nobody has this name.
+            ToolError: there is no such client, server or router.
             OSError: it cannot be written.
         """
         if name not in LISTENING:
-            return self._issue(self.register.holder(name), days)
-        _store(self.path, name, self.authority.server(name, self.register.hosts, days))
+            return self._issue(self.holder(name), days)
+        _store(self.path, name, self.authority.server(name, self.hosts, days))
         self._write_access()
         return self._file(name)
 
     def remove(self, name: str) -> None:
-        """Take a role away: servers that start anew let its holder do nothing any more.
+        """Take a role away: servers that are started again let its holder do nothing any more.
 
         Raises:
-            ToolError: nobody has this name.
+            ToolError: there is no such client.
             OSError: it cannot be written.
         """
-        self.register.holder(name)
-        self._write_register(self.register.without(name))
+        del self.entries[self.holder(name).name]
+        self._write_access()
         self._file(name).unlink(missing_ok=True)  # it may have been moved to its holder
 
+    @property
+    def holders(self) -> tuple[Holder, ...]:
+        """All clients."""
+        return tuple(entry.holder for entry in self.entries.values())
+
+    def holder(self, name: str) -> Holder:
+        """Return the client of this name.
+
+        Raises:
+            ToolError: there is none.
+        """
+        if name not in self.entries:
+            names = ", ".join(self.entries) or "nobody"
+            raise ToolError(f"nobody is called {name!r}; there are: {names}")
+        return self.entries[name].holder
+
     def certificate(self, name: str) -> Certificate:
-        """That of the server, the router or the authority."""
-        return self._stored(name)
+        """Return that of the server, the router or the authority."""
+        stem = self.path / _AUTHORITY / name
+        return Certificate(Path(f"{stem}.pem").read_bytes(), Path(f"{stem}-key.pem").read_bytes())
 
     def _issue(self, holder: Holder, days: float) -> Path:
-        own = self.authority.client(holder.common_name, days)
-        file = self._file(holder.name)
-        hosts = self.register.hosts or LOCAL_HOSTS[:1]
-        title = f"{holder.role.value} {holder.name}"
-        access = access_control(client_grants())
-        authority = self.authority.own
-        private_files.write(file, configurations.connecting(title, own, authority, access, hosts))
-        self._write_register(self.register.with_entry(Entry(holder, own.expires)))
+        own, authority = self.authority.client(holder.common_name, days), self.authority.own
+        file, title = self._file(holder.name), f"{holder.role.value} {holder.name}"
+        access, hosts = access_control(client_grants()), self.hosts or LOCAL_HOSTS[:1]
+        _write(file, configurations.connecting(title, own, authority, access, hosts))
+        self.entries[holder.name] = Entry(holder, own.expires)
+        self._write_access()
         return file
 
-    def _write_register(self, register: Register) -> None:
-        private_files.write(self.path / _AUTHORITY / _REGISTER, register.text())
-        self.register = register
-        self._write_access()
-
     def _write_access(self) -> None:
-        """Write what servers and routers go by."""
-        access = access_control(server_grants(self.register.holders))
+        """Write the register, and the files of the server and the router that follow from it."""
+        _write(self.path / _AUTHORITY / _REGISTER, _register(self.hosts, self.entries))
+        access = access_control(server_grants(self.holders))
         for name in LISTENING:
-            text = configurations.listening(
-                f"the {name}", self._stored(name), self.authority.own, access
-            )
-            private_files.write(self._file(name), text)
+            own, authority = self.certificate(name), self.authority.own
+            text = configurations.listening(f"the {name}", own, authority, access)
+            _write(self._file(name), text)
 
     def _file(self, name: str) -> Path:
         return self.path / f"{name}.json5"
 
-    def _stored(self, name: str) -> Certificate:
-        folder = self.path / _AUTHORITY
-        return Certificate(
-            (folder / f"{name}.pem").read_bytes(), (folder / f"{name}-key.pem").read_bytes()
-        )
+
+def _register(hosts: Sequence[str], entries: dict[str, Entry]) -> bytes:
+    roles = [
+        {**asdict(one.holder), "role": one.holder.role.value, "expires": one.expires.isoformat()}
+        for one in entries.values()
+    ]
+    return (json.dumps({"hosts": hosts, "roles": roles}, indent=2) + "\n").encode()
+
+
+def _entry(*, role: str, sources: list[str], expires: str, **others: Any) -> Entry:
+    holder = Holder(role=Role(role), sources=tuple(sources), **others)
+    return Entry(holder, datetime.fromisoformat(expires))
 
 
 def _store(path: Path, name: str, certificate: Certificate) -> None:
-    folder = path / _AUTHORITY
-    private_files.write(folder / f"{name}-key.pem", certificate.key_pem)
-    private_files.write(folder / f"{name}.pem", certificate.pem)
+    _write(path / _AUTHORITY / f"{name}-key.pem", certificate.key_pem)
+    _write(path / _AUTHORITY / f"{name}.pem", certificate.pem)
+
+
+def _write(path: Path, data: bytes) -> None:
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
