@@ -46,12 +46,12 @@ def _top(options: argparse.Namespace) -> int:
     reached = connect(options.connect, name, timeout_s=_TIMEOUT_S, config=options.config)
     with sigterm_interrupts(), reached as client:
         if options.once or not (options.json or is_screen):
-            _, seen = itertools.islice(_observed(client, options.interval, time.sleep), 2)
+            _, seen = itertools.islice(_observed(client, options.interval, _sleep), 2)
             if seen.silent is not None:
                 return complain(_COMMAND, seen.silent, FAILED)
             print_line(draw(seen))
         elif options.json:
-            for seen in _observed(client, options.interval, time.sleep):
+            for seen in _observed(client, options.interval, _sleep):
                 print_line(draw(seen))
         else:
             _show(server, name, client, options.interval)
@@ -59,7 +59,7 @@ def _top(options: argparse.Namespace) -> int:
 
 
 def _observed(
-    client: Client, period_s: float, ends_within: Callable[[float], object]
+    client: Client, period_s: float, ends_within: Callable[[float], bool]
 ) -> Iterator[Seen]:
     """Yield what is known of a server, at each interval; one that does not answer is waited for."""
     seen, due_s = Seen(Sample(client.status(), client.metrics()), None), time.monotonic()
@@ -86,6 +86,11 @@ def _show(server: str, name: str, client: Client, period_s: float) -> None:
             live.update(page(f"map {name} at {server}", seen, console.width), refresh=True)
 
 
+def _sleep(seconds: float) -> bool:
+    time.sleep(seconds)
+    return False
+
+
 @contextmanager
 def _keyboard() -> Iterator[Callable[[float], bool]]:
     """Yield what waits for some seconds, and tells whether ``q`` was typed meanwhile."""
@@ -99,7 +104,7 @@ def _keyboard() -> Iterator[Callable[[float], bool]]:
         return False
 
     if sys.stdin is None or not sys.stdin.isatty():
-        yield lambda seconds: bool(time.sleep(seconds))
+        yield _sleep
         return
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)

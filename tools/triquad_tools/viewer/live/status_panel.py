@@ -5,7 +5,6 @@ import time
 from triquad_format.wire.messages import ServerStatus
 
 from triquad_tools.console.amounts import duration
-from triquad_tools.top.interval import Rates, Sample, interval
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.page.panel_html import problem_html, table_html
 from triquad_tools.viewer.page.refresher import Refresher
@@ -19,7 +18,7 @@ class StatusPanel:
 
     def __init__(self, source: LiveSource, page: Page) -> None:
         self._client = source.client
-        self._before: Sample | None = None
+        self._before: ServerStatus | None = None
         self._folder = page.gui.add_folder("Server")
         with self._folder:
             self._figures = page.gui.add_html("")
@@ -35,21 +34,22 @@ class StatusPanel:
         asked_s = time.perf_counter()
         status = self._client.status()
         answered_ms = 1e3 * (time.perf_counter() - asked_s)
-        sample = Sample(time.time_ns(), status, metrics=None)
-        rates = interval(self._before, sample).rates
-        self._before = sample
-        self._figures.content = table_html(_rows(status, rates, answered_ms))
+        rows = _rows(status, _samples_per_s(self._before, status), answered_ms)
+        self._before = status
+        self._figures.content = table_html(rows)
         problems = [text for text in (status.store_error, status.warnings) if text]
         self._warnings.content = "".join(map(problem_html, problems))
 
 
-def _rows(status: ServerStatus, rates: Rates | None, answered_ms: float) -> list[tuple[str, str]]:
+def _rows(
+    status: ServerStatus, samples_per_s: float | None, answered_ms: float
+) -> list[tuple[str, str]]:
     dropped = sum(status.scans_dropped.values())
     lost = sum(status.scans_lost.values())
     regions = "1 region" if status.regions == 1 else f"{status.regions} regions"
     return [
         ("epoch", f"{status.epoch}"),
-        ("learning", _learning(status, rates)),
+        ("learning", _learning(status, samples_per_s)),
         ("scans", f"{status.scans_taken:,} taken, {status.scans_waiting} waiting"),
         ("not taken", f"{dropped:,} refused, {lost:,} lost"),
         ("map", f"{regions}, {status.parameters / 1e6:.2f} M parameters"),
@@ -59,11 +59,20 @@ def _rows(status: ServerStatus, rates: Rates | None, answered_ms: float) -> list
     ]
 
 
-def _learning(status: ServerStatus, rates: Rates | None) -> str:
+def _learning(status: ServerStatus, samples_per_s: float | None) -> str:
     if status.settled:
         return "settled: nothing is left to learn"
     left = f"{status.samples_left / 1e6:.1f} M samples left"
-    return left if rates is None else f"{rates.samples_trained / 1e6:.2f} M samples/s, {left}"
+    return left if samples_per_s is None else f"{samples_per_s / 1e6:.2f} M samples/s, {left}"
+
+
+def _samples_per_s(before: ServerStatus | None, now: ServerStatus) -> float | None:
+    """Return how fast the server learns, ``None`` where it was restarted since."""
+    if before is None or before.server != now.server or now.uptime_s <= before.uptime_s:
+        return None
+    return max(
+        0.0, (now.samples_trained - before.samples_trained) / (now.uptime_s - before.uptime_s)
+    )
 
 
 def _checkpoint(status: ServerStatus) -> str:
