@@ -20,7 +20,7 @@ from triquad_tools.top.page import Seen, page
 
 PICTURE = Path(__file__).parent / "images" / "top.svg"
 _WIDTH = 126  # characters: three columns
-_SECONDS, _RATE_HZ = 30, 10
+_SECONDS, _RATE_HZ = 30, 4
 
 
 def _simulated() -> list[SimulatedScan]:

@@ -111,8 +111,8 @@ def test_the_page_tells_rates_counts_and_times_on_any_width(width):
     lines = (
         r"taken +10\.0 +12\.4 k|bytes received +8\.20 MB +8\.01 GB|samples /s +812 k|"
         r"to learn +3\.10 M samples, 3\.8 s|epoch +1,236, 0\.4 s old|distance +24\.0 +55\.0 +99\.1|"
-        r"scans +3 +10|evidence +120 MB|last checkpoint +32 s ago|camera +0 +12 +0\.2 s ago|"
-        r"too_near +0 +5,000|client +2"
+        r"scans +3 +10|evidence +120 MB|last checkpoint +epoch 1,200, 32 s ago|client +2|"
+        r"camera +0 +12 +0\.2 s ago|too_near +0 +5,000"
     )
     assert [line for line in lines.split("|") if not re.search(line, text)] == []
     assert "up 3 h 12 min" in " ".join(text.split())
@@ -227,7 +227,7 @@ def test_once_is_the_whole_page_as_text_or_json(endpoint, capsys):
     assert text.startswith(f"map default at {endpoint}, triquad ")
     for positive in ("taken", "roof", "distance", "flush", "epochs /s", "process", "client"):
         assert re.search(rf"{positive} +\d*\.?\d*[1-9]", text), positive
-    assert re.search(r"last checkpoint +\d+\.\d s ago", text)
+    assert re.search(r"last checkpoint +epoch \d+, \d+\.\d s ago", text)
     (line,) = capsys.readouterr().out.splitlines()
     report = json.loads(line)
     assert (report["endpoint"], report["map"], report["silent"]) == (endpoint, "default", None)

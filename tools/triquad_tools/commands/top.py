@@ -41,20 +41,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _top(options: argparse.Namespace) -> int:
     name, server = options.map or DEFAULT_MAP, server_name(options)
-    is_screen = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
-    draw = partial(_json_line, server, name) if options.json else partial(_plain, server, name)
+    can_draw = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     reached = connect(options.connect, name, timeout_s=_TIMEOUT_S, config=options.config)
     with sigterm_interrupts(), reached as client:
-        if options.once or not (options.json or is_screen):
+        if not options.once and options.json:
+            for seen in _observed(client, options.interval, _sleep):
+                print_line(_json_line(server, name, seen))
+        elif not options.once and can_draw:
+            _show(f"map {name} at {server}", client, options.interval)
+        else:
             _, seen = itertools.islice(_observed(client, options.interval, _sleep), 2)
             if seen.silent is not None:
                 return complain(_COMMAND, seen.silent, FAILED)
-            print_line(draw(seen))
-        elif options.json:
-            for seen in _observed(client, options.interval, _sleep):
-                print_line(draw(seen))
-        else:
-            _show(server, name, client, options.interval)
+            title = f"map {name} at {server}"
+            print_line(_json_line(server, name, seen) if options.json else _plain(title, seen))
     return OK
 
 
@@ -67,7 +67,7 @@ def _observed(
     while True:
         yield seen
         due_s = max(due_s + period_s, time.monotonic())
-        if ends_within(due_s - time.monotonic()):
+        if ends_within(max(0.0, due_s - time.monotonic())):
             return
         try:
             sample, last = Sample(client.status(), client.metrics()), seen.sample
@@ -75,15 +75,16 @@ def _observed(
             seen, answered_s = Seen(sample, rates(last, sample), restarted), time.monotonic()
         except TriquadError as error:
             silent_s = time.monotonic() - answered_s
-            seen = replace(seen, silent=f"no answer for {duration(silent_s)}: {error}")
+            silent = f"no answer for {duration(silent_s)}: {error}"
+            seen = replace(seen, silent=silent, restarted=False)
 
 
-def _show(server: str, name: str, client: Client, period_s: float) -> None:
+def _show(title: str, client: Client, period_s: float) -> None:
     """Draw the page until q or Ctrl-C is typed; the terminal is then as it was."""
     console = Console()
     with _keyboard() as q_within, Live(console=console, screen=True, auto_refresh=False) as live:
         for seen in _observed(client, period_s, q_within):
-            live.update(page(f"map {name} at {server}", seen, console.width), refresh=True)
+            live.update(page(title, seen, console.width), refresh=True)
 
 
 def _sleep(seconds: float) -> bool:
@@ -114,11 +115,11 @@ def _keyboard() -> Iterator[Callable[[float], bool]]:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
-def _plain(server: str, name: str, seen: Seen) -> str:
+def _plain(title: str, seen: Seen) -> str:
     """Return the whole page as text without colours."""
     has_width = sys.stdout.isatty() or "COLUMNS" in os.environ
     console = Console(width=None if has_width else _PLAIN_WIDTH)
-    lines = console.render_lines(page(f"map {name} at {server}", seen, console.width))
+    lines = console.render_lines(page(title, seen, console.width))
     return "\n".join("".join(part.text for part in line).rstrip() for line in lines)
 
 

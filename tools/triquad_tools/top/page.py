@@ -131,23 +131,18 @@ def _map(sample: Sample, rates: Rates) -> Iterator[tuple[str, str]]:
     if status.fit is not None:
         yield "held-out rays within", within(status.fit.median_m, status.fit.upper_m)
     yield "regions", count(status.regions)
-    if checkpoints.age_s is not None:
-        yield "last checkpoint", f"{duration(checkpoints.age_s)} ago"
+    if status.last_checkpoint is not None:
+        ago = "" if checkpoints.age_s is None else f", {duration(checkpoints.age_s)} ago"
+        yield "last checkpoint", f"epoch {status.last_checkpoint.epoch:,}{ago}"
     yield "written, failed", f"{count(checkpoints.written)}, {count(checkpoints.failed)}"
 
 
 def _operations(sample: Sample, rates: Rates) -> Iterator[tuple[str, ...]]:
     """Yield a row for each operation that was ever answered, the most frequent first."""
-    longest_s = max(sample.metrics.bounds_s.tolist(), default=0.0)
-
-    def shown(seconds: float | None) -> str:
-        if seconds is None:
-            return "-"
-        return milliseconds(seconds) if seconds <= longest_s else f">{milliseconds(longest_s)}"
-
     for name, total in sorted(sample.each("operations.answered").items(), key=lambda one: -one[1]):
+        times_s = (rates.p50_s[name], rates.p99_s[name])
         if total:
-            times = (shown(rates.p50_s[name]), shown(rates.p99_s[name]))
+            times = ("-" if time_s is None else milliseconds(time_s) for time_s in times_s)
             yield name.rpartition("/")[2], rate(rates.answered[name]), *times
 
 
