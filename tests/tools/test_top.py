@@ -110,7 +110,7 @@ def test_the_page_tells_rates_counts_and_times_on_any_width(width):
     )
     lines = (
         r"taken +10\.0 +12\.4 k|bytes received +8\.20 MB +8\.01 GB|samples /s +812 k|"
-        r"to learn +3\.10 M samples, 3\.8 s|epoch +1,236, 0\.4 s old|distance +24\.0 +55\.0 +99\.1|"
+        r"samples left +3\.10 M, 3\.8 s|epoch +1,236, 0\.4 s old|distance +24\.0 +55\.0 +99\.1|"
         r"scans +3 +10|evidence +120 MB|last checkpoint +epoch 1,200, 32 s ago|client +2|"
         r"camera +0 +12 +0\.2 s ago|too_near +0 +5,000"
     )

@@ -123,10 +123,10 @@ def _map(sample: Sample, rates: Rates) -> Iterator[tuple[str, str]]:
     yield "epoch", f"{status.epoch:,}, {duration(sample.metrics.epoch_age_s)} old"
     yield "epochs /s", rate(rates.epochs)
     yield "samples /s", rate(rates.samples_trained)
-    left = "nothing, settled" if status.settled else f"{count(status.samples_left)} samples"
+    left = "nothing, settled" if status.settled else count(status.samples_left)
     if not status.settled and rates.samples_trained > 0.0:
         left += f", {duration(status.samples_left / rates.samples_trained)}"
-    yield "to learn", left
+    yield "samples left", left
     yield "loss", f"{status.loss:.4f}"
     if status.fit is not None:
         yield "held-out rays within", within(status.fit.median_m, status.fit.upper_m)
