@@ -22,7 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 from support import servers
-from support.server_records import BOUNDS_S, METRICS, STATUS, later, operation
+from support.server_records import METRICS, STATUS, later, operation
 from support.terminal import Terminal, terminal
 from triquad_client import Client, ServerMetrics, ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, SourceMetrics
@@ -34,7 +34,6 @@ from triquad_tools.top.page import Seen, page
 CODE = "import sys; from triquad_tools.commands.entry_points import top; sys.exit(top())"
 CAUSE = "source 'camera': range_min_m = 1.5 drops 12 % of its points: set scan.range_min_m to less"
 COUNTS = st.integers(0, 10**12)
-TIMES_S = st.lists(st.floats(1e-4, 9.9), min_size=1, max_size=200)
 EXTREMES: dict[type, tuple[Any, ...]] = {
     bool: (True, False),
     int: (-(2**63), -1, 0, 1, 2**63 - 1),
@@ -55,21 +54,6 @@ def test_a_rate_times_its_interval_is_what_was_counted(before, more, seconds):
     assert seen.scans_taken * seen.seconds == pytest.approx(more)
     dropped = {name: per_s * seen.seconds for name, per_s in seen.points_dropped.items()}
     assert dropped == pytest.approx({"too_near": more, "new": more, "forgotten": 0.0})
-
-
-@settings(deadline=None)
-@given(before=TIMES_S, during=TIMES_S)
-def test_quantiles_are_those_of_the_interval_alone(before, during):
-    first = later(0.0, metrics={"operations": {"query/sdf": operation(before)}})
-    second = later(2.0, metrics={"operations": {"query/sdf": operation(before + during)}})
-    seen = rates(first, second)
-    assert seen is not None
-    assert seen.answered["query/sdf"] == pytest.approx(len(during) / 2.0)
-    edges = np.concatenate([[0.0], BOUNDS_S])
-    for shown_s, share in ((seen.p50_s["query/sdf"], 0.5), (seen.p99_s["query/sdf"], 0.99)):
-        bucket = int(np.searchsorted(BOUNDS_S, np.quantile(during, share, method="inverted_cdf")))
-        assert shown_s is not None  # as near as a histogram tells
-        assert edges[bucket] * (1.0 - 1e-9) <= shown_s <= edges[bucket + 1] * (1.0 + 1e-9)
 
 
 @pytest.mark.parametrize("seconds", [float("nan"), float("inf"), 0.0, -1.0])
@@ -297,18 +281,16 @@ def test_a_server_that_is_killed_and_started_again_is_noticed(tmp_path: Path) ->
             assert "no answer" not in opened.wait_for(r"taken +0 +0\b")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "text"),
-    [
-        (("--map", "other"), 1, "no server has a map 'other'; available: default"),
-        (("--map", "\x1b[2J"), 2, r"map name '\x1b[2J' is not allowed"),
-    ],
-)
-def test_what_cannot_be_watched_is_said_in_one_line(endpoint, capsys, arguments, status, text):
-    assert main(["--connect", endpoint, *arguments]) == status
-    (line,) = capsys.readouterr().err.splitlines()
-    assert text in line
-    assert line.isprintable()
-    for wrong in (["--interval", "0"], ["--interval", "x"]):
+def test_what_cannot_be_watched_is_said_in_one_line(endpoint, capsys):
+    cases = {
+        "other": (1, "available: default"),
+        "\x1b[2J": (2, r"map name '\x1b[2J' is not allowed"),
+    }
+    for name, (status, text) in cases.items():
+        assert main(["--connect", endpoint, "--map", name]) == status
+        (line,) = capsys.readouterr().err.splitlines()
+        assert text in line
+        assert line.isprintable()
+    for wrong in ("0", "x"):
         with pytest.raises(SystemExit, match="2"):
-            main(wrong)
+            main(["--interval", wrong])

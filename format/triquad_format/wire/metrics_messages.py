@@ -87,7 +87,7 @@ class CheckpointMetrics(Message):
 class ServerMetrics(Message):
     """Answer to :class:`MetricsRequest`."""
 
-    server: Name  # a name of this server process: all counts begin anew with it
+    server: Name  # a name of this server process: all counts begin at zero with it
     uptime_s: Duration
     problem: str | None  # why the server does not do what it should; None: it does
     epoch: Epoch

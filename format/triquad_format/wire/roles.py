@@ -51,7 +51,7 @@ class Holder:
 
     @property
     def common_name(self) -> str:
-        """Of its certificate, by which Zenoh knows it."""
+        """The common name of its certificate, which tells Zenoh who it is."""
         return f"{self.role.value}:{self.name}:{self.issue}"
 
 

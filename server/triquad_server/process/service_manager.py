@@ -33,7 +33,7 @@ class ServiceManager:
         lines += (f"STATUS={printable(status)}",) if status else ()
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
-                sender.settimeout(5.0)  # a manager that does not listen must not hold up the server
+                sender.settimeout(5.0)  # a manager that does not listen must not stop the server
                 sender.sendto("\n".join(lines).encode(), self._address)
         except OSError as error:
             _log.warning("the service manager could not be told %s: %s", lines[0], error)
