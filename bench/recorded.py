@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_sensors.sweep import PosedScan
 from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.folders.kitti import read_kitti_folder
+from triquad_tools.sensors.sweep import PosedScan
 
 _SKIP_EVERY = 7
 _RANGE_MIN_M = 2.0  # nearer is the vehicle's own body

@@ -6,7 +6,6 @@ from functools import partial
 
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
-from triquad_sensors.sweep import PosedScan
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
@@ -24,6 +23,7 @@ from triquad_tools.evaluation.metrics import (
     ScoreSettings,
     score_against_scene,
 )
+from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 

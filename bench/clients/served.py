@@ -13,10 +13,10 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
-from triquad_sensors.sweep import PosedScan
 from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.demo.server import DemoServer
+from triquad_tools.sensors.sweep import PosedScan
 
 from bench.figures import Figure
 from bench.street import BenchStreet

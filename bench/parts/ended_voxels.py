@@ -6,10 +6,9 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.status import Status
 from triquad_map.view import MapView
-from triquad_sensors.pose import moved
-from triquad_sensors.sweep import PosedScan
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
+from triquad_tools.sensors.sweep import PosedScan, moved
 
 _KEY_SIDE = 1 << 20  # voxels along an axis that keys can tell apart
 _NONE = -1  # no voxel's key

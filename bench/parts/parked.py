@@ -8,10 +8,10 @@ from collections.abc import Iterable
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_sensors.sweep import PosedScan
 from triquad_server.settings import Settings
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.map_scores import driven_street
+from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import box

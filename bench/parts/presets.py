@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
-from triquad_sensors.sweep import PosedScan
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import (
     STREET_SAMPLES_MAX,
@@ -18,6 +17,7 @@ from triquad_tools.evaluation.metrics import (
 )
 from triquad_tools.recordings.cloud import merged
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
+from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 

@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_client.pose import Pose
 from triquad_format.records.arrays import Doubles
-from triquad_sensors.motion.frame_tree import FrameTree, Transform
-from triquad_sensors.pose import Pose
-from triquad_sensors.sweep import Sweep
+from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
+from triquad_tools.sensors.sweep import Sweep
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
 

@@ -35,9 +35,6 @@ from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Polyline, Segments
 from triquad_map.questions.spheres import Spheres
-from triquad_sensors.depth_image import Intrinsics, depth_points
-from triquad_sensors.errors import InvalidScanError
-from triquad_sensors.pose import Pose
 
 from triquad_client.async_client import AsyncClient
 from triquad_client.calls.async_queries import AsyncPinnedMap
@@ -49,12 +46,14 @@ from triquad_client.calls.sources import NewestScan, ScanSource, SourceReport
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.client import Client
 from triquad_client.connecting import connect, connect_async
+from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
     ConnectError,
     DownloadError,
     EmptierMapError,
+    InvalidScanError,
     NoReplyError,
     RequestTimeoutError,
     UnknownMapError,
@@ -66,6 +65,7 @@ from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.offline_map import OfflineMap, open_map
 from triquad_client.offline.synced_map import AsyncSyncedMap, SyncedMap, SyncReport
 from triquad_client.organised_cloud import empty_returns
+from triquad_client.pose import Pose
 
 __all__ = [
     "Alignment",

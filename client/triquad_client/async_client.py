@@ -12,7 +12,6 @@ from triquad_format.wire.messages import (
     TileList,
 )
 from triquad_format.wire.metrics_messages import ServerMetrics
-from triquad_sensors.depth_image import Intrinsics, depth_points
 
 from triquad_client.calls import admin, changes, download, questions, sources
 from triquad_client.calls.async_queries import AsyncMapQueries, AsyncPinnedMap
@@ -21,6 +20,7 @@ from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.calls.sources import SourceReport
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.client import Client
+from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.documentation import documented_as
 from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles

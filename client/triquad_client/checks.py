@@ -25,8 +25,9 @@ from triquad_format.wire.limits import (
 )
 from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
-from triquad_sensors.errors import NO_NUMBER, InvalidScanError
-from triquad_sensors.pose import Pose
+
+from triquad_client.errors import NO_NUMBER, InvalidScanError
+from triquad_client.pose import Pose
 
 PoseLike: TypeAlias = ArrayLike | Pose
 """A rigid pose in the map frame: a matrix [4, 4], or a position and a quaternion."""

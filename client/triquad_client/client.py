@@ -12,7 +12,6 @@ from triquad_format.wire.messages import (
     TileList,
 )
 from triquad_format.wire.metrics_messages import ServerMetrics
-from triquad_sensors.depth_image import Intrinsics, depth_points
 
 from triquad_client.calls import admin, changes, download, questions, sources
 from triquad_client.calls.changes import ChangeReport
@@ -20,6 +19,7 @@ from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport, ScanPublisher
 from triquad_client.calls.sources import SourceReport
 from triquad_client.checks import Bounds, PoseLike
+from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.mesh_calls import fetch_mesh, fetch_tile, fetch_tiles

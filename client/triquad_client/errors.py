@@ -1,9 +1,16 @@
 """The errors of the client. Each text says what to do about it."""
 
-from triquad_format.errors import TriquadError
+from triquad_format.errors import InvalidInputError, TriquadError
+
+NO_NUMBER = (TypeError, ValueError, OverflowError)
+"""What conversions to numbers raise: Python's integers may be larger than any float."""
 
 _MAPS_NAMED = 20
 _NO_MAPS = "none (is this a router without a triquad server?)"
+
+
+class InvalidScanError(InvalidInputError):
+    """A scan that cannot be published; nothing was sent."""
 
 
 class ConnectError(TriquadError):

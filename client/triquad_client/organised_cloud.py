@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
-from triquad_sensors.errors import InvalidScanError
 
 from triquad_client import checks
+from triquad_client.errors import InvalidScanError
 
 
 def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:

@@ -1,7 +1,7 @@
 """A lidar that moves while it turns."""
 
 import numpy as np
-from triquad_sensors.motion.placing import place
+from triquad_tools.sensors.motion.placing import place
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import box, half_space

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from triquad_format.records.arrays import Doubles
 from triquad_map.questions.align import Alignment, AlignOptions, align
 from triquad_map.view import MapView
-from triquad_sensors.sweep import PosedScan
 from triquad_server.settings import Settings
+from triquad_tools.sensors.sweep import PosedScan
 
 from bench.recorded import recorded_scans
 from bench.street import settled_mapper

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_sensors.depth_image import Intrinsics
+from triquad_client.depth_image import Intrinsics
 
 CAMERA = Intrinsics(60.0, 62.0, 31.5, 23.5)
 WIDTH, HEIGHT = 64, 48

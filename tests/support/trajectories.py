@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_sensors.pose import Pose
+from triquad_client.pose import Pose
 
 
 def drive(

@@ -1,6 +1,6 @@
 import numpy as np
-from triquad_sensors.sweep import PosedScan
 from triquad_tools.recordings.cloud import is_withheld, merged, points_in_range, world_points
+from triquad_tools.sensors.sweep import PosedScan
 
 
 def test_the_last_of_every_few_scans_is_withheld() -> None:

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.trajectories import drive, matrices, write_log, write_tum
-from triquad_sensors.errors import NoTransformError
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
 from triquad_tools.recordings.folders.trajectory import find_trajectories, read_trajectory
+from triquad_tools.sensors.errors import NoTransformError
 
 START_NS = 1_700_000_000_000_000_000
 LINE = "1 0 0 0 0 0 0 1"

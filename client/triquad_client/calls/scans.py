@@ -13,12 +13,11 @@ from triquad_format.errors import FormatError, InvalidInputError, RefusedError
 from triquad_format.printable import printable
 from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest, Scan, ServerStatus
-from triquad_sensors.errors import InvalidScanError
 
 from triquad_client import checks
 from triquad_client.calls import admin
 from triquad_client.checks import PoseLike
-from triquad_client.errors import RequestTimeoutError
+from triquad_client.errors import InvalidScanError, RequestTimeoutError
 from triquad_client.net.call import Ask, Call, Pause, ask_each
 from triquad_client.net.connection import Connection
 

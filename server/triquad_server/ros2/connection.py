@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 import zenoh
 from triquad_map.compiled.team import Team
-from triquad_sensors.ros.type_store import MARKER, OCCUPANCY_GRID
+from triquad_tools.sensors.ros.type_store import MARKER, OCCUPANCY_GRID
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue

@@ -7,7 +7,7 @@ zenoh-bridge-ros2dds (its liveliness_mgt.rs).
 from dataclasses import dataclass
 from enum import Enum
 
-from triquad_sensors.ros.type_store import type_store
+from triquad_tools.sensors.ros.type_store import type_store
 
 ANY_HASH = "*"
 NO_HASH = "TypeHashNotSupported"

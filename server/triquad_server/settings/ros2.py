@@ -3,7 +3,7 @@
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
-from triquad_sensors.ros.header import frame_name
+from triquad_tools.sensors.ros.header import frame_name
 
 from triquad_server.settings.section import SECTION
 

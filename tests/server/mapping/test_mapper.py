@@ -7,7 +7,6 @@ from support.small_world import World, settings, settle, settled_mapper, surface
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
-from triquad_sensors.pose import moved
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.engine.memory import ArrayMemory
 from triquad_server.errors import ScanRefusedError
@@ -18,6 +17,7 @@ from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay_pool import RAY_BYTES
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
+from triquad_tools.sensors.sweep import moved
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 

@@ -1,10 +1,10 @@
 """Sweeps that wait for transforms take no memory without end."""
 
 import numpy as np
-from triquad_sensors.sweep import Sweep
 from triquad_server.ros2.intake.inbox import LaneLimit
 from triquad_server.ros2.intake.motion import Motion
 from triquad_server.ros2.intake.placement import Placement
+from triquad_tools.sensors.sweep import Sweep
 
 POINT_BYTES = 12
 

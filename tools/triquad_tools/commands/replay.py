@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 
 from triquad_client import Client, FlushReport, connect
-from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
@@ -25,6 +24,7 @@ from triquad_tools.recordings.publishing import (
 )
 from triquad_tools.recordings.recording import ScanEntry
 from triquad_tools.recordings.selection import Selection, open_selected
+from triquad_tools.sensors.sweep import PosedScan
 
 _COMMAND = "triquad-replay"
 _LOOK_PERIOD_S = 1.0  # between questions how many scans were lost

@@ -4,8 +4,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from triquad_sensors.depth_image import Intrinsics
-from triquad_sensors.ros.header import frame_name
+from triquad_client.depth_image import Intrinsics
 
 from triquad_tools.console.arguments import count, not_negative, positive
 from triquad_tools.console.command import ToolError
@@ -13,6 +12,7 @@ from triquad_tools.recordings.folders.cloud_folder import CloudOptions
 from triquad_tools.recordings.folders.depth_folder import DepthOptions
 from triquad_tools.recordings.opening import RecordingOptions
 from triquad_tools.recordings.ros_options import RosOptions, parse_transform
+from triquad_tools.sensors.ros.header import frame_name
 
 _Add = Callable[..., argparse.Action]
 

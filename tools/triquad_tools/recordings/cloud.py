@@ -5,8 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
-from triquad_sensors.pose import moved
-from triquad_sensors.sweep import PosedScan
+
+from triquad_tools.sensors.sweep import PosedScan, moved
 
 _MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 

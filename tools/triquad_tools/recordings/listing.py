@@ -4,11 +4,10 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from triquad_sensors.ros.type_store import IMAGE
-
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 from triquad_tools.recordings.recording import Recording
+from triquad_tools.sensors.ros.type_store import IMAGE
 
 _OF_DEPTH = ("depth images", IMAGE)
 

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from triquad_sensors.errors import NoTransformError
-from triquad_sensors.motion.frame_tree import ROOT_NAMES, FrameTree
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.ros_options import RosOptions
 from triquad_tools.recordings.ros_survey import SeenCloud, Survey
+from triquad_tools.sensors.errors import NoTransformError
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
 
 TF = "tf"
 """Stands for all transforms, whatever their topics."""

@@ -4,9 +4,9 @@ import time
 from collections.abc import Sequence
 
 from triquad_client import Client, FlushReport, ServerStatus
-from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.progress import Speed, progress
+from triquad_tools.sensors.sweep import PosedScan
 
 _POLL_S = 0.5  # the server says how it is doing when it is asked, not when it changes
 

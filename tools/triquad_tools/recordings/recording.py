@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from triquad_sensors.sweep import PosedScan
+from triquad_tools.sensors.sweep import PosedScan
 
 DEFAULT_SOURCE = "default"
 """Of recordings that name no sensor: the source that the client takes by default, too."""

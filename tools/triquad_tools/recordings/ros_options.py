@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-from triquad_sensors.motion.frame_tree import STATIC, Transform
-from triquad_sensors.pose import Pose
-from triquad_sensors.ros.header import frame_name
+from triquad_client.pose import Pose
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
+from triquad_tools.sensors.ros.header import frame_name
 
 
 @dataclass(frozen=True)

@@ -5,20 +5,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from triquad_sensors.errors import NoScanError
-from triquad_sensors.motion.frame_tree import ROOT_NAMES
-from triquad_sensors.motion.placing import place
-from triquad_sensors.ros import type_store
-from triquad_sensors.ros.point_cloud import sweep_of_cloud
-from triquad_sensors.ros.topic import source_of_topic
-from triquad_sensors.sweep import PosedScan, Sweep
-
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
 from triquad_tools.recordings.pose_source import TF, PoseSource, choose_poses
 from triquad_tools.recordings.recording import ScanEntry, Stream
 from triquad_tools.recordings.ros_options import RosOptions
 from triquad_tools.recordings.ros_survey import SeenCloud, Survey, survey, sweep_of_image
+from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
+from triquad_tools.sensors.motion.placing import place
+from triquad_tools.sensors.ros import type_store
+from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
+from triquad_tools.sensors.ros.topic import source_of_topic
+from triquad_tools.sensors.sweep import PosedScan, Sweep
 
 _CLOCKS = (
     "no cloud's stamp lies within the times of the poses: where they are of another clock, "

@@ -7,22 +7,22 @@ from itertools import chain
 from typing import Any
 
 from triquad_format.errors import InvalidInputError
-from triquad_sensors.errors import NoScanError
-from triquad_sensors.motion.frame_tree import STATIC, FrameTree, Transform
-from triquad_sensors.motion.track import Track
-from triquad_sensors.ros import type_store
-from triquad_sensors.ros.depth_camera import camera_topic, is_depth, sweep_of_depth
-from triquad_sensors.ros.point_cloud import sweep_of_cloud
-from triquad_sensors.ros.transforms import (
-    transform_of_odometry,
-    transform_of_pose,
-    transforms_of_tf,
-)
-from triquad_sensors.sweep import Sweep
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.bag import Bag, Message, OpenBag
+from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
+from triquad_tools.sensors.motion.track import Track
+from triquad_tools.sensors.ros import type_store
+from triquad_tools.sensors.ros.depth_camera import camera_topic, is_depth, sweep_of_depth
+from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
+from triquad_tools.sensors.ros.transforms import (
+    transform_of_odometry,
+    transform_of_pose,
+    transforms_of_tf,
+)
+from triquad_tools.sensors.sweep import Sweep
 
 POSE_KINDS = (type_store.ODOMETRY, type_store.POSE)
 _TF_KINDS = (type_store.TF, type_store.TF_OF_ROS_1)

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
@@ -13,6 +12,7 @@ from triquad_tools.recordings.arguments import options_of
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.recording import Recording, ScanEntry
+from triquad_tools.sensors.sweep import PosedScan
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.recordings.cloud import merged
+from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.scene import Scene
 
 _SENSOR_HEIGHT_M = 1.8

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
-from triquad_sensors.ros.depth_camera import camera_topic
-from triquad_sensors.ros.type_store import (
+from triquad_tools.sensors.ros.depth_camera import camera_topic
+from triquad_tools.sensors.ros.type_store import (
     CAMERA_INFO,
     IMAGE,
     ODOMETRY,

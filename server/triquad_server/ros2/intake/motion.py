@@ -1,7 +1,8 @@
 """What is known of how the robot moves, from transforms or from a topic of poses."""
 
-from triquad_sensors.errors import InvalidScanError, NoScanError
-from triquad_sensors.motion.frame_tree import STATIC, FrameTree, Transform
+from triquad_client.errors import InvalidScanError
+from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
 
 BEGAN_ANEW_NS = 10 * 10**9
 """Transforms that go back by more are of a simulation or a bag that began anew."""

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from triquad_sensors.errors import NoScanError, NoTransformError
-from triquad_sensors.motion.frame_tree import ROOT_NAMES
-from triquad_sensors.motion.placing import place
-from triquad_sensors.sweep import PosedScan, Sweep
+from triquad_tools.sensors.errors import NoScanError, NoTransformError
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
+from triquad_tools.sensors.motion.placing import place
+from triquad_tools.sensors.sweep import PosedScan, Sweep
 
 from triquad_server.ros2.intake.inbox import LaneLimit
 from triquad_server.ros2.intake.motion import Motion

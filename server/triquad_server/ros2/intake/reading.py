@@ -3,16 +3,16 @@
 from dataclasses import replace
 from typing import Any
 
-from triquad_sensors.errors import NoScanError
-from triquad_sensors.motion.frame_tree import STATIC, Transform
-from triquad_sensors.ros.depth_camera import camera_topic, sweep_of_depth
-from triquad_sensors.ros.point_cloud import sweep_of_cloud
-from triquad_sensors.ros.transforms import (
+from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
+from triquad_tools.sensors.ros.depth_camera import camera_topic, sweep_of_depth
+from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
+from triquad_tools.sensors.ros.transforms import (
     transform_of_odometry,
     transform_of_pose,
     transforms_of_tf,
 )
-from triquad_sensors.ros.type_store import (
+from triquad_tools.sensors.ros.type_store import (
     CAMERA_INFO,
     IMAGE,
     ODOMETRY,
@@ -21,7 +21,7 @@ from triquad_sensors.ros.type_store import (
     TF,
     decode_cdr,
 )
-from triquad_sensors.sweep import Sweep
+from triquad_tools.sensors.sweep import Sweep
 
 from triquad_server.ros2.intake.feeds import Role
 from triquad_server.ros2.intake.inbox import Arrival

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import zenoh
-from triquad_sensors.errors import NoScanError
+from triquad_tools.sensors.errors import NoScanError
 
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.ros2.attachment import SequenceGaps

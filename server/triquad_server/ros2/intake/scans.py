@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire.messages import Scan
-from triquad_sensors.errors import NoScanError
-from triquad_sensors.ros.topic import source_of_topic
-from triquad_sensors.sweep import PosedScan, Sweep
+from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.ros.topic import source_of_topic
+from triquad_tools.sensors.sweep import PosedScan, Sweep
 
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import check_count

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterable
 
-from triquad_sensors.ros.type_store import IMAGE, POINT_CLOUD
+from triquad_tools.sensors.ros.type_store import IMAGE, POINT_CLOUD
 
 from triquad_server.ros2.intake.feeds import Choice
 from triquad_server.ros2.topics import Topic

@@ -13,7 +13,7 @@ from triquad_format.records.status import Status
 from triquad_map.compiled.priority import lower_priority
 from triquad_map.compiled.team import Team
 from triquad_map.questions.grid import Grid, GridShape, grid
-from triquad_sensors.ros.type_store import OCCUPANCY_GRID, encode_cdr, type_store
+from triquad_tools.sensors.ros.type_store import OCCUPANCY_GRID, encode_cdr, type_store
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory

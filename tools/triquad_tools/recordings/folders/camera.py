@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
-from triquad_sensors.depth_image import Intrinsics
-from triquad_sensors.errors import NO_NUMBER, InvalidScanError
+from triquad_client.depth_image import Intrinsics
+from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.depth_png import ImageSize

@@ -7,11 +7,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Floats
-from triquad_sensors.errors import NoTransformError
-from triquad_sensors.motion.placing import place
-from triquad_sensors.point_times import offsets_s
-from triquad_sensors.pose import moved
-from triquad_sensors.sweep import PosedScan, Sweep
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.file_names import in_order
@@ -28,6 +23,10 @@ from triquad_tools.recordings.folders.point_files.pcd import check_pcd, read_pcd
 from triquad_tools.recordings.folders.point_files.ply import check_ply, read_ply
 from triquad_tools.recordings.folders.trajectory import SENSOR, WORLD, Trajectory, read_trajectory
 from triquad_tools.recordings.recording import ScanEntry, Stream
+from triquad_tools.sensors.errors import NoTransformError
+from triquad_tools.sensors.motion.placing import place
+from triquad_tools.sensors.point_times import offsets_s
+from triquad_tools.sensors.sweep import PosedScan, Sweep, moved
 
 
 class _Format(NamedTuple):

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from triquad_sensors.depth_image import Intrinsics, depth_points
-from triquad_sensors.sweep import PosedScan
+from triquad_client.depth_image import Intrinsics, depth_points
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.camera import Camera, check_fits, choose_camera
@@ -24,6 +23,7 @@ from triquad_tools.recordings.folders.placed_files import (
 from triquad_tools.recordings.folders.trajectory import Trajectory, read_trajectory
 from triquad_tools.recordings.recording import ScanEntry, Stream
 from triquad_tools.recordings.text_lines import parse_stamp, read_lines
+from triquad_tools.sensors.sweep import PosedScan
 
 _LIST_NAME = "depth.txt"  # of TUM RGB-D
 _FOLDER_NAME = "depth"  # of Open3D

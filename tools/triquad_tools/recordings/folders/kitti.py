@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
-from triquad_sensors.sweep import PosedScan
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry, Stream
 from triquad_tools.recordings.text_lines import parse_rigid, parse_stamp, read_lines
+from triquad_tools.sensors.sweep import PosedScan
 
 SCAN_FOLDERS = (".", "scans", "velodyne", "velodyne_points/data")
 DEFAULT_PERIOD_NS = 100_000_000  # between scans of a folder without times

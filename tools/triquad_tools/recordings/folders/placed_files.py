@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from triquad_format.records.arrays import Doubles
-from triquad_sensors.errors import NoTransformError
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
@@ -17,6 +16,7 @@ from triquad_tools.recordings.folders.trajectory import (
     find_trajectories,
 )
 from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry
+from triquad_tools.sensors.errors import NoTransformError
 
 _Found = TypeVar("_Found")
 

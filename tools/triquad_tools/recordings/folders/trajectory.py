@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from triquad_client.errors import InvalidScanError
+from triquad_client.pose import Pose
 from triquad_format.records.arrays import Doubles, Longs
-from triquad_sensors.errors import InvalidScanError, NoTransformError
-from triquad_sensors.motion.frame_tree import FrameTree, Transform
-from triquad_sensors.pose import Pose
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.kitti import DEFAULT_PERIOD_NS
@@ -24,6 +23,8 @@ from triquad_tools.recordings.text_lines import (
     parse_stamp,
     read_lines,
 )
+from triquad_tools.sensors.errors import NoTransformError
+from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
 
 TRAJECTORY_NAMES = ("trajectory.txt", "trajectory.log", "poses.txt", "groundtruth.txt", "*.tum")
 WORLD, SENSOR = "world", "sensor"

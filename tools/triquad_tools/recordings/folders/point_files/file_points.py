@@ -8,9 +8,9 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
-from triquad_sensors.point_times import TIME_FIELDS
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.sensors.point_times import TIME_FIELDS
 
 
 class FilePoints(NamedTuple):

@@ -28,3 +28,9 @@ class PosedScan:
 
     points: NDArray[np.floating]  # [N, 3] metres, sensor frame
     world_from_sensor: Doubles  # [4, 4]
+
+
+def moved(points: NDArray[np.floating], pose: NDArray[np.floating]) -> Doubles:
+    """Points [N, 3] by a pose [4, 4], in double precision: they may lie far from the origin."""
+    result: Doubles = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    return result

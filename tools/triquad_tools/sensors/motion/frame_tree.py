@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_client.pose import Pose, pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
-from triquad_sensors.errors import NoTransformError
-from triquad_sensors.motion.track import Track
-from triquad_sensors.pose import Pose, pose_matrices
+from triquad_tools.sensors.errors import NoTransformError
+from triquad_tools.sensors.motion.track import Track
 
 STATIC = None
 """The stamp of a transform that always holds."""

@@ -4,10 +4,10 @@ from array import array
 from bisect import bisect_left
 
 import numpy as np
+from triquad_client.pose import pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
-from triquad_sensors.errors import NoTransformError
-from triquad_sensors.pose import pose_matrices
+from triquad_tools.sensors.errors import NoTransformError
 
 MAX_GAP_S = 2.0
 """Between poses that lie farther apart nothing is interpolated."""

@@ -1,13 +1,6 @@
-"""The errors of what robots and sensors say. Each text says what to do about it."""
+"""Why no scan can be made of what a sensor said. Each text says what to do about it."""
 
-from triquad_format.errors import InvalidInputError, TriquadError
-
-NO_NUMBER = (TypeError, ValueError, OverflowError)
-"""What conversions to numbers raise: Python's integers may be larger than any float."""
-
-
-class InvalidScanError(InvalidInputError):
-    """A scan that cannot be published; nothing was sent."""
+from triquad_format.errors import TriquadError
 
 
 class NoScanError(TriquadError):

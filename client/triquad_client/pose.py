@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
 
-from triquad_sensors.errors import NO_NUMBER, InvalidScanError
+from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 _UNIT_TOLERANCE = 1e-2
 """By how much a quaternion's length may be off: files of three digits are."""
@@ -63,12 +63,6 @@ def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
     poses[..., :3, 3] = positions
     poses[..., 3, 3] = 1.0
     return poses
-
-
-def moved(points: NDArray[np.floating], pose: NDArray[np.floating]) -> Doubles:
-    """Points [N, 3] by a pose [4, 4], in double precision: they may lie far from the origin."""
-    result: Doubles = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-    return result
 
 
 def _numbers(name: str, values: ArrayLike, count: int) -> Doubles:

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
-from triquad_sensors.errors import NoTransformError
-from triquad_sensors.motion.frame_tree import STATIC, FrameTree, Transform
-from triquad_sensors.motion.placing import place
-from triquad_sensors.motion.track import Track
-from triquad_sensors.pose import Pose
-from triquad_sensors.sweep import Sweep
+from triquad_client.pose import Pose
+from triquad_tools.sensors.errors import NoTransformError
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
+from triquad_tools.sensors.motion.placing import place
+from triquad_tools.sensors.motion.track import Track
+from triquad_tools.sensors.sweep import Sweep
 
 SECOND = 10**9
 T0 = 1_700_000_000 * SECOND

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.records.arrays import Floats
 
-from triquad_sensors.errors import NO_NUMBER, InvalidScanError
+from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 _MILLIMETRES_PER_M = 1000.0
 

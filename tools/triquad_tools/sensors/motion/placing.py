@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats, Longs
 
-from triquad_sensors.motion.frame_tree import FrameTree
-from triquad_sensors.sweep import PosedScan, Sweep
+from triquad_tools.sensors.motion.frame_tree import FrameTree
+from triquad_tools.sensors.sweep import PosedScan, Sweep
 
 _MAX_KNOTS = 2048  # times of a sweep for which poses are computed; more are rounded to them
 

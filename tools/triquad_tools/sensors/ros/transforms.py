@@ -2,9 +2,10 @@
 
 from typing import Any
 
-from triquad_sensors.motion.frame_tree import STATIC, Transform
-from triquad_sensors.pose import Pose
-from triquad_sensors.ros.header import frame_name, stamp_ns
+from triquad_client.pose import Pose
+
+from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
+from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 
 
 def transforms_of_tf(message: Any, *, static: bool) -> list[Transform]:
